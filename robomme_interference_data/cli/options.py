@@ -89,7 +89,12 @@ def _options(config: Any) -> list[inspect.Parameter]:
 
 def _option(field: dataclasses.Field[Any], kind: Any) -> inspect.Parameter:
     declared, default = field.metadata[SETTING], field.default
-    about = {"help": declared["help"], "metavar": declared["metavar"], "envvar": declared["env"]}
+    about = {
+        "help": declared["help"],
+        "metavar": declared["metavar"],
+        "envvar": declared["env"],
+        "rich_help_panel": declared["group"],
+    }
     plain = _without_none(kind)
     if get_origin(plain) is tuple:
         listed: Any = list.__class_getitem__(get_args(plain)[0])

@@ -26,6 +26,7 @@ def setting(
     env: str | None = None,
     shown: str | None = None,
     whole: bool = False,
+    group: str | None = None,
 ) -> Any:
     """Declare a field that is also an option.
 
@@ -37,6 +38,7 @@ def setting(
         env: Environment variable that can give it.
         shown: What the help shows as its default, where that says more than the value.
         whole: Values of a list may contain commas, which do not separate them.
+        group: Title under which the help lists it; by default among the plain options.
     """
     declared = {
         "help": help,
@@ -45,5 +47,6 @@ def setting(
         "env": env,
         "shown": shown,
         "whole": whole,
+        "group": group,
     }
     return dataclasses.field(default=default, metadata={SETTING: declared})
