@@ -1,7 +1,7 @@
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help setup install vulkan demo test check format types bench pins
+.PHONY: help setup install vulkan demo test check docs format types bench pins
 
 BIN := .venv/bin
 # The folders that pyproject.toml maps under robomme_interference_data.
@@ -36,6 +36,10 @@ check: setup types  ## Lint; check the format, the types and who imports whom.
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy build/typecheck/robomme_interference_data
 	@cd build/typecheck && $(CURDIR)/$(BIN)/lint-imports --config $(CURDIR)/pyproject.toml --no-logo
+
+docs: setup  ## Build the documentation site, without a network, into build/docs.
+	@$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet docs build/docs
+	@echo "Open build/docs/index.html"
 
 format: setup  ## Mend what ruff can mend.
 	@$(BIN)/ruff check --fix .

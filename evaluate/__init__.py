@@ -36,7 +36,7 @@ __getattr__ = lazy_exports(
     __name__,
     {
         ".policies.policy": "Policy RolloutInfo",
-        ".run.config": "RunConfig",
+        ".run.config": "AskConfig RunConfig",
         ".run.evaluation": "RunResult run_evaluation",
         ".run.merge": "Merged merge_runs",
     },

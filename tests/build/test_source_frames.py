@@ -26,7 +26,7 @@ from robomme_interference_data.errors import InterferenceError
 DRAWER, MOVE = "OpenDrawer/train/0", "MoveCube/val/2"
 FOUR = make_episode(4, 4, "open it", cameras=("front",))
 FRONT = FOUR.images["front"]
-DOCS = Path(__file__).parents[2] / "docs" / "sources.md"
+DOCS = Path(__file__).parents[2] / "docs" / "how-to" / "your-own-recordings.md"
 
 
 def place(folder: Path, name: str = DRAWER, kind: str = "images", camera: str = "front") -> Path:

@@ -119,7 +119,7 @@ def test_what_is_no_source_lists_all_kinds(text: str, hint: str | None) -> None:
 
 
 def test_the_docs_know_all_kinds() -> None:
-    table = (Path(__file__).parents[2] / "docs" / "sources.md").read_text()
+    table = (Path(__file__).parents[2] / "docs" / "reference" / "sources.md").read_text()
     for usage in KINDS.values():
         assert "| `" + usage.replace(" or ", "` or `") in table
 

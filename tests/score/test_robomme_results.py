@@ -1,4 +1,4 @@
-"""What docs/robomme-results.md tells is what its rows say."""
+"""What docs/results/robomme.md tells is what its rows say."""
 
 import re
 from pathlib import Path
@@ -10,7 +10,7 @@ from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.scoring import Score
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "robomme-results.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "results" / "robomme.md").read_text(encoding="utf-8")
 FILES = sorted((ROOT / "docs" / "results").glob("*.csv"))
 
 

@@ -35,7 +35,7 @@ from robomme_interference_data.simulators.tabletop.families.video_place_button i
 from robomme_interference_data.simulators.tabletop.kit import CUBE, SIDE
 from robomme_interference_data.simulators.tabletop.stage import Spot, lanes
 
-PAGE = Path(__file__).parents[2] / "docs" / "simulators.md"
+PAGE = Path(__file__).parents[2] / "docs" / "results" / "tabletop.md"
 
 
 def seeds_of(family: str, split: str | None, difficulty: str | None) -> list[int]:

@@ -1,39 +1,60 @@
 """What README and docs show must work: examples run, and every command line is a valid one."""
 
+import json
 import re
 import runpy
 import shlex
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
+from support import worlds
 from support.buffer_sets import GOLDEN, QUERIES
 from support.chat_server import ChatServer
 from support.command_lines import parse
 from support.hub import push_buffer_set, running_hub
+from support.runs import run as evaluate_world
 from support.tabletop import copy_tabletop
 
 from robomme_interference_data.evaluate.run import evaluation as run_module
 from robomme_interference_data.runtime.executor import Serial
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCS = ROOT / "docs"
+TUTORIAL = DOCS / "tutorial.ipynb"
+PAGES = sorted(one for one in DOCS.rglob("*.md") if "generated" not in one.parts)
+README = ROOT / "README.md"
+
+
+def text_of(page: Path) -> str:
+    """The Markdown of a page; of a notebook, its sources, commands as blocks of code."""
+    text = page.read_text(encoding="utf-8")
+    if page.suffix != ".ipynb":
+        return text
+    cells = ((one["cell_type"], "".join(one["source"])) for one in json.loads(text)["cells"])
+    return "\n\n".join(
+        source
+        if kind == "markdown"
+        else f"```{'bash' if source.startswith('%%bash') else 'ipython'}\n{source}\n```"
+        for kind, source in cells
+    )
 
 
 def command_lines(page: Path) -> list[str]:
     """Return the command lines in the code blocks of a page, without the command's own name."""
     # Every second part lies between fences; its first line is the language.
-    blocks = page.read_text(encoding="utf-8").split("```")[1::2]
+    blocks = text_of(page).split("```")[1::2]
     shell = [block.partition("\n") for block in blocks]
-    text = "\n".join(code for language, _, code in shell if language in ("bash", ""))
-    lines = text.replace("\\\n", " ").splitlines()
-    pattern = re.compile(r"robomme-interference (.*?)(?:\s+#.*)?$")
+    text = "\n".join(code for language, _, code in shell if language in ("bash", "text", ""))
+    lines = re.sub(r" *\\\n *", " ", text).splitlines()
+    pattern = re.compile(r"(?:PYTHONPATH=\S+ )?robomme-interference (.*?)(?:\s+#.*)?$")
     return [match[1] for line in lines if (match := pattern.match(line.strip()))]
 
 
 DEMO = runpy.run_path(str(ROOT / "scripts" / "demo.py"))
-ALL = [(page.name, line) for page in PAGES for line in command_lines(page)]
+ALL = [(page.name, line) for page in (README, TUTORIAL, *PAGES) for line in command_lines(page)]
 ALL += [("demo.py", line) for line in DEMO["STEPS"].values()]
 ALL += [("demo.py", line.removeprefix("robomme-interference ")) for line in DEMO["NEXT"]]
 
@@ -43,59 +64,41 @@ def test_command_lines_are_understood(page: str, line: str) -> None:
     parse(shlex.split(line))
 
 
-@pytest.mark.slow
-def test_the_readmes_commands_run(
-    tmp_path: Path, run: Any, hub: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In a folder with the buffer set of `make demo`, on made-up recordings, without a renderer."""
-    push_buffer_set(hub, GOLDEN, tmp_path / "work", "namespace/name")
-    demo = copy_tabletop(tmp_path / "demo" / "tabletop")
-    (tmp_path / "demo" / "buffers").symlink_to(demo)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("WORLDS_DATA", "S")
-    monkeypatch.setattr(run_module, "make_executor", lambda config: Serial())
-    for line in command_lines(ROOT / "README.md"):
-        given = line.replace("robomme-h5:recordings/", "sample")
-        if line.startswith("evaluate "):
-            given = re.sub(r"demo/\w+ ", "S --simulator support.worlds:World ", given)
-        code, out, err = run(*shlex.split(given))
-        assert code == 0, f"{line}\n{out}\n{err}"
-    assert (tmp_path / "strip.png").stat().st_size > 10_000
-    assert (tmp_path / "S" / "manifests" / "manifest.json").is_file()
-
-
 ELSEWHERE = (
     "--policy websocket",  # a policy server
+    "--executor ray",
     "--simulator robomme",  # the official simulator
     "simulate ",  # a renderer
-    "--source ",  # recordings, or a renderer
+    "--source tabletop",  # a renderer
+    "--source robomme",  # recordings
+    "--source lerobot",  # a dataset on the Hub
+    "--source frames",  # recordings
     "--shift ",  # a renderer
     "k31",  # more units than the golden buffer set has
     "stale-k7",  # contradicting lessons, which a renderer plays
     "retrieval_rollouts.csv",  # the released rows
     "my-units",  # recordings, of which it is made
     "transformers:",  # a model on the Hub
-    "--encoder siglip",  # weights
+    "siglip",  # weights
+    "lerobot:",  # a checkpoint
+    "theirs/",  # published results
+    "python:retrace",  # has a test of its own
 )
-"""What marks command lines of the pages that need what is not at hand: they are parsed alone."""
+"""What marks command lines of the pages that need what is not available: they are parsed only."""
 
 BEFORE = {
-    "evaluate.md": ["evaluate my-buffers --policy replay --out runs/shard-1 --shard 1/8"],
-    "cluster.md": ["evaluate my-buffers --policy replay --out runs/part-2 --shard 2/8"],
-    "score.md": [
-        f"evaluate my-buffers --policy replay:{memory} --out runs/{name}"
-        for name, memory in (
-            *(("window", "window"), ("framesamp", "framesamp")),
-            *(("retrieval", "framesamp"), ("window-light-2", "window")),
-        )
+    "many-machines.md": ["evaluate my-buffers --policy replay --out runs/shard-1 --shard 1/8"],
+    "score-tables.md": [
+        f"evaluate my-buffers --policy replay:{name} --out runs/{name}"
+        for name in ("window", "framesamp")
     ],
-    "publish.md": ["evaluate my-buffers --policy replay --out my-run --episodes 0"],
+    "publish-results.md": ["evaluate my-buffers --policy replay --out my-run --episodes 0"],
 }
-"""Runs that pages speak of without making them."""
+"""Runs that pages use without making them."""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", PAGES[1:], ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [README, *PAGES], ids=lambda page: page.name)
 def test_the_commands_of_the_pages_run(
     page: Path,
     own_buffers: Path,
@@ -106,31 +109,33 @@ def test_the_commands_of_the_pages_run(
     hub: Any,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """On a golden buffer set, in a world without a renderer, in this process, logged in to a Hub.
+    """On a golden buffer set, in a world without a renderer, in this process, with a loopback Hub.
 
     Where pages name a chat endpoint, one answers that knows one letter; prompts are the page's own.
     """
+    lines = [line for line in command_lines(page) if not any(mark in line for mark in ELSEWHERE)]
+    if not lines:
+        return
     login("my-name")
     push_buffer_set(hub, GOLDEN, tmp_path / "work", "namespace/name")
-    asked = page.name == "questions.md"
+    asked = any(line.startswith(("ask ", "build questions")) for line in lines)
     buffer_set = copy_tabletop(tmp_path / "tabletop") if asked else own_buffers
     (tmp_path / "docs").symlink_to(ROOT / "docs")  # rows that a page scores
-    for name in ("my-buffers", "S"):
+    (tmp_path / "demo").mkdir()
+    for name in ("my-buffers", "demo/buffers"):
         (tmp_path / name).symlink_to(buffer_set)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("WORLDS_DATA", str(tiny_buffers))
+    world = buffer_set if asked else tiny_buffers
+    monkeypatch.setenv(worlds.BUFFER_SET, str(world))
     monkeypatch.setattr(run_module, "make_executor", lambda config: Serial())
-    for name, prompt in re.findall(
-        r"```toml\n# (\S+)\n(.*?)```", page.read_text("utf-8"), flags=re.S
-    ):
+    for name, prompt in re.findall(r"```toml\n# (\S+)\n(.*?)```", text_of(page), flags=re.S):
         (tmp_path / name).write_text(prompt)
-    lines = [line for line in command_lines(page) if not any(mark in line for mark in ELSEWHERE)]
     with ChatServer(lambda seen: "A") as chat:
         for line in (*BEFORE.get(page.name, ()), *lines):
             given = re.sub(r"--episodes [0-9-]+", "--episodes 0", line)
             given = re.sub(r"openai:\S+", f"openai:{chat.url}#tiny", given)
-            given = given.replace("RouteStick", "PatternLock")
-            given = given.replace("VideoUnmask/", "VideoRepick/")
+            if not asked:
+                given = given.replace("RouteStick", "PatternLock").replace("Unmask/", "Repick/")
             if given.startswith("evaluate "):
                 given += " --simulator support.worlds:World"
             if given.startswith("publish") and "--dry-run" not in given:
@@ -139,35 +144,100 @@ def test_the_commands_of_the_pages_run(
             assert code == 0, f"{line}\n{out}\n{err}"
 
 
-@pytest.mark.parametrize("example", ["hub", "load"])
-def test_the_readmes_python_examples(
-    example: str, tmp_path: Path, tiny_buffers: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    found = re.search(rf"<!-- example: {example} -->\n```python\n(.*?)```", text, flags=re.S)
+@pytest.mark.slow
+def test_the_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a reader runs it, on the embedded simulator; the numbers that its text states come out."""
+    import nbformat
+    from nbclient import NotebookClient
+
+    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:/usr/bin:/bin")
+    notebook = nbformat.read(TUTORIAL, 4)
+    resources = {"metadata": {"path": str(tmp_path)}}
+    NotebookClient(notebook, timeout=580, kernel_name="python3", resources=resources).execute()
+    rates = {}
+    for name in ("framesamp", "retrieval"):
+        lines = (tmp_path / f"tutorial/runs/{name}/rollouts.jsonl").read_text().splitlines()
+        rows = [json.loads(line) for line in lines]
+        for condition in ("k0", "k7", "raw-k7"):
+            solved = [row["success"] for row in rows if row["condition"] == condition]
+            rates[name, condition] = (sum(solved), len(solved))
+    assert rates["framesamp", "k0"] == rates["framesamp", "k7"] == (6, 6)
+    assert rates["framesamp", "raw-k7"] == (0, 6)
+    assert rates["retrieval", "raw-k7"] == (6, 6)
+    assert (tmp_path / "tutorial/score/report.html").is_file()
+
+
+def example(page: Path, name: str) -> str:
+    found = re.search(rf"<!-- example: {name} -->\n```python\n(.*?)```", text_of(page), flags=re.S)
     assert found is not None
+    return found[1]
+
+
+@pytest.mark.parametrize("name", ["hub", "load"])
+def test_the_readmes_python_examples(
+    name: str, tmp_path: Path, tiny_buffers: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "demo").mkdir()
     (tmp_path / "demo" / "buffers").symlink_to(tiny_buffers)
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     with running_hub(tmp_path / "cache", monkeypatch) as hub:
         push_buffer_set(hub, tiny_buffers, tmp_path / "work", "namespace/name")
-        exec(found[1], names)
+        exec(example(README, name), names)
     buffer = names["buffer"]
     assert len(buffer) == 48 + 3 * 32  # type: ignore[arg-type]
     assert str(buffer.episode_id) in QUERIES  # type: ignore[attr-defined]
 
 
-def test_the_readme_names_every_light_dependency() -> None:
+def test_the_example_of_a_policy_runs(
+    tmp_path: Path, tiny_buffers: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code = example(DOCS / "how-to" / "your-own-policy.md", "policy")
+    (tmp_path / "retrace.py").write_text(code, encoding="utf-8")
+    monkeypatch.setenv(worlds.BUFFER_SET, str(tiny_buffers))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "retrace", raising=False)
+    families, conditions = ("MoveCube",), ("no-history", "k0")
+    policy = "python:retrace:make"
+    result = evaluate_world(
+        tmp_path / "run", policy=policy, families=families, conditions=conditions
+    )
+    # The world asks for the lesson's pose 3: the fourth action of the first chunk.
+    assert [(row.condition, row.status, row.steps) for row in result.rows] == [
+        ("no-history", "fail", worlds.STEPS),
+        ("k0", "success", 4),
+    ]
+
+
+def test_python_in_pages_compiles_and_names_exist() -> None:
+    for page in PAGES:
+        for code in re.findall(r"```python\n(.*?)```", text_of(page), flags=re.S):
+            compile(code, page.name, "exec")
+            for module, names in re.findall(
+                r"^from (robomme_interference_data\S*) import ([\w, ]+)$", code, flags=re.M
+            ):
+                for name in names.split(", "):
+                    exec(f"from {module} import {name}", {})
+
+
+def test_the_readme_is_short_and_names_every_light_dependency() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    section = text.split("## Load a buffer")[1].split("```")[0]
+    text = README.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 120
     for requirement in project["dependencies"]:
-        assert re.split("[<>=~]", requirement)[0] in section
+        assert re.split("[<>=~]", requirement)[0] in text
+
+
+def test_the_pages_stay_short() -> None:
+    """All but the generated reference and the results."""
+    words = sum(
+        len(text_of(page).split()) for page in (TUTORIAL, *PAGES) if page.parent.name != "results"
+    )
+    assert words <= 22_000
 
 
 def test_links_lead_somewhere() -> None:
-    for page in [*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]:
-        for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
-            if "://" not in target:
+    for page in [README, TUTORIAL, *PAGES, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]:
+        for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text_of(page)):
+            if "://" not in target and "/generated/" not in target and "generated/" not in target:
                 assert (page.parent / target).exists(), f"{page.name}: {target}"

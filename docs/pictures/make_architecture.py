@@ -1,0 +1,65 @@
+"""Draw architecture.svg: the folders of the package, and which may import which."""
+
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("svg")
+matplotlib.rcParams["svg.hashsalt"] = "architecture"
+from matplotlib import pyplot  # noqa: E402
+
+BOXES = {
+    "cli": (4.0, 7, "the command line"),
+    "cards": (4.0, 6, "publish data and results, with cards"),
+    "build_dataset": (1.6, 5, "recordings to datasets and manifests"),
+    "evaluate": (6.4, 5, "buffers into rollouts, rows into scores"),
+    "retrieval": (5.2, 4, "select the relevant session"),
+    "simulators": (4.0, 3, "tabletop and RoboMME"),
+    "data": (4.0, 2, "datasets, queries, buffers"),
+    "stats": (8.2, 1, "intervals, tests"),
+    "viz": (2.2, 1, "tables, figures"),
+    "runtime": (5.0, 1, "tasks in processes or on Ray"),
+    "storage": (4.0, 0, "files, Hub, Parquet, video, cache"),
+    "schema": (4.0, -1, "records and rules, without IO"),
+}
+"""Folder to the center of its box, and what is in it."""
+
+ARROWS = (
+    *(("cli", "cards"), ("cards", "build_dataset"), ("cards", "evaluate")),
+    *(("build_dataset", "simulators"), ("evaluate", "retrieval"), ("retrieval", "simulators")),
+    *(("evaluate", "stats"), ("simulators", "data"), ("data", "viz"), ("data", "runtime")),
+    *(("viz", "storage"), ("runtime", "storage"), ("storage", "schema")),
+)
+
+
+def main() -> None:
+    """Write the picture beside this script."""
+    figure, axes = pyplot.subplots(figsize=(9, 6.6))
+    width, height = {"stats": 1.7, "viz": 2.0}, 0.56
+    for source, target in ARROWS:
+        (x0, y0, _), (x1, y1, _) = BOXES[source], BOXES[target]
+        arrow = {"arrowstyle": "-|>", "color": "#777777", "lw": 1.2, "shrinkA": 0, "shrinkB": 0}
+        ends = (x1, y1 + height / 2), (x0, y0 - height / 2)
+        axes.annotate("", *ends, arrowprops=arrow)
+    for name, (x, y, text) in BOXES.items():
+        wide = width.get(name, 3.4)
+        box = pyplot.Rectangle(
+            (x - wide / 2, y - height / 2),
+            wide,
+            height,
+            fc="#eef3fa",
+            ec="#4a6fa5",
+            lw=1.2,
+            zorder=2,
+        )
+        axes.add_patch(box)
+        axes.text(x, y + 0.1, name, ha="center", va="center", weight="bold", size=10, zorder=3)
+        axes.text(x, y - 0.13, text, ha="center", va="center", size=7.5, color="#333", zorder=3)
+    axes.set(xlim=(-0.3, 9.2), ylim=(-1.45, 7.45))
+    axes.axis("off")
+    path = Path(__file__).parent / "architecture.svg"
+    figure.savefig(path, bbox_inches="tight", metadata={"Date": None})
+
+
+if __name__ == "__main__":
+    main()
