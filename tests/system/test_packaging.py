@@ -62,7 +62,10 @@ def pins() -> dict[str, str]:
 
 def declared() -> list[Requirement]:
     project = CONFIG["project"]
-    lines = [*project["dependencies"], *CONFIG["dependency-groups"]["dev"]]
+    groups = CONFIG["dependency-groups"].values()
+    lines = project["dependencies"] + [
+        one for group in groups for one in group if "include" not in str(one)
+    ]
     for extra in project["optional-dependencies"].values():
         lines += extra
     requirements = [Requirement(line) for line in lines]

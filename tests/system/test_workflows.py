@@ -12,7 +12,7 @@ from support.package import CONFIG, ROOT
 
 FOLDER = ROOT / ".github"
 VERSION = CONFIG["project"]["version"]
-NAMES = ("ci", "publish")
+NAMES = ("ci", "docs", "publish")
 
 
 def workflow(name: str) -> dict[Any, Any]:
