@@ -19,7 +19,7 @@ from robomme_interference_data.evaluate import commands as evaluating
 from robomme_interference_data.evaluate.score import commands as scoring
 from robomme_interference_data.retrieval import commands as retrieving
 from robomme_interference_data.simulators import commands as simulating
-from robomme_interference_data.storage.hub_errors import check_endpoint
+from robomme_interference_data.storage.hub import check_endpoint
 
 from . import commands
 from .console import Group, echo, log_to_stderr, print_status

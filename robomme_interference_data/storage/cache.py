@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError, InvalidOptionError
 
-from .arrays import map_array, write_array
-from .digest import FeatureDigests
+from .arrays import FeatureDigests, map_array, write_array
 from .files import atomic_path
 
 _OWN = re.compile(r"[0-9a-f]{64}\.npy")

@@ -12,10 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, NoReturn, Protocol
 
-from robomme_interference_data.errors import (
-    FormatError,
-    MissingFileError,
-)
+from robomme_interference_data.constants import FORMAT_VERSION
+from robomme_interference_data.errors import FormatError, MissingFileError
 
 _MOST_JSON = 16 << 20
 """Bytes of a file of JSON, at most: ours have some thousand, and Python takes forty times as many
@@ -218,6 +216,21 @@ def _is_deep(value: Any) -> bool:
             if isinstance(one, dict | list)
         ]
     return bool(inside)
+
+
+def read_header[T](path: Path, record: type[T]) -> T:
+    """Read a JSON file as a record, if it has the `format_version` of this package."""
+    from robomme_interference_data.schema.codec import descriptions, from_dict
+
+    value = read_json(path)
+    if "format_version" in descriptions(record):
+        version = value.get("format_version")
+        if version != FORMAT_VERSION:
+            raise FormatError(
+                f"{path} has format version {version!r}; this package reads {FORMAT_VERSION}",
+                "Install the version of robomme-interference-data that wrote it, or make it again.",
+            )
+    return from_dict(record, value, path, strict=True)
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -21,8 +21,7 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.storage.files import LocalFiles
-from robomme_interference_data.storage.lerobot import LeRobotFiles
-from robomme_interference_data.storage.lerobot_layout import fill_template
+from robomme_interference_data.storage.lerobot import LeRobotFiles, fill_template
 
 VIDEO = "videos/observation.images.front/"
 V21 = "chunk-000/episode_000002"
@@ -249,8 +248,8 @@ def test_episode_tables_that_are_wrong(v30: Path, columns: dict[str, Any]) -> No
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
-        ({"episode_index": [0] * 13 + [1] * 6 + [2] * 9}, "13 rows of episode 0; 12"),
-        ({"episode_index": [0, 1] * 14}, "14 rows of episode 0; 12"),
+        ({"episode_index": [0] * 13 + [1] * 6 + [2] * 9}, "13 rows of episode 0; .* 12,"),
+        ({"episode_index": [0, 1] * 14}, "14 rows of episode 0; .* 12,"),
         ({"frame_index": [0, 2, 1, *range(3, 12), *range(7), *range(9)]}, "one after the other"),
         ({"episode_index": None}, "no column 'episode_index'"),
         ({"observation.state": pa.array([[0.0]] * 28)}, "1 values a frame; info.json"),

@@ -13,8 +13,15 @@ from hypothesis import strategies as st
 
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.storage.parquet import RowSpan
-from robomme_interference_data.storage.untrusted.parquet_pages import decoded_size, read_chunks
-from robomme_interference_data.storage.untrusted.thrift import I32, I64, LIST, STRUCT, Thrift
+from robomme_interference_data.storage.untrusted.parquet_pages import (
+    I32,
+    I64,
+    LIST,
+    STRUCT,
+    Thrift,
+    decoded_size,
+    read_chunks,
+)
 
 GIBIBYTE = 1 << 30
 

@@ -22,7 +22,7 @@ from robomme_interference_data.schema.codec import (
 from robomme_interference_data.schema.manifest import BufferManifest
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.schema.rollouts import Rollout
-from robomme_interference_data.storage.headers import read_header
+from robomme_interference_data.storage.files import read_header
 
 
 @dataclass(frozen=True)

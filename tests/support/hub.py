@@ -17,8 +17,7 @@ from support.hub_server import HubServer
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, MANIFEST_PATH
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.manifest import ManifestHeader
-from robomme_interference_data.storage.files import write_json
-from robomme_interference_data.storage.headers import read_header
+from robomme_interference_data.storage.files import read_header, write_json
 
 BUFFER_SET, BASE = "someone/units", "someone/demonstrations"
 

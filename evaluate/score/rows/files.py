@@ -17,8 +17,7 @@ from robomme_interference_data.errors import FormatError, InvalidOptionError, Mi
 from robomme_interference_data.evaluate.run.log import MOST_BYTES, RunHeader, whole_lines
 from robomme_interference_data.schema.codec import arrow_schema
 from robomme_interference_data.schema.rollouts import KEY_COLUMNS, Rollout, Status
-from robomme_interference_data.storage.files import read_bytes
-from robomme_interference_data.storage.headers import read_header
+from robomme_interference_data.storage.files import read_bytes, read_header
 from robomme_interference_data.storage.parquet import open_parquet, read_table, reading
 
 _SCHEMA = arrow_schema(Rollout)
