@@ -1,9 +1,9 @@
-"""Arrays in `.npy` files, and SHA-256 over decoded data: what bit-exact means in this package.
+"""Arrays in `.npy` files, and SHA-256 over decoded data, which defines bit-exact here.
 
 The digest of a *feature* over a span of frames is the SHA-256 of its values in order, without any
 header: images as `(T, H, W, 3) uint8` RGB, vectors as `(T, D) float32` little-endian, C order. The
 digest of a *span* is the SHA-256 of the canonical JSON of its feature digests by name, without that
-of the actions. So any hashlib can recompute both from decoded arrays.
+of the actions. Both can be recomputed from decoded arrays with hashlib alone.
 """
 
 import hashlib
@@ -26,18 +26,13 @@ _FILE = re.compile(
     rb"'shape': \((\d{1,12}(?:, \d{1,12})*),?\), \} *\n",
     re.DOTALL,
 )
-"""What a file begins with. numpy reads a header as Python, and of damaged ones ends in all kinds of
-errors and warnings."""
+"""The header. numpy parses it as Python, which raises any error or warning if it is damaged."""
 
-_HEADER_BYTES = 1024
-"""Bytes in which the header ends, at most: `np.save` writes 128 for what this package stores."""
+_MAX_HEADER_BYTES = 1024  # `np.save` writes 128 for the arrays of this package
 
 
 def write_array(path: Path, array: NDArray[Any]) -> None:
-    """Write an array as `np.save` does, in C order.
-
-    From `np.save` itself, a full disk is an error without a number.
-    """
+    """Write an array as `np.save` does, in C order; unlike it, keep the system's error number."""
     with path.open("wb") as file:
         array = np.asarray(array, order="C")
         np.lib.format.write_array_header_1_0(  # type: ignore[no-untyped-call]
@@ -50,28 +45,23 @@ def write_array(path: Path, array: NDArray[Any]) -> None:
 def map_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:
     """Return an array that `write_array` wrote as a read-only memory map.
 
-    Nothing is allocated before type, shape and the file's size agree. Not by `np.load`, which also
-    opens archives.
-
-    Args:
-        path: The file.
-        dtype: Type that it must have.
-        shape: Shape that it must have; -1 for a side of any length.
+    Type and shape must be the given ones (-1 for any length), and fit the file's size, before
+    anything is allocated. `np.load` would also open archives.
     """
     expected = f"{np.dtype(dtype)} of shape {shape}"
     with path.open("rb") as file:
-        header = _FILE.match(start := file.read(_HEADER_BYTES))
+        header = _FILE.match(start := file.read(_MAX_HEADER_BYTES))
     if header is None or int.from_bytes(start[8:10], "little") != header.end() - 10:
-        raise FormatError.damaged(path, f"no array: {start[:99]!r}; expected {expected}")
+        raise FormatError.damaged(path, f"not an array: {start[:99]!r}; expected {expected}")
     kind, sides = header[1].decode(), tuple(map(int, header[2].split(b", ")))
     fits = len(sides) == len(shape) and all(
-        wanted in (-1, side) for wanted, side in zip(shape, sides, strict=True)
+        length in (-1, side) for length, side in zip(shape, sides, strict=True)
     )
     if not fits or kind != np.dtype(dtype).str:
         raise FormatError.damaged(path, f"holds {kind} of shape {sides}; expected {expected}")
-    size, whole = math.prod(sides) * np.dtype(dtype).itemsize, path.stat().st_size
-    if header.end() + size != whole:
-        raise FormatError.damaged(path, f"{whole} bytes, of an array of shape {sides}")
+    size = path.stat().st_size
+    if header.end() + math.prod(sides) * np.dtype(dtype).itemsize != size:
+        raise FormatError.damaged(path, f"{size} bytes do not fit an array of shape {sides}")
     return np.memmap(path, dtype, "r", header.end(), sides)
 
 
@@ -83,14 +73,14 @@ def read_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:
 def combine(digests: Mapping[str, str]) -> str:
     """Return the digest of a span from the digests of its features, by feature name.
 
-    Actions are left out: a buffer does not show them, and a dataset that grows may lose them.
+    Actions are excluded: a buffer does not hold them, and a dataset may lose them as it grows.
     """
-    shown = {name: digest for name, digest in digests.items() if name != ACTION}
-    return hashlib.sha256(canonical_json(shown).encode()).hexdigest()
+    included = {name: digest for name, digest in digests.items() if name != ACTION}
+    return hashlib.sha256(canonical_json(included).encode()).hexdigest()
 
 
 class FeatureDigests:
-    """Digests of several features, computed while frames pass by."""
+    """Running digests of several features."""
 
     def __init__(self) -> None:
         self._running: dict[str, Any] = {}
@@ -100,27 +90,23 @@ class FeatureDigests:
         if values.dtype == np.float32:
             values = values.astype("<f4", copy=False)
         elif values.dtype != np.uint8:
-            raise TypeError(f"digests are over uint8 or float32 values, not {values.dtype}")
+            raise TypeError(f"expected uint8 or float32 values to digest, not {values.dtype}")
         running = self._running.setdefault(feature, hashlib.sha256())
         running.update(np.ascontiguousarray(values).data)
 
     def current(self) -> dict[str, str]:
-        """Return the digests of all that came so far, by feature name; more may follow."""
+        """Return the digests of the values so far, by feature name."""
         return {name: running.copy().hexdigest() for name, running in self._running.items()}
 
 
 class SpanDigester:
-    """Digests of spans of an episode, computed while its frames pass by.
-
-    Args:
-        spans: First frame, and the one after the last; they may overlap.
-    """
+    """Running digests of spans `(start, stop)` of an episode, which may overlap."""
 
     def __init__(self, spans: Iterable[tuple[int, int]]):
         self._spans = [(start, stop, FeatureDigests()) for start, stop in spans]
 
     def update(self, feature: str, index: int, value: NDArray[Any]) -> None:
-        """Add a feature's value at a frame; each feature's come in order."""
+        """Add a feature's value at a frame, in order."""
         for start, stop, running in self._spans:
             if start <= index < stop:
                 running.update(feature, value)

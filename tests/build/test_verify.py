@@ -163,7 +163,7 @@ def test_info_that_is_wrong(own_buffers: Path, before: str, after: str) -> None:
     info = own_buffers / "distractors" / "meta" / "info.json"
     assert before in info.read_text()
     info.write_text(info.read_text().replace(before, after))
-    expect(own_buffers, "info.json: does not have", "observation.state|is too long|is no path")
+    expect(own_buffers, "info.json: does not have", "observation.state|is too long|not a valid path")
 
 
 @pytest.mark.parametrize(
@@ -247,7 +247,7 @@ def test_tables_that_mean_something_else(
     ("name", "field", "value", "told"),
     [
         ("stats", "action", None, "stats.json: action is not what follows"),
-        ("stats", "action", {"mean": [float("nan")]}, "NaN is no finite number"),
+        ("stats", "action", {"mean": [float("nan")]}, "NaN is not a finite number"),
         ("info", "total_frames", 1, "total_frames is 1"),
         ("info", "total_episodes", 1, "does not list the episodes"),
         ("info", "splits", {}, "splits is {}"),

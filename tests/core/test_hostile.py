@@ -87,7 +87,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         ("one text many times", "once decoded"),
         ("many equal numbers", "83,886,080 rows"),
         ("compressed noughts", "once decoded"),
-        ("a page that lies", "values; 16384 are told"),
+        ("a page that lies", "values; its metadata has 16384"),
         ("common prefixes", "common prefixes"),
         ("many row groups", "cannot be read"),
         ("large metadata", "bytes of metadata"),
@@ -97,14 +97,14 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         ("a playlist", "no MP4, Matroska or AVI file"),
         ("a list of files", "no MP4, Matroska or AVI file"),
         ("long", "at most"),
-        ("deep", "not JSON"),
-        ("deep, but read by Python", "inside each other"),
+        ("deep", "not valid JSON"),
+        ("deep, but read by Python", "nested arrays"),
         ("sparse", "at most"),
         ("sparse sums", "at most"),
         ("sparse rows", "at most"),
-        ("a header alone", "128 bytes, of an array"),
-        ("an archive", "no array"),
-        ("pickled", "no array"),
+        ("a header alone", "128 bytes do not fit an array"),
+        ("an archive", "not an array"),
+        ("pickled", "not an array"),
         ("a large image", "an image is damaged"),
     ],
 )
@@ -173,7 +173,7 @@ def test_frames_that_take_too_much_at_once_are_refused(tmp_path: Path) -> None:
     buffer = load_buffer(QUERIES[0], "k7", buffer_set=root)
     short = load_buffer(QUERIES[0], "no-history", buffer_set=root)
     assert len(buffer) * 4096 * 4096 * 3 <= 16 * 2**30  # so its videos are looked at
-    with pytest.raises(FormatError, match="pixels; the dataset's info.json says 4096×4096"):
+    with pytest.raises(FormatError, match="pixels; expected 4096×4096"):
         buffer.frames()
     assert short.frames().shape == (0, 4096, 4096, 3)
     many = with_sessions(buffer.manifest, *buffer.manifest.sessions * 8)

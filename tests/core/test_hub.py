@@ -115,7 +115,12 @@ def test_missing_file(hub: HubServer) -> None:
 @pytest.mark.parametrize(
     ("repo", "revision", "telling", "hint"),
     [
-        ("someone/smal", None, "dataset repository 'someone/smal' .* does not exist", "hf auth login"),
+        (
+            "someone/smal",
+            None,
+            "dataset repository 'someone/smal' .* does not exist",
+            "hf auth login",
+        ),
         (REPO, "v9", "has no revision 'v9'", "/tree/main"),
         (REPO, "0" * 40, "has no revision '0000", "/tree/main"),
         ("someone/gated", None, "is gated", "/datasets/someone/gated, then log in: hf auth login"),

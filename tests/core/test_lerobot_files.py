@@ -123,7 +123,7 @@ def test_any_template_is_filled_or_one_clear_error(template: str) -> None:
         ("../../etc/passwd", "leads out of it"),
         ("/etc/passwd", "leads out of it"),
         ("videos/../../outside.mkv", "leads out of it"),
-        ("videos/\ud800.mkv", "is no path"),
+        ("videos/\ud800.mkv", "is not a valid path"),
         ("x" * 1000, "is too long"),
         ("{file_index}" * 500, "_path is '"),
         ("linked.mkv", "is a link that leads out of the folder"),
@@ -202,7 +202,7 @@ GOOD = json.dumps(LINE) + "\n"
     ("text", "message"),
     [
         ("{\n", "line 1: "),
-        ("[0, 1]\n", "line 1: no JSON object"),
+        ("[0, 1]\n", "line 1: not a JSON object"),
         (GOOD + "[" * 100_000, "line 2: "),
         (GOOD, "the episodes 0 to 2, each once"),
         (GOOD * 3, "the episodes 0 to 2, each once"),

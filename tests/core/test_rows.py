@@ -148,9 +148,9 @@ class Header:
         ('{"name": "a"}', "has format version None"),
         ('{"format_version": 1}', "name is missing"),
         ('{"format_version": 1, "name": "a", "nmae": 1}', "unknown nmae"),
-        ("[]", "no JSON object"),
-        ("{", "not JSON"),
-        ("[" * 100_000, "not JSON"),
+        ("[]", "not a JSON object"),
+        ("{", "not valid JSON"),
+        ("[" * 100_000, "not valid JSON"),
     ],
 )
 def test_headers(tmp_path: Path, text: str, told: str) -> None:
