@@ -205,7 +205,7 @@ def test_links_that_lead_nowhere(own_buffers: Path) -> None:
         (DATA, as_text("timestamp"), "timestamp of episode 3 is of type string"),
         (DATA, first_changed("task_index", 0), "task_index of episode 3"),
         (DATA, first_changed("index", 5), "index of episode 3"),
-        (DATA, first_changed("frame_index", 1), "holds 32 rows of episode 3"),
+        (DATA, first_changed("frame_index", 1), "32 rows of episode 3"),
         (DATA, first_changed("episode_index", 4), "episode 3"),
         (RECORDS, first_changed("dataset_from_index", 7), "dataset_from_index"),
         (RECORDS, first_changed("dataset_to_index", 7), "dataset_to_index"),
