@@ -30,11 +30,7 @@ _DECODERS = (
 
 
 def iter_frames(
-    path: Path,
-    start: int,
-    stop: int | None,
-    fps: float,
-    shape: tuple[int, ...] | None = None,
+    path: Path, start: int, stop: int | None, fps: float, shape: tuple[int, ...] | None = None
 ) -> Generator[NDArray[np.uint8]]:
     """Decode the frames `start` to `stop` (excluded; None for all) of a video file, in order.
 

@@ -216,8 +216,7 @@ def test_a_folder_of_a_folder_that_comes_damaged(hub: HubServer) -> None:
 
 
 @pytest.mark.parametrize(
-    "given",
-    ["", "not a url", "http://", "http://[", "http://a:b", "http://a b", "ftp://a", "a:9"],
+    "given", ["", "not a url", "http://", "http://[", "http://a:b", "http://a b", "ftp://a", "a:9"]
 )
 def test_no_address_of_a_hub(monkeypatch: pytest.MonkeyPatch, run: Run, given: str) -> None:
     monkeypatch.setenv("HF_ENDPOINT", given)

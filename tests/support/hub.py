@@ -1,4 +1,4 @@
-"""A buffer set on a Hub on the loopback interface, as `publish` lays it out, and others who use it."""
+"""A buffer set on a Hub on the loopback interface, laid out like a published one."""
 
 import os
 import shutil
@@ -64,7 +64,7 @@ def kill_at(hub: HubServer, method: str, path: str, after: int, *arguments: str)
 def push_buffer_set(
     hub: HubServer, root: Path, work: Path, name: str = BUFFER_SET
 ) -> tuple[str, str]:
-    """Put a buffer set into two repositories; return the commits of buffer set and demonstrations."""
+    """Push a buffer set to two repositories; return the commits of it and its demonstrations."""
     base = hub.push(f"datasets/{BASE}", root / DEMONSTRATIONS)
     shutil.copytree(root / DISTRACTORS, work)
     shutil.copytree(root / "manifests", work / "manifests")

@@ -21,14 +21,7 @@ _SQUEEZED = 1024
 
 @dataclass
 class Request:
-    """What was asked, and what became of it.
-
-    Attributes:
-        method, target: As they came; `path` is the target without its query.
-        headers, body: As they came.
-        status: Of the answer; 0 if there was none.
-        sent: Bytes of the answer's body that were sent.
-    """
+    """A request, the status of its answer (0 for none), and the bytes sent of the answer's body."""
 
     method: str
     target: str
@@ -61,11 +54,7 @@ class Request:
 
 @dataclass
 class Answer:
-    """What is answered: a file's bytes or JSON.
-
-    Attributes:
-        plain: Whether it may be compressed on its way.
-    """
+    """An answer: a file's bytes or JSON, which is compressed if `plain`."""
 
     body: bytes
     status: int = 200
@@ -78,19 +67,13 @@ class Answer:
         return cls(json.dumps(value).encode(), status, told, plain=True)
 
     def fit(self, asked: HTTPMessage) -> None:
-        """Leave only the range that is asked for, or compress what may be and is worth it."""
-        span = re.fullmatch(r"bytes=(\d*)-(\d*)", asked.get("Range", ""))
+        """Leave only the requested end, or compress the body if it may be and is worth it."""
+        span = re.fullmatch(r"bytes=(\d+)-", asked.get("Range", ""))
         size = len(self.body)
         if span and self.status == 200:
-            first, last = span.groups()
-            start = int(first) if first else max(size - int(last), 0)
-            stop = min(int(last) + 1, size) if first and last else size
-            if start >= size:
-                self.status, self.body, told = 416, b"", f"bytes */{size}"
-            else:
-                self.status, self.body = 206, self.body[start:stop]
-                told = f"bytes {start}-{stop - 1}/{size}"
-            self.headers["Content-Range"] = told
+            start = int(span[1])
+            self.status, self.body = 206, self.body[start:]
+            self.headers["Content-Range"] = f"bytes {start}-{size - 1}/{size}"
         elif self.plain and size >= _SQUEEZED and "gzip" in asked.get("Accept-Encoding", ""):
             self.body = gzip.compress(self.body, 1)
             self.headers["Content-Encoding"] = "gzip"
