@@ -25,7 +25,9 @@ _CONTAINERS = re.compile(
 _OTHERS = re.compile(b"iprp|jp2h|stsd|wave")
 """Boxes in which it does so after other fields: there, the names of tables are searched for."""
 
-_TABLES = re.compile(b"stsz|stz2|trun|elst|stsc|stco|co64|cmov")
+_TABLES = re.compile(b"stsz|stz2|trun|elst|stsc|stco|co64|cmov|sidx")
+"""Tables of frames, and boxes that hide some: compressed ones, and an index of fragments, by which
+FFmpeg would jump into what is not read here."""
 
 _MAX_SAMPLES = 1 << 22  # frames and samples of sound: 38 hours at 30 frames per second
 _MAX_EDITED = 1 << 23  # frames times edits: FFmpeg iterates over all frames for each edit
@@ -123,8 +125,9 @@ class _Tables:
     def _add(self, kind: bytes, data: bytes, at: int) -> None:
         """Add a table, which begins with version and flags, and maybe one size for all entries."""
         self.count_box()
-        if kind == b"cmov":
-            raise ValueError("its metadata is compressed")
+        if kind in (b"cmov", b"sidx"):
+            what = "its metadata is compressed or has a segment index"
+            raise ValueError(f"{what}; convert it with ffmpeg -i OLD -c copy NEW")
         skipped = 8 if kind in (b"stsz", b"stz2") else 4
         count = int.from_bytes(data[at + skipped : at + skipped + 4])
         self._sums[kind] += count
