@@ -115,6 +115,19 @@ def test_wherever_ffmpeg_finds_a_table_it_is_looked_at() -> None:
     assert found > 20
 
 
+def test_an_index_of_segments_is_refused(tmp_path: Path) -> None:
+    """FFmpeg would jump to fragments that it names, even inside of frames."""
+    path = tmp_path / "a.mp4"
+    with av.open(str(path), "w", options={"movflags": "empty_moov+global_sidx"}) as container:
+        stream = container.add_stream("mjpeg", rate=10)
+        stream.pix_fmt, stream.height, stream.width = "yuvj444p", 16, 32
+        container.mux(stream.encode(av.VideoFrame(32, 16, "yuvj444p")))
+        container.mux(stream.encode(None))
+    assert b"sidx" in path.read_bytes()
+    with pytest.raises(FormatError, match="segment index.* ffmpeg"):
+        list(iter_frames(path, 0, None, 10))
+
+
 def test_frames_themselves_are_not_looked_at(tmp_path: Path) -> None:
     looks_like = box(b"mdat", table(b"stsz", 100, 1 << 23))
     assert find_container(video(tmp_path / "a.mp4", looks_like)) == "mp4"

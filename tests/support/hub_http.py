@@ -84,15 +84,14 @@ class Fault:
     """What goes wrong with requests.
 
     Attributes:
-        method, path: Of which: a method, and a regular expression that is found in the path.
-        times: How many of them.
-        after: How many come through before.
-        status, headers: Answer this instead, such as 429 with `Retry-After`, or 503.
+        method, path: The requests' method, and a regular expression found in their path.
+        times, after: The number of requests, and of those that succeed before.
+        status: Answer this instead, such as 503.
         drop: Close the connection after so many bytes of the request's body, or of the answer's.
-        lost: Do what is asked, and close the connection instead of answering.
-        cut: Leave out so many bytes at the end of the answer, as if there were no more.
+        lost: Handle the request, and close the connection instead of answering.
+        cut: Omit so many bytes at the end of the answer.
         wrong: Change the last byte of the answer.
-        call: What happens just before, such as a commit by somebody else.
+        call: Called just before, such as for a commit by somebody else.
     """
 
     method: str
@@ -100,7 +99,6 @@ class Fault:
     times: int = 1
     after: int = 0
     status: int | None = None
-    headers: dict[str, str] = field(default_factory=dict)
     drop: int | None = None
     lost: bool = False
     cut: int | None = None
@@ -194,8 +192,7 @@ class LoopbackServer(ABC):
         """Return the answer to a request whose body has come."""
         time.sleep(self.latency)
         if fault.status is not None or self.down:
-            told = {"error": "something went wrong"}
-            answer = Answer.json(told, fault.status or 503, fault.headers)
+            answer = Answer.json({"error": "something went wrong"}, fault.status or 503)
         else:
             if fault.call is not None:
                 fault.call()
