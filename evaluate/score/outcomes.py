@@ -174,8 +174,8 @@ def rate_of(status: Statuses) -> Rate:
 def outcomes_of(rows: Rows, expected: Expected) -> dict[str, Outcomes]:
     """Return simulator to the outcomes in it, by name, with the cells that are expected."""
     return {
-        name: _outcomes(part, name, expected, rows.unpinned)
-        for name, part in rows.by("simulator").items()
+        name: _outcomes([r for r in rows if r.simulator == name], name, expected, rows.unpinned)
+        for name in rows.names("simulator")
     }
 
 
