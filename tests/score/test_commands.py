@@ -91,7 +91,7 @@ def test_what_is_printed(tmp_path: Path) -> None:
     assert lines[0] == "Success by system and condition, tabletop"
     assert lines[2].split() == ["system", "no-history", "k0", "k1", "k3", "k7"]
     assert "**58.3%** [32.0, 80.7] n=12" in lines[4]
-    assert "Rows of tabletop are not set against the paper's RoboMME." in done.stderr
+    assert "Rows of tabletop are not compared with the paper's RoboMME." in done.stderr
     done = run("compare", path, again(path))
     assert done.stdout.startswith("Two runs compared\n\nsimulator")
     value = json.loads(run("compare", path, again(path), "--json").stdout)

@@ -102,7 +102,7 @@ def test_what_is_not_in_the_paper_is_told(tmp_path: Path) -> None:
     other = made.changed(made.rows(), simulator="robomme", revision="cd" * 32)
     path = made.write_csv(tmp_path / "both.csv", [*made.rows(), *other])
     assert made.score(path, paper=True).notes == (
-        "Rows of tabletop are not set against the paper's RoboMME.",
+        "Rows of tabletop are not compared with the paper's RoboMME.",
         f"Not in the paper under these conditions: {OWN}.",
     )
     rows = made.changed(cells({(OWN, "k0"): "sf", (BASE, "k15"): "s"}), simulator="robomme")
@@ -153,7 +153,7 @@ def test_where_paper_and_repository_differ_is_told(tmp_path: Path) -> None:
     rows = made.changed(cells({(system, "k0"): "sf", (system, "k7"): "ff"}), simulator="robomme")
     found = made.score(made.write_csv(tmp_path / "a.csv", rows), paper=True)
     table = found.tables["paper_family"]
-    assert table.note.endswith("They do not under: TokenDrop-Modul k1, k3, k7.")
+    assert table.note.endswith("They do not for: TokenDrop-Modul k1, k3, k7.")
     (own,) = table.records()
     assert (own["condition"], own["family"], own["n"]) == ("k0", "MoveCube", 2)
     assert own["difference"] == own["rate"] - own["published_rate"] and not own["complete"]

@@ -83,7 +83,7 @@ def test_a_ceiling_is_behind_the_same_retrieval_step(tmp_path: Path) -> None:
     found = steps("siglip", "thumbnail")
     assert "ceiling" not in found.tables
     (note,) = found.notes
-    assert "other retrieval steps, siglip and thumbnail" in note
+    assert "retrieval steps differ: siglip and thumbnail" in note
     assert record(found, "effects")["against_system"] == "replay-full"  # that one has none
 
 

@@ -1,4 +1,4 @@
-"""Does one system fall more than another: the difference of their differences, paired."""
+"""Whether one system falls more than another: the paired difference of their changes."""
 
 import numpy as np
 
@@ -15,12 +15,12 @@ from .ranks import ranked, to_best
 
 
 def interactions_of(outcomes: Outcomes) -> list[Contrast]:
-    """Compare the change of systems from k0 with that of the best at k0, and of their base.
+    """Compare each system's change from k0 with that of the best at k0, and of its base.
 
     The change is to the most sessions under which both have rows. Systems whose histories may
-    differ are left out, and so are bounds.
+    differ are left out, and so are references.
     """
-    leader, found = None, []
+    leader, contrasts = None, []
     if systems := dict(ranked(outcomes)).get(START):
         leader, _ = to_best(outcomes, START, systems, np.ones(len(outcomes.episodes), bool))
     for system in outcomes.systems:
@@ -29,8 +29,8 @@ def interactions_of(outcomes: Outcomes) -> list[Contrast]:
         others = dict.fromkeys(one for one in (leader, base_of(system)) if one and one != system)
         for other in others:
             if other in outcomes.systems and outcomes.pairable(system, other):
-                found += _contrasts(outcomes, system, other)
-    return found
+                contrasts += _contrasts(outcomes, system, other)
+    return contrasts
 
 
 def _contrasts(outcomes: Outcomes, system: str, other: str) -> list[Contrast]:
@@ -47,13 +47,12 @@ def _contrasts(outcomes: Outcomes, system: str, other: str) -> list[Contrast]:
 
 
 def changes(first: Statuses, second: Statuses) -> Pairs:
-    """Compare the change of one side with that of another, over the episodes that count in all.
+    """Compare two changes over the episodes that count in all four cells.
 
-    The interval is `mover_interval` of both changes' own, with the correlation of the changes over
-    episodes; the test is the exact sign-flip test of the episodes' differences of differences. Each
-    side is the outcomes before and after, `(2, E, M) int8`. In what comes of it `first`, `second`
-    and `change` are the changes and their difference; `pairs` are episodes, gained and lost those
-    whose change is higher, or lower, on the second side.
+    Each side is its outcomes before and after, `(2, E, M) int8`. The interval combines those of
+    both changes and their correlation (`mover_interval`); the test is the exact sign-flip test of
+    the episodes' differences of differences. `first` and `second` of the result are the changes,
+    `pairs` episodes, gained and lost those whose change is higher or lower on the second side.
     """
     values = success(np.stack([*first, *second]))
     known = ~np.isnan(values).any(axis=0)

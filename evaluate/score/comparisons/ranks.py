@@ -1,4 +1,4 @@
-"""Systems set against each other within a condition: differences to the best, ranks, all pairs."""
+"""Systems compared within a condition: difference to the best, ranks, all pairs."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import combinations
@@ -6,12 +6,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.evaluate.score.outcomes import (
-    Flags,
-    Outcomes,
-    rate_of,
-    success,
-)
+from robomme_interference_data.evaluate.score.outcomes import Flags, Outcomes, rate_of, success
 from robomme_interference_data.evaluate.systems import is_bound
 from robomme_interference_data.stats.bootstrap import DRAWS, Floats, drawn_means
 from robomme_interference_data.stats.significance import ALPHA, holm
@@ -32,10 +27,7 @@ def against(outcomes: Outcomes, condition: str, one: str, other: str, here: Flag
 def to_best(
     outcomes: Outcomes, condition: str, systems: Sequence[str], here: Flags
 ) -> tuple[str, dict[str, Pairs]]:
-    """Return the first system of the highest rate, and the others' comparisons with it.
-
-    Each has a complete cell under the condition; the episodes that are compared are `(E,) bool`.
-    """
+    """Return the first system of the highest rate, and the comparisons of the others with it."""
     cells = [outcomes.status[outcomes.cell(one, condition)][here] for one in systems]
     rates = [rate_of(cell).value for cell in cells]
     best = systems[rates.index(max(rates))]
@@ -44,46 +36,38 @@ def to_best(
 
 
 def tied_with_best(best: str, others: Mapping[str, Pairs]) -> set[str]:
-    """Return the systems that cannot be told from the best, itself included; none of one alone."""
+    """Return the best and the systems not distinguishable from it; empty for a single system."""
     ps = holm([pairs.p for pairs in others.values()])
-    near = {system for system, p in zip(others, ps, strict=True) if not p < ALPHA}
-    return near | {best} if others else set()
+    tied = {system for system, p in zip(others, ps, strict=True) if not p < ALPHA}
+    return tied | {best} if others else set()
 
 
 def ranked(outcomes: Outcomes) -> Iterator[tuple[str, list[str]]]:
-    """Yield each condition and the systems that are ranked in it: of complete cells, no bounds."""
+    """Yield each condition and the systems ranked in it: complete cells, no references."""
     for place, condition in enumerate(outcomes.conditions):
         whole = zip(outcomes.systems, outcomes.complete[:, place], strict=True)
         yield condition, [system for system, has in whole if has and not is_bound(system)]
 
 
 def systems_of(outcomes: Outcomes) -> list[Contrast]:
-    """Compare the ranked systems of each condition with the best, then all pairs of them.
-
-    The first are of the table `systems`, the others of `matrix`: each with those after it.
-    """
+    """Compare the ranked systems of each condition with the best (`systems`), and all pairs."""
     every: Flags = np.ones(len(outcomes.episodes), bool)
-    found, matrix = list[Contrast](), list[Contrast]()
+    found = {"systems": list[Contrast](), "matrix": list[Contrast]()}
     for condition, systems in ranked(outcomes):
         if len(systems) < 2:
             continue
-
-        def contrast(
-            system: str, other: str, table: str, pairs: Pairs, condition: str = condition
-        ) -> Contrast:
-            names = (outcomes.simulator, system, condition, (other, condition))
-            return Contrast(*names, table, pairs, complete=True)
-
         best, compared = to_best(outcomes, condition, systems, every)
-        found += [contrast(s, best, "systems", pairs) for s, pairs in compared.items()]
+        rows = [("systems", system, best, pairs) for system, pairs in compared.items()]
         for two in combinations(systems, 2):
-            pairs = against(outcomes, condition, *two, every)
-            matrix.append(contrast(*two, "matrix", pairs))
-    return found + matrix
+            rows.append(("matrix", *two, against(outcomes, condition, *two, every)))
+        for table, system, other, pairs in rows:
+            names = (outcomes.simulator, system, condition, (other, condition))
+            found[table].append(Contrast(*names, table, pairs, complete=True))
+    return [*found["systems"], *found["matrix"]]
 
 
 def rank_table(every: Iterable[Outcomes], draws: int = DRAWS) -> Table:
-    """Return the rank of each ranked system with the interval that draws of episodes give it."""
+    """Return the rank of each ranked system with its bootstrap interval over episodes."""
     rows = []
     for outcomes in every:
         for condition, systems in ranked(outcomes):
@@ -106,9 +90,9 @@ def rank_table(every: Iterable[Outcomes], draws: int = DRAWS) -> Table:
         "Ranks of systems",
         "simulator condition system rate:rate rank:count rank_low:count rank_high:count",
         rows,
-        "Complete cells; 1 is the highest rate, equal rates share a rank. rank_low to rank_high: "
-        f"the middle 95% of a system's ranks in {draws:,} draws of episodes, the same for all "
-        "systems.",
+        "Complete cells only; rank 1 is the highest rate, and equal rates share a rank. rank_low "
+        f"to rank_high: the middle 95% of a system's ranks in {draws:,} bootstrap draws of "
+        "episodes, the same draws for all systems.",
     )
 
 

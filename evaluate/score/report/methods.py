@@ -50,7 +50,7 @@ def methods(score: Score) -> tuple[str, str]:
 
 
 def _part(score: Score, outcomes: Outcomes) -> dict[str, Any]:
-    there = np.flatnonzero(outcomes.there.any(axis=0)).tolist()
+    there = np.flatnonzero(outcomes.has_episode.any(axis=0)).tolist()
     cells = [one for one in score.cells if one.simulator == outcomes.simulator and not one.part]
     return {
         "simulator": outcomes.simulator,

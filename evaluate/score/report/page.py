@@ -136,7 +136,7 @@ def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
         for place, system in enumerate(outcomes.systems):
             counts = outcomes.counts[place].transpose(1, 0, 2).tolist()
             rates = success(outcomes.status[place]).T.tolist()
-            for number in np.flatnonzero(outcomes.there[place]).tolist():
+            for number in np.flatnonzero(outcomes.has_episode[place]).tolist():
                 episode, hard = outcomes.episodes[number], int(outcomes.difficulty[number])
                 came = dict(zip(outcomes.conditions, counts[number], strict=True))
                 found = [
