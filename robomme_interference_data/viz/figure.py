@@ -34,6 +34,7 @@ MAKER = "robomme-interference"
 _METADATA: dict[str, dict[str, str | None]] = {
     ".png": {"Software": MAKER},
     ".svg": {"Creator": MAKER, "Date": None, "Format": None, "Type": None},
+    ".pdf": {"Creator": MAKER, "Producer": None, "CreationDate": None},
 }
 """For each suffix that can be written, what it says; without matplotlib's version and the date."""
 

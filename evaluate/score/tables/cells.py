@@ -30,8 +30,8 @@ _NOTE = (
     "cell without any rollout is missing."
 )
 _BEST = (
-    " Best (bold): not distinguishable from the highest rate; the p against it, after Holm's "
-    "correction over the others, is 0.05 or more."
+    " Best (bold): above zero and not distinguishable from the highest rate; the p against it, "
+    "after Holm's correction over the others, is 0.05 or more."
 )
 
 
@@ -121,7 +121,7 @@ def _ranked(outcomes: Outcomes, cells: list[Cell], parts: Mapping[str, Flags]) -
         best = tied_with_best(*to_best(outcomes, condition, systems, parts[part]))
         for place, cell in zip(places, group, strict=True):
             rank = 1 + sum(other.rate > cell.rate for other in group)
-            cells[place] = replace(cell, rank=rank, best=cell.system in best)
+            cells[place] = replace(cell, rank=rank, best=cell.system in best and cell.rate > 0)
     return cells
 
 
