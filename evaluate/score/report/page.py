@@ -174,10 +174,10 @@ def _outcome(counts: Sequence[int]) -> str:
 def _videos(rows: Rows) -> dict[tuple[str, ...], Path]:
     """Return the existing videos of the lowest model seeds, by rollout."""
     found: dict[tuple[str, ...], Path] = {}
-    for row in sorted((one for one in rows if one.video), key=lambda one: one.model_seed):
+    for row in sorted(rows, key=lambda one: one.model_seed):
         episode = f"{row.family}/{row.split}/{row.episode}"
         key = (row.simulator, row.system, row.condition, episode)
-        if key not in found and row.video.is_file():
+        if row.video and key not in found and row.video.is_file():
             found[key] = row.video
     return found
 

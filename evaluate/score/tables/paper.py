@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from importlib import resources
+from typing import Any
 
 from robomme_interference_data.evaluate.score.comparisons.pairs import compare_unpaired
 from robomme_interference_data.evaluate.score.comparisons.ranks import tied_with_best
@@ -127,7 +128,7 @@ def paper_table(cells: Sequence[Cell], *, by_part: bool = False) -> Table:
     rows = []
     for cell, paper in _comparable(cells):
         won = (cell.rate * cell.trials, cell.trials, round(paper.rate * paper.n), paper.n)
-        row = [cell.system, cell.condition, *[cell.part] * by_part, paper.system]
+        row: list[Any] = [cell.system, cell.condition, *[cell.part] * by_part, paper.system]
         row += [cell.n, cell.rate, *cell.interval, paper.n, paper.rate, *paper.interval]
         row += [paper.best] * (not by_part)
         rows.append((*row, cell.rate - paper.rate, *newcombe(*won), cell.complete))
