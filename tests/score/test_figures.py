@@ -65,6 +65,12 @@ def test_systems_differ_from_each_other_and_look_the_same_in_every_figure() -> N
     assert len(shapes(paper, color=True)) == 13
 
 
+def test_retrieval_steps_of_one_system_differ_in_color_and_marker() -> None:
+    names = [f"retrieval-replay-full-{step}" for step in ("max", "oracle", "joined")]
+    found = styles_of(names).values()
+    assert len({style.color for style in found}) == len({style.marker for style in found}) == 3
+
+
 # --- figures -----------------------------------------------------------------------------------
 
 WHOLE = [row for row in made.rows() if row.system == BASE]

@@ -213,6 +213,7 @@ def test_the_released_rows_give_the_published_numbers() -> None:
     assert headline(found, "robomme") == (
         "In robomme, Retrieval-FrameSamp-Modul succeeds in 44.9% of 450 episodes if the history "
         "holds only the lesson (k0, 95% interval 40.4 to 49.5), and in 44.9% with 7 distractor "
-        "sessions after it (k7): 0.0 points (−2.3 to +2.3; 13 episodes gained, 13 lost, McNemar p = 1). "
+        "sessions after it (k7): 0.0 points (−2.3 to +2.3; 13 episodes gained, 13 lost, McNemar "
+        "p = 1). "
         "Without retrieval, FrameSamp-Modul falls from 45.3% to 19.3% (published)."
     )

@@ -98,4 +98,4 @@ def rank_table(every: Iterable[Outcomes], draws: int = DRAWS) -> Table:
 
 def _ranks(rates: Floats) -> NDArray[np.int64]:
     """Return 1 + the number of systems with a higher rate, `(D, S)`."""
-    return 1 + np.stack([(rates > own[:, None]).sum(axis=1) for own in rates.T], axis=1)
+    return 1 + np.stack([(rates > column[:, None]).sum(axis=1) for column in rates.T], axis=1)
