@@ -9,7 +9,7 @@ from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.stats.bootstrap import DRAWS
 from robomme_interference_data.viz.tables import Table
 
-from .comparisons import effects, families, interaction, ranks
+from .comparisons import effects, families, ranks
 from .comparisons.contrast import Contrast
 from .comparisons.tables import SPECS, comparison_table
 from .config import Against, Expected, Settings
@@ -127,7 +127,7 @@ def _compared(
             found, decay = effects.effects_of(outcomes, system, **beside, draws=draws)
             compared += found
             decays += decay
-        compared += ranks.systems_of(outcomes) + interaction.interactions_of(outcomes)
+        compared += ranks.systems_of(outcomes) + ranks.interactions_of(outcomes)
     return compared, decays, notes
 
 

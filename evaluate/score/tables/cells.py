@@ -168,14 +168,16 @@ def main_grids(cells: Sequence[Cell]) -> list[Table]:
         )
         errors = sum(cell.errors for cell in found)
         references = dict.fromkeys(display_name(c.system) for c in found if is_bound(c.system))
-        note = _NOTE if several or not episodes else f"n = {episodes.pop()} in each cell. {_NOTE}"
-        note += _BEST * any(cell.best for cell in found)
-        note += f" References, not ranked: {', '.join(references)}." * bool(references)
-        chances = [cell.chance for cell in found if not math.isnan(cell.chance)]
-        if chances:
+        notes = [] if several or not episodes else [f"n = {episodes.pop()} in each cell."]
+        if not grids:  # once for all grids
+            notes.append(_NOTE + _BEST * any(cell.best for cell in whole))
+        if references:
+            notes.append(f"References, not ranked: {', '.join(references)}.")
+        if chances := [cell.chance for cell in found if not math.isnan(cell.chance)]:
             levels = dict.fromkeys(percent(one(chances)) for one in (min, max))
-            note += f" Guessing succeeds in {' to '.join(levels)}: see the table chance."
-        note += f" Errors: {errors}." if errors else " No errors."
+            notes.append(f"Guessing succeeds in {' to '.join(levels)}: see the table chance.")
+        notes.append(f"Errors: {errors}." if errors else "No errors.")
+        note = " ".join(notes)
         title = f"Success by system and condition, {simulator}"
         grids.append(Table.make(simulator, title, " ".join(["system", *conditions]), rows, note))
     return grids
