@@ -44,20 +44,24 @@ class Settings:
         metavar="ROWS",
         help="Folders of runs, or CSV, parquet or jsonl files.",
     )
-    system: str | None = setting(None, help="System of rows that name none.")
-    against: Against | None = setting(None, help="Compare with the published rates.")
+    system: str | None = setting(None, help="System of rows that name none.", group="Rows")
+    against: Against | None = setting(
+        None, help="Compare with the published rates.", group="Statistics"
+    )
     expected: Expected = setting(
         Expected.BENCHMARK,
         help="Episodes of a complete cell: the benchmark's (nine families, test episodes 0 to 49), "
         "or those that occur in any row.",
+        group="Statistics",
     )
     margin: float | None = setting(
         None,
         metavar="POINTS",
         help="Test whether differences are within this many points: k against k0, and a system "
         "with retrieval against the one without.",
+        group="Statistics",
     )
-    lenient: bool = setting(False, help="Leave out bad rows and count them.")
+    lenient: bool = setting(False, help="Leave out bad rows and count them.", group="Rows")
 
     def __post_init__(self) -> None:
         if self.margin is not None and not 0 < self.margin <= 100:

@@ -154,7 +154,7 @@ def main_grids(cells: Sequence[Cell]) -> list[Table]:
     The best of a condition (see `Cell.best`) are bold, between `**`. If all rates have the same n,
     only the note states it.
     """
-    grids = []
+    grids: list[Table] = []
     whole = [cell for cell in cells if not cell.part]
     for simulator, group in groupby(whole, lambda cell: cell.simulator):
         found = list(group)
