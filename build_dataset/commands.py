@@ -5,13 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.cli.console import (
-    Group,
-    echo,
-    graceful_interrupt,
-    print_json,
-    print_status,
-)
+from robomme_interference_data.cli.console import echo, graceful_interrupt, print_json, print_status
+from robomme_interference_data.cli.help import App
 from robomme_interference_data.cli.options import AsJson, BufferSetFolder, with_settings
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
@@ -40,10 +35,7 @@ from .config import (
 if TYPE_CHECKING:
     from robomme_interference_data.storage.files import Files
 
-app = typer.Typer(
-    cls=Group,
-    no_args_is_help=True,
-    rich_markup_mode=None,
+app = App(
     help="Build a buffer set's datasets, demonstrations and distractor units first, and manifests.",
     epilog="""Flow: record or download episodes, build the datasets and the manifests, verify.
 

@@ -11,26 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import typer
-from typer.core import TyperGroup
 
 from robomme_interference_data.constants import IDENTITY_PATH, MANIFEST_HEADER, MANIFEST_ROWS
 from robomme_interference_data.errors import InvalidOptionError, visible
-
-
-class Group(TyperGroup):
-    """Commands whose help says each one's first sentence whole."""
-
-    @property
-    def sections(self) -> dict[str, list[str]]:
-        """The names of the commands, under titles."""
-        return {"Commands": list(self.commands)}
-
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the section of each title."""
-        for title, names in self.sections.items():
-            with formatter.section(title):
-                told = [(name, self.commands[name].get_short_help_str(200)) for name in names]
-                formatter.write_dl(told)
 
 
 def echo(text: str, *, nl: bool = True) -> None:
@@ -58,7 +41,7 @@ def log_to_stderr() -> None:
 
 
 def check_output(*paths: Path | None) -> None:
-    """Refuse to write into a dataset or the manifests of a buffer set, every file of which is hashed."""
+    """Raise if a path is inside a dataset or manifests, whose files are hashed."""
     for path in filter(None, paths):
         for folder in (path.resolve(), *path.resolve().parents):
             manifests = (folder / name for name in (MANIFEST_HEADER, MANIFEST_ROWS))

@@ -8,7 +8,7 @@ import signal
 import sys
 import traceback
 from importlib import metadata
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -22,7 +22,8 @@ from robomme_interference_data.simulators import commands as simulating
 from robomme_interference_data.storage.hub import check_endpoint
 
 from . import commands
-from .console import Group, echo, log_to_stderr, print_status
+from .console import echo, log_to_stderr, print_status
+from .help import App, Group
 from .hints import PROGRAM, error_lines, option_names
 
 
@@ -34,15 +35,13 @@ class _Root(Group):
         return {title: [name for name, _ in group] for title, group in _GROUPS.items()}
 
 
-app = typer.Typer(
+app = App(
     cls=_Root,
     name=PROGRAM,
-    no_args_is_help=True,
-    rich_markup_mode=None,  # rich would take longer to load than all else
     pretty_exceptions_enable=False,
     help="History buffers for RoboMME-Interference: build, load, stream and score.",
-    epilog="""A buffer set is a folder with demonstrations, distractor units and manifests of buffers.
-An option that takes several values is repeated, or has commas between them (NAME,…).
+    epilog="""A buffer set is a folder with demonstrations, distractor units and manifests.
+Options shown with NAME,… accept several values: separate them by commas or repeat the option.
 
 ```
 robomme-interference doctor
@@ -92,8 +91,8 @@ _GROUPS = {
 """Commands in the order in which one uses them."""
 
 
-def _tell_version(asked: bool) -> None:
-    if asked:
+def _print_version(requested: bool) -> None:
+    if requested:
         echo(f"{PROGRAM} {metadata.version('robomme-interference-data')}")
         raise typer.Exit
 
@@ -102,7 +101,9 @@ def _tell_version(asked: bool) -> None:
 def _root(
     version: Annotated[
         bool,
-        typer.Option("--version", help="Tell the version.", callback=_tell_version, is_eager=True),
+        typer.Option(
+            "--version", help="Print the version.", callback=_print_version, is_eager=True
+        ),
     ] = False,
 ) -> None:
     check_endpoint()  # before a library that works with the Hub is imported
@@ -113,25 +114,13 @@ for _commands in _GROUPS.values():
         if isinstance(_command, typer.Typer):
             app.add_typer(_command, name=_name)
         else:
-            app.command(name=_name)(_command)
-
-
-def _keep_lines(command: Any) -> Any:
-    """Keep the lines of fenced blocks in the help of a command and of those under it."""
-    for name in ("help", "epilog"):
-        prose, *blocks = (getattr(command, name) or "").split("```\n")
-        for number, text in enumerate(blocks):
-            prose += text if number % 2 else "\n\b\n" + text.replace("\n\n", "\n\n\b\n") + "\n"
-        setattr(command, name, prose.replace("```", "").replace("`", ""))
-    for inner in getattr(command, "commands", {}).values():
-        _keep_lines(inner)
-    return command
+            app.command(_name)(_command)
 
 
 def main() -> None:
     """Run the command line; known errors are printed without a traceback."""
     log_to_stderr()
-    command = _keep_lines(typer.main.get_command(app))
+    command = typer.main.get_command(app)
     try:
         command(prog_name=PROGRAM)
     except InterferenceError as error:

@@ -38,13 +38,22 @@ __all__ = [
 class WorkersConfig:
     """Who does the work."""
 
-    workers: int = setting(1, help="Worker processes.", metavar="N")
-    executor: str = setting("processes", help="processes, on this machine, or ray, on a cluster.")
-    ray_address: str = setting(
-        "auto", metavar="ADDRESS", help="ray: auto, local or HOST:PORT; see docs/cluster.md."
+    workers: int = setting(1, help="Worker processes.", metavar="N", group="Execution")
+    executor: str = setting(
+        "processes", help="processes (on this machine) or ray (on a cluster).", group="Execution"
     )
-    cpus_per_worker: float = setting(1.0, help="ray: processors that each worker takes.")
-    gpus_per_worker: float = setting(0.0, help="ray: share of a GPU that each worker takes.")
+    ray_address: str = setting(
+        "auto",
+        metavar="ADDRESS",
+        help="Address of the Ray cluster: auto, local or HOST:PORT.",
+        group="Execution",
+    )
+    cpus_per_worker: float = setting(
+        1.0, help="CPUs that Ray reserves for each worker.", group="Execution"
+    )
+    gpus_per_worker: float = setting(
+        0.0, help="Share of a GPU that Ray reserves for each worker.", group="Execution"
+    )
 
 
 def make_executor(config: WorkersConfig) -> "Executor":

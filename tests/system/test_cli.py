@@ -80,6 +80,14 @@ def test_help_of_every_command(path: tuple[str, ...], run: Run) -> None:
         assert name in out
 
 
+def test_help_shows_options_in_groups_and_examples_last(run: Run) -> None:
+    out = run("build", "manifests", "--help")[1]
+    assert "[OPTIONS] BUFFER_SET\n" in out
+    out = run("index", "--help")[1]
+    order = ("\n  Embed", "Arguments:", "Options:", "Execution:", "--workers", "--json", "Example")
+    assert [word for word in sorted(order, key=out.index)] == list(order)
+
+
 def test_help_imports_nothing_heavy() -> None:
     code = (
         "import sys; from robomme_interference_data.cli.main import app\n"
