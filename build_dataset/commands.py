@@ -334,6 +334,7 @@ def audit(
     ```
     """
     from robomme_interference_data.data.loading import load_buffer_set
+    from robomme_interference_data.viz.tables import tables_text
 
     from .audit import audit_buffer_set
 
@@ -341,8 +342,7 @@ def audit(
     if as_json:
         print_json(report.as_dict())
     else:
-        for table in report.tables():
-            echo(table.text() + "\n")
+        echo(tables_text(report.tables()) + "\n")
         for leak in report.leaks:
             echo(f"LEAK, {leak.kind}: {leak.where}")
         print_status(
