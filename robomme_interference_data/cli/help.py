@@ -2,14 +2,11 @@
 
 import inspect
 import textwrap
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
-
-_LAST = ("as_json", "help")
-"""Options that follow the groups."""
 
 _Rows = list[tuple[str, str]]
 
@@ -26,81 +23,59 @@ class App(typer.Typer):
         return super().command(name, cls=_Command, **settings)
 
 
-class _Command(TyperCommand):
-    def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        arguments = [_argument_name(param) for param in self.params if not _is_option(param)]
-        return ["[OPTIONS]", *arguments]
+class _Layout:
+    """Formats the help of a command or group."""
 
-    def format_help_text(self, ctx: Any, formatter: Any) -> None:
-        _write_prose(formatter, inspect.cleandoc(self.help or "").partition("\nExample")[0])
+    help: str | None
+    epilog: str | None
 
-    def format_options(self, ctx: Any, formatter: Any) -> None:
-        _write_options(self, ctx, formatter)
-
-    def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        _, heading, examples = inspect.cleandoc(self.help or "").partition("\nExample")
-        _write_prose(formatter, heading + examples)
-
-
-class Group(TyperGroup):
-    """A group of commands; its help shows the whole first sentence of each."""
-
-    @property
     def sections(self) -> dict[str, list[str]]:
-        """The names of the commands by title."""
-        return {"Commands": list(self.commands)}
+        """Return the names of a group's commands by title."""
+        return {"Commands": list(getattr(self, "commands", ()))}
 
-    def format_help_text(self, ctx: Any, formatter: Any) -> None:
-        """Write the description."""
-        _write_prose(formatter, self.help or "")
+    def format_help(self: Any, ctx: Any, formatter: Any) -> None:
+        """Write the help."""
+        arguments: _Rows = []
+        groups: dict[str, _Rows] = {"Options": []}
+        last: _Rows = []
+        for param in self.get_params(ctx):
+            name, text = param.get_help_record(ctx)
+            group = getattr(param, "rich_help_panel", None) or "Options"
+            if param.param_type_name == "argument":
+                name = param.metavar or param.name.upper()
+                name = (name if param.required else f"[{name}]") + "..." * (param.nargs != 1)
+                arguments.append((name, text.removesuffix("[required]").rstrip()))
+            elif param.name in ("as_json", "help"):
+                last.append((name, text))
+            else:
+                groups.setdefault(group, []).append((name, text))
+        groups.setdefault("Options" if len(groups) == 1 else "Other options", []).extend(last)
 
-    def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write the options and the commands."""
-        _write_options(self, ctx, formatter)
-        for title, names in self.sections.items():
-            rows = [(name, self.commands[name].get_short_help_str(200)) for name in names]
+        commands = getattr(self, "commands", {})
+        usage = [name for name, _ in arguments] + ["COMMAND [ARGS]..."] * bool(commands)
+        formatter.write_usage(ctx.command_path, " ".join(["[OPTIONS]", *usage]))
+        description, heading, examples = inspect.cleandoc(self.help).partition("\nExample")
+        _write_prose(formatter, description)
+        for title, rows in [("Arguments", arguments), *groups.items()]:
             _write_section(formatter, title, rows)
-
-    def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        """Write the examples."""
-        _write_prose(formatter, self.epilog or "")
-
-
-def _is_option(param: Any) -> bool:
-    return bool(param.param_type_name == "option")
+        for title, names in self.sections().items():
+            summaries = [(name, commands[name].get_short_help_str(200)) for name in names]
+            _write_section(formatter, title, summaries)
+        _write_prose(formatter, heading + examples + (self.epilog or ""))
 
 
-def _argument_name(param: Any) -> str:
-    name = param.metavar or param.name.upper()
-    return f"{name if param.required else f'[{name}]'}{'...' if param.nargs != 1 else ''}"
+class _Command(_Layout, TyperCommand):
+    pass
 
 
-def _write_options(command: Any, ctx: Any, formatter: Any) -> None:
-    """Write the arguments, the options without a group, each group, and `--json` and `--help`."""
-    sections: dict[str, _Rows] = {"Arguments": [], "Options": []}
-    last: _Rows = []
-    for param in command.get_params(ctx):
-        record = param.get_help_record(ctx)
-        if record is None:
-            continue
-        group = getattr(param, "rich_help_panel", None) or "Options"
-        if not _is_option(param):
-            help = record[1].removesuffix("[required]").rstrip()
-            sections["Arguments"].append((_argument_name(param), help))
-        elif param.name in _LAST:
-            last.append(record)
-        else:
-            sections.setdefault(group, []).append(record)
-    sections.setdefault("Options" if len(sections) == 2 else "Other options", []).extend(last)
-    for title, rows in sections.items():
-        _write_section(formatter, title, rows)
+class Group(_Layout, TyperGroup):
+    """A group of commands."""
 
 
 def _write_section(formatter: Any, title: str, rows: _Rows) -> None:
-    if not rows:
-        return
-    formatter.write(f"\n{title}:\n")
-    column = min(28, max(len(name) for name, _ in rows))
+    if rows:
+        formatter.write(f"\n{title}:\n")
+    column = min(28, max((len(name) for name, _ in rows), default=0))
     for name, text in rows:
         lines = _wrap(text, formatter.width - column - 4)
         if len(name) > column:
@@ -116,16 +91,11 @@ def _write_prose(formatter: Any, text: str) -> None:
     for number, block in enumerate(text.split("```")):
         if number % 2:
             commands = block.strip().replace("\\\n", " ").split("\n")
-            _write_lines(formatter, (line for text in commands for line in _fold(text, width)))
+            paragraphs = [[line for text in commands for line in _fold(text, width)]]
         else:
-            for paragraph in block.replace("`", "").split("\n\n"):
-                _write_lines(formatter, _wrap(paragraph, width))
-
-
-def _write_lines(formatter: Any, lines: Iterable[str]) -> None:
-    text = "\n".join(f"  {line}".rstrip() for line in lines)
-    if text:
-        formatter.write(f"\n{text}\n")
+            paragraphs = [_wrap(part, width) for part in block.replace("`", "").split("\n\n")]
+        for lines in filter(None, paragraphs):
+            formatter.write("\n" + "".join(f"  {line}".rstrip() + "\n" for line in lines))
 
 
 def _fold(command: str, width: int) -> list[str]:
@@ -134,9 +104,9 @@ def _fold(command: str, width: int) -> list[str]:
     if len(command) <= width:
         return [command]
     unbroken = command.replace(" ", "\xa0").replace("\xa0--", " --")
-    first, *rest = _wrap(unbroken, width - 6)
-    lines = [first, *(f"    {line}" for line in rest)]
-    return [line.replace("\xa0", " ") for line in " \\\n".join(lines).split("\n")]
+    lines = [line.replace("\xa0", " ") for line in _wrap(unbroken, width - 6)]
+    ends = [" \\"] * (len(lines) - 1) + [""]
+    return [f"{'    ' * (n > 0)}{line}{ends[n]}" for n, line in enumerate(lines)]
 
 
 def _wrap(text: str, width: int) -> list[str]:

@@ -1,7 +1,4 @@
-"""The `robomme-interference` command: a thin root, and how errors are shown.
-
-Each area has its own commands file; only this one sees all of them.
-"""
+"""The root of the command line, and the display of errors. Each area declares its own commands."""
 
 import os
 import signal
@@ -28,9 +25,8 @@ from .hints import PROGRAM, error_lines, option_names
 
 
 class _Root(Group):
-    """Lists the commands under the titles of `_GROUPS`."""
+    """Lists the commands below the titles of `_GROUPS`."""
 
-    @property
     def sections(self) -> dict[str, list[str]]:
         return {title: [name for name, _ in group] for title, group in _GROUPS.items()}
 
@@ -88,7 +84,7 @@ _GROUPS = {
         ("publish-results", publishing.publish_results),
     ),
 }
-"""Commands in the order in which one uses them."""
+"""Commands by title, in their order of use."""
 
 
 def _print_version(requested: bool) -> None:
@@ -106,7 +102,7 @@ def _root(
         ),
     ] = False,
 ) -> None:
-    check_endpoint()  # before a library that works with the Hub is imported
+    check_endpoint()  # before libraries that use the Hub are imported
 
 
 for _commands in _GROUPS.values():
@@ -118,28 +114,27 @@ for _commands in _GROUPS.values():
 
 
 def main() -> None:
-    """Run the command line; known errors are printed without a traceback."""
+    """Run the command line; print known errors without a traceback."""
     log_to_stderr()
     command = typer.main.get_command(app)
     try:
         command(prog_name=PROGRAM)
     except InterferenceError as error:
         _fail(*error_lines(error, option_names(command, sys.argv[1:])))
-    except KeyboardInterrupt:  # before the command itself has begun, see `graceful_interrupt`
+    except KeyboardInterrupt:  # outside `graceful_interrupt`
         sys.exit(128 + signal.SIGINT)
-    except BrokenPipeError:  # the reader of stdout (head, less) has gone
+    except BrokenPipeError:  # head or less closed stdout
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except Exception as error:
-        if not isinstance(error, OSError) or error.errno is None:  # a fault of ours
+        if not isinstance(error, OSError) or error.errno is None:  # a bug
             print_status(traceback.format_exc())
             sys.exit(1)
-        names = [name for name in (error.filename, error.filename2) if name is not None]
-        where = f"{' -> '.join(map(str, names))}: " if names else ""
-        hint = "Check the path, its permissions and the space left on the disk."
+        names = [str(name) for name in (error.filename, error.filename2) if name is not None]
+        hint = "Check the path, its permissions and the free disk space."
         if isinstance(error, FileExistsError | NotADirectoryError):
-            hint = "A file lies where a folder is to be: give another path, or move the file away."
-        _fail(f"{where}{error.strerror}", hint)
+            hint = "The path must be a folder, but a file has this name. Use another path."
+        _fail(": ".join(filter(None, (" -> ".join(names), error.strerror))), hint)
 
 
 def _fail(message: str, *further: str) -> None:

@@ -136,9 +136,10 @@ class Table:
     def text(self, width: int | None = None) -> str:
         """Return the table for a terminal: title, aligned columns, note.
 
-        Cells wrap, and columns continue below, to fit the width: by default the terminal's, or 80.
+        Cells wrap, and columns continue below, to fit the width: by default the terminal's, at
+        least 80.
         """
-        width = width or shutil.get_terminal_size().columns
+        width = width or max(80, shutil.get_terminal_size().columns)
         sides, heads, rows = self._layout("<", ">")
         columns = list(zip(heads, *rows, strict=True))
         widths = [max(map(len, cells)) for cells in columns]

@@ -114,7 +114,7 @@ def test_ctrl_c_gives_all_workers_back(cluster: Any, tmp_path: Path) -> None:
     assert len(workers) == 3
     running.send_signal(signal.SIGINT)
     _, err = running.communicate(timeout=60)
-    assert running.returncode == 130 and "go on with:" in err
+    assert running.returncode == 130 and "resume with:" in err
     wait_until_gone(workers)
     assert 1 <= len(read_record(tmp_path / "run")) < ROLLOUTS
 
