@@ -144,7 +144,7 @@ def show(
     )
     echo(table.text())
     if evidence:
-        spans = Table.make(
+        answers = Table.make(
             "evidence",
             "Frames of the buffer that show the answer",
             "part:count text session frames",
@@ -153,7 +153,7 @@ def show(
                 for one in evidence
             ),
         )
-        echo(f"\n{spans.text()}")
+        echo(f"\n{answers.text()}")
     echo(
         f"\n{len(buffer)} history frames; {manifest.lesson_share:.0%} of an even 32-frame sample "
         "are of the lesson"
