@@ -141,7 +141,7 @@ def bind_options(
             value = float(value)
         if kinds and type(value) not in kinds:  # here, bool is not a number
             expected = " or ".join(_TYPES[kind] for kind in kinds)
-            raise InvalidOptionError.expected(f"{what}: option {name}", value, expected)
+            raise InvalidOptionError.expected(f"{what}: option {name} is", value, expected)
         values[name] = value
     try:
         bound = signature.bind(**given, **values)

@@ -71,6 +71,7 @@ def test_help_of_every_command(path: tuple[str, ...], run: Run) -> None:
     code, out, err = run(*path, "--help")
     assert (code, err) == (0, "")
     assert "Usage: robomme-interference" in out
+    assert max(map(len, out.splitlines())) <= 80
     assert "robomme-interference " in out.split("Usage:")[1].split("\n", 1)[1], "no example"
     for parameter in ALL[path].params:
         if parameter.name != "help":
@@ -249,7 +250,7 @@ def test_show(run: Run, tiny_buffers: Path) -> None:
     assert rows[0] == ["0", "lesson", "MoveCube", EPISODE, "0 to 47"]
     assert [row[4] for row in rows] == ["0 to 47", "48 to 79", "80 to 111", "112 to 143"]
     assert "144 history frames" in out
-    assert "34% of an even 32-frame sample" in " ".join(out.split())  # 11 of an even 32-frame sample
+    assert "34% of an even 32-frame sample" in " ".join(out.split())
 
 
 def test_show_as_json_and_as_a_picture(run: Run, tiny_buffers: Path, tmp_path: Path) -> None:
