@@ -104,9 +104,9 @@ def _fold(command: str, width: int) -> list[str]:
     if len(command) <= width:
         return [command]
     unbroken = command.replace(" ", "\xa0").replace("\xa0--", " --")
-    lines = [line.replace("\xa0", " ") for line in _wrap(unbroken, width - 6)]
+    lines = [line.replace("\xa0", " ") for line in _wrap(unbroken, width - 4)]
     ends = [" \\"] * (len(lines) - 1) + [""]
-    return [f"{'    ' * (n > 0)}{line}{ends[n]}" for n, line in enumerate(lines)]
+    return [f"{'  ' * (n > 0)}{line}{ends[n]}" for n, line in enumerate(lines)]
 
 
 def _wrap(text: str, width: int) -> list[str]:
