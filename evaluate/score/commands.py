@@ -60,6 +60,7 @@ def score(
     ```
     """
     from robomme_interference_data.runtime.progress import WorkProgress
+    from robomme_interference_data.viz.tables import tables_text
 
     from .report.headline import headline
     from .scoring import score as compute
@@ -87,8 +88,7 @@ def score(
             }
         )
     else:
-        for grid in found.grids:
-            echo(f"{grid.text()}\n")
+        echo(f"{tables_text(found.grids)}\n")
     print_status(f"Report: {out / 'report.html'}")
 
 

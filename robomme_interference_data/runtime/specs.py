@@ -1,7 +1,7 @@
-"""Specifications: `kind:target` texts, `NAME=VALUE` options, and the factories behind them.
+"""Specs, such as `kind:target`, with `NAME=VALUE` options, and the factories that they select.
 
-Policies, models and simulators are named by such texts. What makes them is imported when one is
-made, as it may bring large libraries.
+Policies, models and simulators are selected by specs. A factory is imported when it is first used,
+since it may import large libraries.
 """
 
 import inspect
@@ -32,14 +32,13 @@ class Kind:
     """One kind of a registry.
 
     Attributes:
-        form: How it is written, for messages.
-        factory: What makes it, `package.module:name`.
-        target: Regular expression of what follows the colon; its named groups are arguments of the
-            factory.
-        default: The target where none is written.
+        form: Its syntax, for messages.
+        factory: Its factory, `package.module:name`.
+        target: Regular expression of the target; its named groups are arguments of the factory.
+        default: The target of a spec without one.
         given: Further arguments of the factory.
-        extra: The extra that has its libraries.
-        no_effect: Options, and keys of metadata, that change no result.
+        extra: The extra that installs its libraries.
+        no_effect: Options, and keys of metadata, that do not affect results.
     """
 
     form: str
@@ -53,7 +52,7 @@ class Kind:
 
 @dataclass(frozen=True)
 class Spec:
-    """A text that was read: its kind, what follows the colon, and the arguments in that."""
+    """A parsed spec: its kind, its target, and the factory's arguments."""
 
     kind: str
     target: str = ""
@@ -64,13 +63,13 @@ class Spec:
 
 
 class Registry:
-    """Kinds by name; `what` they are, such as `policy`, is for messages."""
+    """Kinds by name; messages call them `what`, such as `policy`."""
 
     def __init__(self, what: str, kinds: Mapping[str, Kind]):
         self._what, self.kinds = what, kinds
 
     def parse(self, text: str) -> Spec:
-        """Read a text: `UnknownNameError` for an unknown kind, else `InvalidOptionError`."""
+        """Parse a spec."""
         name, colon, target = text.partition(":")
         if name not in self.kinds:
             forms = ", ".join(kind.form for kind in self.kinds.values())
@@ -86,39 +85,38 @@ class Registry:
         return Spec(name, target, {**kind.given, **match.groupdict()})
 
     def factory(self, spec: Spec, name: str | None = None) -> Factory:
-        """Import what makes such a spec, or another name of the same module."""
+        """Import the factory of a spec, or another name in its module."""
         kind = self.kinds[spec.kind]
-        module, _, usual = kind.factory.partition(":")
-        return load_extra(module, name or usual, f"the {self._what} {spec}", kind.extra)
+        module, _, default = kind.factory.partition(":")
+        return load_extra(module, name or default, f"the {self._what} {spec}", kind.extra)
 
     def identity(self, spec: Spec, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return those options, or entries of metadata, that can change a result."""
-        without = self.kinds[spec.kind].no_effect
-        return {name: value for name, value in sorted(values.items()) if name not in without}
+        """Return the options, or entries of metadata, that can affect results."""
+        ignored = self.kinds[spec.kind].no_effect
+        return {name: value for name, value in sorted(values.items()) if name not in ignored}
 
 
 def import_factory(what: str, target: str) -> Factory:
-    """Import a function or class by `module:name`; `what` it makes is for messages."""
+    """Import a function or class by `module:name`; messages call its result `what`."""
     module, _, name = target.partition(":")
     if module == "__main__":
         raise InvalidOptionError(
-            f"{what} {target!r}: worker processes run another program, and find no such function "
-            "in it",
-            "Put the function into a module, a .py file beside the script or on PYTHONPATH, and "
-            "write MODULE:FUNCTION.",
+            f"{what} {target!r}: worker processes cannot import from __main__",
+            "Move the function to a module, a .py file next to the script or on PYTHONPATH, and "
+            "use MODULE:FUNCTION.",
         )
     try:
         loaded = import_module(module)
     except Exception as error:
         raise InvalidOptionError(
             f"{what} {target!r}: importing {module} failed: {type(error).__name__}: {error}",
-            "Install it, or run with PYTHONPATH set to the folder that it is in.",
+            "Install it, or set PYTHONPATH to the folder that contains it.",
         ) from error
-    found: Any = getattr(loaded, name, None)
-    if not callable(found):
+    factory: Any = getattr(loaded, name, None)
+    if not callable(factory):
         known = [key for key, value in vars(loaded).items() if callable(value)]
         raise UnknownNameError.among("function", name, f"module {module!r}", known)
-    return found  # type: ignore[no-any-return]
+    return factory  # type: ignore[no-any-return]
 
 
 def bind_options(
@@ -128,22 +126,22 @@ def bind_options(
     options: Iterable[str],
     also: Iterable[str] = (),
 ) -> dict[str, Any]:
-    """Return all options that a factory is called with, defaults included.
+    """Return all options of a call of a factory, including defaults.
 
-    Text stays text where the factory declares it. Elsewhere it is read as JSON (`3`, `0.5`,
-    `true`, `null`) if it is that. Anything wrong is an `InvalidOptionError`. For messages are
-    `what` is made, such as `policy 'replay:full'`, and which options something else takes `also`.
+    A value is text if the factory declares it as text; else it is parsed as JSON if possible.
+    Messages name `what` is made, such as `policy 'replay:full'`, and the options that are accepted
+    `also`, by something else.
     """
     signature, declared = signature_of(factory), _declared_types(factory)
     values: dict[str, Any] = {}
-    for name, text in _buffer_set(what, options).items():
+    for name, text in _parse_options(what, options).items():
         kinds = declared.get(name)
-        value = text if kinds and str in kinds else _read(text)
+        value = text if kinds and str in kinds else _parse_json(text)
         if kinds and float in kinds and type(value) is int:
             value = float(value)
-        if kinds and type(value) not in kinds:  # bool is none of the numbers here
+        if kinds and type(value) not in kinds:  # here, bool is not a number
             expected = " or ".join(_TYPES[kind] for kind in kinds)
-            raise InvalidOptionError.expected(f"{what}: its option {name} is", value, expected)
+            raise InvalidOptionError.expected(f"{what}: option {name} is", value, expected)
         values[name] = value
     try:
         bound = signature.bind(**given, **values)
@@ -153,24 +151,24 @@ def bind_options(
             f"{what}: {error}", f"Its options: {', '.join(names) or 'none'}."
         ) from error
     bound.apply_defaults()
-    taken: dict[str, Any] = {}
+    arguments: dict[str, Any] = {}
     for name, value in bound.arguments.items():
         if signature.parameters[name].kind is inspect.Parameter.VAR_KEYWORD:
-            taken |= value
+            arguments |= value
         elif signature.parameters[name].kind is not inspect.Parameter.VAR_POSITIONAL:
-            taken[name] = value
-    return {name: value for name, value in taken.items() if name not in given}
+            arguments[name] = value
+    return {name: value for name, value in arguments.items() if name not in given}
 
 
 def signature_of(factory: Factory) -> inspect.Signature:
-    """Return a factory's parameters; of one that declares none, that it takes any by name."""
+    """Return a factory's signature, or one that accepts any options if it has none."""
     try:
         return inspect.signature(factory)
-    except ValueError:  # something built in
+    except ValueError:  # a builtin
         return inspect.signature(lambda **options: None)
 
 
-def _buffer_set(what: str, options: Iterable[str]) -> dict[str, str]:
+def _parse_options(what: str, options: Iterable[str]) -> dict[str, str]:
     values: dict[str, str] = {}
     for option in options:
         name, equals, value = option.partition("=")
@@ -179,12 +177,12 @@ def _buffer_set(what: str, options: Iterable[str]) -> dict[str, str]:
                 f"{what}: option", option, "NAME=VALUE, such as device=cpu"
             )
         if name in values:
-            raise InvalidOptionError(f"{what}: option {name} is given twice", "Give it once.")
+            raise InvalidOptionError(f"{what}: option {name} is set twice", "Set it once.")
         values[name] = value
     return values
 
 
-def _read(text: str) -> Any:
+def _parse_json(text: str) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError):
@@ -192,10 +190,10 @@ def _read(text: str) -> Any:
 
 
 def _declared_types(factory: Factory) -> dict[str, tuple[type, ...]]:
-    """Return the types of the parameters that are declared as plain values."""
+    """Return the types of the parameters that are declared with plain types."""
     try:
         hints = get_type_hints(factory.__init__ if inspect.isclass(factory) else factory)
-    except (AttributeError, NameError, TypeError):  # nothing can be known of it
+    except (AttributeError, NameError, TypeError):  # no readable annotations
         return {}
     declared = {}
     for name, hint in hints.items():

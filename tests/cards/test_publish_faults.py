@@ -158,7 +158,7 @@ def test_stopped_while_publishing(
     hub.fault("PUT", "/store/datasets/someone/tiny/", after=20, call=interrupt)
     command = ("publish", GOLDEN, "--repo-id", UNITS, "--yes")
     code, _, err = run(*command)
-    assert code == 130 and "go on with:\nrobomme-interference publish" in err
+    assert code == 130 and "resume with:\nrobomme-interference publish" in err
     assert "data-1.0.0" in tags(hub, LESSONS) and tags(hub, UNITS) == {}
     assert run(*command)[0] == 0
     assert whole(hub)
