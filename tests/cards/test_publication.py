@@ -22,7 +22,7 @@ COMMIT = "0123456789" * 4
     [
         *({"repo_id": one} for one in ("tiny", "a/b/c", "a/b b", "a/b\n", "a/b.git", "", None)),
         *({"version": one} for one in ("1.0", "v1.0.0", "01.0.0", "1.0.0\n")),
-        *({"license": one} for one in ("CC BY 4.0", "a: b", "")),
+        *({"license": one} for one in ("CC BY 4.0", "cc-by-4", "a: b", "")),
         *({"base": one} for one in ("people/demos", "people/demos@main", f"demos@{COMMIT}")),
     ],
 )
@@ -30,6 +30,14 @@ def test_what_is_an_error(wrong: dict[str, Any]) -> None:
     with pytest.raises(InvalidOptionError, match="expected") as caught:
         Publication(**{"repo_id": "people/tiny", **wrong})
     assert repr(next(iter(wrong.values())))[:6] in caught.value.message
+
+
+def test_licenses_are_those_of_the_hub() -> None:
+    for license in ("other", "mit", "cc-by-4.0", "openrail++"):
+        assert Publication("people/tiny", license=license).license == license
+    with pytest.raises(InvalidOptionError) as caught:
+        Publication("people/tiny", license="cc-by-4")
+    assert "'cc-by-4.0'" in str(caught.value.hint) and "licenses" in str(caught.value.hint)
 
 
 @pytest.mark.parametrize(
@@ -49,9 +57,9 @@ def test_settings_that_are_an_error(options: dict[str, str], words: str) -> None
 
 @pytest.mark.parametrize("location", [None, ".", "demo/buffers", 7, f"demos@{COMMIT}"])
 def test_a_base_is_a_commit_on_the_hub(location: object) -> None:
-    about = Publication("people/tiny").made_for(location)
-    assert about.base is None
-    known = about.made_for(f"people/demos@{COMMIT}")
+    publication = Publication("people/tiny").made_for(location)
+    assert publication.base is None
+    known = publication.made_for(f"people/demos@{COMMIT}")
     assert known.base == known.made_for(f"people/others@{COMMIT}").base == f"people/demos@{COMMIT}"
 
 

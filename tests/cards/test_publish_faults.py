@@ -13,8 +13,8 @@ from support.hub_server import HubServer
 from support.machine import full_disk
 from support.publishing import LESSONS, UNITS, files, plain_cards, plan_again, publish, tags
 
-from robomme_interference_data.cards import checks
-from robomme_interference_data.cards.checks import open_with_lerobot
+from robomme_interference_data.cards import publish as publish_module
+from robomme_interference_data.cards.publish import open_with_lerobot
 from robomme_interference_data.errors import HubError
 
 
@@ -153,7 +153,7 @@ def test_a_full_disk_while_lerobot_looks(tmp_path: Path, monkeypatch: pytest.Mon
 def test_stopped_while_publishing(
     hub: HubServer, run: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(checks, "check_buffer_set", lambda *_: None)
+    monkeypatch.setattr(publish_module, "check_buffer_set", lambda *_: None)
     interrupt = partial(os.kill, os.getpid(), signal.SIGINT)
     hub.fault("PUT", "/store/datasets/someone/tiny/", after=20, call=interrupt)
     command = ("publish", GOLDEN, "--repo-id", UNITS, "--yes")

@@ -1,4 +1,4 @@
-"""The files of a repository: how they differ from others, in a folder, and what a buffer set has."""
+"""The files of a repository: differences, in a folder, and for a buffer set."""
 
 import hashlib
 from pathlib import Path
@@ -63,7 +63,7 @@ def test_what_is_unmanaged_is_left_alone() -> None:
     assert compare({}, existing).removed == ("LICENSES/x", "NOTICE", "data/.x")
 
 
-# --- what the repository of a buffer set holds --------------------------------------------------------
+# --- what the repository of a buffer set holds ---------------------------------------------------
 
 
 def test_the_files_of_a_buffer_set(tmp_path: Path) -> None:
@@ -136,7 +136,7 @@ def test_a_folder_of_something_else_is_kept(tmp_path: Path, other: str) -> None:
         (out / other).parent.mkdir(exist_ok=True)
         (out / other).write_bytes(b"mine")
     before = contents(tmp_path)
-    with pytest.raises(PublishError, match="nothing that was exported"):
+    with pytest.raises(PublishError, match="not an earlier export"):
         write_folder(folder(GOLDEN), out)
     assert contents(tmp_path) == before
 

@@ -12,7 +12,7 @@ from support.hub_server import HubServer
 from support.publishing import LESSONS, UNITS, files, publish, tags
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.cards.checks import open_with_lerobot
+from robomme_interference_data.cards.publish import open_with_lerobot
 from robomme_interference_data.errors import PublishError
 
 PUBLISH = """
@@ -28,8 +28,8 @@ import json, sys
 from datasets import load_dataset
 
 for name in ("buffers", "episodes"):
-    [(buffer set, rows)] = load_dataset(sys.argv[1], name).items()
-    print(json.dumps([name, buffer set, rows["episode_id"][:2], len(rows)]))
+    [(split, rows)] = load_dataset(sys.argv[1], name).items()
+    print(json.dumps([name, split, rows["episode_id"][:2], len(rows)]))
 """
 
 
