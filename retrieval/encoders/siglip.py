@@ -4,7 +4,6 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,7 @@ from . import encoder_name
 _FILES = ("*.json", "*.safetensors")
 
 _VERSION = 2
-"""Version of this file's part of the computation: which output is used, and how weights are hashed."""
+"""Version of the computation in this file, and of the digest of weights."""
 
 _NOT_COMPUTING = ("_name_or_path", "architectures", "dtype", "transformers_version")
 """Settings of a vision tower that record its origin and do not affect its output."""
@@ -75,7 +74,7 @@ class Siglip:
         self.batch = batch or (32 if self._device.type == "cuda" else 8)
         with self._format_errors():
             config = transformers.AutoConfig.from_pretrained(self._folder)
-            classes = {
+            classes: dict[str, Any] = {
                 "siglip": transformers.SiglipVisionModel,
                 "siglip2": transformers.Siglip2VisionModel,
             }
@@ -89,7 +88,8 @@ class Siglip:
             if not any(self._folder.glob("*.safetensors")):
                 raise OSError("it has no weights, *.safetensors")
             # Pillow resizes the same everywhere; the other backend needs torchvision.
-            self._processor = transformers.AutoImageProcessor.from_pretrained(
+            processors: Any = transformers.AutoImageProcessor
+            self._processor = processors.from_pretrained(
                 self._folder, backend="pil", local_files_only=True
             )
         tower = json.loads(getattr(config, "vision_config", config).to_json_string())
@@ -158,8 +158,9 @@ class Siglip:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Keep transformers from reporting that the text tower of the file is not loaded."""
-    from transformers.utils import logging
+    import transformers
 
+    logging: Any = transformers.utils.logging
     level, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()
     logging.set_verbosity_error()
     logging.disable_progress_bar()

@@ -112,7 +112,7 @@ def test_published_demonstrations_without_an_index(
     shutil.rmtree(out / "demonstrations")
     offline()
     code, _, err = run("index", out)
-    assert code == 0 and "cannot be told" in err
+    assert code == 0 and "cannot check" in err
 
 
 @pytest.mark.parametrize(
