@@ -66,8 +66,8 @@ def draw_calibration(found: Calibration, title: str, out: Path) -> None:
         last = found.sweep[-1].condition
         trials = [trial for trial in found.sweep if trial.condition == last]
         for share, color in zip(_SHARES, (Hue.BLUE, Hue.VERMILION), strict=True):
-            values = [100 * getattr(trial, share) for trial in trials]
-            right.plot([trial.threshold for trial in trials], values, color=color, label=share)
+            means = [100 * getattr(trial, share) for trial in trials]
+            right.plot([trial.threshold for trial in trials], means, color=color, label=share)
         right.set_xlabel(f"threshold, under {last}", size=8, color=INK)
         right.set_ylabel("mean over queries, %", size=8, color=INK)
         _percent(right)

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -27,6 +28,7 @@ from robomme_interference_data.cli.options import (
 from robomme_interference_data.constants import IDENTITY_PATH, MANIFEST_PATH
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.runtime.executor import Serial, WorkersConfig, make_executor
+from robomme_interference_data.schema.settings import setting
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
 
 if TYPE_CHECKING:
@@ -35,18 +37,36 @@ if TYPE_CHECKING:
 _RETRIEVAL = "Retrieval"
 _EXECUTION = "Execution"
 
-EncoderName = Annotated[
-    str,
-    typer.Option(
-        help="thumbnail (no weights), siglip (the paper's model), or siglip:ID with the id or "
-        "folder of another SigLIP or SigLIP 2 model.",
-        rich_help_panel=_RETRIEVAL,
-    ),
-]
-Camera = Annotated[
-    str, typer.Option(help="Camera whose frames are compared.", rich_help_panel=_RETRIEVAL)
-]
+_ENCODER_HELP = (
+    "thumbnail (no weights), siglip (the paper's model), or siglip:ID with the id or folder of "
+    "another SigLIP or SigLIP 2 model."
+)
+_CAMERA_HELP = "Camera whose frames are compared."
+
+EncoderName = Annotated[str, typer.Option(help=_ENCODER_HELP, rich_help_panel=_RETRIEVAL)]
+Camera = Annotated[str, typer.Option(help=_CAMERA_HELP, rich_help_panel=_RETRIEVAL)]
 Shift = Annotated[str, typer.Option(help=SHIFT_HELP, rich_help_panel=_RETRIEVAL)]
+
+
+@dataclass(frozen=True)
+class IndexConfig:
+    """The settings of `index`."""
+
+    encoder: str = setting("thumbnail", help=_ENCODER_HELP, group=_RETRIEVAL)
+    camera: str = setting("front", help="Camera to embed.", group=_RETRIEVAL)
+    force: bool = setting(False, help="Build the index again.", group=_RETRIEVAL)
+    device: str | None = setting(
+        None,
+        help="Device of siglip, such as cuda.",
+        shown="a GPU if there is one",
+        group=_EXECUTION,
+    )
+    batch: int | None = setting(
+        None, help="Images per batch.", shown="the encoder's default", group=_EXECUTION
+    )
+    threads: int | None = setting(
+        None, help="Threads that decode.", shown="all processors", group=_EXECUTION
+    )
 
 
 @with_settings
@@ -54,35 +74,8 @@ def index(
     buffer_set: Annotated[
         Path, typer.Argument(help="Folder of a buffer set, or of one of its datasets.")
     ],
-    encoder: EncoderName = "thumbnail",
-    camera: Camera = "front",
-    device: Annotated[
-        str | None,
-        typer.Option(
-            help="Device of siglip, such as cuda.",
-            show_default="a GPU if there is one",
-            rich_help_panel=_EXECUTION,
-        ),
-    ] = None,
-    batch: Annotated[
-        int | None,
-        typer.Option(
-            help="Images per batch.",
-            show_default="the encoder's default",
-            rich_help_panel=_EXECUTION,
-        ),
-    ] = None,
-    threads: Annotated[
-        int | None,
-        typer.Option(
-            help="Threads that decode.", show_default="all processors", rich_help_panel=_EXECUTION
-        ),
-    ] = None,
-    *,
+    config: IndexConfig,
     workers: WorkersConfig,
-    force: Annotated[
-        bool, typer.Option("--force", help="Build it again.", rich_help_panel=_EXECUTION)
-    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Embed every stored frame, and store the embeddings beside the data.
@@ -111,18 +104,18 @@ def index(
             f"Build one: robomme-interference build all {buffer_set} --source KIND:PATH",
         )
     planned = load_buffer_set(buffer_set) if (buffer_set / MANIFEST_PATH).is_file() else None
-    image_encoder = make_encoder(encoder, device=device, batch=batch)
+    image_encoder = make_encoder(config.encoder, device=config.device, batch=config.batch)
     with graceful_interrupt("Finished episodes are kept"), WorkProgress(quiet=as_json) as progress:
         reports = build_index(
             roots,
             image_encoder,
             progress,
-            camera=camera,
-            threads=(os.cpu_count() or 1) if threads is None else threads,
-            force=force,
+            camera=config.camera,
+            threads=(os.cpu_count() or 1) if config.threads is None else config.threads,
+            force=config.force,
             executor=Serial() if workers == WorkersConfig() else make_executor(workers),
         )
-    for message in look_on_hub(planned, image_encoder, camera) if planned else ():
+    for message in look_on_hub(planned, image_encoder, config.camera) if planned else ():
         print_status(message)
     if as_json:
         print_json([to_dict(report) for report in reports])

@@ -116,7 +116,7 @@ def _draw_bar(
     x, width = _LEFT + span[0] * scale, (span[1] - span[0]) * scale
     edge = GREY if fill == "white" else "white"
     page.box(x, top, width, _BAR, fill=fill, edge=edge, line=0.6)
-    if name := next((n for n in names if page.text_width(n, 5.5, bold=True) < width), None):
+    if name := next((n for n in names if page.text_width(n, 5.5, bold=True) < width - 0.05), None):
         page.text(x + width / 2, top + 0.045, name, 5.5, bold=True, color=ink_on(fill))
 
 

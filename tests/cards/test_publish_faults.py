@@ -15,7 +15,7 @@ from support.publishing import LESSONS, UNITS, files, plain_cards, plan_again, p
 
 from robomme_interference_data.cards import publish as publish_module
 from robomme_interference_data.cards.publish import open_with_lerobot
-from robomme_interference_data.errors import HubError
+from robomme_interference_data.errors import HubError, PublishError
 
 
 @pytest.fixture(autouse=True)
@@ -148,6 +148,13 @@ def test_a_full_disk_while_lerobot_looks(tmp_path: Path, monkeypatch: pytest.Mon
         open_with_lerobot("distractors", GOLDEN / "distractors")
     assert str(caught.value.filename).startswith(str(tmp_path))
     open_with_lerobot("distractors", GOLDEN / "distractors")
+
+
+def test_lerobot_cannot_open_anything(tmp_path: Path) -> None:
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "info.json").write_text("{}")
+    with pytest.raises(PublishError, match="LeRobot cannot open"):
+        open_with_lerobot("distractors", tmp_path)
 
 
 def test_stopped_while_publishing(

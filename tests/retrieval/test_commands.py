@@ -48,7 +48,10 @@ def test_index(own_buffers: Path, run: Run) -> None:
     ]
     header = own_buffers / "distractors/index/thumbnail/index.json"
     change_header(header, computed={"in": "cuda, bfloat16", "batch": 32})
-    assert f"{places[1]} is kept, computed with cuda, bfloat16, 32" in run("index", own_buffers)[2]
+    assert (
+        f"{places[1]} is kept, computed with cuda, bfloat16, batch 32"
+        in run("index", own_buffers)[2]
+    )
     code, out, err = run("index", own_buffers, "--json")
     assert (code, err) == (0, "")
     found = json.loads(out)
