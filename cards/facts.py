@@ -37,29 +37,13 @@ class CardTable:
 
 @dataclass(frozen=True)
 class Facts:
-    """What a card states, computed from data.
+    """What a card states, computed from data; `kind` is the name of its template.
 
-    Attributes:
-        kind: Name of the template.
-        title: Title for readers.
-        description: Contents in a sentence.
-        origin: How it was made, in a sentence.
-        examples: Number of examples: stored frames, or rollouts.
-        tables: Its tables; the first one loads by default.
-        families: Families of its query episodes.
-        simulators: Simulators that its episodes come from.
-        simulated: Whether all its episodes come from a simulator.
-        limits: What it is not suitable for, as plain text, one or two sentences each.
-        provenance: Names and values of its provenance, in Markdown.
-        pictures: Draws the pictures of the card: bytes by path.
-        values: Other values of the template.
-        base_kind: What it was made for, such as `demonstrations`; None for nothing else.
-        base: Location of that; `namespace/name@commit` if on the Hub.
-        repositories: Repositories on the Hub that it was built from, and their commits.
-        source_kinds: Kinds of the sources that it was built from, such as `robomme-h5`.
-        details: Plain values to show as JSON, by title.
-        file_sets: Patterns of its files that are not tables, by name.
-        tags: Additional tags on the Hub.
+    `examples` counts stored frames or rollouts; the first of `tables` loads by default. `limits`
+    and `provenance` are plain text and Markdown; `pictures` draws files of the card by path, and
+    `values` are further values of the template. `base` is the location of what the data was made
+    for, which `base_kind` names. `repositories` on the Hub (with commits) and `source_kinds` are
+    what it was built from. `details` are shown as JSON; `file_sets` are patterns of other files.
     """
 
     kind: str

@@ -157,11 +157,6 @@ class Publication:
         return f"data-{self.version}"
 
     @property
-    def namespace(self) -> str:
-        """Name of the publisher."""
-        return self.repo_id.split("/")[0]
-
-    @property
     def name(self) -> str:
         """Name of the repository in its namespace."""
         return self.repo_id.split("/")[1]
@@ -170,16 +165,6 @@ class Publication:
     def url(self) -> str:
         """Page of the repository."""
         return f"{HUB}/datasets/{self.repo_id}"
-
-    @property
-    def base_repo(self) -> str | None:
-        """Repository of `base`, or None."""
-        return self.base and self.base.split("@")[0]
-
-    @property
-    def base_commit(self) -> str | None:
-        """Commit of `base`, or None."""
-        return self.base and self.base.split("@")[1]
 
 
 @dataclass(frozen=True)

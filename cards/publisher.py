@@ -18,15 +18,7 @@ from robomme_interference_data.viz.tables import Table
 
 from .publication import Publication, Version, versions_of
 from .render import README, is_card
-from .repo import (
-    Difference,
-    HubRepository,
-    LocalFile,
-    RepoFiles,
-    compare,
-    is_unmanaged,
-    total_size,
-)
+from .repo import Difference, HubRepository, LocalFile, RepoFiles, compare, is_unmanaged, total_size
 
 logger = logging.getLogger(__name__)
 

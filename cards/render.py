@@ -140,7 +140,8 @@ def front_matter(facts: Facts, publication: Publication) -> str:
     """Return the part of a card that the Hub reads: YAML between lines of `---`."""
     from huggingface_hub import DatasetCardData
 
-    made_from = sorted({*facts.repositories, *filter(None, [publication.base_repo])})
+    base = [publication.base.split("@")[0]] if publication.base else []
+    made_from = sorted({*facts.repositories, *base})
     configs: list[dict[str, Any]] = [
         {"config_name": one.name, "data_files": [{"split": one.split, "path": one.path}]}
         for one in facts.tables
@@ -172,10 +173,12 @@ def size_category(count: int) -> str:
 def croissant(facts: Facts, publication: Publication) -> bytes:
     """Return `croissant.json`: JSON that is safe inside a page's script element."""
     repositories = dict(facts.repositories)
-    if publication.base_repo:
-        repositories[publication.base_repo] = publication.base_commit
+    if publication.base:
+        repo_id, _, commit = publication.base.partition("@")
+        repositories[repo_id] = commit
     values = {
         "publication": publication,
+        "namespace": publication.repo_id.split("/")[0],
         "facts": facts,
         "hub": HUB,
         "other": OTHER,

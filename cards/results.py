@@ -7,12 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from robomme_interference_data.constants import (
-    PROTOCOL_VERSION,
-    RUN_HEADER,
-    RUN_RECORD,
-    RUN_TABLES,
-)
+from robomme_interference_data.constants import PROTOCOL_VERSION, RUN_HEADER, RUN_RECORD, RUN_TABLES
 from robomme_interference_data.errors import InvalidOptionError, PublishError
 from robomme_interference_data.evaluate.run.log import RunHeader, read_record
 from robomme_interference_data.evaluate.score.config import Expected, Settings

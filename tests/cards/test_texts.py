@@ -25,12 +25,7 @@ from robomme_interference_data.cards.facts import origin_limit
 from robomme_interference_data.cards.publication import Publication
 from robomme_interference_data.cards.render import card_files, card_text, croissant
 from robomme_interference_data.cards.results import results_facts
-from robomme_interference_data.constants import (
-    IDENTITY_PATH,
-    RECORDS_PATH,
-    REPORT_PATH,
-    SUMS_PATH,
-)
+from robomme_interference_data.constants import IDENTITY_PATH, RECORDS_PATH, REPORT_PATH, SUMS_PATH
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import FormatError, InvalidOptionError
 from robomme_interference_data.evaluate.score.config import Settings

@@ -11,15 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from support.buffer_sets import QUERIES, UNITS
-from support.retrieval import (
-    FRAMES,
-    QUIET,
-    Interrupted,
-    TwoSums,
-    files_of,
-    make_index,
-    remade,
-)
+from support.retrieval import FRAMES, QUIET, Interrupted, TwoSums, files_of, make_index, remade
 
 from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.data.buffer_set_index import normalised
