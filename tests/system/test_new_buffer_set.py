@@ -71,7 +71,8 @@ def test_retrieval_on_published_demonstrations(
     given = ("--demonstrations", BASE, "--source", mine, "--workers", 1)
     assert run("new-buffer-set", out, *given, "--conditions", "k0,k2")[0] == 0
     code, printed, err = run("index", out)
-    assert (code, printed) == (0, f"{out}/distractors/index/thumbnail: 64 frames, 64 embedded now\n")
+    report = f"{out}/distractors/index/thumbnail: 64 frames, 64 embedded now\n"
+    assert (code, printed) == (0, report)
     assert f"{BASE}@{commit} has embeddings by the same encoder" in err
     assert [*verify_buffer_set(load_buffer_set(out))] == []
 
