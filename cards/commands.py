@@ -18,7 +18,7 @@ from robomme_interference_data.cli.options import AsJson, BufferSetFolder, with_
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.evaluate.score.config import Expected
 
-from .publication import Publication, PublishConfig, VersionConfig
+from .publication import OTHER, Publication, PublishConfig
 
 if TYPE_CHECKING:
     from robomme_interference_data.storage.files import Files
@@ -27,13 +27,25 @@ if TYPE_CHECKING:
     from .publisher import Publisher, RepoPlan
     from .repo import RepoFiles
 
-Private = Annotated[bool, typer.Option("--private", help="New repositories are private.")]
+_GROUP = "Publishing"
+
+Private = Annotated[
+    bool,
+    typer.Option("--private", help="Make new repositories private.", rich_help_panel=_GROUP),
+]
 To = Annotated[
     Path | None,
-    typer.Option(help="Folder to write the same files into, instead of publishing them."),
+    typer.Option(
+        help="Write the files into this folder instead of publishing them.", rich_help_panel=_GROUP
+    ),
 ]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Only show what would be sent.")]
-Yes = Annotated[bool, typer.Option("--yes", help="Do not ask.")]
+DryRun = Annotated[
+    bool,
+    typer.Option("--dry-run", help="Only show what would be sent.", rich_help_panel=_GROUP),
+]
+Yes = Annotated[
+    bool, typer.Option("--yes", help="Do not ask for confirmation.", rich_help_panel=_GROUP)
+]
 
 
 def card(
@@ -41,18 +53,19 @@ def card(
         str,
         typer.Argument(
             metavar="DIR",
-            help="Folder of a buffer set, of demonstrations or of a run; or a Hub id.",
+            help="Folder of a buffer set, of demonstrations or of a run; or a repository.",
         ),
     ],
-    repo_id: Annotated[
-        str, typer.Option(help="Repository that the card is for.")
-    ] = "namespace/name",
-    version: Annotated[str, typer.Option(help="Version that it is of.")] = "1.0.0",
+    repo_id: Annotated[str, typer.Option(help="Repository, namespace/name.")] = "namespace/name",
+    version: Annotated[str, typer.Option(help="Version, such as 1.0.0.")] = "1.0.0",
     license: Annotated[
-        str, typer.Option(help="Its license, such as cc-by-4.0; other: the recordings'.")
-    ] = "other",
+        str,
+        typer.Option(help="License, such as cc-by-4.0; other: the license of the recordings."),
+    ] = OTHER,
 ) -> None:
-    """Print the card of a buffer set, of demonstrations or of a run: README.md, all of it from data.
+    """Print the card (README.md) of a buffer set, of demonstrations or of a run.
+
+    The whole text is computed from the data.
 
     Examples:
     ```
@@ -63,12 +76,12 @@ def card(
     """
     from .render import card_text
 
-    about = Publication(repo_id, version, license)
-    echo(card_text(facts_of(source), about), nl=False)
+    publication = Publication(repo_id, version, license)
+    echo(card_text(facts_of(source), publication), nl=False)
 
 
 def facts_of(source: str) -> "Facts":
-    """Return what there is to say of what lies in a folder, or on the Hub under a name."""
+    """Return what the card of a folder or repository states."""
     from robomme_interference_data.constants import (
         IDENTITY_PATH,
         MANIFEST_PATH,
@@ -80,7 +93,7 @@ def facts_of(source: str) -> "Facts":
     from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.storage.hub import locate
 
-    from .facts import buffer_set_facts, demonstrations_facts
+    from .dataset_facts import buffer_set_facts, demonstrations_facts
     from .results import results_facts
 
     if Path(source).is_file():
@@ -93,9 +106,9 @@ def facts_of(source: str) -> "Facts":
     if _has(files, RUN_HEADER):
         return results_facts(files.snapshot(RUN_HEADER, RUN_RECORD, *RUN_TABLES))
     raise MissingFileError(
-        f"{files.describe()} holds no buffer set, no demonstrations and no run: {MANIFEST_PATH}, "
+        f"{files.describe()} is no buffer set, no demonstrations and no run: {MANIFEST_PATH}, "
         f"{IDENTITY_PATH} and {RUN_HEADER} are missing",
-        "Give the folder of a buffer set or of a run.",
+        "Give the folder of a buffer set, of demonstrations or of a run.",
     )
 
 
@@ -116,17 +129,16 @@ def publish(
     yes: Yes = False,
     as_json: AsJson = False,
 ) -> None:
-    """Publish a buffer set on the Hub: its demonstrations, then its units and manifests, with cards.
+    """Publish a buffer set on the Hub, as two repositories with cards.
 
-    All hashes and rules are checked first. A version never changes: its tag, such as data-1.0.0,
-    comes last, and is never moved. Re-run the same command after an interruption to send what is
-    missing.
+    The demonstrations come first, then the units with the manifests. All hashes and rules are
+    checked before anything is sent. A published version never changes; its tag, such as data-1.0.0,
+    is created last. Re-run the same command after an interruption to resume.
 
     Examples:
     ```
     robomme-interference publish my-buffers --repo-id my-name/my-buffers --dry-run
     robomme-interference publish my-buffers --repo-id my-name/my-buffers --license cc-by-4.0
-    robomme-interference publish my-buffers --repo-id my-name/my-buffers --version 1.1.0 --yes
     robomme-interference publish my-buffers --repo-id my-name/my-buffers --to export/
     ```
     """
@@ -134,8 +146,7 @@ def publish(
     from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.runtime.progress import WorkProgress
 
-    from .checks import check_buffer_set
-    from .publish import BufferSetContent, plan_buffer_set, publish_buffer_set
+    from . import publish as publishing
     from .publisher import Publisher
     from .repo import HubRepository
 
@@ -143,7 +154,7 @@ def publish(
     unpublished = opened.header.datasets[DEMONSTRATIONS].location is None
     if unpublished and not opened.dataset_files(DEMONSTRATIONS).list(INDEX_DIR):
         print_status(
-            "The demonstrations are published without embeddings. To add some first: "
+            "The demonstrations have no embeddings. To add them before publishing: "
             f"robomme-interference index {buffer_set}"
         )
     if to is not None:
@@ -151,17 +162,17 @@ def publish(
     elif not dry_run:
         HubRepository(config.repo_id).check_rights(exists=False)  # checks may take hours
     with WorkProgress(quiet=as_json) as progress:
-        check_buffer_set(opened, progress)
-    content = BufferSetContent(opened, config)
+        publishing.check_buffer_set(opened, progress)
+    content = publishing.BufferSetContent(opened, config)
     if to is not None:
         _export(content.folder(), to, dry_run=dry_run, as_json=as_json)
         return
     publisher = Publisher(config, private=private)
-    plans = plan_buffer_set(content, publisher)
+    plans = publishing.plan_buffer_set(content, publisher)
     done = _carry_out(
         publisher,
         plans,
-        lambda: publish_buffer_set(content, publisher, plans),
+        lambda: publishing.publish_buffer_set(content, publisher, plans),
         dry_run=dry_run,
         yes=yes,
         as_json=as_json,
@@ -174,9 +185,9 @@ def publish(
 @with_settings
 def publish_results(
     run: Annotated[Path, typer.Argument(help="Folder of a run.")],
-    config: VersionConfig,
+    config: Publication,
     expected: Annotated[
-        Expected, typer.Option(help="Episodes of a complete cell, as for score.")
+        Expected, typer.Option(help="Episodes of a complete cell, as in score.")
     ] = Expected.BENCHMARK,
     private: Private = False,
     to: To = None,
@@ -184,9 +195,9 @@ def publish_results(
     yes: Yes = False,
     as_json: AsJson = False,
 ) -> None:
-    """Publish the results of a run on the Hub: rows, scores, report and a card.
+    """Publish the results of a run on the Hub: rows, scores, a report and a card.
 
-    Versions are kept as those of a buffer set are. Videos of rollouts are not published.
+    A published version never changes. Videos of rollouts are not published.
 
     Examples:
     ```
@@ -199,7 +210,9 @@ def publish_results(
 
     content = results_content(score_run(run, expected), run, config)
     if to is not None:
-        _export(content.files(config.wanted or content.first), to, dry_run=dry_run, as_json=as_json)
+        _export(
+            content.files(config.requested or content.first), to, dry_run=dry_run, as_json=as_json
+        )
         return
     publisher = Publisher(config, private=private)
     plan = publisher.plan(content)
@@ -209,7 +222,7 @@ def publish_results(
 
 
 def _export(files: "RepoFiles", to: Path, *, dry_run: bool, as_json: bool) -> None:
-    """Write files into a folder, and say so."""
+    """Write files into a folder, and report it."""
     from .repo import total_size, write_folder
 
     written = not dry_run and write_folder(files, to)
@@ -217,8 +230,8 @@ def _export(files: "RepoFiles", to: Path, *, dry_run: bool, as_json: bool) -> No
         size = total_size(files)
         print_json({"to": str(to), "files": len(files), "bytes": size, "written": written})
     else:
-        done = "would be written" if dry_run else "written" if written else "already there"
-        print_status(f"{to}: {len(files):,} files, {total_size(files):,} bytes; {done}")
+        outcome = "dry run" if dry_run else "written" if written else "unchanged"
+        print_status(f"{to}: {len(files):,} files, {total_size(files):,} bytes; {outcome}")
 
 
 def _carry_out(
@@ -230,16 +243,14 @@ def _carry_out(
     yes: bool,
     as_json: bool,
 ) -> "list[RepoPlan]":
-    """Show what is to be done, ask, do it, and report; return what was done."""
+    """Show plans, ask for confirmation, carry them out and report; return the published ones."""
     from .publisher import plan_table
 
     print_status(plan_table(plans).text())
     if not dry_run and any(plan.published is None for plan in plans):
         publisher.check_rights(plans)
         _ask(yes)
-        with graceful_interrupt(
-            "What was sent is kept; nothing is a version before its tag is there"
-        ):
+        with graceful_interrupt("What was sent is kept; a version exists once it has its tag"):
             plans = run()
     if as_json:
         print_json([plan.to_dict() for plan in plans])
@@ -249,12 +260,12 @@ def _carry_out(
 
 
 def _ask(yes: bool) -> None:
-    """Ask whether to go on; where nobody can answer, an `InvalidOptionError` names the option."""
+    """Ask for confirmation; without a terminal, an `InvalidOptionError` names `--yes`."""
     if yes:
         return
     if not sys.stdin.isatty():
         raise InvalidOptionError(
-            "publishing has to be confirmed, and there is no terminal to ask on",
-            "To confirm, type the same command with --yes.",
+            "publishing needs a confirmation, and there is no terminal to ask on",
+            "To confirm, run the same command with --yes.",
         )
     typer.confirm("Publish this?", abort=True, err=True)

@@ -1,4 +1,4 @@
-"""Text that a stranger wrote, made safe for Markdown as the Hub shows it."""
+"""Escape untrusted text for Markdown, as the Hub renders it."""
 
 import re
 import unicodedata
@@ -7,7 +7,7 @@ from typing import Any
 from robomme_interference_data.viz.tables import Table
 
 _MOST, _MOST_IN_BLOCK = 400, 20_000
-"""Letters of a text that are shown."""
+"""Maximum length of a text, in characters."""
 
 _ENTITIES = {"&": "&amp;", "<": "&lt;", ">": "&gt;", "|": "&#124;", "$": "&#36;"}
 _SPECIAL = re.compile(r"[\\`*_\[\]~]")
@@ -16,16 +16,13 @@ _LINK = re.compile(r"(?i)(?<=\w):(?=//)|(?<=www)\.|@")
 
 
 class Raw(str):
-    """Markdown that is written as it is."""
+    """Markdown that is not escaped."""
 
     __slots__ = ()
 
 
 def escape(value: Any) -> Raw:
-    """Return a value as text that Markdown shows as it is, in one line: nothing in it works.
-
-    This is what every value in a card goes through, but for what is `Raw`.
-    """
+    """Return a value as literal text for Markdown, in one line; every value but `Raw` needs it."""
     if isinstance(value, Raw):
         return value
     text = _shortened(_one_line(str(value)))
@@ -40,17 +37,17 @@ def escape(value: Any) -> Raw:
 
 
 def code(value: Any) -> Raw:
-    """Return a value as code inside a line."""
+    """Return a value as inline code."""
     text = _shortened(_one_line(str(value)))
     if text.strip() == text and text and not re.search(r"[`|]", text):
         return Raw(f"`{text}`")
-    # What backquotes and the lines of a table would take for their own.
+    # Escape what would end the code or the cell of a table.
     shown = "".join(_ENTITIES.get(letter, letter) for letter in text)
     return Raw(f"<code>{re.sub(_SPECIAL, lambda match: f'&#{ord(match[0])};', shown)}</code>")
 
 
 def quoted(value: Any) -> Raw:
-    """Return a text as Python writes it, for a line in a block of code."""
+    """Return a text as a Python literal, for a block of code."""
     text = str(value)
     if re.fullmatch(r"[\w./-]*", text, re.ASCII):
         return Raw(f'"{text}"')
@@ -58,7 +55,7 @@ def quoted(value: Any) -> Raw:
 
 
 def block(value: Any, language: str = "") -> Raw:
-    """Return a text of several lines as a block of code."""
+    """Return a text as a block of code."""
     kept = (letter if letter == "\n" or _shown(letter) else " " for letter in str(value))
     text = _shortened("".join(kept), _MOST_IN_BLOCK)
     fence = "`" * max(3, 1 + max(map(len, re.findall("`+", text)), default=0))
@@ -66,7 +63,7 @@ def block(value: Any, language: str = "") -> Raw:
 
 
 def table(value: Table) -> Raw:
-    """Return a table without its title; its texts are escaped already, with `escape`."""
+    """Return a table without its title; its texts are already escaped."""
     return Raw(value.grid())
 
 
@@ -75,7 +72,7 @@ def _one_line(text: str) -> str:
 
 
 def _shown(letter: str) -> bool:
-    """Tell whether a letter is one: not a control, a direction mark or half of a pair."""
+    """Return whether a character is visible: no control, direction mark or surrogate."""
     return unicodedata.category(letter)[0] != "C"
 
 

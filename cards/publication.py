@@ -1,4 +1,4 @@
-"""What is published, as whom and as which version."""
+"""What a version of a repository is: its name, its number, its license, and the settings for it."""
 
 import re
 from collections.abc import Mapping
@@ -6,17 +6,32 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import InvalidOptionError, nearest
 from robomme_interference_data.schema.settings import setting
 
 HUB = "https://huggingface.co"
-"""What cards link to, whatever server they are published on: the same data gives the same card."""
+"""Address that cards link to, on whatever server they are published: equal data, equal cards."""
 
 OTHER = "other"
-"""The license of data whose publisher names none: that of the recordings applies."""
+"""License of data whose publisher chooses none: the license of the recordings applies."""
+
+_LICENSE_IDS = """
+afl-3.0 agpl-3.0 apache-2.0 apple-amlr apple-ascl artistic-2.0 bigcode-openrail-m
+bigscience-bloom-rail-1.0 bigscience-openrail-m bsd bsd-2-clause bsd-3-clause bsd-3-clause-clear
+bsl-1.0 c-uda cc cc-by-2.0 cc-by-2.5 cc-by-3.0 cc-by-4.0 cc-by-nc-2.0 cc-by-nc-3.0 cc-by-nc-4.0
+cc-by-nc-nd-3.0 cc-by-nc-nd-4.0 cc-by-nc-sa-2.0 cc-by-nc-sa-3.0 cc-by-nc-sa-4.0 cc-by-nd-4.0
+cc-by-sa-3.0 cc-by-sa-4.0 cc0-1.0 cdla-permissive-1.0 cdla-permissive-2.0 cdla-sharing-1.0
+creativeml-openrail-m deepfloyd-if-license ecl-2.0 epl-1.0 epl-2.0 etalab-2.0 eupl-1.1 eupl-1.2
+fair-noncommercial-research-license gemma gfdl gpl gpl-2.0 gpl-3.0 grok2-community h-research
+intel-research isc lgpl lgpl-2.1 lgpl-3.0 lgpl-lr llama2 llama3 llama3.1 llama3.2 llama3.3 llama4
+lppl-1.3c mit mpl-2.0 ms-pl ncsa odbl odc-by ofl-1.1 openmdw-1.0 openrail openrail++ osl-3.0 other
+pddl postgresql unknown unlicense wtfpl zlib
+"""
+LICENSES = frozenset(_LICENSE_IDS.split())
+"""Identifiers of licenses that the Hub accepts."""
 
 _VERSION = re.compile(r"(0|[1-9]\d{0,8})\.(0|[1-9]\d{0,8})\.(0|[1-9]\d{0,8})")
-_LICENSE = re.compile(r"[a-z0-9][a-z0-9.+-]{0,63}")
+_GROUP = "Publishing"
 
 
 class Version(NamedTuple):
@@ -28,7 +43,7 @@ class Version(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> "Version | None":
-        """Return the version that a text such as `1.2.0` names; None if it names none."""
+        """Read a text such as `1.2.0`; None if it is no version."""
         match = _VERSION.fullmatch(text)
         return cls(*map(int, match.groups())) if match else None
 
@@ -37,11 +52,11 @@ class Version(NamedTuple):
 
     @property
     def tag(self) -> str:
-        """The tag that names it in a repository."""
+        """The tag of the version in a repository."""
         return f"data-{self}"
 
     def following(self, before: Mapping[str, str], now: Mapping[str, str]) -> "Version":
-        """Return the version that comes next, given the digest of each part before and now."""
+        """Return the next version, given the digest of each part before and now."""
         if any(now.get(name) != digest for name, digest in before.items()):
             return Version(self.major + 1, 0, 0)
         if now.keys() - before.keys():
@@ -51,12 +66,12 @@ class Version(NamedTuple):
 
 def versions_of(tags: Mapping[str, str]) -> dict[Version, str]:
     """Return the versions among tags, in order, with the commit of each."""
-    named = {tag: Version.parse(tag.removeprefix("data-")) for tag in tags if tag[:5] == "data-"}
-    return dict(sorted((version, tags[tag]) for tag, version in named.items() if version))
+    parsed = {tag: Version.parse(tag.removeprefix("data-")) for tag in tags if tag[:5] == "data-"}
+    return dict(sorted((version, tags[tag]) for tag, version in parsed.items() if version))
 
 
 def is_commit(text: object) -> bool:
-    """Tell whether a value is the hash of a commit: 40 digits."""
+    """Return whether a value is the hash of a commit: 40 hexadecimal digits."""
     return isinstance(text, str) and re.fullmatch(r"[0-9a-f]{40}", text) is not None
 
 
@@ -71,7 +86,7 @@ def check_repo_id(repo_id: object, name: str = "repo_id") -> str:
             validate_repo_id(repo_id)
             if "/" in repo_id:
                 return repo_id
-            hint = "The namespace is your name there, or an organization's: hf auth whoami"
+            hint = "The namespace is your user name or an organization: hf auth whoami"
     expected = (
         "namespace/name of a repository on the Hub, of letters, digits, '-', '_' and '.', at most "
         "96 in the name"
@@ -81,36 +96,42 @@ def check_repo_id(repo_id: object, name: str = "repo_id") -> str:
 
 @dataclass(frozen=True)
 class Publication:
-    """A version of something that is published.
+    """A version of a repository, as cards state it; also the settings of `publish-results`.
 
     Attributes:
-        repo_id: Its repository, `namespace/name`.
-        version: Such as `1.2.0`: buffers changed, added, or only card and index did.
-        license: Identifier of its license, as the Hub knows them; `other` for that of the
-            recordings.
-        base: What it was made for, `namespace/name@<40-digit commit>`: of a buffer set its
-            demonstrations, of results their buffer set; None if that is not published.
-        command: The command that made it, or None.
+        repo_id: The repository, `namespace/name`.
+        version: Such as `1.2.0`; None for the published version, or the first. A card needs one.
+        license: Identifier of the license on the Hub; `other` for that of the recordings.
+        base: What the data was made for, `namespace/name@<40-digit commit>`: the demonstrations
+            of a buffer set, the buffer set of results; None if that is not published.
+        command: The command that made the data, or None.
     """
 
-    repo_id: str
-    version: str = "1.0.0"
-    license: str = OTHER
+    repo_id: str = setting(help="Repository, namespace/name.", group=_GROUP)
+    version: str | None = setting(
+        None,
+        help="Version, such as 1.0.0.",
+        shown="the published one, or the first",
+        group=_GROUP,
+    )
+    license: str = setting(
+        OTHER,
+        help="License on the Hub, such as cc-by-4.0; other: the license of the recordings.",
+        group=_GROUP,
+    )
     base: str | None = None
     command: str | None = None
 
     def __post_init__(self) -> None:
         check_repo_id(self.repo_id)
-        if Version.parse(self.version) is None:
+        if self.version is not None and Version.parse(self.version) is None:
             expected = "three numbers, such as 1.2.0"
             raise InvalidOptionError.expected("version", self.version, expected)
-        if not _LICENSE.fullmatch(self.license):
-            raise InvalidOptionError.expected(
-                "license",
-                self.license,
-                f"an identifier such as cc-by-4.0, or {OTHER}",
-                f"All of them: {HUB}/docs/hub/repositories-licenses",
-            )
+        if self.license not in LICENSES:
+            hint = f"All identifiers: {HUB}/docs/hub/repositories-licenses"
+            hint = f"{nearest(self.license, LICENSES, more='')}\n{hint}".lstrip()
+            expected = f"a license of the Hub, such as cc-by-4.0, or {OTHER}"
+            raise InvalidOptionError.expected("license", self.license, expected, hint)
         if self.base is not None:
             repo_id, _, commit = self.base.partition("@")
             if not is_commit(commit):
@@ -119,21 +140,21 @@ class Publication:
             check_repo_id(repo_id, "base")
 
     def made_for(self, location: object) -> "Publication":
-        """Return the same with a base, if it has none and `location` names one on the Hub."""
+        """Return the same with `location` as its base, if it has none and that is on the Hub."""
         with suppress(InvalidOptionError):
             if self.base is None and isinstance(location, str):
                 return replace(self, base=location)
         return self
 
     @property
-    def tag(self) -> str:
-        """Tag of the version in its repository."""
-        return f"data-{self.version}"
+    def requested(self) -> Version | None:
+        """The version, or None."""
+        return None if self.version is None else Version.parse(self.version)
 
     @property
-    def namespace(self) -> str:
-        """Who publishes."""
-        return self.repo_id.split("/")[0]
+    def tag(self) -> str:
+        """Tag of the version in the repository."""
+        return f"data-{self.version}"
 
     @property
     def name(self) -> str:
@@ -145,44 +166,16 @@ class Publication:
         """Page of the repository."""
         return f"{HUB}/datasets/{self.repo_id}"
 
-    @property
-    def base_repo(self) -> str | None:
-        """Repository of `base`, or None."""
-        return self.base and self.base.split("@")[0]
-
-    @property
-    def base_commit(self) -> str | None:
-        """Commit of `base`, or None."""
-        return self.base and self.base.split("@")[1]
-
 
 @dataclass(frozen=True)
-class VersionConfig:
-    """The settings of `publish-results`, and those that `publish` shares with it."""
-
-    repo_id: str = setting(help="Repository, namespace/name.")
-    version: str | None = setting(
-        None, help="Version, such as 1.0.0.", shown="the published one, or the first"
-    )
-    license: str = setting(OTHER, help="Its license, such as cc-by-4.0; other: the recordings'.")
-
-    def __post_init__(self) -> None:
-        Publication(self.repo_id, "1.0.0" if self.version is None else self.version, self.license)
-
-    @property
-    def wanted(self) -> Version | None:
-        """The version that is asked for, or None."""
-        return None if self.version is None else Version.parse(self.version)
-
-
-@dataclass(frozen=True)
-class PublishConfig(VersionConfig):
+class PublishConfig(Publication):
     """The settings of `publish`."""
 
     demonstrations_id: str | None = setting(
         None,
-        help="Repository of its demonstrations, unless the manifests name a published one.",
+        help="Repository of the demonstrations, unless the manifests name a published one.",
         shown="REPO_ID-demonstrations",
+        group=_GROUP,
     )
 
     def __post_init__(self) -> None:
@@ -190,8 +183,9 @@ class PublishConfig(VersionConfig):
         check_repo_id(self.demonstrations, "demonstrations_id")
         if self.repo_id == self.demonstrations_id:
             raise InvalidOptionError(
-                f"repo_id and demonstrations_id are both {self.repo_id!r}",
-                "Give each a repository of its own.",
+                f"repo_id and demonstrations_id are both {self.repo_id!r}; expected two "
+                "repositories",
+                "Choose another demonstrations_id.",
             )
 
     @property

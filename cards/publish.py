@@ -1,12 +1,16 @@
-"""Publish a buffer set: its demonstrations, then its units with the manifests that name them."""
+"""Check a buffer set, and publish it: its demonstrations, then its units and manifests."""
 
-from collections.abc import Iterable, Sequence
+import logging
+from collections.abc import Iterable, Sequence, Sized
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from hashlib import sha256
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
+from robomme_interference_data.build_dataset.audit import audit_buffer_set
+from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
+from robomme_interference_data.build_dataset.verify import verify_buffer_set
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,
@@ -23,27 +27,26 @@ from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.questions import read_questions
 from robomme_interference_data.errors import MissingFileError, PublishError
+from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.codec import to_dict
-from robomme_interference_data.schema.manifest import BufferManifest, ManifestHeader
-from robomme_interference_data.storage.files import LocalFiles, indented_json
+from robomme_interference_data.schema.manifest import BufferManifest
+from robomme_interference_data.storage.files import LocalFiles, indented_json, with_filename
 from robomme_interference_data.storage.hub import HubFiles
 
-from .facts import Facts, buffer_set_facts, demonstrations_facts
+from .dataset_facts import buffer_set_facts, demonstrations_facts
+from .facts import Facts
 from .publication import Publication, PublishConfig, Version
 from .publisher import Publisher, RepoContent, RepoPlan, digest
 from .render import card_files
 from .repo import LocalFile, RepoFiles
 
-_UNKNOWN = "0" * 40
-"""Stands for the commit of demonstrations that are not published yet."""
-
 
 class BufferSetContent:
-    """What the repositories of a buffer set hold.
+    """What the repositories of a buffer set are to hold.
 
     Args:
-        buffer_set: The buffer set, whose checks have passed.
-        config: As what it is published.
+        buffer_set: The buffer set, which `check_buffer_set` has checked.
+        config: The version to publish.
     """
 
     def __init__(self, buffer_set: BufferSet, config: PublishConfig):
@@ -52,52 +55,67 @@ class BufferSetContent:
 
     @cached_property
     def base(self) -> str | None:
-        """The published demonstrations that the buffer set is for, `namespace/name@commit`, or None."""
+        """Location of the demonstrations that the manifests name, if those are published."""
         recorded = self.buffer_set.header.datasets[DEMONSTRATIONS]
         repo_id, _, commit = (recorded.location or "").partition("@")
         if not commit or self.config.demonstrations_id not in (None, repo_id):
             return None
         if Dataset(HubFiles(repo_id, commit)).revision != recorded.revision:
             raise PublishError(
-                f"{recorded.location} holds other demonstrations than those that "
-                f"{self.buffer_set.location} is for",
+                f"{recorded.location} holds other demonstrations than those of "
+                f"{self.buffer_set.location}",
                 self.buffer_set.fix,
             )
         return recorded.location
 
     @cached_property
     def demonstrations(self) -> RepoContent:
-        """What the repository of the demonstrations holds."""
+        """The repository of the demonstrations."""
         dataset = self.buffer_set.datasets[DEMONSTRATIONS]
         facts, files = demonstrations_facts(dataset), dataset_files(dataset)
         parts = parts_of_dataset(dataset)
         return self._content(self.config.demonstrations, dataset, facts, files, parts)
 
     @cached_property
-    def _facts(self) -> Facts:
-        return buffer_set_facts(self.buffer_set)
-
-    def units(self, base: str | None) -> RepoContent:
-        """Return what the buffer set's own repository holds: units at its root, and the manifests.
-
-        Args:
-            base: Where the demonstrations are, `namespace/name@commit`; None for a folder beside.
-        """
+    def _units(self) -> tuple[Facts, RepoFiles, dict[str, str]]:
+        """Facts, files and parts of the buffer set's repository, but for its manifest.json."""
         buffer_set, datasets = self.buffer_set, self.buffer_set.header.datasets
-        names = [DISTRACTORS, *(name for name in OPTIONAL_DATASETS if name in datasets)]
         files: RepoFiles = {}
-        parts = parts_of_buffers(buffer_set.manifests()) | parts_of_questions(buffer_set)
-        for name in names:
+        parts = parts_of_buffers(buffer_set.manifests())
+        for name in (DISTRACTORS, *(name for name in OPTIONAL_DATASETS if name in datasets)):
             folder = "" if name == DISTRACTORS else f"{name}/"
             dataset = buffer_set.datasets[name]
             files |= {folder + path: file for path, file in dataset_files(dataset).items()}
             parts |= parts_of_dataset(dataset)
-        header = indented_json(to_dict(with_locations(buffer_set.header, base))).encode()
-        files[MANIFEST_PATH] = LocalFile(header)
-        for path in (f"{MANIFESTS}/{MANIFEST_ROWS}", *[QUESTIONS_PATH] * has_questions(buffer_set)):
-            files[path] = LocalFile(buffer_set.files.path(path))
-        units, repo_id = buffer_set.datasets[DISTRACTORS], self.config.repo_id
-        return self._content(repo_id, units, self._facts, files, parts, base)
+        rows_path = f"{MANIFESTS}/{MANIFEST_ROWS}"
+        files[rows_path] = LocalFile(buffer_set.files.path(rows_path))
+        with suppress(MissingFileError):
+            questions = buffer_set.files.path(QUESTIONS_PATH)
+            if questions.is_file():
+                files[QUESTIONS_PATH] = LocalFile(questions)
+                parts |= parts_of_questions(buffer_set)
+        return buffer_set_facts(buffer_set), files, parts
+
+    def units(self, base: str | None, *, pending: bool = False) -> RepoContent:
+        """Return the buffer set's own repository: units at its root, and the manifests.
+
+        Args:
+            base: Location of the demonstrations, `namespace/name@commit`; None for a folder beside.
+            pending: The demonstrations get a location when they are published, after this.
+        """
+        facts, files, parts = self._units
+        if not pending:
+            locations = {DEMONSTRATIONS: base, DISTRACTORS: "."}
+            header = self.buffer_set.header
+            datasets = {
+                name: replace(dataset, location=locations.get(name, dataset.location))
+                for name, dataset in header.datasets.items()
+            }
+            text = indented_json(to_dict(replace(header, datasets=datasets)))
+            files = files | {MANIFEST_PATH: LocalFile(text.encode())}
+        units = self.buffer_set.datasets[DISTRACTORS]
+        content = self._content(self.config.repo_id, units, facts, files, parts, base)
+        return replace(content, pending=pending)
 
     def folder(self) -> RepoFiles:
         """Return the files of the buffer set's repository, with the other one in `demonstrations/`.
@@ -105,12 +123,12 @@ class BufferSetContent:
         Demonstrations that are only on the Hub stay there.
         """
         base = self.buffer_set.header.datasets[DEMONSTRATIONS].location
-        own = self.units(base if base and "@" in base else None)
-        files = own.files(self.config.wanted or own.first)
+        units = self.units(base if base and "@" in base else None)
+        files = units.files(self.config.requested or units.first)
         if isinstance(self.buffer_set.dataset_files(DEMONSTRATIONS), LocalFiles):
-            other = self.demonstrations
-            lessons = other.files(self.config.wanted or other.first)
-            files |= {f"{DEMONSTRATIONS}/{path}": file for path, file in lessons.items()}
+            lessons = self.demonstrations
+            lesson_files = lessons.files(self.config.requested or lessons.first)
+            files |= {f"{DEMONSTRATIONS}/{path}": file for path, file in lesson_files.items()}
         return files
 
     def _content(
@@ -122,7 +140,7 @@ class BufferSetContent:
         parts: dict[str, str],
         base: str | None = None,
     ) -> RepoContent:
-        # No paths of this machine: the same data gives the same card.
+        # Without paths of this machine: equal data gives equal cards.
         command = f"robomme-interference publish BUFFER_SET --repo-id {self.config.repo_id}"
 
         def card(version: Version) -> dict[str, bytes]:
@@ -135,45 +153,37 @@ class BufferSetContent:
 
 
 def plan_buffer_set(content: BufferSetContent, publisher: Publisher) -> list[RepoPlan]:
-    """Return what is to be done: the demonstrations, unless they are published, then the buffer set."""
+    """Plan the demonstrations, unless the manifests name published ones, and the buffer set."""
     if content.base is not None:
         return [publisher.plan(content.units(content.base))]
     first = publisher.plan(content.demonstrations, follows=True)
-    return [first, publisher.plan(content.units(_location(first)))]
+    base = _location(first)
+    return [first, publisher.plan(content.units(base, pending=base is None))]
 
 
 def publish_buffer_set(
     content: BufferSetContent, publisher: Publisher, plans: Sequence[RepoPlan]
 ) -> list[RepoPlan]:
-    """Do what was planned; return the plans with their commits."""
+    """Carry out plans; return them with their commits."""
     *first, last = plans
     done = [publisher.put(plan) for plan in first]
-    if [*map(_location, done)] != [*map(_location, first)]:  # their commit is known only now
+    if last.content.pending:
         last = publisher.plan(content.units(_location(done[0])))
     return [*done, publisher.put(last)]
 
 
-def _location(plan: RepoPlan) -> str:
-    """Return what a buffer set names of its demonstrations: it stays when only their card changes."""
-    return f"{plan.repository.repo_id}@{plan.same or plan.published or _UNKNOWN}"
-
-
-def with_locations(header: ManifestHeader, base: str | None) -> ManifestHeader:
-    """Return a header that says where the datasets of a published buffer set lie."""
-    places = {DEMONSTRATIONS: base, DISTRACTORS: "."}
-    datasets = {
-        name: replace(one, location=places.get(name, one.location))
-        for name, one in header.datasets.items()
-    }
-    return replace(header, datasets=datasets)
+def _location(plan: RepoPlan) -> str | None:
+    """Return the location of demonstrations, the same while only their card changes."""
+    commit = plan.same or plan.published
+    return commit and f"{plan.repository.repo_id}@{commit}"
 
 
 def dataset_files(dataset: Dataset) -> RepoFiles:
-    """Return the files of a dataset: those that its list names, the list, and embeddings."""
+    """Return the files of a dataset: those in its list of SHA-256 sums, the list, embeddings."""
     index = [
         path
         for path in dataset.files.list(INDEX_DIR)
-        if not any(part.startswith(".") for part in PurePosixPath(path).parts)  # being made
+        if not any(part.startswith(".") for part in PurePosixPath(path).parts)  # unfinished
     ]
     paths = [*dataset.sums(), SUMS_PATH, IDENTITY_PATH, *index]
     dataset.files.fetch(paths)
@@ -184,7 +194,7 @@ def dataset_files(dataset: Dataset) -> RepoFiles:
 
 
 def parts_of_dataset(dataset: Dataset) -> dict[str, str]:
-    """Return a digest of each episode of a dataset, wherever it stands in it."""
+    """Return a digest of each episode of a dataset, whatever its position."""
     records = ((record, to_dict(record)) for record in dataset.records())
     return {
         f"{dataset.kind} {record.episode_id}": digest(row | {"episode_index": None})
@@ -193,7 +203,7 @@ def parts_of_dataset(dataset: Dataset) -> dict[str, str]:
 
 
 def parts_of_buffers(manifests: Iterable[BufferManifest]) -> dict[str, str]:
-    """Return a digest of each buffer, wherever the datasets keep its sessions."""
+    """Return a digest of each buffer, wherever its sessions are stored."""
     parts = {}
     for manifest in manifests:
         row = to_dict(manifest)
@@ -204,20 +214,72 @@ def parts_of_buffers(manifests: Iterable[BufferManifest]) -> dict[str, str]:
     return parts
 
 
-def has_questions(buffer_set: BufferSet) -> bool:
-    """Tell whether a buffer set has questions about the past."""
-    with suppress(MissingFileError):
-        return buffer_set.files.path(QUESTIONS_PATH).is_file()
-    return False
-
-
 def parts_of_questions(buffer_set: BufferSet) -> dict[str, str]:
-    """Return a digest of each question with its picture; of a buffer set without questions, none."""
-    if not has_questions(buffer_set):
-        return {}
+    """Return a digest of each question, its picture included."""
     return {
-        f"question {one.episode_id}": digest(
-            to_dict(one) | {"picture": sha256(one.picture).hexdigest()}
+        f"question {question.episode_id}": digest(
+            to_dict(question) | {"picture": sha256(question.picture).hexdigest()}
         )
-        for one in read_questions(buffer_set).values()
+        for question in read_questions(buffer_set).values()
     }
+
+
+# --- checks --------------------------------------------------------------------------------------
+
+
+def check_buffer_set(buffer_set: BufferSet, progress: WorkProgress | None = None) -> None:
+    """Check hashes, rules and leaks, and that LeRobot opens the datasets."""
+    require_lerobot()
+    violations = list(verify_buffer_set(buffer_set, progress=progress))
+    if violations:
+        first = violations[0]
+        raise PublishError(
+            f"{buffer_set.location} has {_number(violations, 'violation')}, such as "
+            f"{first.where}: {first.what}",
+            "List all violations.",
+            f"verify {buffer_set.location}",
+        )
+    leaks = audit_buffer_set(buffer_set).leaks
+    if leaks:
+        raise PublishError(
+            f"{buffer_set.location} has {_number(leaks, 'leak')}, such as {leaks[0].kind}: "
+            f"{leaks[0].where}",
+            "List all leaks.",
+            f"audit {buffer_set.location}",
+        )
+    for name in buffer_set.header.datasets:
+        files = buffer_set.dataset_files(name)
+        if isinstance(files, LocalFiles):  # one on the Hub was checked when it was published
+            open_with_lerobot(name, files.root)
+
+
+def open_with_lerobot(name: str, root: Path) -> None:
+    """Open a dataset with LeRobot, and read its first and last frame."""
+    from datasets import config
+
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        dataset = LeRobotDataset(f"local/{name}", root=root, video_backend="pyav")
+        for index in (0, len(dataset) - 1):
+            dataset[index]
+    except Exception as error:
+        cause: BaseException | None = error
+        while cause is not None:  # LeRobot copies tables to a cache, and that disk may be full
+            if isinstance(cause, OSError) and cause.errno is not None:
+                with with_filename(config.HF_DATASETS_CACHE):
+                    raise cause from None
+            cause = cause.__cause__
+        raise PublishError(
+            f"LeRobot cannot open {root}: {type(error).__name__}: {error}",
+            "The files match their recorded hashes: check the version of lerobot.",
+            "doctor",
+        ) from error
+    finally:
+        logging.disable(before)
+
+
+def _number(items: Sized, noun: str) -> str:
+    return f"{len(items)} {noun}{'s' * (len(items) > 1)}"

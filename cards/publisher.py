@@ -1,6 +1,6 @@
-"""What every publication is: a repository gets a version in one commit, and a tag that names it.
+"""Publish a version of a repository: one commit, and then a tag that names the version.
 
-The tag comes last. What has no tag is no version, whatever an upload that failed has left behind.
+The tag comes last. Content without a tag is no version, so an interrupted upload publishes nothing.
 """
 
 import logging
@@ -16,35 +16,24 @@ from robomme_interference_data.storage.files import canonical_json, indented_jso
 from robomme_interference_data.storage.hub import HubFiles
 from robomme_interference_data.viz.tables import Table
 
-from .publication import Version, VersionConfig, versions_of
+from .publication import Publication, Version, versions_of
 from .render import README, is_card
-from .repo import (
-    Difference,
-    HubRepository,
-    LocalFile,
-    RepoFiles,
-    RepoState,
-    compare,
-    is_unmanaged,
-    total_size,
-)
+from .repo import Difference, HubRepository, LocalFile, RepoFiles, compare, is_unmanaged, total_size
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class RepoContent:
-    """What is published in one repository.
+    """What a repository is to hold.
 
-    Attributes:
-        repo_id: The repository.
-        first: The version that it has if it has none yet and none is asked for.
-        data: Its files without the card.
-        parts: Digest of each part of it, such as an episode: they decide the next version.
-        card: Makes the card of a version: bytes by path.
-        marker_file: A file that tells such a repository from others.
-        lerobot: Tag by which LeRobot finds a dataset of its format, such as `v3.0`; None if it is
-            no dataset of LeRobot.
+    `data` are its files without the card, `parts` the digests that decide the next version (one
+    for each episode, buffer, question or rollout), `card` makes the card of a version, `first` is
+    the version of an empty repository, `marker_file` a file that only such a repository has, and
+    `lerobot` the tag by which LeRobot finds the format of its dataset.
+
+    Content is `pending` while it has to name a commit that does not exist yet: the files that
+    name it are missing.
     """
 
     repo_id: str
@@ -54,46 +43,41 @@ class RepoContent:
     card: Callable[[Version], Mapping[str, bytes]]
     marker_file: str
     lerobot: str | None = None
+    pending: bool = False
 
     def files(self, version: Version) -> RepoFiles:
         """Return all files of a version."""
-        more = {PARTS_PATH: indented_json(dict(self.parts)).encode(), **self.card(version)}
-        return self.data | {path: LocalFile(content) for path, content in more.items()}
+        parts = {PARTS_PATH: indented_json(dict(self.parts)).encode()}
+        card = {} if self.pending else self.card(version)
+        return self.data | {path: LocalFile(data) for path, data in (parts | dict(card)).items()}
 
 
 @dataclass(frozen=True)
 class RepoPlan:
-    """What is to become of one repository.
+    """What publishing a version of a repository changes.
 
-    Attributes:
-        repository: The repository.
-        version: Version that it is to have.
-        files: All files of that version.
-        state: What it holds now; None if the repository is to be created.
-        difference: What has to be sent and removed.
-        published: Commit of the version; None as long as it is not there.
-        lerobot: See `RepoContent`.
-        same: Commit of the first version that holds the same but for the card, of a repository
-            whose versions count on their own; None if none does.
+    `head` is the commit of its main branch (None for a new repository) and `published` that of the
+    version (None until it exists). `same` is the first of the latest versions that hold equal data
+    and differ in the card alone; None if there is none.
     """
 
     repository: HubRepository
+    content: RepoContent
     version: Version
     files: RepoFiles
-    state: RepoState | None
+    head: str | None
     difference: Difference
     published: str | None
-    lerobot: str | None
     same: str | None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as plain values, for JSON."""
+        """Return plain values, for JSON."""
         sent = self.difference.sent
         return {
             "repo_id": self.repository.repo_id,
             "version": str(self.version),
             "commit": self.published,
-            "new_repository": self.state is None,
+            "new_repository": self.head is None,
             "files": len(self.files),
             "bytes": total_size(self.files),
             "sent_files": len(sent),
@@ -103,13 +87,13 @@ class RepoPlan:
 
     @property
     def status(self) -> str:
-        """What is there, in words."""
+        """The state of the repository, in words."""
         if self.published is not None:
             return f"published, {self.published[:12]}"
-        if self.state is None:
-            return "new repository"
-        removed = len(self.difference.removed)
-        return f"exists, {removed} files are removed" if removed else "exists"
+        status = "new repository" if self.head is None else "exists"
+        if self.difference.removed and not self.content.pending:
+            status += f", {len(self.difference.removed)} files are removed"
+        return status + ", without files that name the demonstrations" * self.content.pending
 
 
 def digest(value: Any) -> str:
@@ -118,60 +102,62 @@ def digest(value: Any) -> str:
 
 
 def plan_table(plans: Iterable[RepoPlan]) -> Table:
-    """Return plans as a table, a row a repository."""
+    """Return plans as a table, one row per repository."""
     columns = "repository version files:count bytes:count sent:count sent_bytes:count state"
     names = ("repo_id", "version", "files", "bytes", "sent_files", "sent_bytes")
     rows = [(*map(plan.to_dict().get, names), plan.status) for plan in plans]
-    return Table.make("publish", "What is published", columns, rows)
+    return Table.make("publish", "Repositories", columns, rows)
 
 
 class Publisher:
-    """Gives repositories their versions.
+    """Plans and publishes versions of repositories.
 
     Args:
-        config: As what something is published.
-        private: Whether repositories that have to be created are private.
+        config: The version to publish.
+        private: Create new repositories as private.
     """
 
-    def __init__(self, config: VersionConfig, *, private: bool = False):
-        self._wanted = config.wanted
+    def __init__(self, config: Publication, *, private: bool = False):
+        self._requested = config.requested
         self._private = private
 
     def plan(self, content: RepoContent, *, follows: bool = False) -> RepoPlan:
-        """Look at what is there; return what is to become of a repository.
+        """Compare content with the repository, and return what publishing it changes.
 
-        A `PublishError` says that the version is there already and is another one, or does not say
-        how much has changed, or that the repository holds something else.
+        Raises a `PublishError` if the version exists with other content, if its number is too low
+        for what changed, or if the repository holds something else.
 
         Args:
-            content: What it is to hold.
-            follows: Its versions count on their own: if it has changed it takes the next one that
-                fits, whatever version is asked for.
+            content: What the repository is to hold.
+            follows: Ignore the requested version if anything changed, and take the next one that
+                fits: the repository counts its own versions.
         """
         repository = HubRepository(content.repo_id)
-        state = repository.state()
-        files_at = cache(repository.files)  # what a commit holds never changes
-        existing = files_at(state.head) if state else {}
-        versions = versions_of(state.tags) if state else {}
+        revisions = repository.revisions() or {}
+        head = revisions.get("main")
+        files_at = cache(repository.files)  # the files of a commit never change
+        existing = files_at(head) if head else {}
+        versions = versions_of(revisions)
         if not versions:
-            _check_ours(content, repository, existing)
-        newest = max(versions, default=self._wanted or content.first)
-        version = newest if follows or self._wanted is None else self._wanted
+            _check_unused(content, repository, existing)
+        newest = max(versions, default=self._requested or content.first)
+        version = newest if follows or self._requested is None else self._requested
         files, published, difference = content.files(version), versions.get(version), Difference()
         if published is not None and (difference := compare(files, files_at(published))):
             published = None
         if published is None and versions:
-            fits = newest.following(_parts_at(content.repo_id, versions[newest]), content.parts)
+            fitting = newest.following(_parts_at(content.repo_id, versions[newest]), content.parts)
             if follows:
-                version, files = fits, content.files(fits)
-            elif difference or version < fits:
+                version, files = fitting, content.files(fitting)
+            elif difference or version < fitting:
+                changes = "other demonstrations" if content.pending else difference
                 raise PublishError(
-                    f"{content.repo_id} has the version {version} already, and it is another one: "
-                    f"{difference}"
+                    f"{content.repo_id} already has a version {version} with other content: "
+                    f"{changes}"
                     if difference
-                    else f"version {version} of {content.repo_id} does not say how much has "
-                    f"changed since {newest}",
-                    f'The next version that fits: version="{fits}"',
+                    else f"version {version} of {content.repo_id} is too low for what changed "
+                    f"since {newest}",
+                    f'The next version that fits: version="{fitting}"',
                 )
         same = None
         for earlier in reversed(versions.values() if follows else ()):
@@ -179,26 +165,24 @@ class Publisher:
                 break
             same = earlier
         difference = Difference() if published else compare(files, existing)
-        return RepoPlan(
-            repository, version, files, state, difference, published, content.lerobot, same
-        )
+        return RepoPlan(repository, content, version, files, head, difference, published, same)
 
     def check_rights(self, plans: Iterable[RepoPlan]) -> None:
-        """Check that this login may write to all repositories, as far as that can be known."""
+        """Check as far as possible that this login may write to all repositories."""
         for plan in plans:
             if plan.published is None:
-                plan.repository.check_rights(plan.state is not None)
+                plan.repository.check_rights(plan.head is not None)
 
     def put(self, plan: RepoPlan) -> RepoPlan:
-        """Do what was planned for a repository; return the plan with its commit."""
+        """Carry out a plan; return it with the commit of the version."""
         if plan.published is not None:
             return plan
         repository, version = plan.repository, plan.version
         logger.info("%s: sending %d files", repository.repo_id, len(plan.difference.sent))
-        state = plan.state or repository.create(self._private)
-        commit = repository.commit(plan.files, state.head, f"Version {version}")
-        if plan.lerobot is not None:
-            repository.tag(plan.lerobot, commit, move=True)
+        head = plan.head or repository.create(self._private)
+        commit = repository.commit(plan.files, head, f"Version {version}")
+        if plan.content.lerobot is not None:
+            repository.tag(plan.content.lerobot, commit, move=True)
         repository.tag(version.tag, commit)
         logger.info("%s: version %s is %s", repository.repo_id, version, commit)
         return replace(plan, published=commit)
@@ -209,20 +193,20 @@ def _without_card[F](files: Mapping[str, F]) -> dict[str, F]:
 
 
 def _parts_at(repo_id: str, commit: str) -> dict[str, str]:
-    """Return the digests of the parts that a published version holds."""
+    """Return the digests of the parts of a published version."""
     try:
         return read_json(HubFiles(repo_id, commit).path(PARTS_PATH))
     except (FormatError, MissingFileError):
-        return {"what cannot be read": ""}
+        return {"unreadable": ""}
 
 
-def _check_ours(
+def _check_unused(
     content: RepoContent, repository: HubRepository, existing: Mapping[str, object]
 ) -> None:
-    """Check that a repository without versions holds nothing, or what an upload left behind."""
+    """Check that a repository without versions is empty, or holds an interrupted upload."""
     others = [path for path in existing if not is_unmanaged(path) and path != README]
     if others and content.marker_file not in existing:
         raise PublishError(
             f"{repository.repo_id} holds something else, such as {others[0]}",
-            f"Give another repository; the files of this one: {repository.page}/tree/main",
+            f"Choose another repository; the files of this one: {repository.page}/tree/main",
         )

@@ -1,12 +1,16 @@
-"""Cards as files: what a repository says of itself, all of it from data.
+"""The files of a card: `README.md`, pictures, and `croissant.json` for machines.
 
-The same data, publication and version of this package (and, for the picture, of matplotlib) give
-the same bytes.
+Equal data, publication and version of this package (and, for pictures, of matplotlib) give equal
+bytes. `croissant.json` uses the vocabulary of Croissant 1.0 and its extension for responsible AI;
+of the latter it has the minimum that dataset tracks require.
 """
 
 import json
 from importlib import metadata
+from pathlib import PurePosixPath
 from typing import Any
+
+import pyarrow as pa
 
 from robomme_interference_data.constants import (
     FORMAT_VERSION,
@@ -20,15 +24,24 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.viz.tables import Table
 from robomme_interference_data.viz.templates import fill
 
-from .croissant import BIBTEX, PAPER, croissant
 from .facts import Facts
 from .markdown import Raw, block, code, escape, quoted, table
-from .publication import OTHER, Publication
-from .tables import column_table
+from .publication import HUB, OTHER, Publication
+from .tables import column_table, columns_of
 
 README, CROISSANT = "README.md", "croissant.json"
 
-_TAGS = ("robotics", "robot-memory", "RoboMME", "RoboMME-Interference")
+PAPER = "https://robotmemorybench.com"
+BIBTEX = f"""@article{{rathi2026robommeinterference,
+  title  = {{RoboMME-Interference: Benchmarking Robot Memory Under Interference}},
+  author = {{Rathi, Soumil}},
+  year   = {{2026}},
+  month  = {{8}},
+  url    = {{{PAPER}}}
+}}"""
+"""The paper; `CITATION.cff` of the project says the same."""
+
+_TAGS = ("robotics", "robot-memory", "RoboMME-Interference")
 _PROTOCOL = {
     "fps": FPS,
     "unit_frames": UNIT_FRAMES,
@@ -46,38 +59,58 @@ _FILTERS = {
     "number": "{:,}".format,
 }
 
+_TYPES = {
+    pa.string(): "sc:Text",
+    pa.int64(): "sc:Integer",
+    pa.float64(): "sc:Float",
+    pa.bool_(): "sc:Boolean",
+    pa.binary(): "sc:ImageObject",
+}
+_FORMATS = {
+    ".parquet": "application/x-parquet",
+    ".json": "application/json",
+    ".jsonl": "application/jsonlines",
+    ".csv": "text/csv",
+    ".mp4": "video/mp4",
+}
 
-def card_files(facts: Facts, about: Publication) -> dict[str, bytes]:
-    """Return a card: its files by their path in the repository.
+
+def card_files(facts: Facts, publication: Publication) -> dict[str, bytes]:
+    """Return the files of a card, by their path in the repository.
 
     Args:
-        facts: What there is to say, such as `buffer_set_facts(buffer set)`.
-        about: As what it is published; where `base` is not given, the data names it.
+        facts: What the card states, such as `buffer_set_facts(buffer_set)`.
+        publication: The version; without a `base` it gets the one that the data names.
     """
-    about = about.made_for(facts.base)
-    text, data = card_text(facts, about), croissant(facts, about)
+    publication = publication.made_for(facts.base)
+    text, data = card_text(facts, publication), croissant(facts, publication)
     return {README: text.encode(), **facts.pictures(), CROISSANT: data}
 
 
 def is_card(path: str) -> bool:
-    """Tell whether a file of a repository is one of its card."""
+    """Return whether a file of a repository belongs to its card."""
     return path.startswith("README") or path == CROISSANT
 
 
-def card_text(facts: Facts, about: Publication) -> str:
-    """Return the README of a card alone, without drawing; see `card_files`."""
-    about = about.made_for(facts.base)
+def card_text(facts: Facts, publication: Publication) -> str:
+    """Return the README of a card, without drawing pictures; see `card_files`."""
+    publication = publication.made_for(facts.base)
+    base = code(publication.base) if publication.base else "none"
     rows = (
-        ("repository", code(about.repo_id)),
-        ("version", code(about.tag)),
-        *facts.provenance(about),
-        ("made with", code(f"robomme-interference-data {_package_version()}")),
+        ("repository", code(publication.repo_id)),
+        ("version", code(publication.tag)),
+        *([(f"published {facts.base_kind}", base)] if facts.base_kind else []),
+        *facts.provenance,
+        (
+            "made with",
+            code(f"robomme-interference-data {metadata.version('robomme-interference-data')}"),
+        ),
         ("version of the format", code(FORMAT_VERSION)),
     )
     values = {
         **_PROTOCOL,
         **facts.values,
-        "about": about,
+        "publication": publication,
         "repositories": facts.repositories,
         "paper": PAPER,
         "bibtex": BIBTEX,
@@ -86,7 +119,10 @@ def card_text(facts: Facts, about: Publication) -> str:
         "split_name": facts.tables[0].split,
         "columns": column_table(facts.tables[0].record),
         "provenance": Table.make("provenance", "Provenance", "what value", rows),
-        "details": {title: _readable_json(value) for title, value in facts.details.items()},
+        "details": {
+            title: json.dumps(value, indent=2, sort_keys=True, ensure_ascii=False)
+            for title, value in facts.details.items()
+        },
         "limits": facts.limits,
     }
     text = fill(
@@ -97,24 +133,25 @@ def card_text(facts: Facts, about: Publication) -> str:
         finalize=escape,
         filters=_FILTERS,
     )
-    return f"{front_matter(facts, about)}\n{text.rstrip()}\n"
+    return f"{front_matter(facts, publication)}\n{text.rstrip()}\n"
 
 
-def front_matter(facts: Facts, about: Publication) -> str:
-    """Return what the Hub reads of a card: YAML, `---` lines included."""
+def front_matter(facts: Facts, publication: Publication) -> str:
+    """Return the part of a card that the Hub reads: YAML between lines of `---`."""
     from huggingface_hub import DatasetCardData
 
-    made_from = sorted({*facts.repositories, *filter(None, [about.base_repo])})
+    base = [publication.base.split("@")[0]] if publication.base else []
+    made_from = sorted({*facts.repositories, *base})
     configs: list[dict[str, Any]] = [
         {"config_name": one.name, "data_files": [{"split": one.split, "path": one.path}]}
         for one in facts.tables
     ]
     configs[0]["default"] = True
     data = DatasetCardData(
-        pretty_name=f"{facts.title}: {about.name}",
-        license=about.license,
+        pretty_name=f"{facts.title}: {publication.name}",
+        license=publication.license,
         task_categories=["robotics"],
-        tags=[*facts.tags, *_TAGS],
+        tags=[*facts.tags, *_TAGS, *["RoboMME"] * ("robomme" in facts.simulators)],
         size_categories=[size_category(facts.examples)],
         source_datasets=made_from or ["original"],
         configs=configs,
@@ -133,9 +170,34 @@ def size_category(count: int) -> str:
     return f"{names[power]}<n<{names[power + 1]}" if power + 1 < len(names) else "n>1T"
 
 
-def _readable_json(value: Any) -> str:
-    return json.dumps(value, indent=2, sort_keys=True, ensure_ascii=False)
+def croissant(facts: Facts, publication: Publication) -> bytes:
+    """Return `croissant.json`: JSON that is safe inside a page's script element."""
+    repositories = dict(facts.repositories)
+    if publication.base:
+        repo_id, _, commit = publication.base.partition("@")
+        repositories[repo_id] = commit
+    values = {
+        "publication": publication,
+        "namespace": publication.repo_id.split("/")[0],
+        "facts": facts,
+        "hub": HUB,
+        "other": OTHER,
+        "bibtex": BIBTEX,
+        "repositories": sorted(repositories.items()),
+        "types": _TYPES,
+        "columns": columns_of,
+    }
+    filters = {"tojson": json.dumps, "format": _format}  # that of jinja2 sorts keys
+    package = "robomme_interference_data.cards"
+    text = fill(package, "croissant.json.j2", values, what="croissant.json", filters=filters)
+    return as_bytes(json.loads(text))
 
 
-def _package_version() -> str:
-    return metadata.version("robomme-interference-data")
+def as_bytes(data: Any) -> bytes:
+    """Return JSON, without `<`."""
+    text = json.dumps(data, indent=2, ensure_ascii=False).replace("<", "\\u003c")
+    return f"{text}\n".encode(errors="backslashreplace")
+
+
+def _format(path: str) -> str:
+    return _FORMATS.get(PurePosixPath(path).suffix.lower(), "application/octet-stream")

@@ -1,10 +1,10 @@
-"""The files of a repository: in a folder, or on the Hub in one commit and a tag."""
+"""The files of a repository: written to a folder, or to the Hub in one commit."""
 
 import hashlib
 import shutil
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     from huggingface_hub.hf_api import RepoFile as RemoteFile
 
 _ROOTS = ("data", "videos", INDEX_DIR, DEMONSTRATIONS, QUESTIONS_PATH, *OPTIONAL_DATASETS)
-"""What one version has at its root and another may not have, beside the files that all have."""
+"""Optional files and folders at the root of an export."""
 
 
 @dataclass(frozen=True)
 class LocalFile:
-    """What a file of a repository is to hold: bytes, or a file on this machine that holds them."""
+    """Content for a file of a repository: bytes, or a file on this machine."""
 
     source: bytes | Path
 
@@ -40,14 +40,14 @@ class LocalFile:
 
     @cached_property
     def sha256(self) -> str:
-        """SHA-256 of the bytes: by it the Hub knows large files."""
+        """SHA-256 of the bytes: the Hub identifies large files by it."""
         if isinstance(self.source, bytes):
             return hashlib.sha256(self.source).hexdigest()
         return sha256_file(self.source)
 
     @cached_property
     def git_sha1(self) -> str:
-        """SHA-1 of the bytes as git computes it: by it the Hub knows small files."""
+        """SHA-1 of the bytes as git computes it: the Hub identifies small files by it."""
         from huggingface_hub.utils.sha import git_hash
 
         return str(git_hash(self.read()))
@@ -57,7 +57,7 @@ class LocalFile:
         return self.source if isinstance(self.source, bytes) else self.source.read_bytes()
 
     def equals(self, remote: "RemoteFile") -> bool:
-        """Tell whether a file on the Hub holds the same."""
+        """Return whether a file on the Hub has the same content."""
         if self.size != remote.size:
             return False
         if remote.lfs is None:
@@ -66,50 +66,44 @@ class LocalFile:
 
 
 RepoFiles = dict[str, LocalFile]
-"""What a repository is to hold, by path."""
+"""Files for a repository, by path."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """How what a repository is to hold differs from what it holds: sorted paths."""
+    """Sorted paths of files to send to a repository, and of files to remove from it."""
 
-    added: tuple[str, ...] = ()
-    changed: tuple[str, ...] = ()
+    sent: tuple[str, ...] = ()
     removed: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
-        return bool(self.added or self.changed or self.removed)
-
-    @property
-    def sent(self) -> tuple[str, ...]:
-        """Paths that have to be sent."""
-        return (*self.added, *self.changed)
+        return bool(self.sent or self.removed)
 
     def __str__(self) -> str:
-        named = {what: paths for what, paths in vars(self).items() if paths}
-        parts = (f"{len(paths):,} {what} (such as {paths[0]})" for what, paths in named.items())
-        return ", ".join(parts) or "no difference"
+        lists = {"differ": self.sent, "are no longer part of it": self.removed}
+        parts = [
+            f"{len(paths):,} files {what} (such as {paths[0]})"
+            for what, paths in lists.items()
+            if paths
+        ]
+        return ", ".join(parts)
 
 
 def compare(files: Mapping[str, LocalFile], existing: "Mapping[str, RemoteFile]") -> Difference:
-    """Return how files differ from those of a repository; unmanaged ones are left alone."""
-    both = sorted(files.keys() & existing.keys())
-    gone = existing.keys() - files.keys()
-    return Difference(
-        added=tuple(sorted(files.keys() - existing.keys())),
-        changed=tuple(path for path in both if not files[path].equals(existing[path])),
-        removed=tuple(sorted(path for path in gone if not is_unmanaged(path))),
-    )
+    """Return how a repository has to change to hold `files`; unmanaged files stay."""
+    sent = (p for p in files if p not in existing or not files[p].equals(existing[p]))
+    removed = (p for p in existing if p not in files and not is_unmanaged(p))
+    return Difference(tuple(sorted(sent)), tuple(sorted(removed)))
 
 
 def is_unmanaged(path: str) -> bool:
-    """Tell whether a file is the Hub's or its owner's: hidden files, and a license."""
+    """Return whether a file is left alone: hidden files and the license at the root."""
     name = PurePosixPath(path).parts[0]
     return name.startswith(".") or (name.startswith("LICENSE") and name == path)
 
 
 def total_size(files: Mapping[str, LocalFile], paths: Iterable[str] | None = None) -> int:
-    """Return the bytes of all files, or of those at some paths."""
+    """Return the total size of all files, or of those at some paths, in bytes."""
     return sum(files[path].size for path in (files if paths is None else paths))
 
 
@@ -117,18 +111,17 @@ def total_size(files: Mapping[str, LocalFile], paths: Iterable[str] | None = Non
 
 
 def write_folder(files: RepoFiles, out: Path) -> bool:
-    """Write files into a folder, all of them or none; an earlier version there is replaced.
+    """Write files into a folder, all or none, replacing an earlier export.
 
-    Returns:
-        Whether it was written: False if all of it was there.
+    Returns False if the folder already holds exactly these files.
     """
     existing = all_files(out) if out.is_dir() else []
     known = {*_ROOTS, *(path.split("/")[0] for path in files)}
     others = [path for path in existing if path.split("/")[0] not in known]
     if others or (existing and PARTS_PATH not in existing) or (out.exists() and not out.is_dir()):
-        found = f", but {others[0]}" if others else ""
-        message = f"{out} exists, and is nothing that was exported{found}"
-        raise PublishError(message, "Give another folder.")
+        example = f": it holds {others[0]}" if others else ""
+        message = f"{out} exists and is not an earlier export{example}"
+        raise PublishError(message, "Choose another folder.")
     if existing == sorted(files) and all(
         LocalFile(out / path).sha256 == files[path].sha256 for path in existing
     ):
@@ -153,21 +146,10 @@ def write_folder(files: RepoFiles, out: Path) -> bool:
 # --- on the Hub ----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class RepoState:
-    """What a repository holds: the commit of its main branch, and that of each tag."""
-
-    head: str
-    tags: dict[str, str]
-
-
 class HubRepository:
     """A dataset repository on the Hub.
 
-    Every method raises a `HubError` where this login may not do it or the Hub cannot be reached.
-
-    Args:
-        repo_id: `namespace/name`.
+    Methods raise a `HubError` if this login lacks the rights or the Hub cannot be reached.
     """
 
     def __init__(self, repo_id: str):
@@ -175,67 +157,61 @@ class HubRepository:
 
         self.repo_id = repo_id
         self._api = HfApi()
-        self._of: dict[str, Any] = {"repo_id": repo_id, "repo_type": "dataset"}
+        self._repo: dict[str, Any] = {"repo_id": repo_id, "repo_type": "dataset"}
 
     @property
     def page(self) -> str:
         """Address of its page."""
         return HubCall(self.repo_id).page
 
-    def state(self) -> RepoState | None:
-        """Return what it holds; None if there is none of this name that this login may see."""
+    def revisions(self) -> dict[str, str] | None:
+        """Return the commits of its tags and of `main`; None if this login sees no such name."""
         from huggingface_hub.errors import RepositoryNotFoundError
 
         try:
-            info = self._call(self._api.repo_info, **self._of)
-            refs = self._call(self._api.list_repo_refs, **self._of)
+            info = self._call(self._api.repo_info, **self._repo)
+            refs = self._call(self._api.list_repo_refs, **self._repo)
         except HubError as error:
             if isinstance(error.__cause__, RepositoryNotFoundError):
                 return None
             raise
         if info.id != self.repo_id:
             raise HubError(
-                f"{self.repo_id} is now called {info.id}", "Give that name: the old one may go."
+                f"{self.repo_id} is now called {info.id}", "Use the new name: the old one may go."
             )
-        return RepoState(str(info.sha), {tag.name: tag.target_commit for tag in refs.tags})
+        return {tag.name: tag.target_commit for tag in refs.tags} | {"main": str(info.sha)}
 
     def files(self, revision: str) -> "dict[str, RemoteFile]":
         """Return its files at a revision, by path."""
         from huggingface_hub.hf_api import RepoFile
 
-        listed = self._call(
-            lambda: list(
-                self._api.list_repo_tree(**self._of, revision=revision, recursive=True)  # in pages
-            )
-        )
-        return {one.path: one for one in listed if isinstance(one, RepoFile)}
+        # The client reads the list in pages.
+        tree = partial(self._api.list_repo_tree, **self._repo, revision=revision, recursive=True)
+        entries = self._call(lambda: list(tree()))
+        return {entry.path: entry for entry in entries if isinstance(entry, RepoFile)}
 
     def check_rights(self, exists: bool) -> None:
-        """Check that somebody is logged in who may write to it, as far as that can be known."""
+        """Check as far as possible that this login may write to it."""
         if exists:
-            self._call(self._api.auth_check, **self._of, write=True)
+            self._call(self._api.auth_check, **self._repo, write=True)
         else:
             self._call(self._api.whoami)
 
-    def create(self, private: bool) -> RepoState:
-        """Create it, private or as its owner's are; return what it holds then."""
-        self._call(self._api.create_repo, **self._of, private=private or None, exist_ok=True)
-        state = self.state()
-        if state is None:
+    def create(self, private: bool) -> str:
+        """Create it, private or with the default of its owner; return the commit of `main`."""
+        self._call(self._api.create_repo, **self._repo, private=private or None, exist_ok=True)
+        revisions = self.revisions()
+        if revisions is None:
             raise HubError(
-                f"{self.repo_id} was created, and is not there", "Run the same command again."
+                f"{self.repo_id} was created but cannot be found", "Run the same command again."
             )
-        return state
+        return revisions["main"]
 
     def commit(self, files: RepoFiles, head: str, message: str) -> str:
-        """Make the main branch hold exactly these files, in one commit at most; return its hash.
+        """Make the main branch hold exactly these files, in at most one commit; return its hash.
 
-        What is there already is not sent again, be it in a commit or left by one that failed.
-
-        Args:
-            files: All files that it is to hold.
-            head: The commit that this one follows: another one by now is an error.
-            message: Title of the commit.
+        Large files that an earlier commit or an interrupted one sent are not sent again. It is an
+        error if the main branch is no longer at `head`.
         """
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete
 
@@ -244,29 +220,28 @@ class HubRepository:
             return head
         operations: list[Any] = [CommitOperationDelete(path) for path in difference.removed]
         operations += [CommitOperationAdd(path, files[path].source) for path in difference.sent]
-        options = {"commit_message": message, "parent_commit": head, **self._of}
+        options = {"commit_message": message, "parent_commit": head, **self._repo}
         made = self._call(self._api.create_commit, operations=operations, **options)
         if left := compare(files, self.files(made.oid)):
             raise HubError(
                 f"{self.repo_id} does not hold what was sent: {left}",
-                "What was sent is kept: run the same command again.",
+                "Run the same command again: what was sent is kept.",
             )
         return str(made.oid)
 
     def tag(self, name: str, commit: str, *, move: bool = False) -> None:
-        """Make a tag stand for a commit; `move` takes it away from another one."""
-        state = self.state()
-        existing = state.tags.get(name) if state else None
-        if existing not in (None, commit):
+        """Tag a commit; `move` takes the tag away from another commit."""
+        existing = (self.revisions() or {}).get(name)
+        if existing == commit:
+            return
+        if existing is not None:
             if not move:
                 raise HubError(
-                    f"the tag {name} of {self.repo_id} stands for another commit, {existing}",
-                    f"Somebody else made it. Look at {self.page}/tree/{name}, and publish another "
-                    "version.",
+                    f"the tag {name} of {self.repo_id} already names another commit, {existing}",
+                    f"Look at {self.page}/tree/{name}, and publish another version.",
                 )
-            self._call(self._api.delete_tag, **self._of, tag=name)
-        if existing != commit:
-            self._call(self._api.create_tag, **self._of, tag=name, revision=commit)
+            self._call(self._api.delete_tag, **self._repo, tag=name)
+        self._call(self._api.create_tag, **self._repo, tag=name, revision=commit)
 
     def _call(self, call: Callable[..., Any], **options: Any) -> Any:
         return HubCall(self.repo_id).run(call, **options)

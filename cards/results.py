@@ -1,4 +1,4 @@
-"""The results of a run: what their card says, and what their repository holds."""
+"""The results of a run: the facts of their card, and the files of their repository."""
 
 import re
 from collections import Counter
@@ -7,12 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from robomme_interference_data.constants import (
-    PROTOCOL_VERSION,
-    RUN_HEADER,
-    RUN_RECORD,
-    RUN_TABLES,
-)
+from robomme_interference_data.constants import PROTOCOL_VERSION, RUN_HEADER, RUN_RECORD, RUN_TABLES
 from robomme_interference_data.errors import InvalidOptionError, PublishError
 from robomme_interference_data.evaluate.run.log import RunHeader, read_record
 from robomme_interference_data.evaluate.score.config import Expected, Settings
@@ -28,17 +23,16 @@ from robomme_interference_data.storage.files import sha256_file
 from robomme_interference_data.viz.figure import open_figure, save_figure
 from robomme_interference_data.viz.tables import Table
 
-from .facts import CardTable, Facts
+from .facts import CardTable, Facts, Rows, origin_limit
 from .markdown import Raw, code, escape
-from .publication import Publication, Version, VersionConfig
+from .publication import Publication, Version
 from .publisher import RepoContent, digest
 from .render import card_files
 from .repo import LocalFile, RepoFiles
-from .sources import Rows, origin_limit
 
 _EXPECTED = {
-    Expected.BENCHMARK: "the benchmark's: nine families, test episodes 0 to 49 each",
-    Expected.OBSERVED: "the episodes that any of the rows is of",
+    Expected.BENCHMARK: "those of the benchmark, nine families with test episodes 0 to 49 each",
+    Expected.OBSERVED: "all episodes in the rows",
 }
 
 
@@ -46,18 +40,16 @@ _EXPECTED = {
 
 
 def results_facts(results: Score | Path) -> Facts:
-    """Return what there is to say of results.
-
-    The repository holds the files of the run's folder at its root.
+    """Return what the card of results states.
 
     Args:
-        results: The folder of a run, a file of rows, or what either scored.
+        results: The folder of a run, a file of rows, or the score of either.
     """
     found = results if isinstance(results, Score) else score(Settings(rows=(results,)))
     if len(found.rows.sources) != 1:
         raise InvalidOptionError(
-            f"the score is of {len(found.rows.sources)} files; expected those of one run",
-            "Merge the shards of a run into one.",
+            f"the score is of {len(found.rows.sources)} files of rows; expected one run",
+            "Merge the shards of a run.",
             "merge RUN RUN --out RUN",
         )
     [(source, run)] = found.rows.sources.items()
@@ -85,13 +77,14 @@ def results_facts(results: Score | Path) -> Facts:
         title="RoboMME-Interference results",
         description=f"Rollouts of {', '.join(names)} on RoboMME-Interference: "
         f"{len(found.rows):,} rows.",
-        origin="A policy was rolled out in a simulator, a row an episode.",
+        origin="A policy was rolled out in a simulator, one row per episode.",
         examples=len(found.rows),
         tables=[rows],
         families=tuple(found.rows.names("family")),
         simulators=tuple(found.outcomes),
+        simulated=True,
         limits=_limits(found),
-        provenance=lambda about: _provenance(found, run, rows, about),
+        provenance=_provenance(found, run, rows),
         pictures=lambda: _pictures(found, figures),
         values={
             "systems": names,
@@ -109,6 +102,7 @@ def results_facts(results: Score | Path) -> Facts:
             "statuses": ", ".join(f"{statuses[one]:,} {one}" for one in FINAL),
             "refused": found.rows.refused,
         },
+        base_kind="buffer set",
         base=starts[-1].settings.get("buffer_set") if starts else None,
         details=_details(run),
         tags=("evaluation-results",),
@@ -117,21 +111,21 @@ def results_facts(results: Score | Path) -> Facts:
 
 def _limits(found: Score) -> list[str]:
     partial = (
-        "Not every cell is complete: rates over parts of the grid cannot be compared with "
-        "rates over all of it."
+        "Not every cell is complete: success rates of incomplete and complete cells are not "
+        "comparable."
     )
     complete = all(cell.complete for cell in found.cells if not cell.part)
     return [
         origin_limit(tuple(found.outcomes)),
         *found.notes,
         *[partial] * (not complete),
-        "The same episode, repeated on a GPU, may come out otherwise: small differences need "
-        "the paired tests, or repeats with other model seeds.",
+        "Repeating an episode on a GPU may give another outcome: judge small differences by the "
+        "paired tests, or repeat the run with other model seeds.",
     ]
 
 
 def _standing(found: Score, run: RunHeader | None) -> str:
-    """Return how the run stands, in a sentence."""
+    """Return how complete the run is, in a sentence."""
     cells = [cell for cell in found.cells if not cell.part]
     cell_text = f"{sum(cell.complete for cell in cells)} of {len(cells)} cells are complete."
     if run is None:
@@ -142,7 +136,7 @@ def _standing(found: Score, run: RunHeader | None) -> str:
 
 
 def _pictures(found: Score, figures: dict[str, str]) -> dict[str, bytes]:
-    """Draw success by condition, a picture a simulator."""
+    """Draw success by condition, one picture per simulator."""
     with TemporaryDirectory() as folder:
         for file, simulator in figures.items():
             with open_figure() as figure:
@@ -151,38 +145,36 @@ def _pictures(found: Score, figures: dict[str, str]) -> dict[str, bytes]:
         return {file: (Path(folder) / file).read_bytes() for file in figures}
 
 
-def _provenance(found: Score, run: RunHeader | None, table: CardTable, about: Publication) -> Rows:
-    """Return where the results come from: buffer set, revision, rows and policy."""
-    rows: Rows = [("buffer_set", code(run.buffer_set))] if run is not None else []
-    if about.base:
-        rows.append(("published buffer set", code(about.base)))
+def _provenance(found: Score, run: RunHeader | None, table: CardTable) -> Rows:
+    """Return the provenance of results: buffer set, revision, rows and policy."""
+    rows: Rows = [("buffer set of the run", code(run.buffer_set))] if run is not None else []
     for simulator, revision in sorted(found.rows.revisions.items()):
         rows.append((f"revision of the buffer set, {escape(simulator)}", code(revision)))
     if found.rows.unpinned:
-        rows.append(("revision of the buffer set", "the rows name none"))
+        rows.append(("revision of the buffer set", "not in the rows"))
     rows.append((f"SHA-256 of `{table.path}`", code(table.sha256)))
     if run is not None:
         policy = run.identity.get("policy")
-        rows.append(("policy", code(policy) if policy else "not told"))
+        rows.append(("policy", code(policy) if policy else "not recorded"))
         for start in run.starts[-1:]:
             rows += [("git", code(start.git))] if start.git else []
             versions = (f"{name} {version}" for name, version in sorted(start.versions.items()))
-            rows.append(("versions of the last start", escape(", ".join(versions))))
+            rows.append(("versions of the last invocation", escape(", ".join(versions))))
     return [*rows, ("version of the protocol", code(PROTOCOL_VERSION))]
 
 
 def _details(run: RunHeader | None) -> dict[str, Any]:
-    """Return what makes the run the one that it is, and how it was started."""
+    """Return the identity of the run and its commands."""
     if run is None:
         return {}
-    found: dict[str, Any] = {"What makes the run the one that it is": run.identity}
+    found: dict[str, Any] = {"Identity of the run": run.identity}
     if commands := dict.fromkeys(line for start in run.starts for line in start.command):
-        found["Its commands"] = [*commands]
+        found["Commands"] = [*commands]
     return found
 
 
 def _cells(found: Score) -> Table:
-    """Return the main table without what the grid shows already."""
+    """Return the main table without the columns that the grid shows."""
     rows = [
         (
             *(cell.simulator, display_name(cell.system), cell.condition, cell.n, cell.expected),
@@ -199,18 +191,18 @@ def _cells(found: Score) -> Table:
 
 
 def score_run(run: Path, expected: Expected = Expected.BENCHMARK) -> Score:
-    """Score the run that is to be published, which has ended."""
+    """Score the run to publish, which has to be finished."""
     needed = (RUN_HEADER, RUN_RECORD, *RUN_TABLES)
     if missing := [name for name in needed if not (run / name).is_file()]:
         raise PublishError(
-            f"{run} holds no run that has ended: {missing[0]} is missing",
-            "Run it to its end with the same evaluate command, or give the folder of a run.",
+            f"{run} holds no finished run: {missing[0]} is missing",
+            "Finish it with the same evaluate command, or give the folder of another run.",
         )
     return score(Settings(rows=(run,), expected=expected))
 
 
-def results_content(found: Score, run: Path, config: VersionConfig) -> RepoContent:
-    """Return what the repository of a run's results holds; videos of rollouts are left out."""
+def results_content(found: Score, run: Path, config: Publication) -> RepoContent:
+    """Return the repository of a run's results, without videos of rollouts."""
     command = f"robomme-interference publish-results RUN --repo-id {config.repo_id}"
     files: RepoFiles = {
         name: LocalFile(run / name) for name in (RUN_HEADER, RUN_RECORD, *RUN_TABLES)
@@ -223,14 +215,15 @@ def results_content(found: Score, run: Path, config: VersionConfig) -> RepoConte
     facts = results_facts(found)
 
     def card(version: Version) -> dict[str, bytes]:
-        about = Publication(config.repo_id, str(version), config.license, None, command)
-        return card_files(facts, about)
+        return card_files(
+            facts, Publication(config.repo_id, str(version), config.license, None, command)
+        )
 
     parts = {str(item): _rollout_digest(to_dict(row)) for item, row in read_record(run).items()}
     return RepoContent(config.repo_id, Version(1, 0, 0), files, parts, card, RUN_HEADER)
 
 
 def _rollout_digest(row: dict[str, Any]) -> str:
-    """Return a digest of what a rollout came to, its times aside."""
+    """Return a digest of the outcome of a rollout, without its timing."""
     left_out: Iterable[str] = {*TIMING_COLUMNS, "attempt", "video"}
     return digest({name: value for name, value in row.items() if name not in left_out})

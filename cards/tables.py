@@ -1,4 +1,4 @@
-"""The tables of cards. Their texts are Markdown already."""
+"""The tables of cards; their texts are already Markdown."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
@@ -30,7 +30,7 @@ _DIFFICULTIES = "easy:count medium:count hard:count other:count"
 
 
 def count_table(records: Iterable[EpisodeRecord]) -> Table:
-    """Return how many episodes there are by family and difficulty, and their frames."""
+    """Return the number of episodes by family and difficulty, and of their frames."""
     rows = [
         (escape(name), len(found), *_difficulties(found), sum(one.length for one in found))
         for name, found in _by_family(records).items()
@@ -40,11 +40,11 @@ def count_table(records: Iterable[EpisodeRecord]) -> Table:
 
 
 def unit_table(queries: Iterable[EpisodeRecord], units: Iterable[EpisodeRecord]) -> Table:
-    """Return how many queries there are by family and difficulty, and units by family."""
-    asked, pool = _by_family(queries), Counter(one.episode_id.family for one in units)
+    """Return the number of queries by family and difficulty, and of units by family."""
+    groups, pool = _by_family(queries), Counter(one.episode_id.family for one in units)
     rows = []
-    for name in sorted({*asked, *pool}, key=_family_rank):
-        found = asked.get(name, [])
+    for name in sorted({*groups, *pool}, key=_family_rank):
+        found = groups.get(name, [])
         rows.append((escape(name), len(found), *_difficulties(found), pool[name]))
     columns = f"family queries:count {_DIFFICULTIES} units:count"
     return Table.make("counts", "Queries and units", columns, [*rows, _total(rows)])
@@ -60,7 +60,7 @@ def goal_table(records: Iterable[EpisodeRecord]) -> Table:
 
 
 def condition_table(conditions: Iterable[str], manifests: Iterable[BufferManifest]) -> Table:
-    """Return what the buffers of each condition hold."""
+    """Return the contents of the buffers of each condition."""
     groups: dict[str, list[BufferManifest]] = {name: [] for name in conditions}
     for one in manifests:
         groups.setdefault(one.condition, []).append(one)
@@ -69,13 +69,13 @@ def condition_table(conditions: Iterable[str], manifests: Iterable[BufferManifes
         frames = [one.history_frames for one in found] or [0]
         rows.append(
             (
-                *(escape(name), "paper" if name in DEFAULT_CONDITIONS else "ours"),
+                *(escape(name), "paper" if name in DEFAULT_CONDITIONS else "extension"),
                 *(len(found), max((len(one.sessions) for one in found), default=0)),
                 *(min(frames), round(median(frames)), max(frames)),
                 mean(one.lesson_share for one in found) if found else None,
             )
         )
-    columns = "condition whose buffers:count sessions:count min:count median:count max:count"
+    columns = "condition origin buffers:count sessions:count min:count median:count max:count"
     return Table.make("conditions", "Conditions", f"{columns} lesson_share:rate", rows)
 
 
@@ -106,18 +106,11 @@ def _family_rank(name: str) -> tuple[int, str]:
 
 @dataclass(frozen=True)
 class CardColumn:
-    """A column of a table.
-
-    Attributes:
-        name: Its name.
-        type: Its type in Arrow.
-        about: What it means.
-        parts: What a record in it is made of.
-    """
+    """A column of a table; `parts` are the fields of a record in it."""
 
     name: str
     type: pa.DataType
-    about: str
+    meaning: str
     parts: tuple["CardColumn", ...] = ()
 
     @property
@@ -132,17 +125,13 @@ class CardColumn:
 
     @property
     def words(self) -> str:
-        """Its type in words."""
+        """The type in words."""
         one = _WORDS.get(self.item, "record")
         return f"list of {one}s".replace("texts", "text") if self.repeated else one
 
 
 def columns_of(record: Any) -> tuple[CardColumn, ...]:
-    """Return the columns of a record; those of its maps, which differ between files, are left out.
-
-    Args:
-        record: The dataclass.
-    """
+    """Return the columns of a dataclass, without maps, whose keys differ between files."""
     texts, hints = descriptions(record), get_type_hints(record)
     found = []
     for field in arrow_schema(record):
@@ -150,8 +139,8 @@ def columns_of(record: Any) -> tuple[CardColumn, ...]:
         if pa.types.is_struct(field.type) and inner is None:
             continue  # a map
         parts = columns_of(inner) if inner else ()
-        about = texts[field.name].replace("`", "")
-        found.append(CardColumn(field.name, field.type, about, parts))
+        meaning = texts[field.name].replace("`", "")
+        found.append(CardColumn(field.name, field.type, meaning, parts))
     return tuple(found)
 
 
@@ -159,14 +148,14 @@ def column_table(record: type) -> Table:
     """Return the columns of a record as a table."""
     rows = []
     for column in columns_of(record):
-        rows.append((code(column.name), column.words, escape(column.about)))
+        rows.append((code(column.name), column.words, escape(column.meaning)))
         for part in column.parts:
-            rows.append((code(f"{column.name}.{part.name}"), part.words, escape(part.about)))
+            rows.append((code(f"{column.name}.{part.name}"), part.words, escape(part.meaning)))
     return Table.make("columns", "Columns", "column type meaning", rows)
 
 
 def _record_in(hint: Any) -> Any:
-    """Return the record that a value is, or that its list is of, or None."""
+    """Return the dataclass of a value, or of the items of a list; None if there is none."""
     if get_origin(hint) in (tuple, UnionType):
         return next(filter(None, map(_record_in, get_args(hint))), None)
     own = is_dataclass(hint) and isinstance(hint, type) and hint is not EpisodeId

@@ -1,10 +1,10 @@
-"""Fit the cosine below which a history is cut, and tell how much hangs on it: pure.
+"""Fit the cosine below which a history is cut, and grade other thresholds; without IO.
 
-The released rule: midway between the 99th percentile of the cosines across true cuts and the 1st
-percentile of the lowest cosine inside each session. Buffers share their sessions; each stored span
-counts once, and each cut between the same two (ours). The rule looks at true sessions, so a
-threshold that is fitted on a buffer set must not be graded on the same buffer set without saying so;
-`held_out` grades each family with a threshold to which no frame of it contributed.
+The released rule takes the middle between the 99th percentile of the cosines across true cuts and
+the 1st percentile of the lowest cosine inside each session. Buffers share sessions: each stored
+span counts once, and each cut between the same two spans (a choice of this project). The rule uses
+the true sessions, so its threshold is not a fair one for the data that it was fitted on; `held_out`
+grades each family with a threshold that none of its frames contributed to.
 """
 
 from collections.abc import Iterable, Sequence
@@ -26,12 +26,12 @@ _DIGITS = 6
 
 @dataclass(frozen=True)
 class Trial:
-    """What a threshold gives.
+    """Mean grades under a threshold.
 
     Attributes:
         threshold: The threshold.
-        family: Whose queries it was tried on, or `ALL`.
-        condition: Under which condition, or `ALL`.
+        family: Family of the graded queries, or `ALL`.
+        condition: Condition of the graded buffers, or `ALL`.
         purity, coverage: Means over these buffers.
     """
 
@@ -44,19 +44,19 @@ class Trial:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What the released rule finds in a buffer set.
+    """The threshold that the released rule fits to a buffer set.
 
     Attributes:
-        rule: The rule that the encoder goes by itself.
-        in_use: The threshold that this comes to.
-        threshold: What the released rule fits.
+        rule: The encoder's default rule.
+        in_use: The threshold of that rule.
+        threshold: The fitted threshold.
         cuts: Cosines across true cuts, each once, ascending.
         lowest: Lowest cosine inside each session, each once, ascending.
         cut_percentile: The 99th percentile of `cuts`.
-        lowest_percentile: The 1st percentile of `lowest`; where it is below the former, no
-            threshold parts the two.
-        held_out: Each family under the threshold that is fitted without its queries, and without
-            its sessions in other buffers; empty if there is only one.
+        lowest_percentile: The 1st percentile of `lowest`; below `cut_percentile`, no threshold
+            separates cuts from sessions.
+        held_out: Each family under a threshold fitted without its queries, and without its
+            sessions in other buffers; empty for a single family.
         sweep: Other thresholds, ascending, each by condition.
     """
 
@@ -71,37 +71,37 @@ class Calibration:
     sweep: tuple[Trial, ...]
 
     def text(self, title: str) -> str:
-        """Say it for a terminal."""
+        """Return a report for a terminal."""
         apart = self.lowest_percentile - self.cut_percentile
-        gap = f"they overlap by {-apart:.3f}: no threshold parts them"
-        if apart >= 0:
-            gap = f"{apart:.3f} lie between them"
-        said = (
+        gap = f"the gap is {apart:.3f}"
+        if apart < 0:
+            gap = f"they overlap by {-apart:.3f}: no threshold separates them"
+        summary = (
             f"Fitted by the released rule: {self.threshold:.3f}; in use ({self.rule}): "
             f"{self.in_use:.3f}\n"
             f"99th percentile of {len(self.cuts)} true cuts: {self.cut_percentile:.3f}; 1st "
             f"percentile of the lowest cosine inside {len(self.lowest)} sessions: "
             f"{self.lowest_percentile:.3f}; {gap}\n"
-            "Each stored span counts once, and each cut between the same two. Fitted and tried on "
-            "the same buffer set; only the families left out below are unseen."
+            "Each stored span, and each cut between two spans, counts once. The threshold is "
+            "fitted and graded on the same buffer set, except in the table of left-out families."
         )
-        parts = [title, said]
+        parts = [title, summary]
         if self.held_out:
             fitted = [one.threshold for one in self.held_out]
             head = (
-                "Fitted without any frame of one family, tried on it: thresholds from "
+                "Fitted without one family, graded on it: thresholds from "
                 f"{min(fitted):.3f} to {max(fitted):.3f}"
             )
             columns = "left_out threshold:ratio purity:rate coverage:rate"
-            rows = [(o.family, o.threshold, o.purity, o.coverage) for o in self.held_out]
+            rows = [(t.family, t.threshold, t.purity, t.coverage) for t in self.held_out]
             parts.append(Table.make("held_out", head, columns, rows).text())
         conditions = dict.fromkeys(one.condition for one in self.sweep)
         names = [f"{part}_{name}:rate" for part in ("purity", "coverage") for name in conditions]
-        swept = [
-            (f"{cut:.2f}", *(one.purity for one in trials), *(one.coverage for one in trials))
-            for cut, found in groupby(self.sweep, key=lambda one: one.threshold)
-            for trials in [list(found)]
-        ]
+        swept = []
+        for threshold, group in groupby(self.sweep, key=lambda trial: trial.threshold):
+            trials = list(group)
+            shares = (*(t.purity for t in trials), *(t.coverage for t in trials))
+            swept.append((f"{threshold:.2f}", *shares))
         head = "Other thresholds, all families"
         parts.append(Table.make("sweep", head, " ".join(["threshold", *names]), swept).text())
         return "\n\n".join(parts)
@@ -110,12 +110,12 @@ class Calibration:
 def calibrate(
     measured: Sequence[Similarities], rule: Rule, thresholds: Sequence[float]
 ) -> Calibration:
-    """Fit a threshold, refit it without each family, and try others.
+    """Fit a threshold, refit it without each family, and grade other thresholds.
 
     Args:
-        measured: All buffers of a buffer set that hold frames of the lesson; one or more.
-        rule: The rule that the encoder goes by itself.
-        thresholds: What to try, ascending.
+        measured: All buffers of a buffer set that hold frames of the lesson; at least one.
+        rule: The encoder's default rule.
+        thresholds: Other thresholds, ascending.
     """
     threshold, high, low = _fit(measured)
     families = dict.fromkeys(one.episode_id.family for one in measured)
@@ -155,17 +155,17 @@ def _trial(
 def _fit(
     measured: Sequence[Similarities], without: str | None = None
 ) -> tuple[float, float, float]:
-    """Return the threshold of the released rule, and the two percentiles it lies between.
+    """Return the threshold of the released rule, and its two percentiles.
 
-    `without` is a family to leave out: its queries, and every session and cut of it elsewhere.
+    `without` is a family to leave out: its queries, and its sessions and cuts in other buffers.
     """
     kept = [one for one in measured if one.episode_id.family != without]
     cuts, lowest = _true_cosines(kept, without)
     if not cuts or not lowest:
         missing = "cut between sessions" if not cuts else "session of two frames or more"
         raise InvalidOptionError(
-            f"{len(kept)} buffers without any {missing}: nothing to fit a threshold to",
-            "Take a buffer set with conditions such as k3, and four families or more to leave one out.",
+            f"{len(kept)} buffers without any {missing}: no threshold can be fitted",
+            "Use a buffer set with conditions such as k3 and at least four families.",
         )
     high, low = float(np.percentile(cuts, 99)), float(np.percentile(lowest, 1))
     return round((high + low) / 2, _DIGITS), round(high, _DIGITS), round(low, _DIGITS)
@@ -174,10 +174,7 @@ def _fit(
 def _true_cosines(
     measured: Iterable[Similarities], without: str | None = None
 ) -> tuple[list[float], list[float]]:
-    """Return the cosines across true cuts, and the lowest inside each session, both ascending.
-
-    Each stored span counts once, and each cut between the same two.
-    """
+    """Return the cosines across true cuts, and the lowest inside each session, both ascending."""
     cuts: dict[Any, float] = {}
     lowest: dict[Any, float] = {}
     for one in measured:
@@ -185,18 +182,18 @@ def _true_cosines(
         for session in one.sessions:
             entry = session.entry
             stored = entry.dataset, entry.episode_index, entry.start, entry.stop, entry.repeat
-            here = None if session.family == without else stored
-            if before and here:
-                cuts[before, here] = float(one.adjacent[session.start - 1])
-            if here and len(session) > 1:
-                lowest[here] = float(one.adjacent[session.start : session.stop - 1].min())
-            before = here
+            current = None if session.family == without else stored
+            if before and current:
+                cuts[before, current] = float(one.adjacent[session.start - 1])
+            if current and len(session) > 1:
+                lowest[current] = float(one.adjacent[session.start : session.stop - 1].min())
+            before = current
     return sorted(cuts.values()), sorted(lowest.values())
 
 
 def sweep_steps(first: float, last: float) -> list[float]:
     """Return the thresholds from `first` to `last` (included) in steps of 0.01."""
     if not -1 <= first <= last <= 1:
-        expected = "two cosines, the lower one first, such as 0.80 0.99"
+        expected = "two cosines in ascending order, such as 0.80 0.99"
         raise InvalidOptionError.expected("sweep", (first, last), expected)
     return np.arange(first, last + 1e-6, 0.01).round(_DIGITS).tolist()

@@ -1,6 +1,7 @@
-"""Charts of many choices: `retrieval-score … --out` and `calibrate … --out`."""
+"""Charts of retrieval: `retrieval-score … --out` and `calibrate … --out`."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -11,69 +12,96 @@ from robomme_interference_data.viz.figure import GREY, INK, Hue, open_figure, sa
 from .calibrate import Calibration
 from .grade import ALL, PASS_MARK, Cell
 
-_COLOURS = (Hue.BLUE, Hue.VERMILION, Hue.GREEN, Hue.PINK, Hue.ORANGE, Hue.SKY, INK)
-_MARKERS = "osD^vPX"
+_COLORS = (INK, Hue.BLUE, Hue.VERMILION, Hue.GREEN, Hue.PINK, Hue.ORANGE, Hue.SKY)
+_MARKERS = "osD^vPXd*"
 _SHARES = ("purity", "coverage")
-_LINES = ("-", "--")
 
 
 def draw_cells(cells: Sequence[Cell], title: str, out: Path) -> None:
-    """Draw purity and coverage by condition: of one rule by family, or of several, all families."""
+    """Draw purity and coverage by condition: a line per family of one rule, or per rule."""
     rules = dict.fromkeys(cell.rule for cell in cells)
-    panels: dict[str, list[tuple[str, str, list[Cell]]]] = {}
-    if len(rules) == 1:
-        for family in dict.fromkeys([ALL, *(cell.family for cell in cells)]):
-            here = [cell for cell in cells if cell.family == family]
-            name = "All families" if family == ALL else family
-            panels[name] = [(share, share, here) for share in _SHARES]
-        wide, width, height = min(5, len(panels)), 2.0, 1.9
-    else:
-        every = {rule: [c for c in cells if (c.rule, c.family) == (rule, ALL)] for rule in rules}
-        for share in _SHARES:
-            panels[f"{share}, all families"] = [(rule, share, every[rule]) for rule in rules]
-        wide, width, height = 2, 4.2, 3.0
-    high = -(-len(panels) // wide)
+    lines: dict[str, list[Cell]] = {}
+    for cell in sorted(cells, key=lambda one: one.family != ALL):
+        if len(rules) == 1:
+            label = "all families" if cell.family == ALL else cell.family
+            lines.setdefault(label, []).append(cell)
+        elif cell.family == ALL:
+            lines.setdefault(cell.rule, []).append(cell)
     names = [one.name for one in in_order({cell.condition for cell in cells})]
-    with open_figure() as figure:
-        figure.set_size_inches(max(5.0, width * wide), 1.2 + height * high)
-        grid = figure.subplots(high, wide, sharex=True, sharey=True, squeeze=False)
-        for axes in grid.flat[len(panels) :]:
-            axes.set_axis_off()
-        for axes, (name, lines) in zip(grid.flat, panels.items(), strict=False):
-            most = max(cell.queries for *_, here in lines for cell in here)
-            axes.set_title(f"{name} (n = {most})", size=8, color=INK)
-            for number, (label, share, here) in enumerate(lines):
-                shift = 0.08 * (number - (len(lines) - 1) / 2)
-                places = {name: place + shift for place, name in enumerate(names)}
-                _line(axes, here, share, label, number, places)
+    with _two_panels(title, out) as panels:
+        for axes, share in zip(panels, _SHARES, strict=True):
+            for number, (label, line) in enumerate(lines.items()):
+                shift = 0.06 * (number - (len(lines) - 1) / 2)
+                positions = {name: at + shift for at, name in enumerate(names)}
+                _draw_line(axes, line, share, f"{label} (n = {line[0].queries})", number, positions)
             axes.set_xticks(range(len(names)), names)
+            axes.set_ylabel(f"{share}, %", size=8, color=INK)
             _percent(axes)
-        for axes in grid[:, 0]:
-            axes.set_ylabel("%", size=8, color=INK)
+        handles, labels = panels[0].get_legend_handles_labels()
+        unique = dict(zip(labels, handles, strict=True))
+        panels[1].legend(
+            unique.values(), unique, loc="upper left", bbox_to_anchor=(1, 1), frameon=False,
+            fontsize=7,
+        )  # fmt: skip
+
+
+def draw_calibration(found: Calibration, title: str, out: Path) -> None:
+    """Draw the cosines that the released rule separates, and other thresholds."""
+    with _two_panels(title, out) as (left, right):
+        for label, values, color in (
+            ("across true cuts", found.cuts, INK),
+            ("lowest inside a session", found.lowest, Hue.VERMILION),
+        ):
+            shares = [100 * (n + 1) / len(values) for n in range(len(values))]
+            name = f"{label} (n = {len(values)})"
+            left.step(values, shares, where="post", color=color, linewidth=1.5, label=name)
+        for label, value, color in (
+            ("fitted", found.threshold, Hue.BLUE),
+            ("in use", found.in_use, GREY),
+        ):
+            name = f"{label}: {value:.3f}"
+            left.axvline(value, color=color, linewidth=1.1, linestyle="-.", label=name)
+        left.set_xlabel("cosine of adjacent frames", size=8, color=INK)
+        left.set_ylabel("share at or below, %", size=8, color=INK)
+        last = found.sweep[-1].condition
+        trials = [trial for trial in found.sweep if trial.condition == last]
+        for share, color in zip(_SHARES, (Hue.BLUE, Hue.VERMILION), strict=True):
+            means = [100 * getattr(trial, share) for trial in trials]
+            right.plot([trial.threshold for trial in trials], means, color=color, label=share)
+        right.set_xlabel(f"threshold, under {last}", size=8, color=INK)
+        right.set_ylabel("mean over queries, %", size=8, color=INK)
+        _percent(right)
+        for axes in (left, right):
+            tidy(axes)
+            axes.legend(edgecolor="none", fontsize=7)
+
+
+@contextmanager
+def _two_panels(title: str, out: Path) -> Iterator[Any]:
+    """Give two axes side by side, of a figure that is then written."""
+    with open_figure() as figure:
+        figure.set_size_inches(9, 3.7)
+        yield figure.subplots(1, 2)
         figure.suptitle(title, x=0.01, ha="left", size=10, color=INK)
-        figure.tight_layout(rect=(0, 0.18 / high, 1, 0.98))
-        handles, labels = grid.flat[0].get_legend_handles_labels()
-        named = dict(zip(labels, handles, strict=True))
-        look = {"loc": "lower center", "ncols": min(4, len(named)), "frameon": False}
-        figure.legend(list(named.values()), list(named), fontsize=8, **look)
+        figure.tight_layout(rect=(0, 0, 1, 0.98))
         save_figure(figure, out)
 
 
-def _line(
-    axes: Any, cells: Sequence[Cell], share: str, label: str, number: int, places: dict[str, float]
+def _draw_line(
+    axes: Any, cells: Sequence[Cell], share: str, label: str, number: int, at: dict[str, float]
 ) -> None:
-    """Draw a share by condition; conditions of different kinds are not joined."""
-    colour, line = _COLOURS[number % len(_COLOURS)], _LINES[number % 2]
-    style = {"color": colour, "marker": _MARKERS[number % len(_MARKERS)], "markersize": 4}
+    """Draw a share by condition with intervals; conditions of different kinds are not joined."""
+    color = _COLORS[number % len(_COLORS)]
     for _, group in groupby(cells, key=lambda cell: parse_condition(cell.condition).kind):
-        found = list(group)
-        values = [100 * getattr(cell, share) for cell in found]
-        x = [places[cell.condition] for cell in found]
-        axes.plot(x, values, linewidth=1.4, linestyle=line, label=label, **style)
-        for place, cell in zip(x, found, strict=True):
+        joined = list(group)
+        x = [at[cell.condition] for cell in joined]
+        values = [100 * getattr(cell, share) for cell in joined]
+        marker = _MARKERS[number % len(_MARKERS)]
+        axes.plot(x, values, color=color, marker=marker, markersize=4, linewidth=1.2, label=label)
+        for position, cell in zip(x, joined, strict=True):
             low, high = getattr(cell, f"{share}_low"), getattr(cell, f"{share}_high")
             if low is not None:
-                axes.plot((place, place), (100 * low, 100 * high), color=colour, linewidth=1)
+                axes.vlines(position, 100 * low, 100 * high, color=color, linewidth=1)
 
 
 def _percent(axes: Any) -> None:
@@ -81,71 +109,3 @@ def _percent(axes: Any) -> None:
     axes.axhline(100 * PASS_MARK, color=GREY, linewidth=0.9, linestyle=":", zorder=0, label=label)
     axes.set_ylim(-4, 104)
     tidy(axes)
-
-
-def draw_calibration(found: Calibration, title: str, out: Path) -> None:
-    """Draw what the released rule separates, and what other thresholds would give."""
-    with open_figure() as figure:
-        figure.set_size_inches(8.5, 3.7)
-        left, right = figure.subplots(1, 2)
-        _distributions(left, found)
-        _sweep(right, found)
-        for axes in (left, right):
-            limits = axes.get_xlim()
-            for value, colour, name in (
-                (found.threshold, _COLOURS[0], "fitted"),
-                (found.in_use, GREY, "in use"),
-            ):
-                if axes is left or limits[0] <= value <= limits[1]:
-                    label = f"{name}: {value:.3f}"
-                    axes.axvline(value, color=colour, linewidth=1.1, linestyle="-.", label=label)
-            axes.legend(
-                framealpha=1,  # it hides the vertical lines behind it
-                edgecolor="none",
-                fontsize=7,
-                loc="upper left" if axes is left else "lower left",
-            )
-        figure.suptitle(title, x=0.01, ha="left", size=10, color=INK)
-        figure.tight_layout(rect=(0, 0, 1, 0.98))
-        save_figure(figure, out)
-
-
-def _distributions(axes: Any, found: Calibration) -> None:
-    for name, values, colour in (
-        ("across true cuts", found.cuts, INK),
-        ("lowest inside a session", found.lowest, _COLOURS[1]),
-    ):
-        shares = [100 * (n + 1) / len(values) for n in range(len(values))]
-        label = f"{name} (n = {len(values)})"
-        axes.step(values, shares, where="post", color=colour, linewidth=1.5, label=label)
-    between = sorted((found.cut_percentile, found.lowest_percentile))
-    axes.axvspan(*between, color="#eeeeee", zorder=0, label="between the percentiles")
-    if fitted := [one.threshold for one in found.held_out]:
-        middle = [50] * len(fitted)
-        label = "without one family"
-        axes.plot(fitted, middle, "|", color=_COLOURS[0], markersize=9, label=label)
-    axes.set_xlabel("cosine of adjacent frames", size=8, color=INK)
-    axes.set_ylabel("share at or below, %", size=8, color=INK)
-    tidy(axes)
-
-
-def _sweep(axes: Any, found: Calibration) -> None:
-    for number, share in enumerate(_SHARES):
-        for name in dict.fromkeys(trial.condition for trial in found.sweep):
-            here = [trial for trial in found.sweep if trial.condition == name]
-            last = name == found.sweep[-1].condition
-            axes.plot(
-                [trial.threshold for trial in here],
-                [100 * getattr(trial, share) for trial in here],
-                color=_COLOURS[number],
-                linestyle=_LINES[number],
-                linewidth=1.6 if last else 0.6,
-                alpha=1 if last else 0.5,
-                marker=_MARKERS[number] if last and len(here) <= 30 else None,
-                markersize=3,
-                label=f"{share} under {name}" if last else None,
-            )
-    axes.set_xlim(found.sweep[0].threshold - 0.01, found.sweep[-1].threshold + 0.01)
-    axes.set_xlabel("threshold (thin lines: the other conditions)", size=8, color=INK)
-    axes.set_ylabel("mean over queries, %", size=8, color=INK)
-    _percent(axes)

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -27,19 +28,45 @@ from robomme_interference_data.cli.options import (
 from robomme_interference_data.constants import IDENTITY_PATH, MANIFEST_PATH
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.runtime.executor import Serial, WorkersConfig, make_executor
+from robomme_interference_data.schema.settings import setting
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
 
 if TYPE_CHECKING:
     from .select import Similarities
 
-EncoderName = Annotated[
-    str,
-    typer.Option(
-        help="thumbnail (no weights), siglip (the paper's model), or siglip:ID with the id or "
-        "folder of another SigLIP or SigLIP 2 model."
-    ),
-]
-Camera = Annotated[str, typer.Option(help="Camera whose frames are compared.")]
+_RETRIEVAL = "Retrieval"
+_EXECUTION = "Execution"
+
+_ENCODER_HELP = (
+    "thumbnail (no weights), siglip (the paper's model), or siglip:ID with the id or folder of "
+    "another SigLIP or SigLIP 2 model."
+)
+_CAMERA_HELP = "Camera whose frames are compared."
+
+EncoderName = Annotated[str, typer.Option(help=_ENCODER_HELP, rich_help_panel=_RETRIEVAL)]
+Camera = Annotated[str, typer.Option(help=_CAMERA_HELP, rich_help_panel=_RETRIEVAL)]
+Shift = Annotated[str, typer.Option(help=SHIFT_HELP, rich_help_panel=_RETRIEVAL)]
+
+
+@dataclass(frozen=True)
+class IndexConfig:
+    """The settings of `index`."""
+
+    encoder: str = setting("thumbnail", help=_ENCODER_HELP, group=_RETRIEVAL)
+    camera: str = setting("front", help="Camera to embed.", group=_RETRIEVAL)
+    force: bool = setting(False, help="Build the index again.", group=_RETRIEVAL)
+    device: str | None = setting(
+        None,
+        help="Device of siglip, such as cuda.",
+        shown="a GPU if there is one",
+        group=_EXECUTION,
+    )
+    batch: int | None = setting(
+        None, help="Images per batch.", shown="the encoder's default", group=_EXECUTION
+    )
+    threads: int | None = setting(
+        None, help="Threads that decode.", shown="all processors", group=_EXECUTION
+    )
 
 
 @with_settings
@@ -47,28 +74,14 @@ def index(
     buffer_set: Annotated[
         Path, typer.Argument(help="Folder of a buffer set, or of one of its datasets.")
     ],
-    encoder: EncoderName = "thumbnail",
-    camera: Camera = "front",
-    device: Annotated[
-        str | None,
-        typer.Option(help="Where siglip computes.", show_default="a GPU if there is one"),
-    ] = None,
-    batch: Annotated[
-        int | None, typer.Option(help="Images at a time.", show_default="what suits the encoder")
-    ] = None,
-    threads: Annotated[
-        int | None, typer.Option(help="Threads that decode.", show_default="all processors")
-    ] = None,
-    *,
+    config: IndexConfig,
     workers: WorkersConfig,
-    force: Annotated[bool, typer.Option("--force", help="Make it again from nothing.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Embed every stored frame once, and keep the embeddings beside the data.
+    """Embed every stored frame, and store the embeddings beside the data.
 
-    Goes on where an interrupted run stopped. An index that is there and right is kept, even if
-    another device computed it. Where datasets of the buffer set lie on the Hub, it looks whether they
-    have embeddings there.
+    An interrupted run resumes, and a valid index is kept, whichever device computed it. For
+    datasets on the Hub, the command checks whether they have embeddings there.
 
     Examples:
     ```
@@ -83,38 +96,39 @@ def index(
     from .encoders import make_encoder
     from .index import build_index, look_on_hub
 
-    places = [buffer_set / IDENTITY_PATH, *sorted(buffer_set.glob(f"*/{IDENTITY_PATH}"))]
-    roots = [path.parent.parent for path in places if path.is_file()]
+    paths = [buffer_set / IDENTITY_PATH, *sorted(buffer_set.glob(f"*/{IDENTITY_PATH}"))]
+    roots = [path.parent.parent for path in paths if path.is_file()]
     if not roots:
         raise MissingFileError(
             f"{buffer_set} is neither a buffer set nor a dataset of this package",
-            f"Make one: robomme-interference build all {buffer_set} --source KIND:PATH",
+            f"Build one: robomme-interference build all {buffer_set} --source KIND:PATH",
         )
     planned = load_buffer_set(buffer_set) if (buffer_set / MANIFEST_PATH).is_file() else None
-    made = make_encoder(encoder, device=device, batch=batch)
+    image_encoder = make_encoder(config.encoder, device=config.device, batch=config.batch)
     with graceful_interrupt("Finished episodes are kept"), WorkProgress(quiet=as_json) as progress:
         reports = build_index(
             roots,
-            made,
+            image_encoder,
             progress,
-            camera=camera,
-            threads=(os.cpu_count() or 1) if threads is None else threads,
-            force=force,
+            camera=config.camera,
+            threads=(os.cpu_count() or 1) if config.threads is None else config.threads,
+            force=config.force,
             executor=Serial() if workers == WorkersConfig() else make_executor(workers),
         )
-    for told in look_on_hub(planned, made, camera) if planned else ():
-        print_status(told)
+    for message in look_on_hub(planned, image_encoder, config.camera) if planned else ():
+        print_status(message)
     if as_json:
         print_json([to_dict(report) for report in reports])
         return
-    wanted = {"in": made.computed_in, "batch": made.batch}
+    current = {"in": image_encoder.computed_in, "batch": image_encoder.batch}
     for report in reports:
-        frames, found = report.header.frames, report.header.computed
+        frames, recorded = report.header.frames, report.header.computed
         echo(f"{report.folder}: {frames} frames, {report.embedded} embedded now")
-        if found != wanted:
+        if recorded != current:
             print_status(
-                f"{report.folder} is kept, computed with {found['in']}, {found['batch']} images at "
-                f"a time; --force makes it again with {wanted['in']}, {wanted['batch']} at a time"
+                f"{report.folder} is kept, computed with {recorded['in']}, batch "
+                f"{recorded['batch']}; --force builds it again with {current['in']}, batch "
+                f"{current['batch']}"
             )
 
 
@@ -123,20 +137,21 @@ def retrieve(
     episode: QueryName,
     condition: ConditionName,
     encoder: EncoderName = "thumbnail",
-    rule: Annotated[str, typer.Option(help="RULE, as for retrieval-score.")] = "max",
+    rule: Annotated[
+        str, typer.Option(help="RULE, as in retrieval-score.", rich_help_panel=_RETRIEVAL)
+    ] = "max",
     camera: Camera = "front",
-    shift: Annotated[str, typer.Option(help=SHIFT_HELP)] = NO_SHIFT,
+    shift: Shift = NO_SHIFT,
     out: Picture = None,
     as_json: AsJson = False,
 ) -> None:
-    """Tell which part of a history goes with the stored first live observation, and why.
+    """Show which part of a history retrieval chooses for the first live observation, and why.
 
-    Needs the index of the encoder, not its weights.
+    This needs the index of the encoder, but not its weights.
 
     Examples:
     ```
     robomme-interference retrieve my-buffers MoveCube/test/0 k7 --out why.png
-    robomme-interference retrieve my-buffers MoveCube/test/0 k7 --rule mean/0.9
     robomme-interference retrieve my-buffers MoveCube/test/0 k7 --rule joined --shift light:2
     ```
     """
@@ -154,15 +169,15 @@ def retrieve(
     query = live_embedding(opened, buffer, under, name, camera)
     measured = select.measure(buffer, name, camera, query)
     choice = select.choose(measured, parsed)
-    found = explain.explain(buffer, measured, choice, parsed, name, camera)
+    explanation = explain.explain(buffer, measured, choice, parsed, name, camera)
     if out is not None:
         live = live_frame(opened, buffer, under, camera)
-        drawing.draw_retrieval(buffer, measured, choice, found, live, out)
+        drawing.draw_retrieval(buffer, measured, choice, explanation, live, out)
         print_status(f"{out} written")
     if as_json:
-        print_json(to_dict(found))
+        print_json(to_dict(explanation))
     else:
-        echo(found.text())
+        echo(explanation.text())
 
 
 def retrieval_score(
@@ -171,23 +186,24 @@ def retrieval_score(
     rules: Annotated[
         list[str],
         typer.Option(
-            help="How to choose: METHOD or METHOD/CUT, several for comparison, or all. METHOD is "
-            "max (released rule), latest, joined, mean, last, random, top32 or oracle; CUT a "
-            "cosine or adaptive, left out for the encoder's own.",
+            help="Rules METHOD or METHOD/CUT, or all. METHOD is max (released rule), latest, "
+            "joined, mean, last, random, top32 or oracle; CUT is a cosine or adaptive, by default "
+            "the one published for the encoder.",
             metavar="RULE,…",
+            rich_help_panel=_RETRIEVAL,
         ),
     ] = ["max"],  # noqa: B006 - typer copies it
     families: Families = [],  # noqa: B006
     conditions: Conditions = [],  # noqa: B006
     camera: Camera = "front",
-    shift: Annotated[str, typer.Option(help=SHIFT_HELP)] = NO_SHIFT,
+    shift: Shift = NO_SHIFT,
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder for cells.csv, rows.csv (each query) and retrieval.png."),
+        typer.Option(help="Folder for cells.csv, rows.csv (one row per query) and retrieval.png."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Grade retrieval on every buffer of a buffer set that holds a lesson, without a simulator.
+    """Grade retrieval on every buffer with a lesson, without a simulator.
 
     Examples:
     ```
@@ -204,21 +220,21 @@ def retrieval_score(
 
     check_output(out)
     name = encoders.encoder_name(encoder)
-    wanted = select.parse_rules(rules, encoders.published_threshold(name))
+    parsed = select.parse_rules(rules, encoders.published_threshold(name))
     about, measured = _measured(buffer_set, name, camera, shift, families, conditions, as_json)
-    grades = [grade.grade(one, rule) for rule in wanted for one in measured]
+    grades = [grade.grade(one, rule) for rule in parsed for one in measured]
     cells = list(grade.cells(grades))
     title = f"Retrieval on {about['buffer_set']}, encoder {name}, camera {camera}"
     title += "" if shift == NO_SHIFT else f", shift {shift}"
-    if len(wanted) == 1:
-        title += f", rule {wanted[0]}"
+    if len(parsed) == 1:
+        title += f", rule {parsed[0]}"
     if out is not None:
         write_text(out / "cells.csv", Table.of(grade.Cell, cells, "cells", title).csv())
         write_text(out / "rows.csv", Table.of(grade.Grade, grades, "rows", title).csv())
         charts.draw_cells(cells, title, out / "retrieval.png")
         print_status(f"{out / 'cells.csv'}, rows.csv and retrieval.png written")
     if as_json:
-        about |= {"rules": list(map(str, wanted)), "pass_mark": grade.PASS_MARK}
+        about |= {"rules": list(map(str, parsed)), "pass_mark": grade.PASS_MARK}
         print_json(about | {"cells": [to_dict(cell) for cell in cells]})
     else:
         echo(f"{grade.cell_table(cells, title).text()}\n\n{grade.verdict(cells)}.")
@@ -229,7 +245,9 @@ def calibrate(
     encoder: EncoderName = "thumbnail",
     sweep: Annotated[
         tuple[float, float],
-        typer.Option(help="First and last threshold to try, in steps of 0.01."),
+        typer.Option(
+            help="First and last threshold to grade, in steps of 0.01.", rich_help_panel=_RETRIEVAL
+        ),
     ] = (0.80, 0.99),
     families: Families = [],  # noqa: B006
     conditions: Conditions = [],  # noqa: B006
@@ -237,10 +255,10 @@ def calibrate(
     out: Picture = None,
     as_json: AsJson = False,
 ) -> None:
-    """Fit the cosine below which histories are cut, and show what others would give.
+    """Fit the cosine below which histories are cut, and grade other thresholds.
 
-    The released rule: midway between the 99th percentile of the cosines across true cuts and the
-    1st percentile of the lowest cosine inside each session, every stored span once.
+    The released rule takes the middle between the 99th percentile of the cosines across true cuts
+    and the 1st percentile of the lowest cosine inside each session.
 
     Examples:
     ```
@@ -258,15 +276,15 @@ def calibrate(
     thresholds = fitting.sweep_steps(*sweep)
     about, measured = _measured(buffer_set, name, camera, NO_SHIFT, families, conditions, as_json)
     rule = select.Rule.parse("max", encoders.published_threshold(name))
-    found = fitting.calibrate(measured, rule, thresholds)
+    calibration = fitting.calibrate(measured, rule, thresholds)
     title = f"Threshold of {name}, camera {camera}, on {about['buffer_set']}"
     if out is not None:
-        charts.draw_calibration(found, title, out)
+        charts.draw_calibration(calibration, title, out)
         print_status(f"{out} written")
     if as_json:
-        print_json(about | to_dict(found))
+        print_json(about | to_dict(calibration))
     else:
-        echo(found.text(title))
+        echo(calibration.text(title))
 
 
 def _measured(
@@ -278,7 +296,7 @@ def _measured(
     conditions: Sequence[str],
     quiet: bool,
 ) -> tuple[dict[str, Any], list["Similarities"]]:
-    """Measure all wanted buffers that hold frames of the lesson; tell what they are of."""
+    """Return what the buffers belong to, and the similarities of each with frames of the lesson."""
     from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.data.views import live_embedding
     from robomme_interference_data.runtime.progress import WorkProgress
@@ -286,12 +304,12 @@ def _measured(
     from .select import measure
 
     under, opened = parse_shift(shift), load_buffer_set(buffer_set)
-    wanted: dict[str, Any] = {"family": families, "condition": conditions}
-    total = sum(1 for _ in opened.manifests(**wanted))
+    selected: dict[str, Any] = {"family": families, "condition": conditions}
+    total = sum(1 for _ in opened.manifests(**selected))
     measured = []
     with WorkProgress(unit="buffers", quiet=quiet) as progress:
         progress.start(encoder, total)
-        for buffer in opened.buffers(**wanted):
+        for buffer in opened.buffers(**selected):
             if buffer.manifest.lesson_frames:
                 query = live_embedding(opened, buffer, under, encoder, camera)
                 measured.append(measure(buffer, encoder, camera, query))
@@ -299,7 +317,7 @@ def _measured(
     left_out = total - len(measured)
     if not measured:
         raise InvalidOptionError(
-            f"none of the {left_out} buffers of {buffer_set} holds a lesson: there is nothing to grade",
+            f"none of the {left_out} buffers of {buffer_set} holds a lesson, which grading needs",
             command=opened.planning("k0", "k3"),
         )
     if left_out and not quiet:

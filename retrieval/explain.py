@@ -1,4 +1,4 @@
-"""Why a part of a history was chosen: as data, and in a few lines."""
+"""Explain why a part of a history was chosen, as data and as text."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,14 +20,14 @@ class Explanation:
     Attributes:
         encoder: Name of the encoder.
         camera: Camera whose frames were compared.
-        grade: The choice, compared with the true lesson.
-        chosen: First frame of each run of chosen frames, and the one after its last.
-        score: The highest score of a chosen segment, or None if the rule scores none.
-        sessions: Role and source of each session that the chosen part touches, in order.
-        closest, cosine: Chosen frame closest to what the robot sees, and its cosine.
-        other, other_cosine, other_source: Frame closest to it outside the chosen part, its cosine
-            and episode; None if all was chosen.
-        lesson: First frame of each part of the true lesson, and the one after its last.
+        grade: The grade of the choice against the true lesson.
+        chosen: Runs of chosen frames: first frame, and the frame after the last.
+        score: The highest score of a chosen segment; None if the rule has no scores.
+        sessions: Role and source of each session with a chosen frame, in order.
+        closest, cosine: The chosen frame closest to the live image, and its cosine.
+        other, other_cosine, other_source: The closest frame that was not chosen, its cosine and
+            episode; None if all were chosen.
+        lesson: Parts of the true lesson: first frame, and the frame after the last.
     """
 
     encoder: str
@@ -44,14 +44,14 @@ class Explanation:
     lesson: tuple[Span, ...]
 
     def text(self) -> str:
-        """Say it in a few lines."""
+        """Return the explanation in a few lines."""
         one, method = self.grade, self.grade.rule.partition("/")[0]
         score = "" if self.score is None else f", {self.score:.3f}"
         parts = f"{one.segments} segment{'s' if one.segments > 1 else ''}"
-        outside = "nothing lies outside"
+        outside = "all frames are chosen"
         if self.other is not None:
             source = f"frame {self.other} of {self.other_source}"
-            outside = f"the closest one outside is {source}, {self.other_cosine:.3f}"
+            outside = f"the closest other frame is {source}, {self.other_cosine:.3f}"
         lesson = frames_text(self.lesson)
         lines = (
             f"{one.episode_id} under {one.condition}, {self.camera} camera, rule {one.rule}: "
@@ -59,14 +59,14 @@ class Explanation:
             f"adjacent frames is below {one.threshold:.3f}",
             f"Chosen: frames {frames_text(self.chosen)}, of {', '.join(self.sessions)}",
             f"Why: {method} takes {METHODS[method]}{score}",
-            f"What the robot sees now is closest to frame {self.closest} of these, with cosine "
+            f"The live image is closest to frame {self.closest} of these, with cosine "
             f"{self.cosine:.3f}; {outside}",
             f"The lesson is frames {lesson}: {self.graded()}" if lesson else self.graded(),
         )
         return "\n".join(lines)
 
     def graded(self) -> str:
-        """Say how the choice compares with the true lesson."""
+        """Return purity and coverage of the choice, in words."""
         one = self.grade
         if one.coverage is None:
             return "the history holds no lesson"
@@ -75,7 +75,7 @@ class Explanation:
 
 
 def frames_text(spans: Sequence[Span]) -> str:
-    """Name spans by their first and last frames, three of them at most."""
+    """Return the first and last frames of spans, of three at most."""
     parts = [f"{start} to {stop - 1}" for start, stop in spans[:3]]
     return " and ".join(parts) + f" and {len(spans) - 3} more parts" * (len(spans) > 3)
 
@@ -83,7 +83,7 @@ def frames_text(spans: Sequence[Span]) -> str:
 def explain(
     buffer: Buffer, measured: Similarities, choice: Choice, rule: Rule, encoder: str, camera: str
 ) -> Explanation:
-    """Collect why frames were chosen."""
+    """Explain a choice."""
     alike, frames = measured.alike, choice.frames
     closest = int(frames[np.argmax(alike[frames])])
     outside = np.setdiff1d(np.arange(len(alike)), frames)

@@ -1,6 +1,6 @@
-"""Grade what was chosen against the true sessions, without a simulator: pure.
+"""Grade choices against the true sessions, without a simulator and without IO.
 
-A cell is a family under one condition; it is good when mean purity and mean coverage are both at
+A cell is a family under one condition; it passes if mean purity and mean coverage are both at
 least `PASS_MARK` (released reference).
 """
 
@@ -22,10 +22,10 @@ from robomme_interference_data.viz.tables import Table, percent
 from .select import Rule, Similarities, choose
 
 PASS_MARK = 0.9
-"""Least mean purity and mean coverage of a good cell (released reference)."""
+"""Minimum mean purity and mean coverage of a cell that passes (released reference)."""
 
 ALL = "all"
-"""Stands for all families together."""
+"""Name of all families together."""
 
 
 @dataclass(frozen=True)
@@ -33,23 +33,23 @@ class Grade:
     """How well one rule chose for one buffer.
 
     Attributes:
-        rule: The rule, its cut named.
+        rule: The rule with its cut.
         threshold: Cosine below which it cut.
         episode_id: The query episode.
         condition: Name of the condition.
         history_frames: Frames of the history.
-        segments: Segments that it was cut into.
+        segments: Number of segments.
         start: First chosen frame.
         stop: Frame after the last chosen one.
-        chosen_frames: How many were chosen; fewer than `stop - start` for single frames.
+        chosen_frames: Number of chosen frames; there may be gaps.
         hit: Whether any frame of the lesson was chosen.
-        purity: Share of the chosen frames that are of the lesson, in however many parts.
-        coverage: Share of the lesson's frames that were chosen; None where there are none.
-        evidence_kept: Share of the lesson's evidence spans of which a frame was chosen; None where
+        purity: Share of the chosen frames that belong to the lesson.
+        coverage: Share of the lesson's frames that were chosen; None without a lesson.
+        evidence_kept: Share of the lesson's evidence spans of which a frame was chosen; None if
             there are none, or none are known.
-        false_sessions: Sessions that are no lesson of which a frame was chosen.
+        false_sessions: Sessions other than the lesson of which a frame was chosen.
         true_cuts: Borders between true sessions.
-        found_cuts: How many of them are borders of segments.
+        found_cuts: Number of them that are borders of segments.
         false_cuts: Borders of segments inside a true session.
     """
 
@@ -77,15 +77,15 @@ class Cell:
     """How well one rule chose for all queries of a family under one condition.
 
     Shares and means have 95% intervals, from `…_low` to `…_high`: Wilson's for `hit`, BCa bootstrap
-    over episodes for the others, None for a single episode. `evidence_kept` is of the
-    queries of which it is known, None if of none.
+    over episodes for the others, None for a single episode. `evidence_kept` is a mean over the
+    queries for which it is known, None if there are none.
 
     Attributes:
         family: A family, or `ALL`.
-        queries: Query episodes.
+        queries: Number of query episodes.
         hit: Share of them with a frame of the lesson chosen.
-        purity, coverage, evidence_kept, false_sessions: Means of what `Grade` has.
-        true_cuts, found_cuts, false_cuts: Sums of what `Grade` has.
+        purity, coverage, evidence_kept, false_sessions: Means over the grades.
+        true_cuts, found_cuts, false_cuts: Sums over the grades.
         passed: Whether mean purity and mean coverage reach the pass mark.
     """
 
@@ -115,7 +115,7 @@ class Cell:
 
 
 def grade(measured: Similarities, rule: Rule) -> Grade:
-    """Choose by a rule, and compare with the true sessions."""
+    """Choose by a rule, and grade the choice against the true sessions."""
     choice = choose(measured, rule)
     frames, sessions = choice.frames, measured.sessions
     lesson = sum(b - a for a, b in measured.lesson)
@@ -145,10 +145,9 @@ def grade(measured: Similarities, rule: Rule) -> Grade:
 
 
 def cells(grades: Sequence[Grade]) -> Iterator[Cell]:
-    """Yield the cells of grades: by rule, then by family and last all together, then by condition.
+    """Yield cells by rule, family (all families last) and condition.
 
-    Rules and families keep the order in which they first occur. The grades are of buffers that
-    hold frames of the lesson.
+    The grades are of buffers that hold frames of the lesson; rules and families keep their order.
     """
     groups: dict[tuple[str, str, str], list[Grade]] = {}
     for one in grades:
@@ -166,7 +165,7 @@ def _cell(rule: str, family: str, condition: str, grades: Sequence[Grade]) -> Ce
     count, hits = len(grades), sum(one.hit for one in grades)
     means = [(g.purity, g.coverage, g.evidence_kept, g.false_sessions) for g in grades]
     values = np.array(means, float)  # NaN for None
-    # One key: equal values have equal intervals, whatever the rule, family and condition.
+    # One key for all cells: equal values have equal intervals.
     drawn = bootstrap(values, "retrieval")
     bounds = (None if math.isnan(number) else number for one in drawn for number in one)
     cuts = np.sum([(g.true_cuts, g.found_cuts, g.false_cuts) for g in grades], axis=0).tolist()
@@ -178,27 +177,27 @@ def _cell(rule: str, family: str, condition: str, grades: Sequence[Grade]) -> Ce
 # --- in words ----------------------------------------------------------------------------------
 
 _NOTE = (
-    "hit: queries for which any lesson frame was chosen, with the 95% Wilson interval. Means over "
-    "queries with 95% BCa bootstrap intervals (none for a single query): purity, the share of the "
-    "chosen frames that are lesson; coverage, the share of the lesson that was chosen; evidence "
-    "kept, the share of the spans that show the answer of which a frame was chosen; false "
-    "sessions, how many others were touched. cuts found: of all cuts between true sessions, in all "
-    "queries together; false cuts: those inside one. pass: mean purity and mean coverage are both "
-    f"at least {PASS_MARK:.0%}."
+    "hit: share of queries with a chosen lesson frame, with the 95% Wilson interval. Means over "
+    "queries with 95% BCa bootstrap intervals (none for a single query): purity, the share of "
+    "chosen frames that belong to the lesson; coverage, the share of the lesson that was chosen; "
+    "evidence kept, the share of evidence spans with a chosen frame; false sessions, the number of "
+    "other sessions with a chosen frame. Sums over queries: cuts found, of all cuts between true "
+    "sessions; false cuts, inside a true session. pass: mean purity and mean coverage are both at "
+    f"least {PASS_MARK:.0%}."
 )
 
 
 def verdict(cells: Sequence[Cell]) -> str:
-    """Say for each rule how many cells of a family and a condition pass."""
+    """Return for each rule how many cells of a family and a condition pass."""
     parts = []
     for rule in dict.fromkeys(cell.rule for cell in cells):
-        here = [cell for cell in cells if cell.rule == rule and cell.family != ALL]
-        parts.append(f"{rule}: {sum(cell.passed for cell in here)} of {len(here)}")
+        passed = [cell.passed for cell in cells if cell.rule == rule and cell.family != ALL]
+        parts.append(f"{rule}: {sum(passed)} of {len(passed)}")
     return "Cells of a family and a condition that pass: " + ", ".join(parts)
 
 
 def cell_table(cells: Sequence[Cell], title: str) -> Table:
-    """Return the table for the terminal: one rule by family, or several rules, by condition."""
+    """Return a table by condition: of one rule by family, or of several rules."""
     several = len({cell.rule for cell in cells}) > 1
     columns = (
         f"{'rule' if several else 'family'} condition queries:count hit purity coverage "

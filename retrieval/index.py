@@ -1,7 +1,7 @@
-"""Make the index of a dataset: embed every stored frame of a camera, and keep it beside the data.
+"""Build the index of a dataset: embed every stored frame of a camera, and store it beside the data.
 
-It is made in a hidden folder beside its place, an episode at a time, so that an interrupted run
-goes on from there. The index gets its name when it is whole.
+The index is built in a hidden folder, one episode at a time, so that an interrupted run resumes
+there. It is renamed when it is complete.
 """
 
 from collections import deque
@@ -67,12 +67,12 @@ from .segment import typical_cosine
 
 @dataclass(frozen=True)
 class IndexReport:
-    """What was done for one dataset.
+    """The index of one dataset.
 
     Attributes:
-        folder: Where the index lies.
-        embedded: Frames that were embedded now; the others were there already.
-        header: What it is.
+        folder: Folder of the index.
+        embedded: Number of frames that this run embedded.
+        header: Header of the index.
     """
 
     folder: str
@@ -90,48 +90,42 @@ def build_index(
     force: bool = False,
     executor: Executor | None = None,
 ) -> list[IndexReport]:
-    """Embed every stored frame of datasets, each by itself.
+    """Embed every stored frame of datasets, one index per dataset.
 
-    An index depends on its dataset, the encoder and the camera alone. The same data, encoder,
-    device and batch give the same bytes, interrupted or not. An index that is there and right is
-    left as it is, on whatever device it was computed.
+    An index depends on its dataset, the encoder and the camera only. The same data, encoder,
+    device and batch give the same bytes, interrupted or not. A valid index is kept, whichever
+    device computed it.
 
     Args:
         roots: Folders of the datasets.
-        encoder: What embeds.
-        progress: Shows how far it is.
+        encoder: The encoder.
+        progress: Shows the progress.
         camera: Camera to embed, with or without `observation.images.`.
-        threads: Threads that decode and preprocess beside the encoder.
-        force: Make all of it again.
-        executor: Who embeds the episodes; None for this process.
+        threads: Threads that decode and preprocess.
+        force: Build all of it again.
+        executor: Runs the episodes; None for this process.
     """
     if threads < 1:
         raise InvalidOptionError.expected("threads", threads, "1 or more")
-    works = [_Work(root, encoder, camera) for root in roots]
-    with ExitStack() as held:
-        for work in works:
-            held.enter_context(staging_dir(work.folder))
-        progress.start(encoder.name, sum(sum(work.lengths) for work in works))
+    builders = [_IndexBuilder(root, encoder, camera) for root in roots]
+    with ExitStack() as locks:
+        for builder in builders:
+            locks.enter_context(staging_dir(builder.folder))
+        progress.start(encoder.name, sum(sum(builder.lengths) for builder in builders))
         reports = []
-        for work in works:
-            header, embedded = None if force else work.found(), 0
+        for builder in builders:
+            header, embedded = None if force else builder.existing(), 0
             if header is not None:
                 progress.advance(header.frames, before=True)
             else:
-                embedded = work.embed(executor or Serial(), threads, progress, force=force)
-                header = work.write()
-            reports.append(IndexReport(str(work.folder), embedded, header))
+                embedded = builder.embed(executor or Serial(), threads, progress, force=force)
+                header = builder.write()
+            reports.append(IndexReport(str(builder.folder), embedded, header))
         return reports
 
 
 def look_on_hub(buffer_set: BufferSet, encoder: Encoder, camera: str = "front") -> Iterator[str]:
-    """Say of each dataset of a buffer set that lies on the Hub whether retrieval finds embeddings there.
-
-    Args:
-        buffer_set: The buffer set.
-        encoder: What embedded its other datasets.
-        camera: Camera, with or without `observation.images.`.
-    """
+    """Yield for each dataset on the Hub a message on whether it has embeddings by this encoder."""
     for name, recorded in buffer_set.header.datasets.items():
         files = buffer_set.dataset_files(name)
         if not isinstance(files, HubFiles):
@@ -140,22 +134,22 @@ def look_on_hub(buffer_set: BufferSet, encoder: Encoder, camera: str = "front") 
             index = EmbeddingIndex(files, recorded.revision, encoder.name, camera)
             check_encoder(index.header.encoder, encoder, index.remedy)
         except HubError as error:
-            told = f"whether {files.describe()} has embeddings cannot be told: {error.message}"
-            yield "\n".join([told, *filter(None, [error.hint])])
+            message = f"cannot check whether {files.describe()} has embeddings: {error.message}"
+            yield "\n".join([message, *filter(None, [error.hint])])
         except InterferenceError as error:
             yield (
                 f"retrieval will not find the {name}: {error.message}\n"
-                "Ask their publisher for embeddings, or fetch them and embed their frames too:\n"
+                "Ask the publisher for embeddings, or download the dataset and index it too:\n"
                 f"  hf download {files.repo_id} --repo-type dataset --revision {files.commit} "
                 f"--local-dir {buffer_set.location}/{name}"
             )
         else:
-            yield f"{files.describe()} has embeddings by the same encoder: retrieval finds them"
+            yield f"{files.describe()} has embeddings by the same encoder"
 
 
 @dataclass
 class _EmbedTask:
-    """Embeds an episode; a worker that is another process opens dataset and encoder of its own."""
+    """Embeds an episode; each worker process opens its own dataset and encoder."""
 
     files: Files
     camera: str
@@ -167,7 +161,7 @@ class _EmbedTask:
         return Dataset(self.files)
 
     def __call__(self, task: int, worker: Worker) -> NDArray[np.float16]:
-        """Return the features of an episode as they are kept, `(T, D) float16`."""
+        """Return the features of an episode, `(T, D) float16`."""
         dataset, batch = self._dataset, self.encoder.batch
         length = dataset.record(task).length
         features, waiting = [], deque[Future[Any]]()
@@ -184,29 +178,28 @@ class _EmbedTask:
                 if len(waiting) > 2 * self.threads:  # prepared images are large
                     features.append(self.encoder.features(waiting.popleft().result()))
             features += [self.encoder.features(one.result()) for one in waiting]
-        with np.errstate(over="ignore"):  # what is too large is no finite number
+        with np.errstate(over="ignore"):  # too large values become infinite, which is an error
             return np.concatenate(features).astype(np.float16)
 
 
-class _Work:
-    """The index of one dataset, being made."""
+class _IndexBuilder:
+    """Builds the index of one dataset."""
 
     def __init__(self, root: Path, encoder: Encoder, camera: str):
         self.dataset, self.encoder = Dataset(LocalFiles(root)), encoder
-        self.dataset.shape(camera)  # there is such a camera
+        self.dataset.shape(camera)  # an error for an unknown camera
         self.units = self.dataset.kind == DISTRACTORS
         self.camera = camera.removeprefix(CAMERA_PREFIX)
         self.lengths = [record.length for record in self.dataset.records()]
         self.computed = {"in": encoder.computed_in, "batch": encoder.batch}
         self.folder = root / index_folder(encoder.name, camera)
-        self.hidden = staging_path(self.folder)
-        # Features that were made otherwise have another place: they are never mixed.
+        # Features of other settings go to another folder, so that they are never mixed.
         made_of = canonical_json([encoder.fingerprint, self.computed, self.dataset.revision])
-        self.made = self.hidden / sha256(made_of.encode()).hexdigest()[:16]
+        self.made = staging_path(self.folder) / sha256(made_of.encode()).hexdigest()[:16]
         self.features = [self.made / episode_file(episode) for episode in range(len(self.lengths))]
 
-    def found(self) -> IndexHeader | None:
-        """Return the header of the index that is there, if it is right."""
+    def existing(self) -> IndexHeader | None:
+        """Return the header of the existing index, if it is valid."""
         files, revision = self.dataset.files, self.dataset.revision
         try:
             index = EmbeddingIndex(files, revision, self.encoder.name, self.camera)
@@ -219,7 +212,7 @@ class _Work:
     def embed(
         self, executor: Executor, threads: int, progress: WorkProgress, *, force: bool
     ) -> int:
-        """Make the features that are missing; return the number of embedded frames."""
+        """Compute missing features; return the number of embedded frames."""
         missing = []
         for episode, (path, length) in enumerate(zip(self.features, self.lengths, strict=True)):
             if path.is_file() and not force:
@@ -228,15 +221,15 @@ class _Work:
                 missing.append(episode)
         task = _EmbedTask(self.dataset.files, self.camera, self.encoder, threads)
         for outcome in executor.run(task, missing):
-            about = self.dataset.record(outcome.task).episode_id
+            episode_id = self.dataset.record(outcome.task).episode_id
             if isinstance(outcome.error, InterferenceError):
                 raise outcome.error
             if outcome.error is not None:
-                what = f"{about} cannot be embedded: {first_line(outcome.error)}"
-                raise BuildError(what, "Finished episodes are kept: fix it, and run it again.")
+                message = f"{episode_id} cannot be embedded: {first_line(outcome.error)}"
+                raise BuildError(message, "Fix the cause and run the same command again.")
             if not np.isfinite(outcome.value).all():
                 raise BuildError(
-                    f"encoder {self.encoder.name!r} gave values that are not finite for {about}",
+                    f"encoder {self.encoder.name!r} returned NaN or infinity for {episode_id}",
                     'Its weights may be damaged, or its precision too low: try device="cpu".',
                 )
             with atomic_path(self.features[outcome.task]) as partial:
@@ -245,7 +238,7 @@ class _Work:
         return sum(self.lengths[episode] for episode in missing)
 
     def write(self) -> IndexHeader:
-        """Write what belongs to the features, and give the index its name."""
+        """Write the rest of the index, and rename it."""
         made, encoder, typical, centre = self.made, self.encoder, None, None
         names = [episode_file(episode) for episode in range(len(self.lengths))]
         if self.units:

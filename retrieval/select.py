@@ -1,7 +1,7 @@
-"""Choose which part of a history to hand to the policy: the released rule and others.
+"""Choose the part of a history that the policy receives: the released rule and others.
 
-Every rule is a function of the history's cosines and a threshold. The true sessions are known to
-`oracle` alone, which is there to compare with.
+Every rule is a function of the history's cosines and a threshold. Only `oracle`, a reference, uses
+the true sessions.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -20,38 +20,31 @@ from robomme_interference_data.schema.evidence import Evidence
 from robomme_interference_data.schema.manifest import Session
 from robomme_interference_data.schema.sampling import runs
 
-from .segment import (
-    Span,
-    adjacent_cosines,
-    closest_cosines,
-    cosines,
-    segments,
-)
+from .segment import Span, adjacent_cosines, closest_cosines, cosines, segments
 
 ADAPTIVE: Final = "adaptive"
 
 MIN_FRAMES = 4
-"""Frames of the shortest segment that may be chosen (released reference)."""
+"""Minimum length of a segment that may be chosen, in frames (released reference)."""
 
 _FOLLOWING = 0.1
-"""Quantile of a segment's adjacent cosines from which on frames are like those that follow each
-other (ours)."""
+"""Quantile of a segment's adjacent cosines from which other frames count as similar (ours)."""
 
 METHODS = {
-    "max": "the segment with the frame closest to what the robot sees now (released rule)",
-    "latest": "the segment that max takes, or the last of those with equally close frames",
-    "joined": "the segment that max takes, and all that hold a frame like one of its own (ours)",
-    "mean": "the segment with the highest mean cosine with what the robot sees now",
+    "max": "the segment with the frame closest to the live image (released rule)",
+    "latest": "the segment of max, or the last segment with an equally close frame",
+    "joined": "the segment of max, and all segments with a similar frame (ours)",
+    "mean": "the segment with the highest mean cosine with the live image",
     "last": "the last segment",
-    "random": "a segment by lot",
-    "top32": "the 32 frames closest to what the robot sees now, without segments",
+    "random": "a random segment",
+    "top32": "the 32 frames closest to the live image, without segments",
     "oracle": "the true lesson, or its first part",
 }
-"""What each method takes. Ties go to the earliest but for `latest`; segments of fewer than
-`MIN_FRAMES` frames are left aside.
+"""What each method chooses. Ties go to the earliest segment, except for `latest`; segments of fewer
+than `MIN_FRAMES` frames are skipped.
 
-`joined` finds a session that is in several parts: two frames are alike if their cosine is that of
-nine in ten adjacent frames of the segment that `max` takes, or more.
+`joined` finds a session that is in several parts: two frames are similar if their cosine reaches
+that of nine in ten adjacent frames of the segment of `max`.
 """
 
 _SCORES: dict[str, Callable[[NDArray[np.float32]], float]] = {
@@ -62,13 +55,13 @@ _SCORES: dict[str, Callable[[NDArray[np.float32]], float]] = {
 
 @dataclass(frozen=True)
 class Rule:
-    """A way to choose, and where to cut before; checks itself.
+    """A method of choosing, and the boundary of segments; validates itself.
 
     Attributes:
         method: One of `METHODS`.
-        boundary: Cosine of adjacent frames below which a history is cut, or `adaptive`: halfway
-            from what unrelated frames share to equality. That is ours; it has no free parameter,
-            and knows the train pool but no test episode.
+        boundary: Cosine of adjacent frames below which a history is cut, or `adaptive` (ours): the
+            middle between the cosine of unrelated frames and 1. It has no free parameter, and uses
+            the train pool but no test episode.
     """
 
     method: str = "max"
@@ -86,8 +79,7 @@ class Rule:
     def parse(cls, text: str, published: float | None = None) -> Self:
         """Read `METHOD` or `METHOD/CUT`, such as `max`, `mean/0.9` or `max/adaptive`.
 
-        Where the text names no cut it is `published`, the encoder's own, or adaptive if that is
-        None.
+        Without a cut it is `published`, the one published for the encoder, or else adaptive.
         """
         method, slash, text = text.partition("/")
         if not slash:
@@ -99,20 +91,20 @@ class Rule:
         return cls(method, cut)
 
     def threshold(self, typical: float) -> float:
-        """Return the cosine below which it cuts, where unrelated frames have cosine `typical`."""
+        """Return the cosine below which it cuts; unrelated frames have the cosine `typical`."""
         return (1 + typical) / 2 if self.boundary == ADAPTIVE else float(self.boundary)
 
     def __str__(self) -> str:
-        """Return what `parse` reads, with every digit of the cut."""
+        """Return the text that `parse` reads, with every digit of the cut."""
         adaptive = self.boundary == ADAPTIVE
         at = ADAPTIVE if adaptive else repr(float(self.boundary)).removesuffix(".0")
         return f"{self.method}/{at}"
 
 
 def parse_rules(texts: Sequence[str], published: float | None) -> list[Rule]:
-    """Read rules as `Rule.parse` does, each once, in the order given.
+    """Read rules as `Rule.parse` does, without duplicates.
 
-    A text may hold several, with commas between them; `all` is every method, and both cuts.
+    A text may hold several, separated by commas; `all` is every method, and `max` with both cuts.
     """
     every = [*METHODS, f"max/{ADAPTIVE}"]
     given = (name for text in texts for name in text.split(","))
@@ -122,9 +114,7 @@ def parse_rules(texts: Sequence[str], published: float | None) -> list[Rule]:
 
 @dataclass(frozen=True, eq=False)
 class Similarities:
-    """A buffer whose frames are compared with each other and with a query frame.
-
-    All rules and cuts share it.
+    """Cosines of the frames of a buffer, with each other and with a query frame.
 
     Attributes:
         episode_id: The query episode.
@@ -133,9 +123,9 @@ class Similarities:
         adjacent: Cosine of each frame with the next, `(T - 1,) float32`.
         alike: Cosine of each frame with the query frame, `(T,) float32`.
         typical: Median cosine of two frames of different distractor units.
-        closest: From a span to the cosine of each frame with the closest one of that span,
-            `(T,) float32`; looked up when asked for, as embeddings of many buffers take much room.
-        evidence: Which frames show the hidden answer; None where that is unknown.
+        closest: Returns for a span the cosine of each frame with the closest frame of the span,
+            `(T,) float32`. It reads the embeddings again, which take much memory for many buffers.
+        evidence: Frames that show the hidden answer; None if unknown.
     """
 
     episode_id: EpisodeId
@@ -159,14 +149,10 @@ def measure(
     camera: str = "front",
     query: NDArray[np.floating] | None = None,
 ) -> Similarities:
-    """Look up the embeddings of a buffer and compare them.
+    """Return the similarities of a buffer from its stored embeddings.
 
-    Args:
-        buffer: The buffer.
-        encoder: Name of the encoder.
-        camera: Name of the camera.
-        query: Embedding of the query frame, `(D,)`, of length 1; None for the stored first live
-            observation.
+    `query` is the embedding of the query frame, `(D,)`, of length 1; None for the stored first
+    live observation.
     """
     embeddings = buffer.embeddings(encoder, camera)
     return Similarities(
@@ -183,14 +169,13 @@ def measure(
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """What was chosen of a history, and what it was chosen by.
+    """The chosen part of a history.
 
     Attributes:
         threshold: Cosine of adjacent frames below which the history was cut.
         frames: The chosen frames, ascending, `(n,) int64`, n at least 1.
         segments: All segments in order.
-        scores: What segments were scored by; without those too short to be chosen, and empty if
-            the method scores none.
+        scores: Score of each segment that may be chosen; empty if the method has no scores.
     """
 
     threshold: float
@@ -205,21 +190,16 @@ class Choice:
 
 
 def choose(measured: Similarities, rule: Rule) -> Choice:
-    """Choose the part of a history that goes with the query frame.
-
-    Args:
-        measured: The buffer; only `oracle` looks at its sessions.
-        rule: How to choose.
-    """
-    about = f"{measured.episode_id} under {measured.condition}"
+    """Choose the part of a history that matches the query frame."""
+    name = f"{measured.episode_id} under {measured.condition}"
     if not len(measured.alike):
         raise InvalidOptionError(
-            f"{about}: the history is empty, there is nothing to choose from",
-            "Retrieval needs a condition with history, such as k0; leave out no-history.",
+            f"{name}: the history is empty",
+            "Retrieval needs a condition with a history, such as k0; leave out no-history.",
         )
     threshold = rule.threshold(measured.typical)
     spans = segments(measured.adjacent, threshold)
-    # Where all segments are short, all may be chosen (ours).
+    # If all segments are short, all may be chosen (ours).
     candidates = [(a, b) for a, b in spans if b - a >= MIN_FRAMES] or list(spans)
     scores: dict[Span, float] = {}
     if rule.method == "top32":
@@ -227,7 +207,6 @@ def choose(measured: Similarities, rule: Rule) -> Choice:
         return Choice(threshold, np.sort(closest), spans, scores)
     if score := _SCORES.get(rule.method):
         scores = {span: score(measured.alike[slice(*span)]) for span in candidates}
-        # The first of equal ones, or the last.
         order = candidates[::-1] if rule.method == "latest" else candidates
         chosen = max(order, key=lambda span: scores[span])
         if rule.method == "joined":
@@ -235,20 +214,20 @@ def choose(measured: Similarities, rule: Rule) -> Choice:
     elif rule.method == "last":
         chosen = candidates[-1]
     elif rule.method == "random":
-        lot = f"{measured.episode_id} {measured.condition}"
-        number = int.from_bytes(sha256(f"robomme-interference random\n{lot}".encode()).digest())
+        seed = f"robomme-interference random\n{measured.episode_id} {measured.condition}"
+        number = int.from_bytes(sha256(seed.encode()).digest())
         chosen = candidates[number % len(candidates)]
     elif measured.lesson:
         chosen = measured.lesson[0]
     else:
-        raise InvalidOptionError(f"{about}: there is no lesson that oracle could choose")
+        raise InvalidOptionError(f"{name}: oracle needs a lesson, and the history holds none")
     return Choice(threshold, np.arange(*chosen), spans, scores)
 
 
 def _joined(measured: Similarities, first: Span, candidates: Sequence[Span]) -> NDArray[np.int64]:
-    """Return the frames of a segment, and of those that hold a frame like one of its own."""
+    """Return the frames of a segment, and of all segments with a similar frame."""
     following = measured.adjacent[first[0] : first[1] - 1]
-    if not len(following):  # a single frame tells nothing of what frames that follow are like
+    if not len(following):  # a single frame has no adjacent cosine
         return np.arange(*first)
     alike = measured.closest(first) >= np.quantile(following, _FOLLOWING, method="lower")
     chosen = (span for span in candidates if span == first or alike[slice(*span)].any())

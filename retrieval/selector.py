@@ -1,4 +1,4 @@
-"""The retrieval step of a rollout: embed what the robot sees, look its session up."""
+"""The retrieval step of a rollout: embed the live image, and choose frames of the history."""
 
 from pathlib import PurePath
 from typing import Any
@@ -12,34 +12,25 @@ from robomme_interference_data.data.buffer_set_index import BufferSetIndex
 from robomme_interference_data.data.embeddings import index_folder
 from robomme_interference_data.errors import InvalidOptionError
 
-from .encoders import (
-    check_encoder,
-    make_encoder,
-    published_threshold,
-)
+from .encoders import check_encoder, make_encoder, published_threshold
 from .select import Rule, choose, measure
 
 
 class Selector:
-    """Chooses the frames of a history that go with what the robot sees.
+    """Chooses the frames of a history that match a live image.
 
-    The history's embeddings are looked up in the index beside the data; only the live image is
-    embedded. True sessions are read after the choice, to grade it, and by `oracle`.
+    The embeddings of the history come from the index beside the data; only the live image is
+    embedded.
 
     Args:
         encoder: Name of the encoder, see `make_encoder`.
-        rule: How to choose, as `Rule.parse` reads it.
-        camera: Camera whose frames it compares.
-        device: Where to compute; None for a GPU if there is one.
+        rule: Rule of the choice, see `Rule.parse`.
+        camera: Camera whose frames are compared.
+        device: Device to compute on; None for a GPU if there is one.
     """
 
     def __init__(
-        self,
-        encoder: str,
-        *,
-        rule: str = "max",
-        camera: str = "front",
-        device: str | None = None,
+        self, encoder: str, *, rule: str = "max", camera: str = "front", device: str | None = None
     ):
         self.rule = Rule.parse(rule, published_threshold(encoder))
         self.camera = camera.removeprefix(CAMERA_PREFIX)
@@ -47,20 +38,18 @@ class Selector:
 
     @property
     def name(self) -> str:
-        """Encoder, camera if it is not the front one, and rule, such as `siglip/max/0.923`."""
+        """Encoder, camera unless it is the front one, and rule, such as `siglip/max/0.923`."""
         return f"{PurePath(index_folder(self._encoder.name, self.camera)).name}/{self.rule}"
 
     def identity(self, buffer: Buffer) -> dict[str, Any]:
-        """Return what its choices depend on besides the buffers, as plain values.
-
-        Two selectors of one identity choose alike from the same buffer set.
+        """Return everything that its choices depend on besides the buffers, as plain values.
 
         Args:
-            buffer: Any buffer of the buffer set whose index it looks up.
+            buffer: Any buffer of the buffer set.
 
         Returns:
-            `encoder`, its name; `fingerprint`, the SHA-256 over all that determines the features;
-            `camera`; `method`; `boundary`; and `threshold`, the cosine that it comes to.
+            `encoder`, the name; `fingerprint`, the SHA-256 over everything that determines the
+            features; `camera`; `method`; `boundary`; and `threshold`, the resulting cosine.
         """
         index = self._index(buffer)
         return {
@@ -73,25 +62,25 @@ class Selector:
         }
 
     def select(self, buffer: Buffer, image: NDArray[np.uint8]) -> NDArray[np.int64]:
-        """Choose the frames of a buffer that go with an image.
+        """Choose the frames of a buffer that match an image.
 
         Args:
             buffer: The history.
             image: The first live observation, `(H, W, 3) uint8` RGB.
 
         Returns:
-            Their indices in the buffer, ascending, `(n,) int64`, n at least 1.
+            Indices in the buffer, ascending, `(n,) int64`, n at least 1.
         """
         index = self._index(buffer)
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-            given = f"{image.dtype} of shape {image.shape}"
-            raise InvalidOptionError.expected("image", given, "(H, W, 3) uint8")
+            actual = f"{image.dtype} of shape {image.shape}"
+            raise InvalidOptionError.expected("image", actual, "(H, W, 3) uint8")
         features = self._encoder.features(self._encoder.prepare(image[None]))
         query = index.embed(features)[0]
         return choose(measure(buffer, self._encoder.name, self.camera, query), self.rule).frames
 
     def _index(self, buffer: Buffer) -> BufferSetIndex:
-        """Return the index of the buffer set, made with this very encoder."""
+        """Return the index of the buffer set, which this encoder has to have made."""
         index = buffer.index(self._encoder.name, self.camera)
         check_encoder(index.encoder, self._encoder, index.remedy)
         return index

@@ -19,8 +19,8 @@ from robomme_interference_data.errors import (
     ModelError,
     first_line,
 )
-from robomme_interference_data.evaluate.weights import digest_weights
 from robomme_interference_data.storage.hub import HubFiles, locate
+from robomme_interference_data.storage.weights import digest_weights
 
 from .images import within
 from .model import ChatModel, Message, Reply

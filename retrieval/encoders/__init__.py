@@ -1,4 +1,4 @@
-"""Image encoders by name: what each is to the rest, and what is known of it without its weights."""
+"""Image encoders by name: their interface, and what is known without their weights."""
 
 from hashlib import sha256
 from typing import Any, Protocol
@@ -27,21 +27,20 @@ ENCODERS = Registry(
 )
 
 _PAPER_CUT = 0.923
-"""The paper's cut (section "Adding Retrieval"), which was made for its encoder alone."""
+"""The paper's cut (section "Adding Retrieval"), for its encoder only."""
 
 
 class Encoder(Protocol):
-    """Turns images into vectors whose cosine tells how alike two images are; can be pickled.
+    """Turns images into vectors whose cosine measures similarity; can be pickled.
 
-    An image's features depend on that image alone: not on its neighbours in a batch (beyond
-    what float16 keeps), nor on the data that it is from.
+    The features of an image depend on that image only, not on its neighbors in a batch (up to the
+    precision of float16) or on its dataset.
 
     Attributes:
-        name: Under which `make_encoder` makes it.
-        centred: Whether the mean over the distractor units is taken off the features before they
-            are normalised.
-        batch: Images that it takes best at a time.
-        computed_in: Where and in which precision it computes, such as `cpu, float32`.
+        name: Its name, see `make_encoder`.
+        centred: Whether the mean over the distractor units is subtracted before normalization.
+        batch: Images per batch.
+        computed_in: Device and precision, such as `cpu, float32`.
         fingerprint: What determines the features up to that precision, as plain values: model,
             weights, preprocessing.
     """
@@ -53,7 +52,7 @@ class Encoder(Protocol):
     fingerprint: dict[str, Any]
 
     def prepare(self, images: NDArray[np.uint8]) -> Any:
-        """Preprocess images, `(N, H, W, 3) uint8` RGB; may be called from several threads."""
+        """Preprocess images, `(N, H, W, 3) uint8` RGB; several threads may call it."""
         ...
 
     def features(self, prepared: Any) -> NDArray[np.float32]:
@@ -62,28 +61,22 @@ class Encoder(Protocol):
 
 
 def encoder_digest(encoder: Encoder) -> str:
-    """Return the one hash of all that determines an encoder's features."""
+    """Return the hash of an encoder's fingerprint."""
     return sha256(canonical_json(encoder.fingerprint).encode()).hexdigest()
 
 
 def check_encoder(recorded: EncoderRecord, encoder: Encoder, remedy: Remedy) -> None:
-    """Check that embeddings were made with this very encoder.
-
-    Args:
-        recorded: What their index records.
-        encoder: The encoder.
-        remedy: How they are made again.
-    """
+    """Check that this encoder made the embeddings of an index; `remedy` makes them again."""
     if recorded.sha256 != encoder_digest(encoder):
         raise MissingIndexError(
-            f"the embeddings of {encoder.name!r} beside the data were made with another version "
-            "of the encoder: its weights, settings, preprocessing or code differ",
+            f"the stored embeddings of {encoder.name!r} come from another version of the encoder: "
+            "its weights, settings, preprocessing or code differ",
             *remedy,
         )
 
 
 def encoder_name(name: str) -> str:
-    """Return the one name of an encoder: `siglip` for the paper's model, however it was given.
+    """Return the canonical name of an encoder: `siglip` for the id of the paper's model.
 
     Args:
         name: `thumbnail`, `siglip` (the paper's model), or `siglip:` and the id or folder of a
@@ -93,24 +86,24 @@ def encoder_name(name: str) -> str:
 
 
 def published_threshold(name: str) -> float | None:
-    """Return the cut that was published for an encoder, at whatever revision, or None.
+    """Return the cut that was published for an encoder at any revision; None for others.
 
-    A folder is not known to hold the published weights, whatever its name: None.
+    It is None for a folder too, which may hold other weights.
     """
     return _PAPER_CUT if encoder_id(encoder_name(name)) == "siglip" else None
 
 
 def make_encoder(name: str, *, device: str | None = None, batch: int | None = None) -> Encoder:
-    """Make an encoder; heavy libraries are loaded only if it needs them.
+    """Make an encoder; heavy libraries are imported only if it needs them.
 
     Args:
-        name: As `encoder_name` reads it.
-        device: Where to compute, such as `cpu`; None for a GPU if there is one.
-        batch: Images at a time; None for what suits the encoder.
+        name: Name, see `encoder_name`.
+        device: Device to compute on, such as `cpu`; None for a GPU if there is one.
+        batch: Images per batch; None for the encoder's default.
     """
     if batch is not None and batch < 1:
         raise InvalidOptionError.expected("batch", batch, "1 or more")
     spec = ENCODERS.parse(name)
     options = {"device": device, "batch": batch} if spec.kind == "siglip" else {}
-    made: Encoder = ENCODERS.factory(spec)(**spec.given, **options)
-    return made
+    encoder: Encoder = ENCODERS.factory(spec)(**spec.given, **options)
+    return encoder

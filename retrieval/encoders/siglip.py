@@ -3,8 +3,7 @@
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from hashlib import sha256
-from pathlib import Path
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,33 +17,37 @@ from robomme_interference_data.errors import (
     first_line,
 )
 from robomme_interference_data.storage.hub import HubFiles, locate
+from robomme_interference_data.storage.weights import digest_weights
 
 from . import encoder_name
 
 _FILES = ("*.json", "*.safetensors")
 
-_VERSION = 1
-"""Of what is done here: which output is taken, and how images reach the processor."""
+_VERSION = 2
+"""Version of the computation in this file, and of the digest of weights."""
 
 _NOT_COMPUTING = ("_name_or_path", "architectures", "dtype", "transformers_version")
-"""Settings of a vision tower that say where it came from, not what it computes."""
+"""Settings of a vision tower that record its origin and do not affect its output."""
 
-_NOT_WHOLE = "The folder is not a whole model: download or save it again."
+_INCOMPLETE = "The folder does not hold a complete model: download or save it again."
 
 
 class Siglip:
     """The vision tower of a SigLIP or SigLIP 2 model: its pooled output.
 
+    The fingerprint comes from the model's files. The weights are loaded when `features` is first
+    called, so that a process that only needs the fingerprint does not load them.
+
     Args:
-        model: Id on the Hub, with `@revision` if it is not the main branch, or a folder.
-        device: Where to compute, such as `cpu` or `cuda`; None for a GPU if there is one.
-        batch: Images at a time; None for 32 on a GPU and 8 on a CPU.
+        model: Id on the Hub, with `@revision` unless it is the main branch, or a folder.
+        device: Device to compute on, such as `cpu` or `cuda`; None for a GPU if there is one.
+        batch: Images per batch; None for 32 on a GPU and 8 on a CPU.
     """
 
     centred = False
 
     def __init__(self, model: str, device: str | None = None, batch: int | None = None):
-        files = locate(model, "model")  # a folder that is missing is told before seconds of imports
+        files = locate(model, "model")  # a missing folder is reported before the slow imports
         try:
             import PIL  # noqa: F401 - the image processor needs it
             import torch
@@ -52,44 +55,60 @@ class Siglip:
         except ImportError as error:
             library = f"torch, transformers and Pillow ({error})"
             raise MissingExtraError.needs("the encoder siglip", library, "retrieval") from error
-        self._given = model, device, batch
-        self._torch = torch
+        self._arguments = model, device, batch
         self.name = encoder_name(f"siglip:{model}")
         origin: dict[str, str | None] = {"model": None, "revision": None}
-        folder = files.snapshot(*_FILES)
+        self._folder = files.snapshot(*_FILES)
         if isinstance(files, HubFiles):
             origin = {"model": files.repo_id, "revision": files.commit}
         try:
             self._device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
             torch.empty(0, device=self._device)
         except (RuntimeError, AssertionError) as error:
-            what = f"device {device!r} cannot be used: {first_line(error)}"
-            raise InvalidOptionError(what, 'Try device="cpu".') from None
+            message = f"device {device!r} cannot be used: {first_line(error)}"
+            raise InvalidOptionError(message, 'Try device="cpu".') from None
+        self._dtype = torch.float32
+        if self._device.type == "cuda":
+            self._dtype = torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float16
+        self.computed_in = f"{self._device.type}, {str(self._dtype).removeprefix('torch.')}"
         self.batch = batch or (32 if self._device.type == "cuda" else 8)
-        with _quiet(transformers):
-            self._vision, self._processor = _load(transformers, model, folder)
-        tower = json.loads(self._vision.config.to_json_string())
+        with self._format_errors():
+            config = transformers.AutoConfig.from_pretrained(self._folder)
+            classes: dict[str, Any] = {
+                "siglip": transformers.SiglipVisionModel,
+                "siglip2": transformers.Siglip2VisionModel,
+            }
+            model_type = str(config.model_type)
+            if model_type.removesuffix("_vision_model") not in classes:
+                raise FormatError(
+                    f"{model} is a model of type {model_type!r}; expected SigLIP or SigLIP 2",
+                    f'For example: encoder="siglip:{PAPER_ENCODER}"',
+                )
+            self._tower = classes[model_type.removesuffix("_vision_model")]
+            if not any(self._folder.glob("*.safetensors")):
+                raise OSError("it has no weights, *.safetensors")
+            # Pillow resizes the same everywhere; the other backend needs torchvision.
+            processors: Any = transformers.AutoImageProcessor
+            self._processor = processors.from_pretrained(
+                self._folder, backend="pil", local_files_only=True
+            )
+        tower = json.loads(getattr(config, "vision_config", config).to_json_string())
         self.fingerprint: dict[str, Any] = {
             "name": "siglip",
             "version": _VERSION,
             "transformers": str(transformers.__version__),
             **origin,
-            "weights_sha256": _weights_digest(self._vision),
+            "weights_sha256": digest_weights(self._folder, ["*.safetensors"]),
             "tower": {key: tower[key] for key in tower if key not in _NOT_COMPUTING},
             "preprocessing": {
                 "class": type(self._processor).__name__,
                 **json.loads(self._processor.to_json_string()),
             },
         }
-        self._dtype = torch.float32
-        if self._device.type == "cuda":
-            self._dtype = torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float16
-        self._vision.to(self._device, self._dtype)
-        self.computed_in = f"{self._device.type}, {str(self._dtype).removeprefix('torch.')}"
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Let a worker process load the model itself."""
-        return Siglip, self._given
+        return Siglip, self._arguments
 
     def prepare(self, images: NDArray[np.uint8]) -> Any:
         """Preprocess images as the model's own image processor does."""
@@ -97,19 +116,51 @@ class Siglip:
 
     def features(self, prepared: Any) -> NDArray[np.float32]:
         """Return the pooled outputs of the vision tower, `(N, D) float32`."""
+        import torch
+
         inputs = {
             name: value.to(self._device, self._dtype if value.is_floating_point() else None)
             for name, value in prepared.items()
         }
-        with self._torch.inference_mode():
+        with torch.inference_mode():
             pooled = self._vision(**inputs).pooler_output
         return pooled.float().cpu().numpy()
 
+    @cached_property
+    def _vision(self) -> Any:
+        """The vision tower on its device, for inference."""
+        with self._format_errors(), _quiet():
+            vision, loading = self._tower.from_pretrained(
+                self._folder, dtype="float32", local_files_only=True, output_loading_info=True
+            )
+        # transformers fills what the file lacks with random numbers.
+        if missing := sorted(loading["missing_keys"]):
+            raise FormatError(
+                f"{self._folder} lacks {len(missing)} of the {len(vision.state_dict())} tensors of "
+                f"the vision tower, such as {missing[0]}",
+                _INCOMPLETE,
+            )
+        return vision.eval().to(self._device, self._dtype)
+
+    @contextmanager
+    def _format_errors(self) -> Iterator[None]:
+        from safetensors import SafetensorError
+
+        try:
+            yield
+        except FormatError:
+            raise
+        except (OSError, ValueError, RuntimeError, SafetensorError) as error:
+            message = f"{self.name} cannot be loaded from {self._folder}: {first_line(error)}"
+            raise FormatError(message, _INCOMPLETE) from error
+
 
 @contextmanager
-def _quiet(transformers: Any) -> Iterator[None]:
-    """Keep transformers from reporting that the text tower of the file is left unread."""
-    logging = transformers.utils.logging
+def _quiet() -> Iterator[None]:
+    """Keep transformers from reporting that the text tower of the file is not loaded."""
+    import transformers
+
+    logging: Any = transformers.utils.logging
     level, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()
     logging.set_verbosity_error()
     logging.disable_progress_bar()
@@ -119,50 +170,3 @@ def _quiet(transformers: Any) -> Iterator[None]:
         logging.set_verbosity(level)
         if bars:
             logging.enable_progress_bar()
-
-
-def _load(transformers: Any, model: str, folder: Path) -> tuple[Any, Any]:
-    """Return the vision tower, in float32 and for inference, and its image processor."""
-    from safetensors import SafetensorError
-
-    try:
-        kind = transformers.AutoConfig.from_pretrained(folder).model_type
-        classes = {
-            "siglip": transformers.SiglipVisionModel,
-            "siglip2": transformers.Siglip2VisionModel,
-        }
-        tower = classes.get(kind.removesuffix("_vision_model"))
-        if tower is None:
-            raise FormatError(
-                f"{model} is a model of type {kind!r}; expected SigLIP or SigLIP 2",
-                f'For example: encoder="siglip:{PAPER_ENCODER}"',
-            )
-        vision, loading = tower.from_pretrained(
-            folder, dtype="float32", local_files_only=True, output_loading_info=True
-        )
-        # transformers would make up what the file lacks, at random.
-        if missing := sorted(loading["missing_keys"]):
-            raise FormatError(
-                f"{folder} lacks {len(missing)} of the {len(vision.state_dict())} tensors of the "
-                f"vision tower of {model}, such as {missing[0]}",
-                _NOT_WHOLE,
-            )
-        # Pillow resizes the same everywhere; the other backend only where torchvision is.
-        processor = transformers.AutoImageProcessor.from_pretrained(
-            folder, backend="pil", local_files_only=True
-        )
-    except FormatError:
-        raise
-    except (OSError, ValueError, RuntimeError, SafetensorError) as error:
-        what = f"{model} cannot be loaded from {folder}: {first_line(error)}"
-        raise FormatError(what, _NOT_WHOLE) from error
-    return vision.eval(), processor
-
-
-def _weights_digest(vision: Any) -> str:
-    """Return the SHA-256 over the vision tower's weights, by name."""
-    running = sha256()
-    for name, value in sorted(vision.state_dict().items()):
-        running.update(f"{name} {tuple(value.shape)}\n".encode())
-        running.update(value.numpy().tobytes())
-    return running.hexdigest()

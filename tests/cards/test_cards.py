@@ -11,10 +11,15 @@ from support.cards import CARDS, OF_BUFFER_SET, without_version
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.verify import verify_buffer_set
-from robomme_interference_data.cards.croissant import BIBTEX, PAPER
-from robomme_interference_data.cards.facts import buffer_set_facts
-from robomme_interference_data.cards.film import STRIP
-from robomme_interference_data.cards.render import CROISSANT, README, card_files, size_category
+from robomme_interference_data.cards.dataset_facts import STRIP, buffer_set_facts
+from robomme_interference_data.cards.render import (
+    BIBTEX,
+    CROISSANT,
+    PAPER,
+    README,
+    card_files,
+    size_category,
+)
 from robomme_interference_data.constants import RECORDS_PATH
 
 NAMES = ("demonstrations", "buffer_set", "results")

@@ -10,7 +10,7 @@ from support.hub import BASE, BUFFER_SET, push_buffer_set, running_hub
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.cards.commands import facts_of
-from robomme_interference_data.cards.facts import buffer_set_facts
+from robomme_interference_data.cards.dataset_facts import buffer_set_facts
 from robomme_interference_data.cards.publication import Publication
 from robomme_interference_data.cards.render import card_text
 
@@ -38,12 +38,14 @@ def test_a_card_of_what_is_on_the_hub(
         assert code == 0
         place = f"{BASE}@{base}"
         assert out == card_text(
-            buffer_set_facts(load_buffer_set(GOLDEN)), Publication(BUFFER_SET, base=place)
+            buffer_set_facts(load_buffer_set(GOLDEN)), Publication(BUFFER_SET, "1.0.0", base=place)
         )
         assert not [path for path in hub.downloads() if path.endswith(".mp4")]
         code, out, _ = run("card", place, "--repo-id", BASE)
         assert code == 0
-        assert out == card_text(facts_of(str(GOLDEN / "demonstrations")), Publication(BASE))
+        assert out == card_text(
+            facts_of(str(GOLDEN / "demonstrations")), Publication(BASE, "1.0.0")
+        )
 
 
 @pytest.mark.parametrize(
@@ -51,7 +53,7 @@ def test_a_card_of_what_is_on_the_hub(
     [
         ((GOLDEN, "--license", "MIT License"), "--license 'MIT License'"),
         ((GOLDEN / "distractors",), "dataset of distractors"),
-        ((GOLDEN / "demonstrations" / "data",), "holds no buffer set"),
+        ((GOLDEN / "demonstrations" / "data",), "no buffer set"),
         (("nowhere",), "neither a folder"),
         (("nobody/nothing",), "HF_HUB_OFFLINE"),
     ],

@@ -13,9 +13,8 @@ from support.cards import OF_BUFFER_SET
 from support.tabletop import TABLETOP
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.cards.croissant import as_bytes, croissant
-from robomme_interference_data.cards.facts import buffer_set_facts
-from robomme_interference_data.cards.render import CROISSANT, card_text
+from robomme_interference_data.cards.dataset_facts import buffer_set_facts
+from robomme_interference_data.cards.render import CROISSANT, as_bytes, card_text, croissant
 from robomme_interference_data.cards.tables import columns_of
 from robomme_interference_data.constants import RECORDS_PATH
 from robomme_interference_data.data.questions import Question
@@ -99,14 +98,14 @@ def test_every_column_is_described(record: type) -> None:
     columns = columns_of(record)
     assert {one.name for one in columns} == {*arrow_schema(record).names} - {"feature_sha256"}
     for column in (part for one in columns for part in (one, *one.parts)):
-        assert column.about.endswith((".", "…")) and "`" not in column.about, column.name
+        assert column.meaning.endswith((".", "…")) and "`" not in column.meaning, column.name
 
 
 OPTIMIZED = """
 from robomme_interference_data.cards.tables import columns_of
 from robomme_interference_data.schema.manifest import BufferManifest
 
-print(all(part.about for one in columns_of(BufferManifest) for part in (one, *one.parts)))
+print(all(part.meaning for one in columns_of(BufferManifest) for part in (one, *one.parts)))
 """
 
 

@@ -13,9 +13,9 @@ from support.hub_server import HubServer
 from support.machine import full_disk
 from support.publishing import LESSONS, UNITS, files, plain_cards, plan_again, publish, tags
 
-from robomme_interference_data.cards import checks
-from robomme_interference_data.cards.checks import open_with_lerobot
-from robomme_interference_data.errors import HubError
+from robomme_interference_data.cards import publish as publish_module
+from robomme_interference_data.cards.publish import open_with_lerobot
+from robomme_interference_data.errors import HubError, PublishError
 
 
 @pytest.fixture(autouse=True)
@@ -150,10 +150,17 @@ def test_a_full_disk_while_lerobot_looks(tmp_path: Path, monkeypatch: pytest.Mon
     open_with_lerobot("distractors", GOLDEN / "distractors")
 
 
+def test_lerobot_cannot_open_anything(tmp_path: Path) -> None:
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "info.json").write_text("{}")
+    with pytest.raises(PublishError, match="LeRobot cannot open"):
+        open_with_lerobot("distractors", tmp_path)
+
+
 def test_stopped_while_publishing(
     hub: HubServer, run: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(checks, "check_buffer_set", lambda *_: None)
+    monkeypatch.setattr(publish_module, "check_buffer_set", lambda *_: None)
     interrupt = partial(os.kill, os.getpid(), signal.SIGINT)
     hub.fault("PUT", "/store/datasets/someone/tiny/", after=20, call=interrupt)
     command = ("publish", GOLDEN, "--repo-id", UNITS, "--yes")

@@ -16,22 +16,16 @@ from robomme_interference_data.build_dataset.manifests import (
     plan_manifests,
     write_manifests,
 )
-from robomme_interference_data.cards.facts import (
+from robomme_interference_data.cards.dataset_facts import (
     buffer_set_facts,
     count_same_family,
     demonstrations_facts,
 )
-from robomme_interference_data.cards.film import film_of_buffer_set
+from robomme_interference_data.cards.facts import origin_limit
 from robomme_interference_data.cards.publication import Publication
-from robomme_interference_data.cards.render import card_files, card_text
+from robomme_interference_data.cards.render import card_files, card_text, croissant
 from robomme_interference_data.cards.results import results_facts
-from robomme_interference_data.cards.sources import origin_limit
-from robomme_interference_data.constants import (
-    IDENTITY_PATH,
-    RECORDS_PATH,
-    REPORT_PATH,
-    SUMS_PATH,
-)
+from robomme_interference_data.constants import IDENTITY_PATH, RECORDS_PATH, REPORT_PATH, SUMS_PATH
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import FormatError, InvalidOptionError
 from robomme_interference_data.evaluate.score.config import Settings
@@ -96,8 +90,8 @@ def test_lossy_data_is_called_so(tmp_path: Path, part: str, inexact: int) -> Non
 def test_the_lossy_copy_of_the_recordings_is_named(tmp_path: Path) -> None:
     source = {"kind": "lerobot", "repo": "lerobot/robomme", "revision": COMMIT}
     buffer_set = made_up(tmp_path, query={"exact": False}, identity={"sources": [source]})
-    text = buffer_set_text(buffer_set, Publication("people/tiny"))
-    assert "It was built from `lerobot/robomme`, the AV1-lossy copy" in text
+    text = buffer_set_text(buffer_set, Publication("people/tiny", "1.0.0"))
+    assert "It was built from `lerobot/robomme`, a copy of RoboMME" in text
     assert f"`lerobot/robomme@{COMMIT}`" in text
     assert "source_datasets:\n- lerobot/robomme\n" in text
 
@@ -158,10 +152,10 @@ def test_conditions_and_limits_beyond_the_paper(tmp_path: Path) -> None:
     buffer_set = made_up(tmp_path, conditions=("k0", "k2"), position_limit=None, seed=3)
     text = buffer_set_text(buffer_set, OF_BUFFER_SET)
     assert "- Beyond the paper's conditions, `k2`: lesson, n units." in text
-    assert "no limit on the length" in text
+    assert "no length limit" in text
     assert "seed 3" in text
     assert "| k0 | paper |" in text
-    assert "| k2 | ours |" in text
+    assert "| k2 | extension |" in text
 
 
 @pytest.mark.parametrize(
@@ -178,10 +172,33 @@ def test_where_episodes_come_from(simulators: list[str], told: str) -> None:
     assert told in origin_limit(simulators)
 
 
+@pytest.mark.parametrize(
+    ("query", "unit", "synthetic", "simulated", "tabletop"),
+    [
+        (None, None, False, False, False),
+        (None, "tabletop", True, False, False),
+        ("mine", "robomme", True, True, False),
+        ("tabletop", "robomme", True, True, True),
+    ],
+)
+def test_nothing_unknown_is_asserted(
+    tmp_path: Path, query: Any, unit: Any, synthetic: bool, simulated: bool, tabletop: bool
+) -> None:
+    buffer_set = made_up(tmp_path, query={"simulator": query}, unit={"simulator": unit})
+    facts = buffer_set_facts(buffer_set)
+    data = json.loads(croissant(facts, OF_BUFFER_SET))
+    assert data.get("rai:hasSyntheticData") == (True if synthetic else None)
+    assert data["rai:dataBiases"].startswith("One robot arm at a table") == tabletop
+    assert data["rai:personalSensitiveInformation"].startswith("None") == simulated
+    assert ("no people" in data["rai:dataSocialImpact"]) == simulated
+    tags = card_text(facts, OF_BUFFER_SET).split("---\n")[1].splitlines()
+    assert ("- RoboMME" in tags) == ("robomme" in (query, unit))
+
+
 def test_what_yielded_nothing_is_counted(tmp_path: Path) -> None:
     report = {"skipped": [{"episode_id": "MoveCube/train/9", "why": "short"}] * 3}
     buffer_set = made_up(tmp_path, report=report)
-    assert "(3 recorded episodes yielded nothing here" in buffer_set_text(buffer_set, OF_BUFFER_SET)
+    assert "(3 recorded episodes yielded nothing" in buffer_set_text(buffer_set, OF_BUFFER_SET)
     text = demonstrations_text(buffer_set)
     assert "3 recorded episodes yielded no demonstration" in text
 
@@ -192,19 +209,21 @@ def test_the_base_comes_from_the_manifests(tmp_path: Path) -> None:
     place = f"people/demonstrations@{COMMIT}"
     placed = replace(header.datasets["demonstrations"], location=place)
     buffer_set.header = replace(header, datasets={**header.datasets, "demonstrations": placed})
-    assert f"| demonstrations | `{place}` |" in buffer_set_text(
-        buffer_set, Publication("people/tiny")
+    assert f"| published demonstrations | `{place}` |" in buffer_set_text(
+        buffer_set, Publication("people/tiny", "1.0.0")
     )
-    assert "| demonstrations | not published |" not in buffer_set_text(buffer_set, OF_BUFFER_SET)
+    assert "| published demonstrations | none |" not in buffer_set_text(buffer_set, OF_BUFFER_SET)
     buffer_set.header = header
-    assert "| demonstrations | not published |" in buffer_set_text(
-        buffer_set, Publication("people/tiny")
+    assert "| published demonstrations | none |" in buffer_set_text(
+        buffer_set, Publication("people/tiny", "1.0.0")
     )
 
 
-def test_a_buffer_set_without_buffers(tmp_path: Path) -> None:
+def test_a_buffer_set_without_buffers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    buffer_set = made_up(tmp_path)
+    monkeypatch.setattr(buffer_set, "manifests", list)
     with pytest.raises(FormatError, match="no buffers"):
-        film_of_buffer_set(made_up(tmp_path), (), ())
+        buffer_set_facts(buffer_set)
 
 
 # --- results --------------------------------------------------------------------------------------
@@ -230,7 +249,7 @@ def test_results_of_several_runs_are_refused(tmp_path: Path) -> None:
 
 def test_results_of_rows_without_a_run(tmp_path: Path) -> None:
     (tmp_path / "rows.jsonl").write_bytes((RUN / "rollouts.jsonl").read_bytes())
-    text = results_text(tmp_path / "rows.jsonl", Publication("people/rows"))
+    text = results_text(tmp_path / "rows.jsonl", Publication("people/rows", "1.0.0"))
     assert "path: rows.jsonl" in text
     assert "The run is" not in text
 
@@ -242,7 +261,7 @@ def test_results_name_the_buffer_set_that_the_run_names(tmp_path: Path) -> None:
     header["starts"][0]["settings"]["buffer_set"] = place
     header["identity"]["policy"] = "a | `b`"
     write_json(tmp_path / "run.json", header)
-    text = results_text(tmp_path, Publication("people/results"))
+    text = results_text(tmp_path, Publication("people/results", "1.0.0"))
     assert f"| published buffer set | `{place}` |" in text
     assert "source_datasets:\n- people/tiny\n" in text
     assert "| policy | <code>a &#124; &#96;b&#96;</code> |" in text

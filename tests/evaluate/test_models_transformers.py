@@ -11,9 +11,9 @@ from support.asking import ask
 from support.vision_language import save_tiny_adapter, save_tiny_model
 
 from robomme_interference_data.errors import InvalidOptionError, ModelError
-from robomme_interference_data.evaluate import weights
 from robomme_interference_data.evaluate.models.model import Message, Video
 from robomme_interference_data.evaluate.models.registry import make_model, model_identity, pin_model
+from robomme_interference_data.storage import weights
 
 pytest.importorskip("transformers", reason="needs the extra vlm")
 

@@ -48,7 +48,10 @@ def test_index(own_buffers: Path, run: Run) -> None:
     ]
     header = own_buffers / "distractors/index/thumbnail/index.json"
     change_header(header, computed={"in": "cuda, bfloat16", "batch": 32})
-    assert f"{places[1]} is kept, computed with cuda, bfloat16, 32" in run("index", own_buffers)[2]
+    assert (
+        f"{places[1]} is kept, computed with cuda, bfloat16, batch 32"
+        in run("index", own_buffers)[2]
+    )
     code, out, err = run("index", own_buffers, "--json")
     assert (code, err) == (0, "")
     found = json.loads(out)
@@ -169,8 +172,8 @@ def test_why(run: Run, tmp_path: Path, indexed: Path) -> None:
     assert first.startswith(about)
     assert chosen == f"Chosen: frames 0 to 47, of lesson {EPISODE}"
     assert why.startswith("Why: oracle takes the true lesson")
-    assert closest.startswith("What the robot sees now is closest to frame ")
-    assert "the closest one outside is frame " in closest
+    assert closest.startswith("The live image is closest to frame ")
+    assert "the closest other frame is frame " in closest
     assert lesson.startswith(
         "The lesson is frames 0 to 47: purity 100.0%, coverage 100.0%, 0 false"
     )

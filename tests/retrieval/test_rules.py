@@ -202,6 +202,6 @@ def test_refusals() -> None:
     with pytest.raises(InvalidOptionError, match="the history is empty"):
         choose(embedded(HISTORY[:0], X), Rule())
     absent = made(cuts={}, high={1: 1}, lessons=())
-    with pytest.raises(InvalidOptionError, match="no lesson"):
+    with pytest.raises(InvalidOptionError, match="needs a lesson"):
         choose(absent, Rule("oracle"))
     assert choose(absent, Rule("max")).spans == ((0, 15),)

@@ -8,7 +8,7 @@ from support.buffer_sets import GOLDEN
 from support.cards import OF_BUFFER_SET, OF_DEMONSTRATIONS, OF_RESULTS, RUN, without_version
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.cards.facts import buffer_set_facts, demonstrations_facts
+from robomme_interference_data.cards.dataset_facts import buffer_set_facts, demonstrations_facts
 from robomme_interference_data.cards.render import CROISSANT, README, card_files
 from robomme_interference_data.cards.results import results_facts
 

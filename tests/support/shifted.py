@@ -35,7 +35,7 @@ class ShiftedSample(SampleSource):
 
 
 def add_shifted(buffer_set: Path, *families: str, kind: str = "sample") -> None:
-    """Build the views of the golden buffer set's queries, or of some families, and plan it again."""
+    """Build views of the golden queries, or of some families, and plan the buffer set again."""
     source = ShiftedSample(size=32)
     source.provenance["kind"] = kind
     families = families or ("VideoRepick", "MoveCube", "PatternLock")

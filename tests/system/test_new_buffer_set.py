@@ -1,4 +1,4 @@
-"""A buffer set of one's own for demonstrations on a Hub: built, published layout aside, and loaded."""
+"""A new buffer set for demonstrations on a Hub: built, loaded, indexed and verified."""
 
 import os
 import shutil
@@ -70,8 +70,9 @@ def test_retrieval_on_published_demonstrations(
     commit, out = hub.push(f"datasets/{BASE}", indexed), tmp_path / "own"
     given = ("--demonstrations", BASE, "--source", mine, "--workers", 1)
     assert run("new-buffer-set", out, *given, "--conditions", "k0,k2")[0] == 0
-    code, told, err = run("index", out)
-    assert (code, told) == (0, f"{out}/distractors/index/thumbnail: 64 frames, 64 embedded now\n")
+    code, printed, err = run("index", out)
+    report = f"{out}/distractors/index/thumbnail: 64 frames, 64 embedded now\n"
+    assert (code, printed) == (0, report)
     assert f"{BASE}@{commit} has embeddings by the same encoder" in err
     assert [*verify_buffer_set(load_buffer_set(out))] == []
 
@@ -83,11 +84,8 @@ def test_retrieval_on_published_demonstrations(
             load_buffer_set(one).load("MoveCube/test/0", condition) for one in (out, local)
         )
         assert np.array_equal(far.embeddings("thumbnail"), near.embeddings("thumbnail"))
-    said = [
-        run("retrieve", buffer_set, "MoveCube/test/0", "k2", "--json")
-        for buffer_set in (out, local)
-    ]
-    assert said[0][:2] == said[1][:2] and said[0][0] == 0
+    results = [run("retrieve", one, "MoveCube/test/0", "k2", "--json") for one in (out, local)]
+    assert results[0][:2] == results[1][:2] and results[0][0] == 0
 
 
 def test_published_demonstrations_without_an_index(
@@ -112,7 +110,7 @@ def test_published_demonstrations_without_an_index(
     shutil.rmtree(out / "demonstrations")
     offline()
     code, _, err = run("index", out)
-    assert code == 0 and "cannot be told" in err
+    assert code == 0 and "cannot check" in err
 
 
 @pytest.mark.parametrize(

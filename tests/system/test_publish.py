@@ -12,8 +12,6 @@ from support.hub_server import HubServer
 from support.publishing import LESSONS, UNITS, files, publish, tags
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.cards.checks import open_with_lerobot
-from robomme_interference_data.errors import PublishError
 
 PUBLISH = """
 from support.publishing import publish
@@ -28,8 +26,8 @@ import json, sys
 from datasets import load_dataset
 
 for name in ("buffers", "episodes"):
-    [(buffer set, rows)] = load_dataset(sys.argv[1], name).items()
-    print(json.dumps([name, buffer set, rows["episode_id"][:2], len(rows)]))
+    [(split, rows)] = load_dataset(sys.argv[1], name).items()
+    print(json.dumps([name, split, rows["episode_id"][:2], len(rows)]))
 """
 
 
@@ -82,10 +80,3 @@ def test_its_tables_are_loaded_by_name(hub: HubServer) -> None:
         ["buffers", "test", ["VideoRepick/test/0"] * 2, 15],
         ["episodes", "train", ["VideoRepick/train/0", "VideoPlaceOrder/train/0"], 17],
     ]
-
-
-def test_lerobot_cannot_open_anything(tmp_path: Path) -> None:
-    (tmp_path / "meta").mkdir()
-    (tmp_path / "meta" / "info.json").write_text("{}")
-    with pytest.raises(PublishError, match="LeRobot cannot open"):
-        open_with_lerobot("distractors", tmp_path)

@@ -89,6 +89,23 @@ def test_siglip_makes_an_index(own_buffers: Path, model: str) -> None:
     assert 0 <= chosen[0] <= chosen[-1] < len(buffer)
 
 
+def embed(folder: Path) -> np.ndarray:
+    encoder = make_encoder(f"siglip:{folder}", device="cpu")
+    return encoder.features(encoder.prepare(np.zeros((1, 32, 32, 3), np.uint8)))
+
+
+def test_the_identity_needs_no_model(
+    model: str, own_buffers: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from transformers import SiglipVisionModel
+
+    make_index(own_buffers, make_encoder(model, device="cpu"))
+    buffer = load_buffer(QUERIES[0], "k1", buffer_set=own_buffers)
+    monkeypatch.setattr(SiglipVisionModel, "from_pretrained", lambda *_, **__: pytest.fail("loads"))
+    identity = Selector(model, device="cpu").identity(buffer)
+    assert identity["fingerprint"] == buffer.index(model).encoder.sha256
+
+
 def test_a_worker_process_loads_the_model_itself(model: str) -> None:
     encoder = make_encoder(model, device="cpu", batch=3)
     packed = pickle.dumps(encoder)
@@ -140,17 +157,17 @@ def test_a_model_without_all_its_weights_is_refused(model: str, tmp_path: Path) 
     kept = {name: value for name, value in tensors.items() if name not in part}
     save_file(kept, path, metadata={"format": "pt"})
     with pytest.raises(FormatError, match=r"lacks 16 of the .* such as .*layers\.1") as caught:
-        make_encoder(f"siglip:{folder}", device="cpu")
+        embed(folder)
     assert "download or save it again" in str(caught.value.hint)
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(FormatError, match="cannot be loaded"):
-        make_encoder(f"siglip:{folder}", device="cpu")
+        embed(folder)
     save_file(tensors, path, metadata={"format": "pt"})
     config = json.loads((folder / "config.json").read_text())
     config["vision_config"]["intermediate_size"] = 48
     (folder / "config.json").write_text(json.dumps(config))
     with pytest.raises(FormatError, match="cannot be loaded"):
-        make_encoder(f"siglip:{folder}", device="cpu")
+        embed(folder)
 
 
 def test_weights_that_are_not_there(tmp_path: Path) -> None:

@@ -1,0 +1,249 @@
+"""What the cards of demonstrations and of buffer sets state."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from functools import cache
+from typing import Any
+
+from robomme_interference_data.constants import (
+    DEMONSTRATIONS,
+    MANIFEST_ROWS,
+    MANIFESTS,
+    QUESTIONS_PATH,
+    RECORDS_PATH,
+    REPORT_PATH,
+    SUMS_PATH,
+)
+from robomme_interference_data.data.buffer import Buffer
+from robomme_interference_data.data.buffer_set import BufferSet
+from robomme_interference_data.data.dataset import Dataset
+from robomme_interference_data.data.query import Query
+from robomme_interference_data.data.questions import Question
+from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
+from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
+from robomme_interference_data.schema.manifest import BufferManifest
+from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.storage.files import read_json, sha256_file
+from robomme_interference_data.viz.filmstrip import shown_camera, strip_png
+
+from .facts import CardTable, Facts, data_limits, dataset_rows, repositories_of, source_kinds_of
+from .markdown import code
+from .tables import condition_table, count_table, goal_table, unit_table
+
+STRIP = "README-strip.png"
+
+_BUFFERS = f"{MANIFESTS}/{MANIFEST_ROWS}"
+_FILE_SETS = {"frames": "data/*/*.parquet", "videos": "videos/*/*/*.mp4"}
+
+
+def demonstrations_facts(dataset: Dataset) -> Facts:
+    """Return what the card of a dataset of demonstrations states."""
+    if dataset.kind != DEMONSTRATIONS:
+        raise InvalidOptionError(
+            f"{dataset.files.describe()} is a dataset of {dataset.kind}; expected {DEMONSTRATIONS}",
+            "Units are published with the manifests that name them: give the buffer set.",
+        )
+    records = _records(dataset)
+    if not records:
+        raise FormatError.damaged(dataset.files.describe(), "no episodes")
+    query, lesson = Query(dataset, records[0]), dataset.session("lesson", records[0])
+    manifest = query.manifest(parse_condition("k0"), (lesson,), exact=records[0].exact)
+    frames, skipped = sum(record.length for record in records), _skipped([dataset])
+    more = (
+        f"{skipped:,} recorded episodes yielded no demonstration, or were not used: {REPORT_PATH} "
+        "lists them with the reason."
+    )
+    return _facts(
+        {"": dataset},
+        records,
+        Buffer(manifest, query, {dataset.kind: dataset}),
+        [more] * bool(skipped),
+        {
+            "cameras": dataset.cameras,
+            "episodes": len(records),
+            "counts": count_table(records),
+            "goals": goal_table(records),
+            "skipped": skipped,
+            "inexact": sum(not record.exact for record in records),
+        },
+        kind=DEMONSTRATIONS,
+        title="RoboMME-Interference demonstrations",
+        description=f"Demonstrations of RoboMME-Interference: {len(records):,} query episodes, "
+        f"{frames:,} frames, families {', '.join(_families(records))}.",
+        origin="Recorded episodes were cut, encoded, decoded again and compared.",
+        examples=frames,
+        tables=[_episodes(dataset, records)],
+        provenance=dataset_rows(dataset),
+        file_sets=_FILE_SETS,
+    )
+
+
+def buffer_set_facts(buffer_set: BufferSet) -> Facts:
+    """Return what the card of a buffer set states."""
+    header, datasets = buffer_set.header, dict(buffer_set.datasets)
+    records = {name: _records(dataset) for name, dataset in datasets.items()}
+    lessons, ids = records.pop(DEMONSTRATIONS), {*buffer_set.episode_ids}
+    units = [record for found in records.values() for record in found]
+    queries = tuple(record for record in lessons if record.episode_id in ids)
+    manifests = tuple(buffer_set.manifests())
+    if not (manifests and queries):
+        raise FormatError.damaged(buffer_set.location, "no buffers")
+    first = [one for one in manifests if one.episode_id == queries[0].episode_id]
+    shown = max(first, key=lambda one: (one.condition == "k3", len(one.sessions)))
+    same_family = count_same_family(manifests)
+    more = (
+        f"{same_family:,} buffers hold distractors of the query's own family, which the paper's "
+        "protocol excludes: results are not comparable with those of the benchmark."
+    )
+    split_name, questions = one_split(queries), _questions(buffer_set)
+    tables = [CardTable("buffers", BufferManifest, _BUFFERS, header.rows, split_name)]
+    for name in [*records][:1]:
+        tables.append(_episodes(datasets[name], records[name], one_split(units)))
+    if questions is not None:
+        tables.append(CardTable("questions", Question, QUESTIONS_PATH, questions, split_name))
+    return _facts(
+        datasets,
+        queries,
+        buffer_set.load(shown.episode_id, shown.condition, cameras=()),  # fetches no video
+        [more] * bool(same_family),
+        {
+            "cameras": buffer_set.cameras,
+            "buffers": len(manifests),
+            "queries": len(queries),
+            "units": len(units),
+            "units_split": one_split(units),
+            "conditions": buffer_set.conditions,
+            "condition_table": condition_table(buffer_set.conditions, manifests),
+            "counts": unit_table(queries, units),
+            "goals": goal_table(lessons),
+            "questions": questions is not None,
+            "header": header,
+            "other_conditions": _beyond_paper(buffer_set.conditions),
+            "same_family": same_family,
+            "skipped": _skipped(datasets[name] for name in records),
+            "inexact": sum(not one.exact for one in manifests),
+        },
+        kind="buffer_set",
+        title="RoboMME-Interference buffers",
+        description=f"History buffers of RoboMME-Interference: {len(manifests):,} buffers of "
+        f"{len(queries):,} query episodes under {', '.join(buffer_set.conditions)}, and the "
+        "distractor units that they hold.",
+        origin="The sessions of every buffer were drawn by SHA-256, rule version "
+        f"{header.rule_version}, seed {header.seed}.",
+        examples=sum(record.length for record in units),
+        tables=tables,
+        provenance=[
+            ("revision of the buffer set", code(buffer_set.revision)),
+            (f"SHA-256 of `{_BUFFERS}`", code(header.rows)),
+            *(row for name, one in datasets.items() for row in dataset_rows(one, name)),
+            ("version of the draw", code(header.rule_version)),
+        ],
+        base_kind=DEMONSTRATIONS,
+        base=header.datasets[DEMONSTRATIONS].location,
+        file_sets={**_FILE_SETS, "manifest": f"{MANIFESTS}/*.json"},
+    )
+
+
+def _facts(
+    datasets: Mapping[str, Dataset],
+    queries: Sequence[EpisodeRecord],
+    shown: Buffer,
+    limits: Iterable[str],
+    values: Mapping[str, Any],
+    **fields: Any,
+) -> Facts:
+    """Return the facts that demonstrations and buffer sets share, completed by `fields`.
+
+    `shown` is the buffer whose film strip the card shows, drawn once and only when needed.
+    """
+    camera = shown_camera(shown)
+    sessions = ", ".join(f"{one.role} {one.source}" for one in shown.sessions) or "no session"
+    simulators = {one.simulator for dataset in datasets.values() for one in dataset.records()}
+    named = sorted(filter(None, simulators))
+    sources = {name: list(dataset.identity.sources) for name, dataset in datasets.items()}
+
+    @cache
+    def pictures() -> dict[str, bytes]:
+        shown.fetch([camera])
+        return {STRIP: strip_png(shown)}
+
+    return Facts(
+        families=_families(queries),
+        simulators=named,
+        simulated=None not in simulators,
+        limits=data_limits(queries, named, limits),
+        pictures=pictures,
+        values={
+            "strip": STRIP,
+            "caption": f"{shown.episode_id} under {shown.condition}: {sessions}. Goal: "
+            f"{shown.goal}",
+            "shown": shown,
+            "camera": camera,
+            "first": queries[0].episode_id,
+            "header": None,
+            "other_conditions": [],
+            "same_family": 0,
+            **values,
+        },
+        repositories={k: v for one in datasets.values() for k, v in repositories_of(one).items()},
+        source_kinds=source_kinds_of(datasets.values()),
+        details={
+            f"Sources of the {name or DEMONSTRATIONS}": one for name, one in sources.items() if one
+        },
+        **fields,
+    )
+
+
+def one_split(records: Iterable[EpisodeRecord]) -> str:
+    """Return the split of all episodes, or `mixed`."""
+    splits = {record.episode_id.split for record in records}
+    return splits.pop() if len(splits) == 1 else "mixed"
+
+
+def count_same_family(manifests: Iterable[BufferManifest]) -> int:
+    """Return how many buffers have a distractor of the query's own family."""
+    return sum(
+        any(
+            session.role == "distractor" and session.source.family == one.episode_id.family
+            for session in one.sessions
+        )
+        for one in manifests
+    )
+
+
+def _records(dataset: Dataset) -> tuple[EpisodeRecord, ...]:
+    return tuple(sorted(dataset.records(), key=lambda one: one.episode_id.sort_key))
+
+
+def _families(records: Iterable[EpisodeRecord]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(record.episode_id.family for record in records))
+
+
+def _episodes(
+    dataset: Dataset, records: Iterable[EpisodeRecord], split: str | None = None
+) -> CardTable:
+    digest = dataset.sums().get(RECORDS_PATH)
+    if digest is None:
+        where = dataset.files.describe()
+        raise FormatError.damaged(where, f"{RECORDS_PATH} is not in {SUMS_PATH}")
+    return CardTable("episodes", EpisodeRecord, RECORDS_PATH, digest, split or one_split(records))
+
+
+def _questions(buffer_set: BufferSet) -> str | None:
+    """Return the SHA-256 of the questions of a buffer set, or None if it has none."""
+    with suppress(MissingFileError):
+        return sha256_file(buffer_set.files.path(QUESTIONS_PATH))
+    return None
+
+
+def _skipped(datasets: Iterable[Dataset]) -> int:
+    """Return how many recorded episodes yielded nothing."""
+    reports = (read_json(one.files.path(REPORT_PATH)).get("skipped") for one in datasets)
+    return sum(len(skipped) for skipped in reports if isinstance(skipped, list))
+
+
+def _beyond_paper(conditions: Iterable[str]) -> list[tuple[list[str], str]]:
+    """Return the conditions beyond the paper's, grouped by kind, with what the kind holds."""
+    named = {one: parse_condition(one).kind for one in conditions if one not in DEFAULT_CONDITIONS}
+    kinds = dict.fromkeys(named.values())
+    return [([f"`{one}`" for one in named if named[one] == kind], kind.holds) for kind in kinds]
