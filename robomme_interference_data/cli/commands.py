@@ -129,7 +129,7 @@ def show(
         print_status(f"{out} written")
     manifest, evidence = buffer.manifest, buffer.evidence
     if as_json:
-        told = None if evidence is None else [one.told() for one in evidence]
+        told = None if evidence is None else [one.to_dict() for one in evidence]
         print_json(to_dict(manifest) | {"evidence": told})
         return
     table = Table.make(

@@ -16,7 +16,7 @@ from robomme_interference_data.simulators.tabletop.episodes import (
     seed_of,
     turn_of,
 )
-from robomme_interference_data.simulators.tabletop.families import family_class, other_answer
+from robomme_interference_data.simulators.tabletop.families import draw_episode, other_answer
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
 
 
@@ -49,8 +49,7 @@ def test_other_answers_take_turns() -> None:
     for episode in (one for one in episode_ids() if one.split == "test"):
         seed = seed_of(episode)
         number = other_answer(episode)
-        rng = np.random.RandomState(seed)
-        count = len(family_class(episode.family)(difficulty_of(seed), rng).answers)
+        count = len(draw_episode(episode.family, seed, difficulty_of(seed)).answers)
         own = turn_of(seed, count)
         assert number != own
         assert 0 <= number < count

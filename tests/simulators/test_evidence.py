@@ -5,20 +5,19 @@ from itertools import combinations
 from typing import Any
 
 import pytest
-from numpy.random import RandomState
 from support.families import families
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, seed_of
-from robomme_interference_data.simulators.tabletop.families import family_class
+from robomme_interference_data.simulators.tabletop.families import draw_episode
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
 
 
 def drawn(family: str, index: int, split: str = "test") -> Any:
     seed = seed_of(EpisodeId(family, split, index))
-    return family_class(family)(difficulty_of(seed), RandomState(seed))
+    return draw_episode(family, seed, difficulty_of(seed))
 
 
 def seen(scene: Any, answer: Any, known: Iterable[int]) -> dict[int, str]:
@@ -69,7 +68,7 @@ def test_what_is_left_to_guess(family: str, index: int, known: set[int], left: i
             assert len(scene.agreeing(seen(scene, answer, known))) == left
 
 
-def test_a_path_goes_on_to_a_neighbour() -> None:
+def test_a_path_goes_on_to_a_neighbor() -> None:
     """A corner of the grid has three."""
     scene = drawn("PatternLock", 0)
     answer = next(one for one in scene.answers if one[:2] == (0, 1))

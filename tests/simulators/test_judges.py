@@ -13,10 +13,10 @@ from robomme_interference_data.simulators import Status
 
 pytest.importorskip("mani_skill", reason="needs the extra sim")
 
+from robomme_interference_data.simulators.tabletop.bodies import CUBE
 from robomme_interference_data.simulators.tabletop.env import TabletopEnv
 from robomme_interference_data.simulators.tabletop.episodes import seed_of
 from robomme_interference_data.simulators.tabletop.families.move_cube import MoveCube
-from robomme_interference_data.simulators.tabletop.kit import CUBE
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
 
@@ -48,9 +48,9 @@ def play(env: TabletopEnv, script: Script, seen: Callable[[], None] = lambda: No
 # --- VideoUnmask: nothing is seen under a wrong container --------------------------------------
 
 
-def pixels_of(colour: str, image: NDArray[np.uint8]) -> int:
+def pixels_of(color: str, image: NDArray[np.uint8]) -> int:
     """Number of pixels in which one channel leads the others by far."""
-    channel = ("red", "green", "blue").index(colour)
+    channel = ("red", "green", "blue").index(color)
     others = np.delete(image.astype(int), channel, axis=2).max(axis=2)
     return int((image[..., channel].astype(int) - others > 50).sum())
 
@@ -58,7 +58,7 @@ def pixels_of(colour: str, image: NDArray[np.uint8]) -> int:
 def test_no_cube_is_seen_under_a_wrong_container_before_the_failure(env: TabletopEnv) -> None:
     scene = start(env, "VideoUnmask/test/0", 0)
     wrong = next(number for number in scene.under if number != env.answer[0])
-    colour = scene.colours[scene.cubes.index(scene.under[wrong])]
+    color = scene.colors[scene.cubes.index(scene.under[wrong])]
     heights, pixels = [], []
 
     def look() -> dict[str, NDArray[np.uint8]]:
@@ -70,7 +70,7 @@ def test_no_cube_is_seen_under_a_wrong_container_before_the_failure(env: Tableto
     def note() -> None:
         if scene.shells[wrong].p[2] > 0.004:  # lifted at all
             images = look()
-            pixels.append([pixels_of(colour, images[name]) for name in ("front", "wrist")])
+            pixels.append([pixels_of(color, images[name]) for name in ("front", "wrist")])
             heights.append(scene.shells[wrong].p[2])
 
     def lift_slowly() -> Script:
@@ -83,7 +83,7 @@ def test_no_cube_is_seen_under_a_wrong_container_before_the_failure(env: Tableto
     assert max(heights) <= 0.010
     assert not np.any(pixels)
     scene.shells[wrong].put(scene.under[wrong].home)  # at 0.02 m, where the cube comes into sight
-    assert pixels_of(colour, look()["front"]) > 0
+    assert pixels_of(color, look()["front"]) > 0
 
 
 # --- MoveCube: the manner is judged over the whole way -----------------------------------------
@@ -141,7 +141,7 @@ def test_the_manner_is_what_moves_the_cube(
     scene = start(env, "MoveCube/test/0", answer)
     cube = scene.cube.p
     assert play(env, way(env.arm, scene)) is status
-    if way is drag_slowly:  # a wrong manner fails within millimetres
+    if way is drag_slowly:  # a wrong manner fails within millimeters
         assert np.linalg.norm(scene.cube.p - cube) < 0.004
 
 

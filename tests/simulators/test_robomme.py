@@ -114,7 +114,7 @@ def test_it_tells_its_own_subgoal(simulator: RoboMMESimulator) -> None:
     assert simulator.subgoal().grounded == "pick up the cube at <2, 200>, step 2"
     assert simulator.subgoal().simple == "pick up the cube, step 2"
     simulator.reset("PatternLock/test/3")
-    with pytest.raises(UnknownNameError, match="tells no subgoal"):
+    with pytest.raises(UnknownNameError, match="provides no subgoal"):
         simulator.subgoal()
 
 
@@ -205,7 +205,7 @@ def test_a_death_shows_the_end_of_its_log_without_escapes(simulator: RoboMMESimu
     with pytest.raises(SimulatorCrashError, match="died during reset, exit code 7") as caught:
         simulator.reset(f"MoveCube/test/{DIES}")
     lines = (caught.value.hint or "").splitlines()
-    # 20 lines at most, the last ones; the stand-in prints them in colour.
+    # 20 lines at most, the last ones; the stand-in prints them in color.
     assert (len(lines), lines[-1]) == (21, "WARN: planner failure 99")
     assert simulator.pid is None
     assert len(simulator.reset("MoveCube/test/0")[0]) == 2
@@ -218,7 +218,7 @@ def test_a_process_that_was_killed(simulator: RoboMMESimulator) -> None:
         os.kill(simulator.pid, signal.SIGKILL)
         with pytest.raises(SimulatorCrashError, match="exit code -9"):
             call()
-        with pytest.raises(SimulatorCrashError, match="runs no episode"):
+        with pytest.raises(SimulatorCrashError, match="no episode is running"):
             simulator.step(HOLD)
         assert len(simulator.reset("MoveCube/test/0")[0]) == 2
 
@@ -246,7 +246,7 @@ def test_an_exception_leaves_the_process_running(simulator: RoboMMESimulator) ->
     simulator.step(HOLD)
     with pytest.raises(SimulatorCrashError, match="error at step 2: caught: no such joint"):
         simulator.step(HOLD)
-    with pytest.raises(SimulatorCrashError, match="runs no episode"):
+    with pytest.raises(SimulatorCrashError, match="no episode is running"):
         simulator.step(HOLD)
     assert len(simulator.reset("MoveCube/test/0")[0]) == 2
     assert simulator.pid == pid
@@ -335,7 +335,7 @@ def test_what_differs_from_the_fork_is_patched(
     assert results[1] == results[2] == results[0]
     assert len(patches) == 4
     # The description of the arm is written once: the stick's own, and of the camera what hangs on
-    # it, but for its colour, which the fork leaves out too.
+    # it, but for its color, which the fork leaves out too.
     [folder] = (tmp_path / "robomme-interference" / "robomme").iterdir()
     urdf, srdf = ((folder / f"panda_stick.{kind}").read_text() for kind in ("urdf", "srdf"))
     links = [one.get("name") for one in ElementTree.fromstring(urdf).iter("link")]

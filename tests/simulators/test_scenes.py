@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.random import RandomState
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES, SPLITS
@@ -19,21 +18,18 @@ from robomme_interference_data.ids import EpisodeId
 
 pytest.importorskip("mani_skill", reason="needs the extra sim")
 
-from robomme_interference_data.simulators.tabletop.camera import (
-    FRONT_EYE,
-    FRONT_TARGET,
-    FRONT_VIEW,
-)
+from robomme_interference_data.simulators.tabletop.bodies import CUBE, SIDE
+from robomme_interference_data.simulators.tabletop.camera import FRONT_EYE, FRONT_TARGET, FRONT_VIEW
 from robomme_interference_data.simulators.tabletop.episodes import (
     difficulty_of,
     episode_ids,
     seed_of,
     turn_of,
 )
-from robomme_interference_data.simulators.tabletop.families import family_class
-from robomme_interference_data.simulators.tabletop.families.video_place_button import RADIUS
-from robomme_interference_data.simulators.tabletop.kit import CUBE, SIDE
-from robomme_interference_data.simulators.tabletop.stage import Spot, lanes
+from robomme_interference_data.simulators.tabletop.families import draw_episode
+from robomme_interference_data.simulators.tabletop.families.video_place import RADIUS
+from robomme_interference_data.simulators.tabletop.layout import Spot
+from robomme_interference_data.simulators.tabletop.swaps import lanes
 
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "tabletop.md"
 
@@ -49,7 +45,7 @@ def scenes(family: str, split: str | None = None, difficulty: str | None = None)
     """Families drawn for episodes, each with `right`, its hidden answer."""
     made: list[Any] = []
     for seed in seeds_of(family, split, difficulty):
-        scene: Any = family_class(family)(difficulty_of(seed), RandomState(seed))
+        scene: Any = draw_episode(family, seed, difficulty_of(seed))
         scene.right = scene.answers[turn_of(seed, len(scene.answers))]
         made.append(scene)
     return made
@@ -136,7 +132,7 @@ def test_which_containers_hide_a_cube_tells_nothing(family: str, difficulty: str
     under: Counter[int] = Counter()  # containers of cubes that are not asked for
     for scene in drawn:
         covered = scene.covered(scene.right)
-        assert len(set(covered)) == len(scene.colours) == 3
+        assert len(set(covered)) == len(scene.colors) == 3
         assert covered[: len(scene.right)] == list(scene.right)
         rank[sorted(covered).index(scene.right[0])] += 1
         under.update(covered[len(scene.right) :])
@@ -212,7 +208,7 @@ def test_nothing_that_moves_comes_within_5_mm_of_anything_else(family: str) -> N
 
 
 def seen_at(points: Any) -> NDArray[np.float64]:
-    """Column and row of points in the front image, and pixels per metre there, `(3, n)`."""
+    """Column and row of points in the front image, and pixels per meter there, `(3, n)`."""
     ahead = np.subtract(FRONT_TARGET, FRONT_EYE)
     ahead /= np.linalg.norm(ahead)
     right = np.cross(ahead, (0, 0, 1))

@@ -20,7 +20,7 @@ pytest.importorskip("mani_skill", reason="needs the extra sim")
 
 from robomme_interference_data.simulators.base import Observation
 from robomme_interference_data.simulators.tabletop.drawing import PANDA
-from robomme_interference_data.simulators.tabletop.scene_shift import PLACES, TALL, WIDE
+from robomme_interference_data.simulators.tabletop.scene_shift import POSITIONS, TALL, WIDE
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
 
 EPISODE = "MoveCube/test/2"
@@ -106,7 +106,7 @@ def test_things_that_take_no_part_are_in_nobodys_way(blind: TabletopSimulator, f
     names = [f"scene-0-{PANDA}_panda_{name}" for name in ("hand", "leftfinger", "rightfinger")]
     parts = [link for link in robot.links if link.name in names]
     assert len(parts) == 3
-    rigid = [one._rigid for one in blind.env.kit.bodies if one._rigid is not None]  # no table
+    rigid = [one._rigid for one in blind.env.builder.bodies if one._rigid is not None]  # no table
     parts += [one for one in rigid if one.collision_shapes]
     status, steps = Status.ONGOING, 0
     while status is Status.ONGOING:
@@ -114,7 +114,7 @@ def test_things_that_take_no_part_are_in_nobodys_way(blind: TabletopSimulator, f
         steps += 1
         spans = [part.compute_global_aabb_tight() for part in parts if steps % 4 == 0]
         for low, high in spans:
-            for x, y in PLACES:
+            for x, y in POSITIONS:
                 if low[2] < TALL and high[2] > 0:
                     way = np.maximum(0, np.maximum(low[:2] - (x, y), (x, y) - high[:2]))
                     assert math.hypot(*way) > WIDE
@@ -126,5 +126,5 @@ def test_shifts_are_asked_for_by_name(shifted: TabletopSimulator) -> None:
         TabletopSimulator(shift="fog:1")
     with pytest.raises(UnknownNameError):
         shifted.reset("MoveCube/test/99")
-    with pytest.raises(SimulatorCrashError, match="runs no episode"):
+    with pytest.raises(SimulatorCrashError, match="no episode is running"):
         list(shifted.views(SHIFTS))

@@ -127,7 +127,7 @@ def test_points_by_hand() -> None:
     # What the camera looks at is in the middle. It faces the arm: the arm's left is to its right.
     assert to_pixels([FRONT_TARGET]) == ((128, 128),)
     [(y, x)] = to_pixels([(FRONT_TARGET[0], 0.1, FRONT_TARGET[2])])
-    # 256 / 2 / tan(23°) = 301.5 pixels at a metre; the target is hypot(1.10, 0.43) = 1.181 m away.
+    # 256 / 2 / tan(23°) = 301.5 pixels at a meter; the target is hypot(1.10, 0.43) = 1.181 m away.
     assert (y, x) == (128, 128 + int(0.1 * 301.5 / 1.181))
     assert to_pixels([(0.3, 5.0, 0.0)])[0][1] == 255  # beyond the edge, at the edge
 
@@ -156,7 +156,7 @@ def test_the_point_is_on_the_thing(tabletop: TabletopSimulator) -> None:
     for index in range(2):
         _, first, _ = tabletop.reset(f"VideoPlaceButton/test/{index}", demonstration=False)
         subgoal = tabletop.subgoal()
-        colour = subgoal.text.split()[3]
+        color = subgoal.text.split()[3]
         [(y, x)] = subgoal.points
         pixel = first.images["front"][y, x].astype(int)
-        assert pixel.argmax() == ("red", "green", "blue").index(colour)
+        assert pixel.argmax() == ("red", "green", "blue").index(color)

@@ -129,7 +129,7 @@ def test_the_same_actions_have_the_same_outcome_whatever_is_drawn(
 
 
 def test_pictures_are_lit_by_the_scenes_own_lights(scene: TabletopEnv) -> None:
-    """The table's colour by hand: ambient 0.45, two lights at their angles to the vertical."""
+    """The table's color by hand: ambient 0.45, two lights at their angles to the vertical."""
     reset(scene, "PatternLock", 0)
     light = np.array([0.45] * 3)
     light += np.array([0.75, 0.75, 0.72]) / math.sqrt(0.5**2 + 0.4**2 + 1) / math.pi
@@ -202,7 +202,7 @@ def things(view: NDArray[np.int16]) -> NDArray[np.int16]:
 
 @pytest.mark.slow
 def test_no_two_families_could_be_mistaken_for_one_another(scene: TabletopEnv) -> None:
-    """Tables differ in colour, and most of what lies on them even if they did not."""
+    """Tables differ in color, and most of what lies on them even if they did not."""
     views: dict[str, list[Any]] = {}
     for family, index in product(FAMILIES, (0, 1, 2, 27, 28, 29)):
         reset(scene, family, index)

@@ -88,15 +88,15 @@ class Drawn(Source):
         parts, seed = scene.parts(answer), seed_of(episode.id)
         seen = shown(len(parts))
         evidence = spans_of_parts(seen, parts)
-        told = scene.goals(), seed, difficulty_of(seed), "tabletop", True
+        told = (scene.goal,), seed, difficulty_of(seed), "tabletop", True
         return Recording(*told, self._frames(episode.key, seen), evidence)
 
     def _frames(self, number: int, seen: Sequence[Sequence[int]]) -> Generator[Frame]:
         for place in range(UNIT):
             lesson = place < LESSON
             part = 1 + seen[place][0] if lesson and seen[place] else 0
-            colour = (place if lesson else LIVE, number, part)
-            image = np.full((SIZE, SIZE, 3), colour, np.uint8)
+            color = (place if lesson else LIVE, number, part)
+            image = np.full((SIZE, SIZE, 3), color, np.uint8)
             yield Frame({"front": image}, np.zeros(8, np.float32), None, lesson)
 
 
