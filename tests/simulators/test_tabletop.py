@@ -252,10 +252,9 @@ def test_bad_input_is_refused(blind: TabletopSimulator) -> None:
     blind.reset("PatternLock/test/0")
     with pytest.raises(UnknownNameError, match="Did you mean 'oracle'"):
         blind.act("orakle")
-    for wrong in ("MoveCube/test/999", "MoveCub/test/0"):
-        with pytest.raises(UnknownNameError):
-            blind.reset(wrong)
-        with pytest.raises(SimulatorCrashError, match="no episode"):
-            blind.act("oracle")
+    with pytest.raises(UnknownNameError):
+        blind.reset("MoveCube/test/999")
+    with pytest.raises(SimulatorCrashError, match="no episode is running"):
+        blind.act("oracle")
     with pytest.raises(InvalidOptionError, match="Did you mean 'front'"):
         TabletopSimulator(cameras=("fornt",))

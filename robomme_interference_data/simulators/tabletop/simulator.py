@@ -66,7 +66,7 @@ class TabletopSimulator(Simulator):
 
     @classmethod
     def episodes(cls) -> list[EpisodeId]:
-        """List the suite's episodes."""
+        """Return the suite's episodes."""
         return episode_ids()
 
     @classmethod
@@ -105,7 +105,7 @@ class TabletopSimulator(Simulator):
         self.env.show(self.env.shift)
 
     def close(self) -> None:
-        """Release the scene; further calls but `close` are errors."""
+        """Release the scene; afterwards, every method except `close` raises."""
         super().close()
         self.env.close()
 

@@ -45,9 +45,7 @@ class MoveCube(Family):
         self.target_at = np.array([-0.05, -0.055]) + rng.uniform(-1, 1, 2) * (wide, 0.02)
         way = self.target_at - self.cube_at
         self.way = np.append(way / np.linalg.norm(way), 0.0)
-        self.turn = math.atan2(
-            -way[1], -way[0]
-        )  # yaw of a gripper whose x axis points back along the path
+        self.turn = math.atan2(-way[1], -way[0])  # yaw at which x points back along the path
         self.answers = ["push", "grasp", "hook"]
         self.moved: dict[str, float] = {}  # m, by manner, how far the cube has moved
         self.manner, self.opening = "", 0.04
@@ -126,10 +124,8 @@ class MoveCube(Family):
         """Return how the cube is moved now: an answer, or "open" for open fingers."""
         ends = ((0.0, 0.0), (HANDLE, 0.0), (HANDLE, CROSS))
         end, corner, tip = (self.hook.point(x, y, 0) for x, y in ends)
-        beside = min(
-            distance_to_segment(self.cube.p, end, corner),
-            distance_to_segment(self.cube.p, corner, tip),
-        )
+        hook = (end, corner), (corner, tip)
+        beside = min(distance_to_segment(self.cube.p, *part) for part in hook)
         if beside < 0.045 and distance_to_segment(arm.tip, end, corner) < 0.03:
             return "hook"
         if math.dist(self.cube.p, arm.tip) < 0.01 and (
