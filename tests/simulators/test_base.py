@@ -1,4 +1,4 @@
-"""What all simulators share: names, actions, when there is an episode, and the command."""
+"""Common to all simulators: names, actions, episodes, and the command `simulate`."""
 
 import json
 import sys
@@ -87,14 +87,14 @@ def test_what_is_no_action_is_refused(given: Any, chunk: bool) -> None:
         action_array(given, chunk=chunk)
 
 
-# --- when there is an episode ------------------------------------------------------------------
+# --- episodes ----------------------------------------------------------------------------------
 
 
 def test_an_episode_runs_until_it_ends() -> None:
     with Double() as simulator:
         simulator.reset("MoveCube/test/9")
         with pytest.raises(InvalidOptionError):
-            simulator.step(np.zeros(7, np.float32))  # leaves it as it was
+            simulator.step(np.zeros(7, np.float32))  # changes nothing
         statuses = [simulator.step(simulator.act("oracle"))[1] for _ in range(3)]
         assert statuses == [Status.ONGOING, Status.ONGOING, Status.SUCCESS]
         with pytest.raises(SimulatorCrashError, match="no episode is running"):

@@ -11,7 +11,7 @@ from robomme_interference_data.constants import FAMILIES, MAX_STEPS
 SUITE_VERSION = 2
 """Version of the episodes: every change to scenes, shifts, motions, goals or judgments raises it.
 
-Datasets and runs of different versions are incompatible; see `docs/simulators.md`.
+Datasets and runs of different versions are incompatible; see `docs/reference/tabletop.md`.
 """
 
 
