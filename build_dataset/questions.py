@@ -83,7 +83,7 @@ def _planned(query: Query, revision: str) -> tuple[Question, Marks]:
     question = Question(
         query.episode_id,
         revision,
-        scene.question(),
+        scene.question,
         tuple(one.words for one in options),
         tuple(numbers[one] for one in chosen),
         chosen.index(right),

@@ -33,7 +33,7 @@ class Evidence:
     session: Session
     span: EvidenceSpan
 
-    def told(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return plain values: part, text, session and frames in the buffer."""
         told = {"part": self.span.part, "text": self.span.text, "role": self.session.role}
         return told | {"start": self.start, "stop": self.stop}

@@ -17,19 +17,14 @@ from robomme_interference_data.lazy import lazy_exports
 if TYPE_CHECKING:
     from robomme_interference_data.schema.rollouts import Status
 
-    from .base import (
-        Demonstration,
-        EpisodeInfo,
-        Observation,
-        Simulator,
-    )
+    from .base import Demonstration, EpisodeInfo, Observation, Simulator
     from .registry import SIMULATORS, make_simulator
 
 __all__ = [
-    # make one
+    # factory
     "make_simulator",
     "SIMULATORS",
-    # what it serves
+    # interface
     "Simulator",
     "Demonstration",
     "EpisodeInfo",

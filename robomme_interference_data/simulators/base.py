@@ -1,4 +1,4 @@
-"""What every simulator serves, whatever engine is behind it."""
+"""The interface of every simulator."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -21,10 +21,10 @@ from robomme_interference_data.schema.shifts import Shift
 from robomme_interference_data.schema.subgoal import Subgoal
 
 CAMERAS = ("front", "wrist")
-"""The cameras of every simulator, in the order in which they are listed."""
+"""The cameras of every simulator, in canonical order."""
 
 ACTION_SIZE = 8
-"""Numbers of an action, and of a state: 7 joints, then the gripper."""
+"""Length of an action and of a state: 7 joints, then the gripper."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,11 @@ class Observation:
     """What a policy sees at one time step.
 
     Attributes:
-        images: Camera name (`front`, `wrist`) to image, `(256, 256, 3) uint8` RGB; only the
-            cameras that the simulator was asked to draw, and empty where no images were wanted.
-        state: `(8,) float32`: 7 joint positions in rad, then the gripper's opening, which is the
-            way of one finger, 0 closed to 0.04 m open.
-        subgoal: What a policy is told to do next, where something in front of it says so.
+        images: Camera name (`front`, `wrist`) to image, `(256, 256, 3) uint8` RGB. Only the
+            cameras that the simulator renders; empty if no images were requested.
+        state: `(8,) float32`: 7 joint positions in rad, then the opening of one finger, 0 closed
+            to 0.04 m open.
+        subgoal: The next subgoal for the policy, if a subgoal writer provides one.
     """
 
     images: dict[str, NDArray[np.uint8]]
@@ -46,16 +46,15 @@ class Observation:
 
 @dataclass(frozen=True)
 class Demonstration:
-    """The lesson of an episode: T time steps, the first live observation not among them.
+    """The lesson of an episode: T time steps, without the first live observation.
 
     Attributes:
-        images: Camera name to frames, `(T, H, W, 3) uint8` RGB; empty where they
-            were not wanted.
+        images: Camera name to frames, `(T, H, W, 3) uint8` RGB; empty if not requested.
         states: `(T, 8) float32`, as `Observation.state`; `states[t]` belongs to frame t.
-        actions: `(T, 8) float32`: the action taken at time step t, after frame t was seen: 7
-            absolute joint targets in rad, then the gripper, −1 closed to 1 open.
-        evidence: Which frames show the hidden answer, part by part; None where the simulator
-            does not say. Never handed to a policy.
+        actions: `(T, 8) float32`, executed after frame t: 7 absolute joint targets in rad, then
+            the gripper, −1 closed to 1 open. `(0, 8)` if unknown.
+        evidence: Which frames show each part of the hidden answer; None if unknown. Policies never
+            receive it.
     """
 
     images: dict[str, NDArray[np.uint8]]
@@ -73,13 +72,13 @@ class Demonstration:
 
 @dataclass(frozen=True)
 class EpisodeInfo:
-    """What may be known of an episode besides its frames. The hidden answer is not in it.
+    """Public facts about an episode, without the hidden answer.
 
     Attributes:
-        goals: All wordings of the goal; at least one.
+        goals: All wordings of the goal, at least one.
         difficulty: `easy`, `medium` or `hard`.
         seed: Seed of the scene.
-        simulator: Name under which the simulator is registered.
+        simulator: Registered name of the simulator.
     """
 
     goals: tuple[str, ...]
@@ -89,7 +88,7 @@ class EpisodeInfo:
 
     @property
     def goal(self) -> str:
-        """The goal in words: the first of its wordings."""
+        """The first wording of the goal."""
         return self.goals[0]
 
 
@@ -97,28 +96,28 @@ Begun = tuple[Demonstration, Observation, EpisodeInfo]
 
 
 class Simulator(ABC):
-    """One episode at a time of the benchmark's task families.
+    """Runs one episode of the benchmark's task families at a time.
 
-    An episode that is refused, breaks or ends leaves none to step. One that goes on after 1300
-    steps has timed out. A backend begins and executes in `_begin` and `_execute`; an object with
-    the same `reset`, `step`, `act` and `close` will do as well.
+    An episode ends when `step` returns another status than `ongoing`, when a call raises, or after
+    1300 steps (`timeout`). Subclasses implement `_begin`, `_execute` and `act`. Instead of a
+    subclass, any object with the methods `reset`, `step`, `act` and `close` works as well.
 
-    What a simulator supports are attributes and methods of its class, known before one is made. A
-    function that makes one, and is no class, has those of this class.
+    Class attributes and class methods declare what a simulator supports, before one is made. A
+    simulator that a function makes has the values of this class.
 
     Attributes:
-        name: Name under which it is registered.
-        about: What its episodes are, for cards: `the official simulator, RoboMME`.
-        remote: Whether it runs in another process: then `evaluate` decodes the history while it
-            begins the episode.
-        settings: Which settings of a run are arguments of its constructor: `cameras` (those that
-            somebody looks at), `shift`, `python` (another interpreter's path), `subgoals` (whether
-            `subgoal` will be asked), `answer_s` (seconds that a call may take).
-        scripted: Whether `act` can play an episode out.
-        shifts: Whether it can show its live scene under shifts.
-        suite_version: Version of its episodes; None where they have none of their own.
+        name: Registered name.
+        about: What its episodes are, for cards, such as `the official simulator, RoboMME`.
+        remote: Whether it runs in another process; `evaluate` then decodes the history while the
+            simulator begins the episode.
+        settings: Settings of a run that its constructor accepts: `cameras` (to render), `shift`,
+            `python` (path of another interpreter), `subgoals` (whether `subgoal` will be called),
+            `answer_s` (seconds that a call may take).
+        scripted: Whether `act` has built-in policies.
+        shifts: Whether it supports shifts of the live scene.
+        suite_version: Version of its episodes; None if they have none.
         packages: Distributions of this environment that it uses.
-        episode_s: Seconds that an episode may take when it is recorded.
+        episode_s: Seconds that recording one episode may take.
     """
 
     name: ClassVar[str] = ""
@@ -136,53 +135,78 @@ class Simulator(ABC):
 
     @classmethod
     def versions(cls, python: str | None = None) -> dict[str, str]:
-        """Return the versions on which its results depend, by name, without starting it.
+        """Return the versions that its results depend on, by name, without starting it.
 
         Args:
             python: Path of its own interpreter, if it has one.
+
+        Raises:
+            InvalidOptionError: That interpreter does not run.
         """
         return {} if cls.suite_version is None else {cls.name: str(cls.suite_version)}
 
     @classmethod
     def episodes(cls) -> list[EpisodeId]:
-        """List its episodes that have demonstrations."""
+        """Return its episodes that have demonstrations, in canonical order."""
         return []
 
     @classmethod
     def other_answer(cls, episode: EpisodeId) -> int | None:
-        """Return the number of another answer that an episode's scene allows; None if unknown."""
+        """Return the number of another answer that an episode's scene allows.
+
+        Args:
+            episode: The episode, without an answer of its own in the id.
+
+        Returns:
+            The number for `EpisodeId.answer`, from 0; None if the answers are unknown.
+        """
         return None
 
     @classmethod
     def scene(cls, family: str, seed: int, difficulty: str) -> Any:
-        """Return the scene of a recorded episode, to be looked at and not played.
+        """Return the scene of a recorded episode, for questions about its answer.
 
-        That is an object with the methods of `tabletop.family.Family` that concern answers; None
-        where the possible answers are not known.
+        Args:
+            family: Task family.
+            seed: Seed of the scene.
+            difficulty: `easy`, `medium` or `hard`.
+
+        Returns:
+            An object with the attributes `answers`, `question` and `side`, and the methods
+            `agreeing`, `choice`, `option`, `own_answer` and `pixels` of `tabletop.family.Family`;
+            None if the possible answers are unknown.
         """
         return None
 
     def views(self, shifts: Iterable[Shift]) -> Iterator[Observation]:
-        """Yield what is seen now as under each of several shifts; the scene stays unchanged."""
-        raise UnknownNameError(f"the simulator {type(self).__name__} has no shifts")
+        """Yield the current observation under each of several shifts; the scene stays unchanged.
+
+        Args:
+            shifts: The shifts, in the order of the observations.
+
+        Raises:
+            UnknownNameError: The simulator does not support shifts.
+            SimulatorCrashError: No episode is running, or the simulator is closed.
+        """
+        raise UnknownNameError(f"the simulator {type(self).__name__} does not support shifts")
 
     def reset(self, episode_id: str, demonstration: bool = True) -> Begun:
-        """Start an episode: play its demonstration, then set the scene for execution.
+        """Start an episode: play its demonstration, then set up the live scene.
 
         The same id gives the same frames, states and first observation, bit for bit.
 
         Args:
             episode_id: `<Family>/<split>/<index>`, such as `MoveCube/test/3`.
-            demonstration: Whether the frames of the demonstration are wanted. It is played in any
-                case; without, a simulator need not draw it, and its `images` may be empty.
+            demonstration: Whether to return the frames of the demonstration. It is played in any
+                case, but `False` lets a simulator skip rendering and leave `images` empty.
 
         Returns:
-            The demonstration, the first live observation, and what may be known of the episode.
+            The demonstration; the first live observation; the public facts about the episode.
 
         Raises:
             InvalidIdError: The text is not an episode id.
-            UnknownNameError: There is no such family or episode.
-            SimulatorCrashError: The simulator is closed.
+            UnknownNameError: The family or episode does not exist.
+            SimulatorCrashError: The simulator failed, or is closed.
         """
         self._check_open()
         self._episode = None
@@ -192,70 +216,85 @@ class Simulator(ABC):
         return begun
 
     def step(self, action: NDArray[np.float32], observe: bool = True) -> tuple[Observation, Status]:
-        """Execute one action for a tenth of a second.
+        """Execute one action for 0.1 s.
 
         Args:
-            action: `(8,) float32`: 7 absolute joint targets in rad, gripper −1 closed to 1 open.
-            observe: Whether the images are wanted; without, a simulator need not draw them, and
-                the observation's `images` may be empty. The state is always there.
+            action: `(8,) float32`: 7 absolute joint targets in rad, then the gripper, −1 closed to
+                1 open.
+            observe: Whether to return images; `False` lets a simulator skip rendering and leave
+                `images` empty. The state is always returned.
+
+        Returns:
+            The observation after the action, and the status of the episode.
 
         Raises:
-            InvalidOptionError: The action has another shape, or is not finite.
-            SimulatorCrashError: There is no episode to step, or the simulator is closed.
+            InvalidOptionError: The action has another shape or is not finite; the episode
+                continues unchanged.
+            SimulatorCrashError: The simulator failed, no episode is running, or it is closed.
         """
         episode = self._running()
         action = action_array(action)
         self._episode = None
         self._steps += 1
-        seen, status = self._execute(episode, action, observe)
+        observation, status = self._execute(episode, action, observe)
         if status is Status.ONGOING and self._steps >= MAX_STEPS:
             status = Status.TIMEOUT
         if status is Status.ONGOING:
             self._episode = episode
-        return seen, status
+        return observation, status
 
     @abstractmethod
     def act(self, policy: str, known: Mapping[int, str] | None = None) -> NDArray[np.float32]:
-        """Return the next action, `(8,) float32`, of a built-in policy.
+        """Return the next action of a built-in policy.
 
         Args:
-            policy: `oracle`, which reads the hidden answer; `guess`, which draws one at random
-                from the episode's seed; or `recall`, which draws one of those that agree with
-                what is known. Keep to one of them throughout an episode.
-            known: For `recall`, at its first action: parts of the answer by number, in words as
-                the evidence of a demonstration has them; those that are believed most come first.
+            policy: `oracle` uses the hidden answer; `guess` draws an answer from the episode's
+                seed; `recall` draws one that agrees with `known`. Use the same policy throughout
+                an episode.
+            known: For `recall`, at its first action: known parts of the answer, number to text as
+                in the demonstration's evidence, the most trusted first.
+
+        Returns:
+            The action, `(8,) float32`, as `step` takes it.
 
         Raises:
             UnknownNameError: The simulator has no such policy.
-            SimulatorCrashError: There is no episode to act in, or the simulator is closed.
+            SimulatorCrashError: No episode is running, or the simulator is closed.
         """
 
     def subgoal(self) -> Subgoal:
-        """Return what is to be done next, as the scene stands: it knows the hidden answer.
+        """Return the next subgoal for the current state; it depends on the hidden answer.
+
+        Returns:
+            The subgoal; its points are (y, x) in pixels of the current front image.
 
         Raises:
-            UnknownNameError: The simulator does not tell.
-            SimulatorCrashError: There is no episode, or the simulator is closed.
+            UnknownNameError: The simulator provides no subgoals.
+            SimulatorCrashError: No episode is running, or the simulator is closed.
         """
-        raise UnknownNameError(f"the simulator {type(self).__name__} has no subgoals of its own")
+        raise UnknownNameError(f"the simulator {type(self).__name__} provides no subgoals")
 
     def follow_subgoal(self, subgoal: Subgoal | None) -> NDArray[np.float32]:
-        """Return the next action, `(8,) float32`, of a script that does what a subgoal says.
+        """Return the next action of a script that follows subgoals without knowing the answer.
 
-        It finds what words and points name among all that the scene allows; where they leave it
-        open, and without a subgoal, it draws from the episode's seed. Keep to it throughout an
-        episode.
+        It selects what the words and points of the subgoal match in the scene. Where they are
+        ambiguous, and without a subgoal, it draws from the episode's seed. Use only this policy
+        throughout an episode.
+
+        Args:
+            subgoal: The current subgoal; None for none.
+
+        Returns:
+            The action, `(8,) float32`, as `step` takes it.
 
         Raises:
             UnknownNameError: The simulator has no such script.
-            SimulatorCrashError: There is no episode to act in, or the simulator is closed.
+            SimulatorCrashError: No episode is running, or the simulator is closed.
         """
-        raise UnknownNameError(
-            f"the simulator {type(self).__name__} has no script that follows subgoals"
-        )
+        raise UnknownNameError(f"the simulator {type(self).__name__} cannot follow subgoals")
 
     def close(self) -> None:
-        """Release everything; further calls but `close` are errors."""
+        """Release all resources; afterwards, every method except `close` raises."""
         self._episode, self._closed = None, True
 
     def __enter__(self) -> Self:
@@ -266,63 +305,53 @@ class Simulator(ABC):
 
     def _check_open(self) -> None:
         if self._closed:
-            raise SimulatorCrashError("the simulator is closed", "Make another one.")
+            raise SimulatorCrashError("the simulator is closed", "Make a new one.")
 
     def _running(self) -> EpisodeId:
-        """Return the episode that runs."""
+        """Return the running episode."""
         self._check_open()
         if self._episode is None:
             raise SimulatorCrashError(
-                "the simulator runs no episode", "Call reset('<Family>/<split>/<index>') first."
+                "no episode is running", "Call reset('<Family>/<split>/<index>') first."
             )
         return self._episode
 
     @abstractmethod
     def _begin(self, episode: EpisodeId, demonstration: bool) -> Begun:
-        """Start an episode."""
+        """Start an episode; see `reset`."""
 
     @abstractmethod
     def _execute(
         self, episode: EpisodeId, action: NDArray[np.float32], observe: bool
     ) -> tuple[Observation, Status]:
-        """Execute one action in the episode that runs."""
+        """Execute one action in the running episode; see `step`."""
 
 
-def choose_cameras(wanted: Sequence[str] | None, there: Sequence[str] = CAMERAS) -> tuple[str, ...]:
-    """Return the cameras that are wanted, None for all, of those that are there, sorted.
-
-    Raises:
-        InvalidOptionError: One is not there.
-    """
-    for camera in wanted or ():
-        if camera not in there:
-            raise InvalidOptionError.one_of("camera", camera, there)
-    return tuple(sorted(there if wanted is None else set(wanted)))
+def choose_cameras(
+    names: Sequence[str] | None, available: Sequence[str] = CAMERAS
+) -> tuple[str, ...]:
+    """Return the named cameras, all by default, sorted; raise for one that is not available."""
+    for name in names or ():
+        if name not in available:
+            raise InvalidOptionError.one_of("camera", name, available)
+    return tuple(sorted(available if names is None else set(names)))
 
 
 def action_array(action: ArrayLike, *, chunk: bool = False) -> NDArray[np.float32]:
-    """Return an action as `(8,) float32`: the one check of actions.
-
-    Args:
-        action: 7 absolute joint targets in rad, then the gripper, −1 closed to 1 open.
-        chunk: Whether these are several actions, returned as `(n, 8) float32`, n at least 1.
-
-    Raises:
-        InvalidOptionError: It has another shape, or is not finite numbers.
-    """
+    """Check an action, and return it as `(8,) float32`; a chunk of n ≥ 1 actions as `(n, 8)`."""
     try:
-        given = np.asarray(action)
+        array = np.asarray(action)
     except ValueError:  # rows of several lengths
-        given = np.empty(0)
-    shape = given.shape[1:] if chunk else given.shape
-    if shape == (ACTION_SIZE,) and given.dtype.kind in "fiu":
+        array = np.empty(0)
+    shape = array.shape[1:] if chunk else array.shape
+    if shape == (ACTION_SIZE,) and array.dtype.kind in "fiu":
         with np.errstate(over="ignore"):
-            array = given.astype(np.float32)
-        if len(array) and np.isfinite(array).all():
-            return array
+            converted = array.astype(np.float32)
+        if len(converted) and np.isfinite(converted).all():
+            return converted
     expected = f"(n, {ACTION_SIZE}) actions, n at least 1" if chunk else f"({ACTION_SIZE},) action"
     raise InvalidOptionError(
-        f"{given.dtype} {given.shape} {np.array2string(given, threshold=2 * ACTION_SIZE)} is no "
-        f"{expected}, of finite numbers",
+        f"got {array.dtype} {array.shape} {np.array2string(array, threshold=2 * ACTION_SIZE)}; "
+        f"expected {expected}, of finite numbers",
         "An action is 7 absolute joint targets in rad, then the gripper, −1 closed to 1 open.",
     )

@@ -1,84 +1,77 @@
-"""Play one episode with a built-in policy, and film it."""
+"""Play one episode with a built-in policy, and optionally record a video."""
 
-from contextlib import ExitStack
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from robomme_interference_data.constants import FPS
-from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.rollouts import Status
 
-from .base import EpisodeInfo, Simulator
+from .base import Simulator
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    Add = Callable[[Mapping[str, NDArray[np.uint8]], tuple[int, int, int]], None]
+
 NO_POLICY = "none"
 """Plays the demonstration only."""
 
 _LESSON, _LIVE = (40, 90, 200), (230, 130, 20)
-"""Colours of the bar above the pictures: blue, and orange while the policy acts."""
+"""Colors of the bar above the images: blue, and orange while the policy acts."""
 
 
-@dataclass(frozen=True)
-class Played:
-    """An episode that was played.
-
-    Attributes:
-        info: What the simulator reports of it.
-        lesson_frames: Frames of its demonstration.
-        status: How it ended.
-        steps: Executed steps.
-    """
-
-    info: EpisodeInfo
-    lesson_frames: int
-    status: Status
-    steps: int
-
-
-def play(simulator: Simulator, episode: EpisodeId, policy: str, video: Path | None) -> Played:
-    """Play an episode: its demonstration, then a policy.
-
-    Args:
-        simulator: The simulator.
-        episode: The episode.
-        policy: A policy that the simulator has, or `NO_POLICY`.
-        video: File to write a video to, with all cameras side by side; None for none.
-    """
-    from robomme_interference_data.storage.encode import CLIP, VideoEncoder
-    from robomme_interference_data.storage.files import atomic_path
-
-    with ExitStack() as stack:
-        path = None if video is None else stack.enter_context(atomic_path(video))
-        lesson, seen, info = simulator.reset(str(episode))
-        clip = None
-        if path is not None:
-            first = _picture(seen.images, _LIVE)
-            height, width, _ = first.shape
-            clip = VideoEncoder(path, CLIP, FPS, height, width, container="mp4")
-            for index in range(len(lesson)):
-                images = {camera: frames[index] for camera, frames in lesson.images.items()}
-                clip.add(_picture(images, _LESSON))
-            clip.add(first)
+def play(simulator: Simulator, episode: str, policy: str, video: Path | None) -> dict[str, Any]:
+    """Play an episode's demonstration, then a policy; return what `simulate` prints about it."""
+    with _recording(video) as add:
+        lesson, seen, info = simulator.reset(episode)
+        for index in range(len(lesson)):
+            add({camera: frames[index] for camera, frames in lesson.images.items()}, _LESSON)
+        add(seen.images, _LIVE)
         steps, status = 0, Status.ONGOING
         while status is Status.ONGOING and policy != NO_POLICY:
             seen, status = simulator.step(simulator.act(policy))
             steps += 1
-            if clip is not None:
-                clip.add(_picture(seen.images, _LIVE))
-        if clip is not None:
-            clip.close()
-    return Played(info, len(lesson), status, steps)
+            add(seen.images, _LIVE)
+    return {
+        "episode": episode,
+        "simulator": info.simulator,
+        "goal": info.goal,
+        "difficulty": info.difficulty,
+        "seed": info.seed,
+        "policy": policy,
+        "status": str(status),
+        "lesson_frames": len(lesson),
+        "steps": steps,
+    }
 
 
-def _picture(
-    images: "dict[str, NDArray[np.uint8]]", colour: tuple[int, int, int]
-) -> "NDArray[np.uint8]":
-    """Return the cameras side by side, under a bar of a colour."""
+@contextmanager
+def _recording(video: Path | None) -> "Iterator[Add]":
+    """Yield a function that adds the images of all cameras, side by side, to a video."""
+    if video is None:
+        yield lambda images, color: None
+        return
+
     import numpy as np
 
-    views = np.concatenate(list(images.values()), axis=1)
-    return np.concatenate([np.full((16, views.shape[1], 3), colour, np.uint8), views])
+    from robomme_interference_data.storage.encode import CLIP, VideoEncoder
+    from robomme_interference_data.storage.files import atomic_path
+
+    with atomic_path(video) as path:
+        encoder: VideoEncoder | None = None
+
+        def add(images: "Mapping[str, NDArray[np.uint8]]", color: tuple[int, int, int]) -> None:
+            nonlocal encoder
+            views = np.concatenate(list(images.values()), axis=1)
+            bar = np.full((16, views.shape[1], 3), color, np.uint8)
+            picture = np.concatenate([bar, views])
+            height, width, _ = picture.shape
+            encoder = encoder or VideoEncoder(path, CLIP, FPS, height, width, container="mp4")
+            encoder.add(picture)
+
+        yield add
+        if encoder is not None:
+            encoder.close()

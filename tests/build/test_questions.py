@@ -100,7 +100,7 @@ def test_the_right_option_is_the_scenes_answer_and_there_once(
         assert choices.count(scene.choice(answer)) == 1
         told = list(zip(question.options, one.marks, strict=True))
         assert len(set(told)) == len(told)  # whoever looks and reads can tell them apart
-        assert question.text == scene.question() and question.revision == "r"
+        assert question.text == scene.question and question.revision == "r"
         possible = {scene.choice(each) for each in scene.answers}
         assert len(choices) == (len(possible) if len(possible) <= 5 else 4)
         assert question.chance == 1 / len(choices)

@@ -55,7 +55,7 @@ SAYS = {"policy": "python:support.own_policies:says"}
         ({"simulator": "tabeltop"}, UnknownNameError, "no simulator 'tabeltop'"),
         ({"simulator": "tabletop"}, InvalidOptionError, "recorded on 'sample', the run is on"),
         ({"shift": "fog:1"}, InvalidOptionError, "shift 'fog:1'; expected none, or light"),
-        ({"shift": "light:2"}, InvalidOptionError, "on support.worlds:World: it cannot"),
+        ({"shift": "light:2"}, InvalidOptionError, "support.worlds:World does not support shifts"),
         ({"split": "tset"}, InvalidOptionError, "'tset' is none of train, val, test"),
         ({"conditions": ("k2",)}, UnknownNameError, "condition 'k2' is not in"),
         ({"workers": 0}, InvalidOptionError, "workers 0; expected more than 0"),

@@ -1,24 +1,23 @@
-"""What the suite's demonstrations show of the hidden answer, and what follows from a part of it."""
+"""The evidence in demonstrations, and the answers that agree with a part of it."""
 
 from collections.abc import Iterable
 from itertools import combinations
 from typing import Any
 
 import pytest
-from numpy.random import RandomState
 from support.families import families
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, seed_of
-from robomme_interference_data.simulators.tabletop.families import family_class
+from robomme_interference_data.simulators.tabletop.families import draw_episode
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
 
 
 def drawn(family: str, index: int, split: str = "test") -> Any:
     seed = seed_of(EpisodeId(family, split, index))
-    return family_class(family)(difficulty_of(seed), RandomState(seed))
+    return draw_episode(family, seed, difficulty_of(seed))
 
 
 def seen(scene: Any, answer: Any, known: Iterable[int]) -> dict[int, str]:
@@ -27,7 +26,7 @@ def seen(scene: Any, answer: Any, known: Iterable[int]) -> dict[int, str]:
 
 @pytest.mark.parametrize("family", families("VideoUnmaskSwap", "RouteStick"))
 def test_the_more_is_known_the_fewer_answers_agree(family: str) -> None:
-    """Exact at both ends, and the right one always among them."""
+    """With no part all answers agree, with every part one, and the right one always does."""
     for index in range(6):
         scene = drawn(family, index)
         answer = scene.answers[7 * index % len(scene.answers)]
@@ -50,15 +49,15 @@ def test_the_more_is_known_the_fewer_answers_agree(family: str) -> None:
     ("family", "index", "known", "left"),
     [
         ("VideoRepick", 0, {0}, 1),
-        ("VideoRepick", 2, {0}, 4),  # each of five cubes ends elsewhere
-        ("VideoRepick", 2, {1, 2, 3}, 5),  # whose way is known, but not which one was lifted
-        ("VideoPlaceOrder", 0, {0, 1}, 1),  # of three targets the third is left
-        ("VideoPlaceButton", 1, {0}, 3),  # of four targets: asked is the other one
+        ("VideoRepick", 2, {0}, 4),  # each of five cubes ends at another place
+        ("VideoRepick", 2, {1, 2, 3}, 5),  # the swaps are known, but not which cube was lifted
+        ("VideoPlaceOrder", 0, {0, 1}, 1),  # of three targets one is left
+        ("VideoPlaceButton", 1, {0}, 3),  # of four targets; the goal asks for the other visit
         ("VideoUnmaskSwap", 1, {0}, 3),
         ("MoveCube", 0, set(), 3),
         ("InsertPeg", 0, {0}, 4),
         ("InsertPeg", 0, {1, 2}, 2),
-        ("RouteStick", 0, {1, 2}, 1),  # where it starts follows from its first turn
+        ("RouteStick", 0, {1, 2}, 1),  # the first turn implies the start
     ],
 )
 def test_what_is_left_to_guess(family: str, index: int, known: set[int], left: int) -> None:
@@ -69,7 +68,7 @@ def test_what_is_left_to_guess(family: str, index: int, known: set[int], left: i
             assert len(scene.agreeing(seen(scene, answer, known))) == left
 
 
-def test_a_path_goes_on_to_a_neighbour() -> None:
+def test_a_path_continues_to_an_adjacent_button() -> None:
     """A corner of the grid has three."""
     scene = drawn("PatternLock", 0)
     answer = next(one for one in scene.answers if one[:2] == (0, 1))
@@ -78,12 +77,12 @@ def test_a_path_goes_on_to_a_neighbour() -> None:
     assert {one[1] for one in first} == {1, 4, 5} and {one[0] for one in first} == {0}
 
 
-def test_of_parts_that_contradict_each_other_the_first_are_believed() -> None:
+def test_of_contradicting_parts_the_first_take_precedence() -> None:
     scene = drawn("InsertPeg", 0)  # (peg, end, side)
     one, other = (scene.parts(answer) for answer in ((0, 1, 1), (1, -1, -1)))
     assert scene.agreeing({0: one[0], 1: other[1], 2: other[2]}) == [(0, -1, -1)]
     path = drawn("PatternLock", 0)
-    apart = {0: "goes to button 0", 1: "goes to button 15"}  # which no path does
+    apart = {0: "goes to button 0", 1: "goes to button 15"}  # no path has both
     assert {found[0] for found in path.agreeing(apart)} == {0}
     assert {found[1] for found in path.agreeing(dict(reversed(apart.items())))} == {15}
 
@@ -92,7 +91,7 @@ def test_of_parts_that_contradict_each_other_the_first_are_believed() -> None:
 
 
 def test_recall_draws_among_what_is_left() -> None:
-    """Of 600 draws 600 / 4 are right, give or take four standard deviations; more is no worse."""
+    """Of 600 draws 600 / 4 are right, within four standard deviations; more evidence helps."""
     right = fuller = 0
     for seed in range(600):
         scene = drawn("InsertPeg", 0)  # two pegs, two ends, two sides
@@ -112,7 +111,7 @@ def test_recall_draws_among_what_is_left() -> None:
     "family", ["VideoUnmask", *(pytest.param(one, marks=pytest.mark.slow) for one in FAMILIES)]
 )
 def test_played_as_computed(blind: TabletopSimulator, family: str, index: int) -> None:
-    """With all parts it succeeds; without any when what it draws happens to be right."""
+    """With all parts it succeeds; without any, only if the drawn answer is right."""
     env = blind.env
     for known_parts in (True, False):
         blind.reset(f"{family}/test/{index}", demonstration=False)
@@ -141,12 +140,12 @@ def test_every_part_is_shown_in_the_lesson(
     assert lesson.evidence is not None
     assert {(span.part, span.text) for span in lesson.evidence} == {*enumerate(parts)}
     assert all(span.stop <= len(lesson) for span in lesson.evidence)
-    for one, other in combinations(lesson.evidence, 2):  # in the order in which they are shown
+    for one, other in combinations(lesson.evidence, 2):  # in order
         assert one.part < other.part and one.start <= other.start
 
 
 def test_evidence_is_the_act_itself(blind: TabletopSimulator) -> None:
-    """A cube is lifted while, and only while, the lesson shows it."""
+    """The cube is lifted exactly while the evidence span lasts."""
     lesson, _, _ = blind.reset("VideoRepick/test/0", demonstration=False)
     [span] = lesson.evidence or ()
     closed = (lesson.states[:, 7] < 0.025).nonzero()[0]

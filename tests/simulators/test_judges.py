@@ -1,4 +1,4 @@
-"""The embedded suite's judges, against what a script without knowledge of them would try."""
+"""The embedded suite's judges, against scripts that solve tasks in the wrong way."""
 
 from collections.abc import Callable
 from functools import partial
@@ -13,10 +13,10 @@ from robomme_interference_data.simulators import Status
 
 pytest.importorskip("mani_skill", reason="needs the extra sim")
 
+from robomme_interference_data.simulators.tabletop.bodies import CUBE
 from robomme_interference_data.simulators.tabletop.env import TabletopEnv
 from robomme_interference_data.simulators.tabletop.episodes import seed_of
 from robomme_interference_data.simulators.tabletop.families.move_cube import MoveCube
-from robomme_interference_data.simulators.tabletop.kit import CUBE
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
 
@@ -27,7 +27,7 @@ def env(blind: TabletopSimulator) -> TabletopEnv:
 
 
 def start(env: TabletopEnv, episode: str, answer: int) -> Any:
-    """Begin an episode, not drawn, with an answer of our choice; return its scene."""
+    """Begin an episode with a given answer; return its scene."""
     about = EpisodeId.parse(episode)
     env.family = about.family
     env.reset(seed=seed_of(about), options={"answer": answer})
@@ -36,7 +36,7 @@ def start(env: TabletopEnv, episode: str, answer: int) -> Any:
 
 
 def play(env: TabletopEnv, script: Script, seen: Callable[[], None] = lambda: None) -> Status:
-    """Step a script until it is through or the episode has ended."""
+    """Run a script until it or the episode ends."""
     for _ in script:
         env.step(env.arm.action.copy())
         if env.status is not Status.ONGOING:
@@ -45,12 +45,12 @@ def play(env: TabletopEnv, script: Script, seen: Callable[[], None] = lambda: No
     return env.status
 
 
-# --- VideoUnmask: nothing is seen under a wrong container --------------------------------------
+# --- VideoUnmask: lifting a wrong container reveals nothing ------------------------------------
 
 
-def pixels_of(colour: str, image: NDArray[np.uint8]) -> int:
-    """Number of pixels in which one channel leads the others by far."""
-    channel = ("red", "green", "blue").index(colour)
+def pixels_of(color: str, image: NDArray[np.uint8]) -> int:
+    """Number of pixels in which one channel dominates."""
+    channel = ("red", "green", "blue").index(color)
     others = np.delete(image.astype(int), channel, axis=2).max(axis=2)
     return int((image[..., channel].astype(int) - others > 50).sum())
 
@@ -58,7 +58,7 @@ def pixels_of(colour: str, image: NDArray[np.uint8]) -> int:
 def test_no_cube_is_seen_under_a_wrong_container_before_the_failure(env: TabletopEnv) -> None:
     scene = start(env, "VideoUnmask/test/0", 0)
     wrong = next(number for number in scene.under if number != env.answer[0])
-    colour = scene.colours[scene.cubes.index(scene.under[wrong])]
+    color = scene.colors[scene.cubes.index(scene.under[wrong])]
     heights, pixels = [], []
 
     def look() -> dict[str, NDArray[np.uint8]]:
@@ -70,7 +70,7 @@ def test_no_cube_is_seen_under_a_wrong_container_before_the_failure(env: Tableto
     def note() -> None:
         if scene.shells[wrong].p[2] > 0.004:  # lifted at all
             images = look()
-            pixels.append([pixels_of(colour, images[name]) for name in ("front", "wrist")])
+            pixels.append([pixels_of(color, images[name]) for name in ("front", "wrist")])
             heights.append(scene.shells[wrong].p[2])
 
     def lift_slowly() -> Script:
@@ -82,11 +82,11 @@ def test_no_cube_is_seen_under_a_wrong_container_before_the_failure(env: Tableto
     assert len(heights) > 2
     assert max(heights) <= 0.010
     assert not np.any(pixels)
-    scene.shells[wrong].put(scene.under[wrong].home)  # at 0.02 m, where the cube comes into sight
-    assert pixels_of(colour, look()["front"]) > 0
+    scene.shells[wrong].put(scene.under[wrong].home)  # at 0.02 m, where the cube becomes visible
+    assert pixels_of(color, look()["front"]) > 0
 
 
-# --- MoveCube: the manner is judged over the whole way -----------------------------------------
+# --- MoveCube: the manner is judged all the time -----------------------------------------------
 
 PUSH, GRASP = 0, 1
 
@@ -102,7 +102,7 @@ def push_slowly(arm: Arm, scene: MoveCube) -> Script:
 
 
 def push_with_open_fingers(arm: Arm, scene: MoveCube) -> Script:
-    """Push the cube with the outer side of one of the open fingers."""
+    """Push the cube with the outer side of an open finger."""
     behind = scene.cube.p - 0.11 * scene.way
     yield from arm.move((behind[0], behind[1], 0.12), scene.turn - np.pi / 2)
     yield from arm.move((behind[0], behind[1], 0.03))
@@ -116,7 +116,7 @@ def drag_slowly(arm: Arm, scene: MoveCube) -> Script:
 
 
 def drop(arm: Arm, scene: MoveCube) -> Script:
-    """Grasp the cube off its middle, and let it go above the target."""
+    """Grasp the cube away from its middle, and release it above the target."""
     aside = 0.006 * np.array([-np.sin(scene.turn), np.cos(scene.turn), 0.0])
     yield from arm.pick(scene.cube.p + aside, scene.turn)
     yield from arm.put(scene.target.p + np.array([0, 0, CUBE / 2 + 0.012]))
@@ -128,9 +128,9 @@ slow = partial(pytest.param, marks=pytest.mark.slow)
 @pytest.mark.parametrize(
     ("way", "answer", "status"),
     [
-        (push_with_open_fingers, PUSH, Status.FAIL),  # none of the three manners
+        (push_with_open_fingers, PUSH, Status.FAIL),  # not one of the three manners
         (drop, GRASP, Status.SUCCESS),  # its fall and slide belong to the grasp
-        slow(push_slowly, PUSH, Status.SUCCESS),  # as slow as it likes
+        slow(push_slowly, PUSH, Status.SUCCESS),  # at any speed
         slow(push_with_open_fingers, GRASP, Status.FAIL),
         slow(drag_slowly, PUSH, Status.FAIL),
     ],
@@ -141,11 +141,11 @@ def test_the_manner_is_what_moves_the_cube(
     scene = start(env, "MoveCube/test/0", answer)
     cube = scene.cube.p
     assert play(env, way(env.arm, scene)) is status
-    if way is drag_slowly:  # a wrong manner fails within millimetres
+    if way is drag_slowly:  # a wrong manner fails within millimeters
         assert np.linalg.norm(scene.cube.p - cube) < 0.004
 
 
-# --- the stick: it touches what it comes down to, and fails in a post -----------------------------
+# --- the stick: touching buttons and hitting posts ------------------------------------------------
 
 
 @pytest.mark.parametrize(("height", "touches"), [(0.030, False), (0.015, False), (0.013, True)])
@@ -162,7 +162,7 @@ def test_a_button_is_touched_within_4_mm_of_its_top(
 
 @pytest.mark.parametrize(("aside", "status"), [(0.0, "fail"), (0.012, "fail"), (0.03, "ongoing")])
 def test_a_stick_put_down_into_a_post_fails(env: TabletopEnv, aside: float, status: str) -> None:
-    """A post's radius is 10 mm, the stick's 6 mm; so too before the first target is reached."""
+    """A post's radius is 10 mm, the stick's 6 mm; this holds before the first target too."""
     scene = start(env, "RouteStick/test/0", 0)
     x, y = scene.posts[1]
 

@@ -1,4 +1,4 @@
-"""What a question marks is what the task is about, in the scene as it stands after the lesson."""
+"""Questions mark the things of the task where they are after the lesson."""
 
 import math
 from typing import Any
@@ -19,17 +19,17 @@ PLACES: dict[str, list[tuple[int, int, int]]] = {
     "PatternLock": [(number, 0, number) for number in range(6)],
     "RouteStick": [(number, -1, 2 * number) for number in range(5)],
 }
-"""Of a hard episode: the step that carries the answer out, which of its places, and which mark."""
+"""In a hard episode: the step of the answer, which of its points, and which mark."""
 
 BEFORE = 0.03
-"""m: a peg goes in from so far before the box's side."""
+"""Distance in m from which a peg approaches the box."""
 
 
 @pytest.mark.parametrize("family", families("VideoUnmaskSwap", "InsertPeg"))
 def test_the_right_option_alone_is_marked_where_it_is(
     blind: TabletopSimulator, family: str
 ) -> None:
-    """Also after an exchange, when a thing is no longer where it was shown."""
+    """Also after a swap, when a thing is no longer where it was shown."""
     blind.reset(f"{family}/test/2", demonstration=False)
     scene, answer = blind.env.episode, blind.env.answer
     right = scene.choice(answer)

@@ -1,4 +1,4 @@
-"""The official simulator's seam, against a stand-in for RoboMME in an environment of its own."""
+"""The official simulator, with a stand-in for RoboMME in a separate environment."""
 
 import json
 import os
@@ -33,7 +33,7 @@ from robomme_interference_data.simulators.tabletop import SUITE_VERSION
 HOLD = np.array([0, 0, 0, -1.5, 0, 1.5, 0.75, 1], np.float32)
 
 DIES, HANGS, RAISES, BREAKS, LARGE_WRIST, DRAWN = 40, 41, 42, 43, 44, 48
-"""Indices of the stand-in's episodes that do so; the last tells how often it drew each camera."""
+"""Indices of the stand-in's episodes; the last one counts how often each camera was rendered."""
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def simulator(robomme_python: Path) -> Iterator[RoboMMESimulator]:
         yield made
 
 
-# --- what it serves ----------------------------------------------------------------------------
+# --- results -----------------------------------------------------------------------------------
 
 
 def test_an_episode_is_what_robomme_returns(simulator: RoboMMESimulator) -> None:
@@ -97,8 +97,8 @@ def test_robommes_statuses(simulator: RoboMMESimulator) -> None:
         assert statuses == [Status.ONGOING, Status.ONGOING, status]
 
 
-def told(simulator: RoboMMESimulator, episode: str) -> tuple[object, ...]:
-    """Play an episode, and return all that came of it."""
+def play(simulator: RoboMMESimulator, episode: str) -> tuple[object, ...]:
+    """Play an episode, and return all results."""
     lesson, first, info = simulator.reset(episode)
     seen = [first, *(simulator.step(HOLD)[0] for _ in range(2))]
     frames = [one.images[name].tobytes() for one in seen for name in ("front", "wrist")]
@@ -106,7 +106,7 @@ def told(simulator: RoboMMESimulator, episode: str) -> tuple[object, ...]:
     return (info, states, lesson.images["front"].tobytes(), frames)
 
 
-def test_it_tells_its_own_subgoal(simulator: RoboMMESimulator) -> None:
+def test_it_provides_robommes_subgoals(simulator: RoboMMESimulator) -> None:
     simulator.reset("MoveCube/test/3")
     assert simulator.subgoal() == Subgoal("pick up the cube at <point>, step 0", ((5, 200),))
     for _ in range(2):
@@ -114,7 +114,7 @@ def test_it_tells_its_own_subgoal(simulator: RoboMMESimulator) -> None:
     assert simulator.subgoal().grounded == "pick up the cube at <2, 200>, step 2"
     assert simulator.subgoal().simple == "pick up the cube, step 2"
     simulator.reset("PatternLock/test/3")
-    with pytest.raises(UnknownNameError, match="tells no subgoal"):
+    with pytest.raises(UnknownNameError, match="provides no subgoal"):
         simulator.subgoal()
 
 
@@ -128,7 +128,7 @@ def test_it_tells_its_own_subgoal(simulator: RoboMMESimulator) -> None:
         (["front"], True, [14, 1]),
     ],
 )
-def test_what_nobody_looks_at_is_not_drawn(
+def test_only_requested_cameras_are_rendered(
     cameras: list[str], subgoals: bool, drawn: list[int], robomme_python: Path
 ) -> None:
     with RoboMMESimulator(robomme_python, cameras=cameras, subgoals=subgoals) as simulator:
@@ -137,13 +137,10 @@ def test_what_nobody_looks_at_is_not_drawn(
         simulator.step(HOLD, observe=False)
         seen, _ = simulator.step(HOLD)
         assert seen.state[:2].tolist() == drawn
-        # What is drawn is what would be drawn in any case.
-        for camera, (begun, stepped) in {"front": (10, 2), "wrist": (110, 102)}.items():
-            for one, value in ((first, begun), (seen, stepped)):
-                assert (camera in one.images) == (camera in cameras)
-                assert all(
-                    (one.images[camera] == value).all() for _ in cameras if camera in cameras
-                )
+        values = {"front": (10, 2), "wrist": (110, 102)}  # in the first and in the last image
+        for number, one in enumerate((first, seen)):
+            assert sorted(one.images) == cameras
+            assert all((one.images[name] == values[name][number]).all() for name in cameras)
         if not subgoals:
             with pytest.raises(InvalidOptionError, match="without subgoals"):
                 simulator.subgoal()
@@ -156,13 +153,13 @@ def test_a_process_plays_few_episodes_and_none_depends_on_it(simulator: RoboMMES
     episodes = [f"MoveCube/test/{index}" for index in range(EPISODES + 1)]
     pids, results = [], []
     for episode in episodes:
-        results.append(told(simulator, episode))
+        results.append(play(simulator, episode))
         assert simulator.pid is not None
         pids.append(simulator.pid)
     one, two = dict.fromkeys(pids)
     assert pids == [one] * EPISODES + [two]
     wait_until_gone([one], seconds=20)
-    assert [told(simulator, episode) for episode in reversed(episodes)] == results[::-1]
+    assert [play(simulator, episode) for episode in reversed(episodes)] == results[::-1]
     # The goal of this episode counts the environments that are open, itself included.
     assert simulator.reset("VideoRepick/test/0")[2].goals[-1] == "open environments: 1"
 
@@ -181,7 +178,7 @@ def test_simulate_plays_the_demonstration(
     assert (found["seed"], found["policy"], found["lesson_frames"]) == (640_003, "none", 5)
 
 
-# --- what it refuses ---------------------------------------------------------------------------
+# --- invalid input -----------------------------------------------------------------------------
 
 
 def test_what_robomme_does_not_have(simulator: RoboMMESimulator) -> None:
@@ -198,14 +195,14 @@ def test_what_robomme_does_not_have(simulator: RoboMMESimulator) -> None:
     assert len(simulator.reset("MoveCube/test/0")[0]) == 2
 
 
-# --- what breaks -------------------------------------------------------------------------------
+# --- failures ----------------------------------------------------------------------------------
 
 
 def test_a_death_shows_the_end_of_its_log_without_escapes(simulator: RoboMMESimulator) -> None:
     with pytest.raises(SimulatorCrashError, match="died during reset, exit code 7") as caught:
         simulator.reset(f"MoveCube/test/{DIES}")
     lines = (caught.value.hint or "").splitlines()
-    # 20 lines at most, the last ones; the stand-in prints them in colour.
+    # 20 lines at most, the last ones; the stand-in prints them in color.
     assert (len(lines), lines[-1]) == (21, "WARN: planner failure 99")
     assert simulator.pid is None
     assert len(simulator.reset("MoveCube/test/0")[0]) == 2
@@ -218,7 +215,7 @@ def test_a_process_that_was_killed(simulator: RoboMMESimulator) -> None:
         os.kill(simulator.pid, signal.SIGKILL)
         with pytest.raises(SimulatorCrashError, match="exit code -9"):
             call()
-        with pytest.raises(SimulatorCrashError, match="runs no episode"):
+        with pytest.raises(SimulatorCrashError, match="no episode is running"):
             simulator.step(HOLD)
         assert len(simulator.reset("MoveCube/test/0")[0]) == 2
 
@@ -246,7 +243,7 @@ def test_an_exception_leaves_the_process_running(simulator: RoboMMESimulator) ->
     simulator.step(HOLD)
     with pytest.raises(SimulatorCrashError, match="error at step 2: caught: no such joint"):
         simulator.step(HOLD)
-    with pytest.raises(SimulatorCrashError, match="runs no episode"):
+    with pytest.raises(SimulatorCrashError, match="no episode is running"):
         simulator.step(HOLD)
     assert len(simulator.reset("MoveCube/test/0")[0]) == 2
     assert simulator.pid == pid
@@ -328,14 +325,14 @@ def test_what_differs_from_the_fork_is_patched(
         monkeypatch.setenv("STAND_IN_MANI_SKILL", kind)
         with RoboMMESimulator(robomme_python) as simulator:
             results.append(
-                [told(simulator, f"{name}/test/3") for name in ("MoveCube", "RouteStick")]
+                [play(simulator, f"{name}/test/3") for name in ("MoveCube", "RouteStick")]
             )
             patches = simulator.patches
             assert (patches == ()) == (kind == "fork")
     assert results[1] == results[2] == results[0]
     assert len(patches) == 4
     # The description of the arm is written once: the stick's own, and of the camera what hangs on
-    # it, but for its colour, which the fork leaves out too.
+    # it, but for its color, which the fork leaves out too.
     [folder] = (tmp_path / "robomme-interference" / "robomme").iterdir()
     urdf, srdf = ((folder / f"panda_stick.{kind}").read_text() for kind in ("urdf", "srdf"))
     links = [one.get("name") for one in ElementTree.fromstring(urdf).iter("link")]
@@ -358,17 +355,15 @@ def test_what_cannot_be_patched_is_refused(
         RoboMMESimulator(robomme_python)
 
 
-def test_versions_are_told(
-    robomme_python: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # What an installer leaves of a package that came from git.
+def test_versions(robomme_python: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # The metadata of a package that was installed from git.
     installed = tmp_path / "robomme-0.2.dist-info"
     installed.mkdir()
     (installed / "METADATA").write_text("Metadata-Version: 2.1\nName: robomme\nVersion: 0.2\n")
     origin = {"url": "https://example.org/robomme", "vcs_info": {"vcs": "git", "commit_id": "ab12"}}
     (installed / "direct_url.json").write_text(json.dumps(origin))
     found = simulator_versions("robomme", str(robomme_python))
-    # What is only on the path, not installed, has no version.
+    # A package that is only on the path has no version.
     assert found.keys() == {"robomme_python", "robomme_numpy"}
     assert found["robomme_python"] == platform.python_version()
     assert found["robomme_numpy"].startswith("1.")

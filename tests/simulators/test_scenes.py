@@ -1,4 +1,4 @@
-"""The suite's scenes, all 1,800 of them, as they are laid out: nothing is simulated or drawn."""
+"""The layout of all 1,800 scenes of the suite; nothing is simulated or rendered."""
 
 import math
 import re
@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.random import RandomState
-from numpy.typing import NDArray
 
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES, SPLITS
 from robomme_interference_data.errors import UnknownNameError
@@ -19,21 +17,18 @@ from robomme_interference_data.ids import EpisodeId
 
 pytest.importorskip("mani_skill", reason="needs the extra sim")
 
-from robomme_interference_data.simulators.tabletop.camera import (
-    FRONT_EYE,
-    FRONT_TARGET,
-    FRONT_VIEW,
-)
+from robomme_interference_data.simulators.tabletop.bodies import CUBE, SIDE
+from robomme_interference_data.simulators.tabletop.camera import to_pixels
 from robomme_interference_data.simulators.tabletop.episodes import (
     difficulty_of,
     episode_ids,
     seed_of,
     turn_of,
 )
-from robomme_interference_data.simulators.tabletop.families import family_class
-from robomme_interference_data.simulators.tabletop.families.video_place_button import RADIUS
-from robomme_interference_data.simulators.tabletop.kit import CUBE, SIDE
-from robomme_interference_data.simulators.tabletop.stage import Spot, lanes
+from robomme_interference_data.simulators.tabletop.families import draw_episode
+from robomme_interference_data.simulators.tabletop.families.video_place import RADIUS
+from robomme_interference_data.simulators.tabletop.layout import Spot
+from robomme_interference_data.simulators.tabletop.swaps import lanes
 
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "tabletop.md"
 
@@ -46,10 +41,10 @@ def seeds_of(family: str, split: str | None, difficulty: str | None) -> list[int
 
 @cache
 def scenes(family: str, split: str | None = None, difficulty: str | None = None) -> list[Any]:
-    """Families drawn for episodes, each with `right`, its hidden answer."""
+    """Scenes of episodes, each with its hidden answer as `right`."""
     made: list[Any] = []
     for seed in seeds_of(family, split, difficulty):
-        scene: Any = family_class(family)(difficulty_of(seed), RandomState(seed))
+        scene: Any = draw_episode(family, seed, difficulty_of(seed))
         scene.right = scene.answers[turn_of(seed, len(scene.answers))]
         made.append(scene)
     return made
@@ -136,7 +131,7 @@ def test_which_containers_hide_a_cube_tells_nothing(family: str, difficulty: str
     under: Counter[int] = Counter()  # containers of cubes that are not asked for
     for scene in drawn:
         covered = scene.covered(scene.right)
-        assert len(set(covered)) == len(scene.colours) == 3
+        assert len(set(covered)) == len(scene.colors) == 3
         assert covered[: len(scene.right)] == list(scene.right)
         rank[sorted(covered).index(scene.right[0])] += 1
         under.update(covered[len(scene.right) :])
@@ -211,21 +206,9 @@ def test_nothing_that_moves_comes_within_5_mm_of_anything_else(family: str) -> N
 # --- what the front camera sees ------------------------------------------------------------------
 
 
-def seen_at(points: Any) -> NDArray[np.float64]:
-    """Column and row of points in the front image, and pixels per metre there, `(3, n)`."""
-    ahead = np.subtract(FRONT_TARGET, FRONT_EYE)
-    ahead /= np.linalg.norm(ahead)
-    right = np.cross(ahead, (0, 0, 1))
-    right /= np.linalg.norm(right)
-    to = np.subtract(np.reshape(points, (-1, 3)), FRONT_EYE)
-    scale = 128 / math.tan(FRONT_VIEW / 2) / (to @ ahead)
-    up = np.cross(right, ahead)
-    return np.stack([128 + scale * (to @ right), 128 - scale * (to @ up), scale])
-
-
 @pytest.mark.parametrize("family", FAMILIES)
 def test_everything_on_the_table_is_in_view_and_large_enough(family: str) -> None:
-    """Whatever lies there, and where it passes as places are exchanged."""
+    """Every thing where it lies, and where it moves during swaps."""
     spots: list[Any] = []
     for scene in scenes(family):
         for name in ("spots", "posts", "target_spots", "cube_spots"):
@@ -234,7 +217,9 @@ def test_everything_on_the_table_is_in_view_and_large_enough(family: str) -> Non
             spots += [getattr(scene, name)] if hasattr(scene, name) else []
         for pair in getattr(scene, "swaps", []):
             spots += [spot for way in lanes(spots_of(scene), pair, scene.gap) for spot in way]
-    columns, rows, scale = seen_at([(*spot, 0.0) for spot in spots])
-    assert columns.min() > 0 and columns.max() < 256
-    assert rows.min() > 0 and rows.max() < 256
-    assert CUBE * scale.min() >= 10
+    points = [*{(float(x), float(y)) for x, y in spots}]
+    beside = to_pixels([(x, y + CUBE, 0.0) for x, y in points])
+    for (row, column), (_, other) in zip(
+        to_pixels([(*p, 0.0) for p in points]), beside, strict=True
+    ):
+        assert 0 < row < 255 and 0 < column < 255 and other - column >= 10

@@ -1,4 +1,4 @@
-"""What a shift changes: what is seen of the live scene, and nothing else."""
+"""A shift changes the images of the live scene, and nothing else."""
 
 import math
 from typing import Any
@@ -20,7 +20,7 @@ pytest.importorskip("mani_skill", reason="needs the extra sim")
 
 from robomme_interference_data.simulators.base import Observation
 from robomme_interference_data.simulators.tabletop.drawing import PANDA
-from robomme_interference_data.simulators.tabletop.scene_shift import PLACES, TALL, WIDE
+from robomme_interference_data.simulators.tabletop.scene_shift import POSITIONS, TALL, WIDE
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
 
 EPISODE = "MoveCube/test/2"
@@ -28,7 +28,7 @@ EPISODE = "MoveCube/test/2"
 
 @pytest.fixture
 def shifted(tabletop: TabletopSimulator) -> Any:
-    """The simulator, which may be put under a shift."""
+    """The simulator; its shift is reset after the test."""
     yield tabletop
     tabletop.env.shift = None
 
@@ -39,7 +39,7 @@ def begin(simulator: TabletopSimulator, episode: str, shift: Shift | None) -> Ob
 
 
 def apart(one: Observation, other: Observation, camera: str) -> float:
-    """Mean difference of two pictures, of 255."""
+    """Mean difference of two images, 0 to 255."""
     first, second = (seen.images[camera].astype(int) for seen in (one, other))
     return float(np.abs(first - second).mean())
 
@@ -50,7 +50,7 @@ def test_each_shift_is_seen_and_the_stronger_the_more(shifted: TabletopSimulator
     for kind in KINDS:
         weak, middle, strong = (apart(plain, views[Shift(kind, n)], "front") for n in (1, 2, 3))
         assert 0.4 < weak < middle < strong
-        # Things at the sides of the table are not before the wrist camera.
+        # The wrist camera does not see clutter at the sides of the table.
         seen = apart(plain, views[Shift(kind, 1)], "wrist")
         assert seen == 0 if kind == "clutter" else seen > 1
     for seen in views.values():
@@ -75,7 +75,7 @@ def test_a_shift_comes_after_the_demonstration_and_is_the_episodes_own(
     other = begin(shifted, "MoveCube/test/5", shift)
     [moved] = shifted.views([Shift("camera", 1)])
     assert apart(other, first, "front") > 1 and apart(other, moved, "front") > 0.4
-    # And the next episode without a shift is what it always was.
+    # The next episode without a shift is unchanged.
     assert apart(begin(shifted, EPISODE, None), plain[1], "front") == 0
 
 
@@ -99,14 +99,14 @@ def test_the_scene_stays_under_a_shift_while_it_is_played(
 
 
 @pytest.mark.parametrize("family", families("VideoPlaceOrder"))
-def test_things_that_take_no_part_are_in_nobodys_way(blind: TabletopSimulator, family: str) -> None:
-    """No part of the hand, and nothing on the table, comes to where one of them may stand."""
+def test_clutter_is_out_of_the_way(blind: TabletopSimulator, family: str) -> None:
+    """No part of the hand, and no body on the table, reaches a position of clutter."""
     blind.reset(f"{family}/test/2", demonstration=False)
     robot = blind.env.agent.robot._objs[0]
     names = [f"scene-0-{PANDA}_panda_{name}" for name in ("hand", "leftfinger", "rightfinger")]
     parts = [link for link in robot.links if link.name in names]
     assert len(parts) == 3
-    rigid = [one._rigid for one in blind.env.kit.bodies if one._rigid is not None]  # no table
+    rigid = [one._rigid for one in blind.env.builder.bodies if one._rigid is not None]  # no table
     parts += [one for one in rigid if one.collision_shapes]
     status, steps = Status.ONGOING, 0
     while status is Status.ONGOING:
@@ -114,7 +114,7 @@ def test_things_that_take_no_part_are_in_nobodys_way(blind: TabletopSimulator, f
         steps += 1
         spans = [part.compute_global_aabb_tight() for part in parts if steps % 4 == 0]
         for low, high in spans:
-            for x, y in PLACES:
+            for x, y in POSITIONS:
                 if low[2] < TALL and high[2] > 0:
                     way = np.maximum(0, np.maximum(low[:2] - (x, y), (x, y) - high[:2]))
                     assert math.hypot(*way) > WIDE
@@ -126,5 +126,5 @@ def test_shifts_are_asked_for_by_name(shifted: TabletopSimulator) -> None:
         TabletopSimulator(shift="fog:1")
     with pytest.raises(UnknownNameError):
         shifted.reset("MoveCube/test/99")
-    with pytest.raises(SimulatorCrashError, match="runs no episode"):
+    with pytest.raises(SimulatorCrashError, match="no episode is running"):
         list(shifted.views(SHIFTS))

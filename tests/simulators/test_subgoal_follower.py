@@ -1,4 +1,4 @@
-"""Subgoals on `tabletop`: what is told, what is obeyed, and where things are in the image."""
+"""Subgoals on `tabletop`: providing them, following them, and points in the image."""
 
 from collections.abc import Callable
 
@@ -22,50 +22,50 @@ pytest.importorskip("mani_skill", reason="needs the extra sim")
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
 
 
-def obeyed(
+def follow(
     simulator: TabletopSimulator,
     episode: str,
-    told: Callable[[Subgoal], Subgoal | None] = lambda subgoal: subgoal,
+    edit: Callable[[Subgoal], Subgoal | None] = lambda subgoal: subgoal,
 ) -> tuple[Status, list[str]]:
-    """Let it obey what is told of the simulator's subgoal, every 16 steps; and what it was told."""
+    """Follow the edited subgoals of the simulator; return the status and the distinct texts."""
     simulator.reset(episode, demonstration=False)
-    status, steps, heard = Status.ONGOING, 0, list[str]()
+    status, steps, texts = Status.ONGOING, 0, list[str]()
     while status is Status.ONGOING:
         if steps % 16 == 0:
-            subgoal = told(simulator.subgoal())
+            subgoal = edit(simulator.subgoal())
             text = subgoal.simple if subgoal else ""
-            heard += [text] * (text not in heard[-1:])
+            texts += [text] * (text not in texts[-1:])
         _, status = simulator.step(simulator.follow_subgoal(subgoal), observe=False)
         steps += 1
-    return status, heard
+    return status, texts
 
 
-# --- what is obeyed ------------------------------------------------------------------------------
+# --- following subgoals --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("family", families("VideoUnmaskSwap", "InsertPeg"))
-def test_told_what_to_do_it_succeeds(blind: TabletopSimulator, family: str) -> None:
-    """The hard ones have all steps: of two containers, after exchanges, of the longest path."""
-    assert obeyed(blind, f"{family}/test/2")[0] is Status.SUCCESS
+def test_following_its_subgoals_succeeds(blind: TabletopSimulator, family: str) -> None:
+    """Hard episodes have all steps: two containers, swaps, the longest path."""
+    assert follow(blind, f"{family}/test/2")[0] is Status.SUCCESS
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("family", FAMILIES)
-def test_told_what_to_do_it_always_succeeds(blind: TabletopSimulator, family: str) -> None:
+def test_following_its_subgoals_always_succeeds(blind: TabletopSimulator, family: str) -> None:
     for index in range(12):
-        status, heard = obeyed(blind, f"{family}/val/{index}")
-        assert status is Status.SUCCESS, (index, heard)
+        status, texts = follow(blind, f"{family}/val/{index}")
+        assert status is Status.SUCCESS, (index, texts)
 
 
 @pytest.mark.slow
-def test_the_steps_are_told_in_order(blind: TabletopSimulator) -> None:
-    # Episode 2 is hard: the cube is asked for two times.
+def test_subgoals_come_in_order(blind: TabletopSimulator) -> None:
+    # In episode 2, the cube must be picked up twice.
     put, cube = "put it down", "pick up the cube"
-    assert obeyed(blind, "VideoRepick/test/2")[1] == [cube, put, cube, put, "press the button"]
+    assert follow(blind, "VideoRepick/test/2")[1] == [cube, put, cube, put, "press the button"]
 
 
 @pytest.mark.parametrize("family", families("MoveCube"))
-def test_untold_it_does_what_guess_does(blind: TabletopSimulator, family: str) -> None:
+def test_without_subgoals_it_acts_as_guess(blind: TabletopSimulator, family: str) -> None:
     actions = []
     for act in (lambda: blind.follow_subgoal(None), lambda: blind.act("guess")):
         blind.reset(f"{family}/test/1", demonstration=False)
@@ -77,28 +77,26 @@ def test_untold_it_does_what_guess_does(blind: TabletopSimulator, family: str) -
     assert np.array_equal(*map(np.stack, actions))
 
 
-def test_another_wording_and_points_a_little_off_will_do(blind: TabletopSimulator) -> None:
-    def otherwise(subgoal: Subgoal) -> Subgoal:
+def test_similar_words_and_points_suffice(blind: TabletopSimulator) -> None:
+    def vary(subgoal: Subgoal) -> Subgoal:
         text = subgoal.text.replace("pick up", "Pick up").replace(" the cube", " that cube") + "!"
         return Subgoal(text, tuple((y + 3, x - 4) for y, x in subgoal.points))
 
-    assert obeyed(blind, "VideoRepick/test/0", otherwise)[0] is Status.SUCCESS
+    assert follow(blind, "VideoRepick/test/0", vary)[0] is Status.SUCCESS
 
 
 @pytest.mark.slow
-def test_words_alone_leave_it_to_the_seed_which_thing_is_meant(blind: TabletopSimulator) -> None:
-    ends = [
-        [
-            obeyed(blind, f"VideoPlaceOrder/test/{index}", lambda one: Subgoal(one.simple))[0]
-            for index in range(8)
-        ]
+def test_without_points_the_seed_decides(blind: TabletopSimulator) -> None:
+    episodes = [f"VideoPlaceOrder/test/{index}" for index in range(8)]
+    ends, again = (
+        [follow(blind, episode, lambda one: Subgoal(one.simple))[0] for episode in episodes]
         for _ in range(2)
-    ]
-    assert ends[0] == ends[1]
-    assert {*ends[0]} == {Status.SUCCESS, Status.FAIL}  # of three to five targets
+    )
+    assert ends == again
+    assert {*ends} == {Status.SUCCESS, Status.FAIL}  # of three to five targets
 
 
-def test_what_is_not_understood_leaves_it_where_it_is(blind: TabletopSimulator) -> None:
+def test_an_unknown_subgoal_is_ignored(blind: TabletopSimulator) -> None:
     blind.reset("VideoUnmask/test/0", demonstration=False)
     home = blind.follow_subgoal(Subgoal("sing a song at <point>", ((3, 3),)))
     for _ in range(20):
@@ -107,27 +105,26 @@ def test_what_is_not_understood_leaves_it_where_it_is(blind: TabletopSimulator) 
     assert not np.array_equal(blind.follow_subgoal(blind.subgoal()), home)
 
 
-def test_a_thing_that_is_named_wrongly_is_taken(blind: TabletopSimulator) -> None:
-    """It knows no answer: told to lift another container, it does."""
+def test_a_wrong_subgoal_is_followed(blind: TabletopSimulator) -> None:
     blind.reset("VideoUnmask/test/0", demonstration=False)
     scene = blind.env.episode
     [right] = blind.env.answer
     wrong = scene.step(((right + 1) % 3,), 0)
-    told = Subgoal(wrong.text, blind.env.to_pixels(wrong.at))
+    subgoal = Subgoal(wrong.text, blind.env.to_pixels(wrong.at))
     status = Status.ONGOING
     while status is Status.ONGOING:
-        _, status = blind.step(blind.follow_subgoal(told), observe=False)
+        _, status = blind.step(blind.follow_subgoal(subgoal), observe=False)
     assert status is Status.FAIL
 
 
-# --- where things are in the image ---------------------------------------------------------------
+# --- points in the image -------------------------------------------------------------------------
 
 
 def test_points_by_hand() -> None:
-    # What the camera looks at is in the middle. It faces the arm: the arm's left is to its right.
+    # The camera's target is in the middle. It faces the arm: the arm's left is to its right.
     assert to_pixels([FRONT_TARGET]) == ((128, 128),)
     [(y, x)] = to_pixels([(FRONT_TARGET[0], 0.1, FRONT_TARGET[2])])
-    # 256 / 2 / tan(23°) = 301.5 pixels at a metre; the target is hypot(1.10, 0.43) = 1.181 m away.
+    # 256 / 2 / tan(23°) = 301.5 pixels at a meter; the target is hypot(1.10, 0.43) = 1.181 m away.
     assert (y, x) == (128, 128 + int(0.1 * 301.5 / 1.181))
     assert to_pixels([(0.3, 5.0, 0.0)])[0][1] == 255  # beyond the edge, at the edge
 
@@ -156,7 +153,7 @@ def test_the_point_is_on_the_thing(tabletop: TabletopSimulator) -> None:
     for index in range(2):
         _, first, _ = tabletop.reset(f"VideoPlaceButton/test/{index}", demonstration=False)
         subgoal = tabletop.subgoal()
-        colour = subgoal.text.split()[3]
+        color = subgoal.text.split()[3]
         [(y, x)] = subgoal.points
         pixel = first.images["front"][y, x].astype(int)
-        assert pixel.argmax() == ("red", "green", "blue").index(colour)
+        assert pixel.argmax() == ("red", "green", "blue").index(color)

@@ -20,19 +20,15 @@ from robomme_interference_data.simulators.base import (
 STEPS = 3
 
 UNKNOWN, ENDLESS = 3, 4
-"""Index of an episode that does not exist, and of one that never ends; others do after `STEPS`."""
+"""Index of an episode that does not exist, and of one that never ends; others end after `STEPS`."""
 
 
 class Double(Simulator):
-    """A simulator of 4×4 pictures, with a lesson of five frames in every episode.
+    """A simulator of 4×4 images, with a lesson of five frames in every episode.
 
-    States count the frames of the lesson, and then the steps from 10 on; actions count the steps.
-
-    Args:
-        cameras: What it draws: the front camera all in the episode's index, others in 99.
-        name: What it says it is.
-        told: Whether it tells the lesson's actions.
-        options: Kept to be looked at.
+    Pixels of the front camera are the episode's index, of others 99. States count the frames of the
+    lesson, and then the steps from 10 on; actions count the steps. `told` is whether it returns the
+    lesson's actions.
     """
 
     def __init__(

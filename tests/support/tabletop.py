@@ -1,6 +1,6 @@
-"""A buffer set as of `tabletop`, made without it: its scenes, answers and evidence, other frames.
+"""A buffer set with the scenes, answers and evidence of `tabletop`, but synthetic frames.
 
-Every pixel of a frame tells what it shows: red the frame's number in the lesson, green the number
+The color of a frame encodes its content: red is the frame's number in the lesson, green the number
 of the query, blue the part of the answer that the frame shows, from 1, or 0.
 """
 
@@ -47,7 +47,7 @@ LESSON, UNIT = 40, 249
 """Frames of a lesson, and of an episode that yields a unit."""
 
 LIVE, NOBODY = 255, 254
-"""Red of a first live view; green of what is of no query."""
+"""Red of a first live view; green of a frame of no query."""
 
 
 def copy_tabletop(folder: Path) -> Path:
@@ -63,10 +63,7 @@ def scene_of(episode: EpisodeId) -> tuple[Family, Any]:
 
 
 def shown(parts: int) -> list[tuple[int, ...]]:
-    """The parts of the answer that each frame of a lesson shows: each part on two frames of three.
-
-    The last ones show nothing.
-    """
+    """Which part of the answer each frame shows: each part on two frames of three, then none."""
     return [(n // 3,) if n % 3 < 2 and n // 3 < parts else () for n in range(LESSON)]
 
 
@@ -88,15 +85,15 @@ class Drawn(Source):
         parts, seed = scene.parts(answer), seed_of(episode.id)
         seen = shown(len(parts))
         evidence = spans_of_parts(seen, parts)
-        told = scene.goals(), seed, difficulty_of(seed), "tabletop", True
+        told = (scene.goal,), seed, difficulty_of(seed), "tabletop", True
         return Recording(*told, self._frames(episode.key, seen), evidence)
 
     def _frames(self, number: int, seen: Sequence[Sequence[int]]) -> Generator[Frame]:
         for place in range(UNIT):
             lesson = place < LESSON
             part = 1 + seen[place][0] if lesson and seen[place] else 0
-            colour = (place if lesson else LIVE, number, part)
-            image = np.full((SIZE, SIZE, 3), colour, np.uint8)
+            color = (place if lesson else LIVE, number, part)
+            image = np.full((SIZE, SIZE, 3), color, np.uint8)
             yield Frame({"front": image}, np.zeros(8, np.float32), None, lesson)
 
 

@@ -1,4 +1,4 @@
-"""A simulator without physics over a buffer set's episodes, and a policy that would cheat."""
+"""A simulator without physics over a buffer set's episodes, and a policy that cheats if it can."""
 
 import os
 import re
@@ -62,12 +62,11 @@ def lesson_images(query: Query) -> dict[str, NDArray[np.uint8]]:
 
 
 class World:
-    """Episodes of the buffer set that `WORLDS_DATA` names, as a simulator.
+    """Simulates the episodes of the buffer set in `WORLDS_DATA`.
 
     The answer is the lesson's state at frame 3. An action that equals it succeeds; after 40 steps
-    without it the episode fails. `WORLDS_TROUBLE` names a folder: a file `<Family>-<index>` there
-    makes that episode behave as the file says at step 5 (`raise`, `die`, `hang`, `error`), once
-    if the text ends in `once`; or never end (`endless`).
+    the episode fails. A file `<Family>-<index>` in the folder `WORLDS_TROUBLE` makes an episode
+    `raise`, `die`, `hang` or `error` at step 5, once if the text ends in `once`; or `endless`.
     """
 
     def __init__(self) -> None:
@@ -133,11 +132,10 @@ def trouble_of(episode: EpisodeId) -> str:
 
 
 class Cheat:
-    """Does what the lesson shows if it can get hold of any of it, by whatever way; else it holds.
+    """Repeats the lesson if any frame or state of it leaks to the policy; otherwise it holds.
 
-    It knows the buffer set's demonstrations by heart, so that one frame or state of them tells it the
-    answer. It looks for one in all that it is given: everything that can be reached from the info
-    and the goal, the history, and the live observations.
+    It knows all demonstrations of the buffer set, and searches every object that is reachable from
+    the info, the goal, the history and the live observations for one of their frames or states.
     """
 
     cameras: tuple[str, ...] = ("front",)
@@ -172,7 +170,7 @@ class Cheat:
         return np.tile(np.append(state[:7], np.float32(1.0)), (16, 1))
 
     def search(self, given: object) -> None:
-        """Take the answer from the first demonstration frame or state in what was given."""
+        """Take the answer from the first frame or state of a demonstration."""
         if self.answer is None:
             found = (known()[piece] for piece in pieces(given, set()) if piece in known())
             self.answer = next(found, None)
@@ -186,26 +184,26 @@ class Cheat:
 
 @cache
 def known() -> dict[bytes, NDArray[np.float32]]:
-    """Every frame and joint state of the buffer set's lessons, as bytes, and the answer that it tells.
+    """Map every frame and joint state of the lessons, as bytes, to the answer.
 
-    What `World` shows of an episode anyway is left out: its only view and state.
+    The one live view and state that `World` shows of an episode is left out.
     """
-    told: dict[bytes, NDArray[np.float32]] = {}
+    answers: dict[bytes, NDArray[np.float32]] = {}
     shown: set[bytes] = set()
     for episode in FAMILIES:
         query, states, seen = query_of(f"{episode}/test/0")
         images = list(lesson_images(query).values())
-        told |= dict.fromkeys(pieces([states, images], set()), states[ANSWER_FRAME])
+        answers |= dict.fromkeys(pieces([states, images], set()), states[ANSWER_FRAME])
         shown |= set(pieces([seen.state, list(seen.images.values())], set()))
-    return {piece: answer for piece, answer in told.items() if piece not in shown}
+    return {piece: answer for piece, answer in answers.items() if piece not in shown}
 
 
 FAMILIES = ("VideoRepick", "MoveCube")
-"""Those that the tests run: the first test episode of each."""
+"""The tests run the first test episode of each."""
 
 
 def pieces(given: object, seen: set[int]) -> Iterator[bytes]:
-    """Yield every image, and every seven numbers that could be joints, in what was given."""
+    """Yield every image, and every seven numbers that could be joints, of an object."""
     if id(given) in seen:
         return
     seen.add(id(given))

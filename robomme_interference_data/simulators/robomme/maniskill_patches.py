@@ -1,7 +1,7 @@
-"""Patch, at run time, a ManiSkill that is not the fork which RoboMME requires.
+"""Patch, at run time, a ManiSkill that is not the fork that RoboMME requires.
 
-Runs in RoboMME's own interpreter, as `worker.py` does: nothing of ours is imported, and
-nothing of that installation is changed. What is missing is taken from what the installation holds.
+Runs in RoboMME's interpreter, as `worker.py` does, so it does not import this package. The
+installation is not changed; missing parts are taken from its other parts.
 """
 
 import copy
@@ -24,14 +24,13 @@ WRIST, STICK = "wrist camera's size", "wrist camera on the stick"
 
 
 class CannotPatch(Exception):
-    """RoboMME cannot play here as it does on its fork of ManiSkill; says why."""
+    """This ManiSkill cannot be made to behave as RoboMME's fork does."""
 
 
 def apply_patches(folder: Path) -> list[str]:
-    """Patch what differs from RoboMME's fork of ManiSkill; return what was, in words.
+    """Patch what differs from RoboMME's fork of ManiSkill; return descriptions of the patches.
 
-    Args:
-        folder: Where the description of an arm may be written, once for all processes.
+    The patched description of an arm is written to `folder`, once for all processes.
     """
     try:
         from mani_skill.agents.robots.panda import PandaStick, PandaWristCam
@@ -49,65 +48,64 @@ def apply_patches(folder: Path) -> list[str]:
         raise
     except Exception as error:
         what = f"{type(error).__name__}: {error}"
-        raise CannotPatch(f"its ManiSkill is none that is known: {what}") from error
+        raise CannotPatch(f"its ManiSkill is not supported: {what}") from error
 
 
 def _planner(solver: Any) -> list[str]:
-    """Make the planner of the stick hand its base what that takes, and no more."""
+    """Make the stick's planner pass its base class only the arguments that this accepts."""
     base = solver.__mro__[1]
-    signature, taken = (inspect.signature(one.__init__) for one in (solver, base))
+    signature, accepted = (inspect.signature(one.__init__) for one in (solver, base))
     for name in ("visualize_target_grasp_pose", "joint_vel_limits"):
         if name not in signature.parameters:
             raise CannotPatch(f"its ManiSkill's {solver.__name__} takes no {name}")
 
     def trial(*args: Any, **named: Any) -> None:
-        taken.bind(*args, **named)
+        accepted.bind(*args, **named)
 
-    theirs, base.__init__ = base.__init__, trial
+    original, base.__init__ = base.__init__, trial
     try:
         solver.__init__(solver.__new__(solver), env=None)
         return []
     except TypeError:
         pass
     finally:
-        base.__init__ = theirs
+        base.__init__ = original
 
     def init(*args: Any, **named: Any) -> None:
-        given = signature.bind(*args, **named)
-        given.apply_defaults()
-        named = {name: one for name, one in given.arguments.items() if name in taken.parameters}
-        base.__init__(**named)
+        bound = signature.bind(*args, **named)
+        bound.apply_defaults()
+        base.__init__(**{k: v for k, v in bound.arguments.items() if k in accepted.parameters})
 
     solver.__init__ = init
     return [PLANNER]
 
 
 def _body(stick: Any, wrist: Any, folder: Path) -> list[str]:
-    """Give the stick arm the body of the camera, as the arm with the wrist camera has it."""
-    own, other = _Description(stick.urdf_path), _Description(wrist.urdf_path)
-    if LINK in own.links:
+    """Add the camera's body of the arm with the wrist camera to the arm with the stick."""
+    description = _Description(stick.urdf_path)
+    if LINK in description.links:
         return []
-    own.take(LINK, other)
-    stick.urdf_path = own.write(folder)
+    description.take(LINK, _Description(wrist.urdf_path))
+    stick.urdf_path = description.write(folder)
     return [BODY]
 
 
 def _camera(arm: Any, wrist: Any, what: str) -> list[str]:
-    """Give an arm the wrist camera, with as many pixels as in RoboMME's recordings."""
+    """Add the wrist camera to an arm, with the resolution of RoboMME's recordings."""
     before, usual = arm._sensor_configs.fget, wrist._sensor_configs.fget
 
     def hand(configs: list[Any]) -> list[Any]:
         return [one for one in configs if one.uid == CAMERA]
 
     def sensors(self: Any) -> list[Any]:
-        found = list(before(self))
-        if not hand(found):
-            found += hand(usual(self))
-        for one in hand(found):
-            one.width = one.height = SIDE
-        return found
+        configs = list(before(self))
+        if not hand(configs):
+            configs += hand(usual(self))
+        for config in hand(configs):
+            config.width = config.height = SIDE
+        return configs
 
-    # Cameras are those of an arm in a scene; which there are can be asked of one without any.
+    # The property needs an arm in a scene; this stand-in suffices to list its cameras.
     nowhere = SimpleNamespace(robot=SimpleNamespace(links_map=defaultdict(lambda: None)))
     sizes = [(one.width, one.height) for one in hand(before(nowhere))]
     if sizes == [(SIDE, SIDE)]:
@@ -119,7 +117,7 @@ def _camera(arm: Any, wrist: Any, what: str) -> list[str]:
 
 
 class _Description:
-    """An arm's URDF file, and the SRDF file beside it, which says which links may touch."""
+    """An arm's URDF file, and the SRDF file beside it, which lists the links that may touch."""
 
     def __init__(self, path: str):
         self._path = Path(path)
@@ -132,19 +130,19 @@ class _Description:
         return {one.get("name", ""): one for one in self._urdf.iter("link")}
 
     def take(self, link: str, other: "_Description") -> None:
-        """Take a link from another arm, and all between it and the first link that this one has.
+        """Copy a link from another arm, and all links between it and the first common one.
 
-        What its material is, is not taken: on RoboMME's fork the body on the stick is white, too.
+        Materials are not copied: on RoboMME's fork the camera's body on the stick is white, too.
         """
-        there = other.links
+        links = other.links
         joints = {_end(one, "child"): one for one in other._urdf.iter("joint")}
         new: list[str] = []
         while link not in self.links:
-            if link not in there or link not in joints:
-                raise CannotPatch(f"{other._path} has no {LINK} that {self._path} can take")
+            if link not in links or link not in joints:
+                raise CannotPatch(f"{other._path} has no {LINK} to copy to {self._path}")
             new.append(link)
             self._urdf.append(copy.deepcopy(joints[link]))
-            self._urdf.append(copy.deepcopy(there[link]))
+            self._urdf.append(copy.deepcopy(links[link]))
             link = _end(joints[link], "parent")
         for one in other._srdf.iter("disable_collisions"):
             pair = {one.get("link1"), one.get("link2")}
@@ -152,7 +150,7 @@ class _Description:
                 self._srdf.append(copy.deepcopy(one))
 
     def write(self, folder: Path) -> str:
-        """Write it beside links to what its own folder holds; return the path of the URDF file."""
+        """Write both files beside links to the arm's other files; return the path of the URDF."""
         urdf, srdf = (ET.tostring(one) for one in (self._urdf, self._srdf))
         home = self._path.resolve().parent
         name = hashlib.sha256(b"\0".join([bytes(home), urdf, srdf])).hexdigest()
@@ -173,5 +171,5 @@ class _Description:
 
 
 def _end(joint: Any, which: str) -> str:
-    """Return the link at an end of a joint: `child` or `parent`."""
+    """Return the link at an end of a joint, `child` or `parent`."""
     return str(joint.find(which).get("link"))

@@ -1,7 +1,7 @@
-"""Draw only what somebody looks at: RoboMME draws both cameras at every step, most of its time.
+"""Render only the requested cameras: RoboMME renders both at every step, most of its time.
 
-Runs in RoboMME's own interpreter, as `worker.py` does. What is drawn, states and statuses
-are the same, bit for bit; what is not drawn shows what was seen there last.
+Runs in RoboMME's interpreter, as `worker.py` does. Rendered images, states and statuses are the
+same, bit for bit; a camera that is not rendered shows its last image.
 """
 
 from collections.abc import Iterable
@@ -11,46 +11,38 @@ CAMERAS = {"front": "base_camera", "wrist": "hand_camera"}
 """Camera to its name in RoboMME."""
 
 
-class Drawing:
-    """Which cameras of ManiSkill's environments are drawn; all, until it is told which.
-
-    Attributes:
-        cameras: RoboMME's names of those that are drawn from now on.
-    """
+class RenderOnDemand:
+    """Patches ManiSkill to render only `cameras`, given by RoboMME's names; all at first."""
 
     def __init__(self) -> None:
         from mani_skill.envs.sapien_env import BaseEnv
 
         self.cameras: Iterable[str] = CAMERAS.values()
-        self._seen: dict[str, Any] = {}
-        self._draw = BaseEnv._get_obs_sensor_data
-        drawing = self
+        self._last: dict[str, Any] = {}
+        render_all = BaseEnv._get_obs_sensor_data
 
-        def look(self: Any, *args: Any, **named: Any) -> dict[str, Any]:
-            return drawing._look(self, *args, **named)
+        def render(env: Any, *args: Any, **named: Any) -> dict[str, Any]:
+            sensors = env._sensors
+            if sensors.keys() <= self._last.keys():  # otherwise a camera has no last image yet
+                env._sensors = {name: sensors[name] for name in self.cameras if name in sensors}
+            env.scene.sensors = env._sensors
+            try:
+                if env._sensors:
+                    self._last |= render_all(env, *args, **named)
+            finally:
+                env._sensors = env.scene.sensors = sensors
+            return dict(self._last)
 
-        BaseEnv._get_obs_sensor_data = look
+        BaseEnv._get_obs_sensor_data = render
 
-    def forget(self) -> None:
-        """Forget what was seen: another environment comes."""
-        self._seen = {}
+    def reset(self) -> None:
+        """Forget the last images, before another environment is made."""
+        self._last = {}
 
-    def see(self, env: Any, cameras: Iterable[str]) -> dict[str, Any]:
-        """Return what some cameras of an environment see now, `(256, 256, 3) uint8` each."""
+    def images(self, env: Any, cameras: Iterable[str]) -> dict[str, Any]:
+        """Return the current images of some cameras, `(256, 256, 3) uint8` each."""
         if not cameras:
             return {}
         self.cameras = [CAMERAS[one] for one in cameras]
-        seen = env.unwrapped._get_obs_sensor_data()
-        return {one: seen[CAMERAS[one]]["rgb"][0].cpu().numpy() for one in cameras}
-
-    def _look(self, env: Any, *args: Any, **named: Any) -> dict[str, Any]:
-        sensors = env._sensors
-        if sensors.keys() <= self._seen.keys():  # else there is nothing yet that could be shown
-            env._sensors = {name: sensors[name] for name in self.cameras if name in sensors}
-        env.scene.sensors = env._sensors
-        try:
-            if env._sensors:
-                self._seen |= self._draw(env, *args, **named)
-        finally:
-            env._sensors = env.scene.sensors = sensors
-        return dict(self._seen)
+        data = env.unwrapped._get_obs_sensor_data()
+        return {one: data[CAMERAS[one]]["rgb"][0].cpu().numpy() for one in cameras}

@@ -1,4 +1,4 @@
-"""The official simulator: RoboMME, in an interpreter of its own."""
+"""The official simulator, RoboMME, in a separate Python environment."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -7,10 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import MAX_STEPS
-from robomme_interference_data.errors import (
-    InvalidOptionError,
-    UnknownNameError,
-)
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.subgoal import Subgoal, read_grounded
@@ -29,40 +26,43 @@ from robomme_interference_data.simulators.tabletop.episodes import episode_ids
 from .process import Arrays, Process, find_python, installed_versions
 
 ARMS = ("VideoUnmask", "PatternLock")
-"""A family of each arm: with a gripper, with a stick. Their demonstrations are the shortest."""
+"""Families with a gripper and with a stick whose demonstrations are the shortest."""
 
 FRAME_SHAPE = (256, 256, 3)
 
 EPISODES = 5
-"""Episodes that a process of RoboMME's plays before another takes its place.
+"""Episodes that one process plays before a new one replaces it.
 
-Its memory grows as it plays, to 2.6 GB with a demonstration of 1077 frames, and shrinks little
-afterwards. A new one starts with 1.5 GB, in the tenth part of the time of an episode or less.
+Its memory grows up to 2.6 GB, with a demonstration of 1077 frames, and hardly shrinks afterwards. A
+new process takes 1.5 GB, and at most a tenth of the time of an episode.
 """
 
 
 class RoboMMESimulator(Simulator):
-    """See `Simulator`. RoboMME runs in a process of its own, which is started at once.
+    """The official simulator; see `Simulator`. The constructor starts RoboMME's process.
 
-    Each episode gets a fresh environment, and RoboMME plays its demonstration at every reset:
-    5 to 125 s on two cores. RoboMME returns no actions of its demonstrations, so
-    `Demonstration.actions` is empty, `(0, 8)`. In the families with a stick (`PatternLock`,
-    `RouteStick`) the gripper's opening is 0 throughout, and its action is without effect. RoboMME
-    would let an episode go on after 1300 steps; here its status is then `timeout`. An image of
-    another size than 256×256 is an `InvalidOptionError` of `reset`.
+    RoboMME plays the demonstration at every reset, in a new environment: 5 to 125 s on two cores.
+    It does not return the demonstration's actions, so `Demonstration.actions` is `(0, 8)`. In the
+    families with a stick (`PatternLock`, `RouteStick`) the gripper's opening is always 0, and its
+    action has no effect.
 
-    RoboMME keeps memory of the episodes that it has played, so every few of them get a new
-    process; what they return does not depend on it. When it dies, or takes too long, it is ended
-    and the call raises `SimulatorCrashError`; the next reset starts another one.
+    A new process replaces the old one every few episodes, because RoboMME's memory grows; results
+    do not depend on that. If the process dies or takes too long, it is ended and the call raises
+    `SimulatorCrashError`; the next reset starts a new one.
 
     Args:
-        python: RoboMME's interpreter; by default what `ROBOMME_PYTHON` says.
-        cameras: Names of the cameras whose images are wanted: `front`, `wrist`. What nobody looks
-            at is not drawn, which makes it up to 30 times as fast.
-        subgoals: Whether `subgoal` can be asked. RoboMME finds places in its pictures, so the
-            front view is then drawn at every step.
-        answer_s: Seconds that it may take to start, and for each answer. Seen on machines with too
-            much to do: 300 to start, 190 for a reset, 120 for a step.
+        python: RoboMME's interpreter; by default the environment variable `ROBOMME_PYTHON`.
+        cameras: Names of the cameras to render: `front`, `wrist`. Without any, it is up to 30
+            times as fast.
+        answer_s: Seconds that it may take to start, and for each call. On overloaded machines, up
+            to 300 s to start, 190 s for a reset and 120 s for a step occur.
+        subgoals: Whether `subgoal` can be called. RoboMME locates points in its images, so it then
+            renders the front camera at every step.
+
+    Raises:
+        InvalidOptionError: The interpreter is missing or does not run, or a camera is unknown.
+        MissingExtraError: The interpreter cannot run RoboMME.
+        SimulatorCrashError: RoboMME does not start.
     """
 
     name = "robomme"
@@ -86,32 +86,32 @@ class RoboMMESimulator(Simulator):
 
     @property
     def patches(self) -> tuple[str, ...]:
-        """In what its ManiSkill was patched, in words: RoboMME requires a fork of that."""
+        """What was patched because the installed ManiSkill is not RoboMME's fork."""
         return self._process.patches
 
     @classmethod
     def versions(cls, python: str | None = None) -> dict[str, str]:
-        """Return what is installed in its interpreter: `robomme`, `robomme_mani_skill`, and so on.
+        """Return the versions in its interpreter: `robomme`, `robomme_mani_skill`, and so on.
 
-        And so for Python, sapien, torch and numpy, where known; with the commit, if it was
-        installed from one. Read from the metadata of installed packages: RoboMME is not started.
+        They include Python, sapien, torch and numpy, and the commit of a package that was
+        installed from one.
         """
         return installed_versions(find_python(python))
 
     @classmethod
     def episodes(cls) -> list[EpisodeId]:
-        """List its episodes: their numbers are those of the embedded suite."""
+        """Return its episodes: the same ids as those of the embedded suite."""
         return episode_ids()
 
     def act(self, policy: str, known: Mapping[int, str] | None = None) -> NDArray[np.float32]:
-        """Refuse with `UnknownNameError`: RoboMME has no built-in policy."""
+        """Raise `UnknownNameError`: RoboMME has no built-in policies."""
         raise UnknownNameError(
             f"the robomme simulator has no built-in policy {policy!r}",
-            "oracle, guess and recall play on the embedded suite, tabletop, only.",
+            "oracle, guess and recall need the simulator tabletop.",
         )
 
     def subgoal(self) -> Subgoal:
-        """Return RoboMME's own subgoal of now; see `Simulator.subgoal`."""
+        """Return RoboMME's current subgoal; see `Simulator.subgoal`."""
         self._running()
         if not self._subgoals:
             raise InvalidOptionError(
@@ -119,8 +119,8 @@ class RoboMMESimulator(Simulator):
             )
         if not (self._subgoal or "").strip():
             raise UnknownNameError(
-                f"RoboMME in {self._python} tells no subgoal now",
-                "Run without its subgoals, or with a newer RoboMME.",
+                f"RoboMME in {self._python} provides no subgoal",
+                "Run without subgoals, or with a newer RoboMME.",
             )
         return read_grounded(str(self._subgoal))
 
@@ -130,24 +130,24 @@ class RoboMMESimulator(Simulator):
         return self._process.pid
 
     def close(self) -> None:
-        """End RoboMME's process; further calls but `close` are errors."""
+        """End RoboMME's process; afterwards, every method except `close` raises."""
         super().close()
         self._process.end()
 
     def _begin(self, episode: EpisodeId, demonstration: bool) -> Begun:
         if episode.answer is not None:
             raise UnknownNameError(
-                f"{episode}: RoboMME draws scene and answer together; it has no other answer",
-                f"Give the episode itself, {episode.scene}, or use the simulator tabletop.",
+                f"{episode}: RoboMME cannot combine a scene with another answer",
+                f"Use the episode {episode.scene}, or the simulator tabletop.",
             )
-        known = self._process.families
-        if episode.family not in known:
-            raise UnknownNameError.among("family", episode.family, self.name, known)
+        families = self._process.families
+        if episode.family not in families:
+            raise UnknownNameError.among("family", episode.family, self.name, families)
         if self._process.pid is None or self._process.played >= EPISODES:
             self._process.end()
             self._process = Process(self._python, self._answer_s)
         self._process.played += 1
-        about, arrays = self._process.call(
+        facts, arrays = self._process.call(
             "reset",
             family=episode.family,
             split=episode.split,
@@ -157,12 +157,12 @@ class RoboMMESimulator(Simulator):
             demonstration=demonstration,
             subgoals=self._subgoals,
         )
-        self._subgoal = about["subgoal"]
+        self._subgoal = facts["subgoal"]
         first = self._observation(arrays, self._cameras)
         images = {camera: arrays[camera][:-1] for camera in self._cameras if demonstration}
         no_actions = np.empty((0, ACTION_SIZE), np.float32)
         lesson = Demonstration(images, arrays["states"][:-1], no_actions)
-        info = EpisodeInfo(tuple(about["goals"]), about["difficulty"], about["seed"], self.name)
+        info = EpisodeInfo(tuple(facts["goals"]), facts["difficulty"], facts["seed"], self.name)
         return lesson, first, info
 
     def _execute(
@@ -177,13 +177,13 @@ class RoboMMESimulator(Simulator):
         return self._observation(arrays, self._cameras if observe else ()), status
 
     def _observation(self, arrays: Arrays, cameras: tuple[str, ...]) -> Observation:
-        """Return the last frames and state as an observation of its own memory."""
+        """Copy the last frames and state into an observation."""
         images = {camera: arrays[camera][-1].copy() for camera in cameras}
         for camera, image in images.items():
             if (image.shape, image.dtype) != (FRAME_SHAPE, np.uint8):
                 raise InvalidOptionError(
                     f"RoboMME's {camera} camera in {self._python} gives {image.shape} "
                     f"{image.dtype}; expected {FRAME_SHAPE} uint8",
-                    "Install the RoboMME whose recordings are published.",
+                    "Install the RoboMME version of the published recordings.",
                 )
         return Observation(images, arrays["states"][-1].copy())

@@ -1,7 +1,7 @@
 """The embedded suite: nine task families on ManiSkill and sapien.
 
-Importing this package registers a Gymnasium environment per family, `tabletop/MoveCube-v1` and so
-on, so that `gymnasium.make("tabletop/MoveCube-v1")` finds them. Gymnasium imports it itself for
+Importing this package registers a Gymnasium environment per family, such as
+`tabletop/MoveCube-v1`. Gymnasium itself imports the package for
 
     gymnasium.make("robomme_interference_data.simulators.tabletop:tabletop/MoveCube-v1")
 """
@@ -9,15 +9,14 @@ on, so that `gymnasium.make("tabletop/MoveCube-v1")` finds them. Gymnasium impor
 from robomme_interference_data.constants import FAMILIES, MAX_STEPS
 
 SUITE_VERSION = 2
-"""Version of the episodes; raised with every change to scenes, shifts, motions, goals or
-judgements.
+"""Version of the episodes: every change to scenes, shifts, motions, goals or judgments raises it.
 
-Datasets and runs of another version do not fit this one: see `docs/simulators.md`.
+Datasets and runs of different versions are incompatible; see `docs/reference/tabletop.md`.
 """
 
 
 def register_environments() -> None:
-    """Register the nine families with Gymnasium, if it is installed and they are not yet known."""
+    """Register the nine families with Gymnasium, if it is installed."""
     try:
         import gymnasium
     except ImportError:

@@ -1,4 +1,4 @@
-"""Where a point of the scene is in the front camera's image: pure."""
+"""Projection of the scene's points into the front camera's image."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -9,21 +9,21 @@ from numpy.typing import NDArray
 from robomme_interference_data.schema.subgoal import Pixel
 
 FRONT_EYE = (0.80, 0.0, 0.64)
-"""Where the front camera stands, in m: the table up to x = 0.14 m, and at its home pose the whole
-arm but for the top of its shoulder."""
+"""Position of the front camera in m. It sees the table up to x = 0.14 m, and at its home pose the
+whole arm except the top of its shoulder."""
 
 FRONT_TARGET = (-0.30, 0.0, 0.21)
-"""Where it looks, in m."""
+"""The point that it faces, in m."""
 
 FRONT_VIEW = math.radians(46)
 SIZE = 256
-"""Pixels of its image, down and across."""
+"""Pixels of its image, vertically and horizontally."""
 
 
 def looking(eye: Sequence[float], target: Sequence[float]) -> NDArray[np.float64]:
-    """Return the pose of a camera that looks from one point at another, `(4, 4)`.
+    """Return the pose, `(4, 4)`, of a camera at `eye` that faces `target`.
 
-    As sapien has it: x ahead, y to the left, z up.
+    Axes as in sapien: x ahead, y to the left, z up.
     """
     ahead = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
     left = np.cross((0.0, 0.0, 1.0), ahead)
@@ -35,14 +35,11 @@ def looking(eye: Sequence[float], target: Sequence[float]) -> NDArray[np.float64
 
 
 def to_pixels(
-    points: Iterable[Sequence[float] | NDArray[np.float64]],
-    pose: NDArray[np.float64] | None = None,
+    points: Iterable[Sequence[float] | NDArray[np.float64]], pose: NDArray[np.float64] | None = None
 ) -> tuple[Pixel, ...]:
-    """Return where points are in the front image, (y, x) in pixels; beyond it, at its edge.
+    """Project points, `(3,)` in m, into the front image, (y, x) in pixels, clipped to its edges.
 
-    Args:
-        points: Of the scene, `(3,)` each, in m, before the camera.
-        pose: The camera's; None where no shift has moved it.
+    The points must be in front of the camera. `pose` is the camera's, if a shift has moved it.
     """
     pose = looking(FRONT_EYE, FRONT_TARGET) if pose is None else pose
     focal = SIZE / 2 / math.tan(FRONT_VIEW / 2)

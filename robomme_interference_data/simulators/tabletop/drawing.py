@@ -1,10 +1,10 @@
-"""How the suite is drawn fast on a processor: a Panda with few polygons, matt surfaces.
+"""Fast rendering on a CPU: a Panda with few polygons, and matte surfaces.
 
-The visual meshes of the arm, 135,000 triangles, and of the camera on its wrist, 425,000, take
-nearly all of a frame's time. The arm's collision meshes, 2,100 triangles that ship beside them,
-have the same outline, and the camera is a box. The shaders that sapien brings compute reflections,
-textures, positions and segmentation too, of which nothing is seen here, and shade what is hidden
-as well: three times the work of those beside this file.
+The visual meshes of the arm (135,000 triangles) and of its wrist camera (425,000) would take
+nearly all of a frame's time. Instead, the arm is drawn with its collision meshes (2,100 triangles,
+the same outline) and the camera as a box. The shaders beside this file skip the reflections,
+textures, positions, segmentation and hidden surfaces that sapien's shaders compute, and take a
+third of their time.
 """
 
 import math
@@ -20,24 +20,24 @@ from mani_skill.agents.robots import PandaWristCam
 from mani_skill.render.shaders import ShaderConfig
 from mani_skill.sensors.camera import CameraConfig
 
-from .kit import Colour
+from .bodies import Color
 from .motion import ROD
 from .renderer import SHADERS
 
 UPRIGHT = (math.sqrt(0.5), 0, math.sqrt(0.5), 0)
-"""The turn, as a quaternion, that stands up sapien's cylinders, which lie along x."""
+"""The rotation, as a quaternion, that stands up sapien's cylinders, which lie along x."""
 
 SHADER = ShaderConfig(
     shader_pack=str(SHADERS),
     texture_names={"Color": ["rgb"]},
     texture_transforms={"Color": lambda data: {"rgb": data[..., :3]}},
 )
-"""For every camera of the suite; it draws colours and nothing else."""
+"""Shader of every camera of the suite; it renders colors only."""
 
 sapien.render.set_picture_format("Color", "r8g8b8a8unorm")
 
 PANDA = "panda_low_polygon"
-"""Name under which ManiSkill knows the arm."""
+"""Name of the arm in ManiSkill."""
 
 _PAINT = {
     **dict.fromkeys(("link0", "link1", "link3", "link5", "link7", "hand"), (0.93, 0.94, 0.95)),
@@ -55,27 +55,16 @@ class LowPolygonPanda(PandaWristCam):  # type: ignore[misc]
 
     @property
     def _sensor_configs(self) -> list[CameraConfig]:
-        return [
-            CameraConfig(
-                uid="wrist",
-                pose=sapien.Pose(),
-                width=256,
-                height=256,
-                fov=math.pi / 2,
-                near=0.01,
-                far=10,
-                shader_config=SHADER,
-                mount=self.robot.links_map["camera_link"],
-            )
-        ]
+        mount = self.robot.links_map["camera_link"]
+        view = {"fov": math.pi / 2, "near": 0.01, "far": 10, "shader_config": SHADER}
+        return [CameraConfig("wrist", sapien.Pose(), 256, 256, mount=mount, **view)]
 
 
 def draw_low_polygon(articulation: Any, stick: float) -> None:
-    """Replace what is drawn of the arm; its physics stay.
+    """Replace the visual shapes of the arm; its physics stay the same.
 
-    Args:
-        articulation: sapien's articulation.
-        stick: Length in m of the stick to draw in the gripper, beyond the fingertips; 0 for none.
+    `stick` is the length in m that the stick in the gripper reaches beyond the fingertips; 0 for
+    none.
     """
     for link in articulation.links:
         part = link.name.removeprefix(f"scene-0-{PANDA}_").removeprefix("panda_")
@@ -91,7 +80,7 @@ def draw_low_polygon(articulation: Any, stick: float) -> None:
         else:
             mesh = "finger" if part.endswith("finger") else part
             shape = sapien.render.RenderShapeTriangleMesh(*_mesh(mesh), painted)
-        if part == "rightfinger":  # the same mesh, turned half round
+        if part == "rightfinger":  # the same mesh, rotated by 180°
             shape.set_local_pose(sapien.Pose([0, 0, 0], [0, 0, 0, 1]))
         body.attach(shape)
         if stick and part == "hand":
@@ -120,7 +109,7 @@ def _mesh(name: str) -> tuple[Any, Any, Any, Any]:
 
 
 def _smooth(vertices: Any, normals: Any) -> Any:
-    """Average the normals of faces that meet at less than 45°, so that round parts look round."""
+    """Average the normals of faces that meet at less than 45°, to make round parts look round."""
     _, where = np.unique(np.round(vertices, 5), axis=0, return_inverse=True)
     where = where.reshape(-1)
     smooth = np.empty_like(normals)
@@ -132,8 +121,8 @@ def _smooth(vertices: Any, normals: Any) -> Any:
     return smooth.astype(np.float32)
 
 
-def material(colour: Colour, roughness: float = 0.9, specular: float = 0.1) -> Any:
-    """A plain material of a colour, matt unless said otherwise."""
+def material(color: Color, roughness: float = 0.9, specular: float = 0.1) -> Any:
+    """Return a plain material of a color, matte by default."""
     return sapien.render.RenderMaterial(
-        base_color=[*colour, 1.0], roughness=roughness, specular=specular
+        base_color=[*color, 1.0], roughness=roughness, specular=specular
     )

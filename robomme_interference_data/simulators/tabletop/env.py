@@ -20,17 +20,11 @@ from robomme_interference_data.schema.shifts import Shift
 from robomme_interference_data.schema.subgoal import Pixel, Subgoal
 from robomme_interference_data.simulators.base import CAMERAS, Demonstration, Observation
 
-from .camera import (
-    FRONT_EYE,
-    FRONT_TARGET,
-    FRONT_VIEW,
-    SIZE,
-    to_pixels,
-)
+from .bodies import SceneBuilder
+from .camera import FRONT_EYE, FRONT_TARGET, FRONT_VIEW, SIZE, to_pixels
 from .drawing import PANDA, SHADER, draw_low_polygon
 from .episodes import difficulty_of, turn_of
 from .families import draw_episode
-from .kit import Kit
 from .motion import BASE, Arm, Point, Script
 from .renderer import make_renderer
 from .scene_shift import SceneShift
@@ -45,25 +39,28 @@ _POSSIBLE: dict[str, tuple[Any, ...]] = {
     "robot_uids": (PANDA,),
     "sim_backend": ("physx_cpu", "cpu", "auto"),
 }
-# Where nothing is drawn.
+# Without rendering.
 _POSSIBLE_BLIND = _POSSIBLE | {"obs_mode": ("none", "state", "state_dict"), "render_mode": (None,)}
 
 
 class TabletopEnv(BaseEnv):  # type: ignore[misc]
-    """One family's episodes; `reset(seed=s)` is the episode of that seed, demonstration and all.
+    """One family's episodes: `reset(seed=s)` plays the demonstration of that seed's episode.
 
-    `demonstrated` names the cameras that draw the demonstration; where `demonstrating` is False it
-    is not even played. Under `shift` the live scene looks otherwise than the demonstration's, see
-    `look`. `reset` takes seeds from 0 to 2**32 - 1 and the options `difficulty`, and
-    `answer`, the index of the hidden answer to use instead of the seed's own. Its info holds
-    `goal`, `goals`, `difficulty` and `demonstration`.
+    `reset` takes seeds from 0 to 2**32 - 1 and the options `difficulty` and `answer`, the index of
+    a hidden answer that replaces the seed's own. Its info holds `goal`, `goals`, `difficulty` and
+    `demonstration`.
 
     Args:
-        family: Task family to start with; `family` may be set before a reset.
-        render: Whether to draw; without, observations hold no images.
-        **options: As for any ManiSkill environment, but one environment on the processor, joint
-            targets as actions, `obs_mode` `rgb`, `state`, `state_dict` or `none`, `render_mode`
-            `rgb_array` (the front view) or `sensors` (both cameras), a sparse reward or none.
+        family: Task family; may also be set before a reset.
+        render: Whether to render; without, observations hold no images.
+        **options: ManiSkill's options, limited to one environment on the CPU, joint targets as
+            actions, `obs_mode` `rgb`, `state`, `state_dict` or `none`, `render_mode` `rgb_array`
+            (the front view) or `sensors` (both cameras), and a sparse reward or none.
+
+    Attributes:
+        demonstrated: Cameras that render the demonstration.
+        demonstrating: Whether a reset plays the demonstration at all.
+        shift: Shift of the live scene.
     """
 
     SUPPORTED_ROBOTS = [PANDA]  # noqa: RUF012, ManiSkill's name and type
@@ -80,11 +77,11 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
                 expected = " or ".join(map(repr, values))
                 raise InvalidOptionError.expected(name, options[name], expected)
         options.setdefault("render_backend", "cpu" if render else "none")
-        make_renderer()  # sapien wants one even where nothing is drawn
+        make_renderer()  # sapien needs one even without rendering
         super().__init__(**options)
         self.demonstrating = True
 
-    # --- what ManiSkill asks for ---------------------------------------------------------------
+    # --- ManiSkill's hooks ---------------------------------------------------------------------
 
     @property
     def _default_sim_config(self) -> SimConfig:
@@ -102,9 +99,9 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
             draw_low_polygon(self.agent.robot._objs[0], self.episode.stick)
 
     def _load_scene(self, options: dict[str, Any]) -> None:
-        self.kit = Kit(self.scene)
-        self.kit.room(self.episode.table, self.episode.floor)
-        self.episode.build(self.kit)
+        self.builder = SceneBuilder(self.scene)
+        self.builder.room(self.episode.table, self.episode.floor)
+        self.episode.build(self.builder)
 
     def _load_lighting(self, options: dict[str, Any]) -> None:
         self.scene.set_ambient_light([0.45, 0.45, 0.45])
@@ -122,18 +119,18 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         self.episode.react(self.arm)
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        """Return `success` and `fail`, as ManiSkill wants them."""
+        """Return `success` and `fail` as ManiSkill expects them."""
         return {
             "success": torch.tensor([self.status is Status.SUCCESS]),
             "fail": torch.tensor([self.status is Status.FAIL]),
         }
 
-    # --- an episode ------------------------------------------------------------------------------
+    # --- an episode ----------------------------------------------------------------------------
 
     def reset(
         self, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start the episode of a seed: play its demonstration, then set the live scene."""
+        """Start the episode of a seed: play its demonstration, then set up the live scene."""
         options = dict(options or {}, reconfigure=True)  # nothing else is reproducible
         if seed is None:
             seed = int(self._main_rng.randint(2**31))
@@ -142,12 +139,10 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         if difficulty not in DIFFICULTIES:
             raise InvalidOptionError.one_of("difficulty", difficulty, DIFFICULTIES)
         episode = draw_episode(self.family, number, difficulty)
-        answers = episode.answers
-        self.number = number
-        turn = turn_of(number, len(answers))
-        answer = _index(options.get("answer", turn), -len(answers), len(answers), "answer")
-        self.episode, self.answer = episode, answers[answer]
-        self.guess = answers[turn_of(number, len(answers), stream=1)]
+        answers, count = episode.answers, len(episode.answers)
+        answer = _index(options.get("answer", turn_of(number, count)), -count, count, "answer")
+        self.number, self.episode, self.answer = number, episode, answers[answer]
+        self.guess = answers[turn_of(number, count, stream=1)]
         observed, info = super().reset(seed=number, options=options)
         if self.drawing:
             cameras = {name: self._camera(name) for name in CAMERAS}
@@ -157,8 +152,8 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
             if self.shift is not None:
                 self.show(self.shift)
             observed = self.get_obs(self.get_info())
-        goals = self.episode.goals()
-        info.update(goal=goals[0], goals=goals, difficulty=difficulty)
+        goal = episode.goal
+        info.update(goal=goal, goals=(goal,), difficulty=difficulty)
         return observed, info
 
     def _step_action(self, action: Any) -> Any:
@@ -176,17 +171,17 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
                 answer = self.answer if policy == "oracle" else self.guess
             self.arm.reset()
             self._scripts[policy] = self.episode.solve(self.arm, answer)
-        next(self._scripts[policy], None)  # a script that is through holds its last pose
+        next(self._scripts[policy], None)  # a finished script holds its last pose
         return self.arm.action.copy()
 
     def subgoal(self) -> Subgoal:
-        """Return what is to be done next, as the scene stands; see `Simulator.subgoal`."""
-        last = self.episode.steps() - 1
+        """Return the next subgoal; see `Simulator.subgoal`."""
+        last = self.episode.steps - 1
         step = self.episode.step(self.answer, min(self.episode.progress(), last))
         return Subgoal(step.text, self.to_pixels(step.at))
 
     def follow_subgoal(self, subgoal: Subgoal | None) -> NDArray[np.float32]:
-        """Return the next action of a script that obeys, `(8,) float32`; see `Simulator.follow_subgoal`."""
+        """Return the next action, `(8,) float32`; see `Simulator.follow_subgoal`."""
         if self._follower is None:
             if subgoal is None:
                 return self.act("guess")
@@ -197,14 +192,12 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         return self.arm.action.copy()
 
     def to_pixels(self, points: Sequence[Point]) -> tuple[Pixel, ...]:
-        """Return where points are in the front image as it is now; see `camera.to_pixels`."""
-        pose = (
-            self._camera("front").global_pose.to_transformation_matrix() if self.drawing else None
-        )
-        return to_pixels(points, pose)
+        """Project points into the current front image; see `camera.to_pixels`."""
+        pose = self._camera("front").global_pose if self.drawing else None
+        return to_pixels(points, None if pose is None else pose.to_transformation_matrix())
 
     def observe(self, cameras: Sequence[str] = CAMERAS) -> Observation:
-        """Return what a policy sees now, drawing these cameras."""
+        """Return the current observation with the images of some cameras."""
         images = {}
         if self.drawing and cameras:
             self.scene.sub_scenes[0].update_render()
@@ -215,12 +208,12 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         return Observation(images, self.arm.state)
 
     def show(self, shift: Shift | None) -> None:
-        """Let the scene look as under a shift from now on; None as it was built."""
+        """Apply a shift to the live scene from now on; None for no shift."""
         if self.drawing:
             self._scene_shift.show(shift)
 
     def render_rgb_array(self, camera_name: str | None = None) -> torch.Tensor:
-        """Return the view of a camera, front by default, `(1, 256, 256, 3) uint8` RGB."""
+        """Return a camera's image, front by default, `(1, 256, 256, 3) uint8` RGB."""
         name = camera_name or CAMERAS[0]
         return torch.from_numpy(self.observe((name,)).images[name])[None]
 
@@ -234,7 +227,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
             seen.append(self.observe(self.demonstrated))
             actions.append(self.arm.action.copy())
             super()._step_action(actions[-1])
-        self.kit.restore()
+        self.builder.restore()
         self._rest()
         return Demonstration(
             {name: np.stack([one.images[name] for one in seen]) for name in seen[0].images},
@@ -244,7 +237,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         )
 
     def _rest(self) -> None:
-        """Bring the arm to its home pose, at rest."""
+        """Set the arm to its home pose, at rest."""
         self.arm.reset()
         robot = self.agent.robot._objs[0]
         qpos = np.array(self.arm.home_qpos, dtype=np.float32)
@@ -256,7 +249,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
 
 
 def _index(value: Any, start: int, stop: int, what: str) -> int:
-    """Return a whole number from start up to, not including, stop."""
+    """Check that a value is a whole number from start to stop - 1, and return it."""
     if not isinstance(value, int | np.integer) or not start <= value < stop:
         raise InvalidOptionError.expected(what, value, f"a whole number, {start} to {stop - 1}")
     return int(value)

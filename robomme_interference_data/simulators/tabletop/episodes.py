@@ -1,4 +1,4 @@
-"""Which episodes the suite has, and the seed and difficulty of each: pure, without a simulator."""
+"""The suite's episodes, with their seeds and difficulties."""
 
 from numpy.random import RandomState
 
@@ -20,7 +20,7 @@ def seed_of(episode: EpisodeId) -> int:
         raise UnknownNameError.among("family", episode.family, "tabletop", FAMILIES)
     if episode.index >= EPISODES[episode.split]:
         raise UnknownNameError(
-            f"{episode} does not exist: split {episode.split!r} has the episodes 0 to "
+            f"{episode} does not exist: split {episode.split!r} has episodes 0 to "
             f"{EPISODES[episode.split] - 1}"
         )
     family = _FAMILY_SPAN * (1 + FAMILIES.index(episode.family))
@@ -28,22 +28,22 @@ def seed_of(episode: EpisodeId) -> int:
 
 
 def turn_of(seed: int, count: int, stream: int = 0) -> int:
-    """Return which of `count` answers the episode of a seed has, from 0: they take turns.
+    """Return which of `count` answers, counted from 0, the episode of a seed has.
 
-    In each group of episodes of a family, split and difficulty each answer occurs equally often,
-    to within one. It does so once in every `count` episodes of the group, in a new order; another
-    `stream` has orders of its own: answers are of stream 0, guesses of 1.
+    The episodes of a family, split and difficulty come in blocks of `count`; each block has every
+    answer once, in random order. So answers occur equally often, to within one. Each `stream` has
+    its own orders: 0 for answers, 1 for guesses, 2 for other answers.
     """
     family, number = divmod(seed, _FAMILY_SPAN)
     split, number = divmod(number, _SPLIT_SPAN)
     number, difficulty = divmod(number, len(DIFFICULTIES))
-    block, place = divmod(number, count)
+    block, index = divmod(number, count)
     order = RandomState([family, split, difficulty, block, stream]).permutation(count)
-    return int(order[place])
+    return int(order[index])
 
 
 def difficulty_of(seed: int) -> str:
-    """Return the difficulty of a seed's scene: easy, medium, hard, in turn."""
+    """Return the difficulty of a seed's scene: easy, medium and hard alternate."""
     return DIFFICULTIES[seed % len(DIFFICULTIES)]
 
 

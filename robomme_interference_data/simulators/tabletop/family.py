@@ -12,23 +12,21 @@ from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.subgoal import Pixel
 
+from .bodies import Color, SceneBuilder
 from .camera import SIZE, to_pixels
 from .episodes import turn_of
-from .kit import Colour, Kit
 from .motion import Arm, Point, Script
 
 _RECALLED = 2
-"""Stream of random numbers; see `episodes.turn_of` for the others."""
+"""Stream of random numbers; `episodes.turn_of` uses the others."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """One of the steps in which an answer is carried out.
+    """One of the steps that carry out an answer.
 
-    Attributes:
-        text: What is to be done, with `<point>` for the place of each thing (see `Subgoal`).
-        at: These places as the scene stands now, in m.
-        do: Does it.
+    `text` says what to do, with `<point>` for each thing (see `Subgoal`); `at` is where these
+    things are now, in m; `do` is the script.
     """
 
     text: str
@@ -38,11 +36,10 @@ class Step:
 
 @dataclass(frozen=True)
 class Option:
-    """How one of the possible answers is told in a question about the past.
+    """An option of a multiple-choice question.
 
-    Attributes:
-        words: In words, as far as they do; empty where only its place tells it.
-        marks: Where it is in the live scene, in m: one point of a thing, or those of a path.
+    `words` is empty where only the location distinguishes it; `marks` are points of the live
+    scene in m: one for a thing, several for a path.
     """
 
     words: str
@@ -52,8 +49,8 @@ class Option:
 class Family(ABC):
     """One episode of a task family.
 
-    The answer is handed only to what may know it: the demonstration, the solution and the judge.
-    Goal and first live scene are made without it, so they cannot give it away.
+    Only the demonstration, the solution and the judge receive the answer. Goal and first live
+    scene are made without it, so they cannot reveal it.
 
     Args:
         difficulty: `easy`, `medium` or `hard`.
@@ -61,22 +58,26 @@ class Family(ABC):
             are the same in every version of NumPy.
 
     Attributes:
+        table: Color of the table; `floor` that of the floor.
+        side: Pixels of the front image, vertically and horizontally.
+        stick: Length in m of the stick that the gripper holds; 0 for none.
+        pace: Speed of the scripted motion: 1 is 0.25 m/s at the middle of a move.
+        goal: The goal.
+        question: The question about the demonstration; it is asked together with the goal.
+        steps: Number of steps of the task.
         answers: All answers that the scene allows; one is the hidden one.
-        showing: Numbers of the parts of the answer that the demonstration shows now; its script
-            sets them.
+        showing: Numbers of the parts of the answer that the demonstration shows now; set by its
+            script.
     """
 
-    table: ClassVar[Colour]
-    floor: ClassVar[Colour] = (0.55, 0.57, 0.60)
+    table: ClassVar[Color]
+    floor: ClassVar[Color] = (0.55, 0.57, 0.60)
     side: ClassVar[int] = SIZE
-    """Pixels of the front image, down and across."""
-
     stick: ClassVar[float] = 0.0
-    """Length in m of the stick that the gripper holds; 0 for none."""
-
     pace: ClassVar[float] = 0.6
-    """Speed of the scripted motion: 1 is 0.25 m/s at the middle of a move."""
-
+    goal: str
+    question: str
+    steps: int
     answers: Sequence[Any]
     showing: tuple[int, ...] = ()
 
@@ -86,121 +87,105 @@ class Family(ABC):
 
     @abstractmethod
     def draw(self, rng: RandomState) -> None:
-        """Choose the scene, and set `answers`."""
+        """Draw the scene, and set those of `goal`, `question`, `steps` and `answers` that vary."""
 
     @abstractmethod
-    def build(self, kit: Kit) -> None:
-        """Build the scene's bodies at their places."""
+    def build(self, builder: SceneBuilder) -> None:
+        """Build the scene's bodies."""
 
     @abstractmethod
-    def goals(self) -> tuple[str, ...]:
-        """The goal in words, in one wording or more."""
-
-    @abstractmethod
-    def told(self, answer: Any) -> tuple[str, ...]:
-        """The parts of an answer in words, in the order in which the demonstration shows them."""
-
-    @abstractmethod
-    def question(self) -> str:
-        """What is asked about the past, beside the goal."""
+    def answer_texts(self, answer: Any) -> tuple[str, ...]:
+        """Return the parts of an answer as texts, in the order of the demonstration."""
 
     def choice(self, answer: Any) -> Any:
-        """What the question asks for of an answer."""
+        """Return the part of an answer that the question asks for."""
         return answer
 
     @abstractmethod
     def option(self, choice: Any) -> Option:
-        """How such a choice is told in the live scene."""
+        """Return how a choice is presented in the live scene."""
 
     def pixels(self, marks: Sequence[Point]) -> tuple[Pixel, ...]:
-        """Where points are in the front image of the live scene, which is `side` pixels wide."""
+        """Project points of the live scene into the front image, (y, x) in pixels."""
         return to_pixels(marks)
 
     def own_answer(self, seed: int) -> Any:
-        """The answer of the episode of a seed."""
+        """Return the answer of the episode of a seed."""
         return self.answers[turn_of(seed, len(self.answers))]
 
     def parts(self, answer: Any) -> tuple[str, ...]:
-        """All that must be seen of a demonstration to know the answer, in words, in order."""
-        return self.told(answer)
+        """Return everything that one must see to know the answer, as texts, in order."""
+        return self.answer_texts(answer)
 
     def lessons(self) -> Iterable[tuple[Any, tuple[str, ...]]]:
-        """Every answer with what is told of it; several times, if in several ways."""
-        return ((answer, self.told(answer)) for answer in self.answers)
+        """Return all pairs of an answer and its texts; an answer may have several texts."""
+        return ((answer, self.answer_texts(answer)) for answer in self.answers)
 
     def agreeing(self, known: Mapping[int, str]) -> list[Any]:
-        """The answers that somebody cannot rule out who has seen some parts of a demonstration.
+        """Return the answers that are consistent with the known parts of a demonstration.
 
-        The more is known of one, the fewer they are: from all answers down to the one that was
-        shown, which is always among them. Parts of several demonstrations may contradict each
-        other: then those that come first are believed.
+        With no known part these are all answers, with every part only the right one. Where parts
+        of several demonstrations contradict each other, the earlier ones take precedence.
 
         Args:
-            known: What was seen: the number of a part, and the part in words.
+            known: Number of a part to its text.
         """
-        fits = set(narrowed(self._told, known))
-        return [answer for answer in self.answers if answer in fits]
+        fitting = set(consistent(self._lessons, known))
+        return [answer for answer in self.answers if answer in fitting]
 
     def recalled(self, known: Mapping[int, str], seed: int) -> Any:
-        """Draw one of the agreeing answers.
+        """Draw an agreeing answer: the first in an order that depends on the seed alone.
 
-        It is the first of them in an order that the seed alone decides: who knows more keeps to
-        the right answer, if it was drawn.
+        So an answer that was drawn and is right stays drawn when more parts are known.
         """
         left = set(self.agreeing(known))
         return next(answer for answer in self.shuffled(seed) if answer in left)
 
     def shuffled(self, seed: int) -> list[Any]:
-        """Return the answers in an order that the seed alone decides."""
+        """Return the answers in an order that depends on the seed alone."""
         order = RandomState([seed, _RECALLED]).permutation(len(self.answers))
-        return [self.answers[place] for place in order]
+        return [self.answers[number] for number in order]
 
     @cached_property
-    def _told(self) -> list[tuple[Any, tuple[str, ...]]]:
+    def _lessons(self) -> list[tuple[Any, tuple[str, ...]]]:
         return list(self.lessons())
 
     @abstractmethod
     def demonstrate(self, arm: Arm, answer: Any) -> Script:
-        """Show the answer, and keep `showing`: it must not change what is done."""
+        """Show the answer, and keep `showing` current."""
 
     def react(self, arm: Arm) -> None:
-        """Let the scene answer to the arm after a step: lamps, the cap of a button."""
+        """Update the scene after a step: lamps, the cap of a button."""
 
     def solve(self, arm: Arm, answer: Any) -> Script:
-        """Do the task as the answer says, step by step."""
-        for number in range(self.steps()):
+        """Solve the task with an answer, step by step."""
+        for number in range(self.steps):
             yield from self.step(answer, number).do(arm)
 
     @abstractmethod
-    def steps(self) -> int:
-        """How many steps the task takes, whatever the answer."""
-
-    @abstractmethod
     def step(self, answer: Any, number: int) -> Step:
-        """One of these steps, from 0."""
+        """Return one of these steps, counted from 0."""
 
-    @abstractmethod
     def progress(self) -> int:
-        """How many steps are done, as far as the judge has seen."""
+        """Return how many steps are done, according to the judge."""
+        return 0
 
     @abstractmethod
     def judge(self, arm: Arm, answer: Any) -> Status:
-        """Say how the episode stands after a live step."""
+        """Return the status of the episode after a live step."""
 
 
-def narrowed[T](
-    told: Sequence[tuple[T, tuple[str, ...]]], known: Mapping[int, str], first: int = 0
+def consistent[T](
+    candidates: Sequence[tuple[T, tuple[str, ...]]], known: Mapping[int, str], first: int = 0
 ) -> list[T]:
-    """Return those that agree with what is known, passing over what none of them would.
+    """Return the candidates whose texts agree with the known ones.
 
-    Args:
-        told: What is possible, each with its parts in words.
-        known: Parts by number, in words.
-        first: Number of the first of these parts.
+    A known text that no remaining candidate has is ignored. `first` is the part number of a
+    candidate's first text.
     """
-    left = told
+    left = candidates
     for part, text in known.items():
         if part >= first:
-            place, wanted = slice(part - first, part - first + 1), (text,)
-            left = [one for one in left if one[1][place] == wanted] or left
-    return [one for one, _ in left]
+            index = slice(part - first, part - first + 1)
+            left = [one for one in left if one[1][index] == (text,)] or left
+    return [candidate for candidate, _ in left]

@@ -1,8 +1,8 @@
-"""Scripted motion: straight lines of the gripper through sapien's own inverse kinematics.
+"""Scripted motion: straight lines of the gripper, solved with sapien's inverse kinematics.
 
-A script is a generator that yields once per time step of 0.1 s; what it commands stands in
-`Arm.action` then. The gripper always points straight down; `yaw` turns it about the vertical,
-and at yaw 0 the fingers open along y.
+A script is a generator that yields once per time step of 0.1 s, after it has set `Arm.action`.
+The gripper always points straight down; `yaw` rotates it about the vertical, and at yaw 0 the
+fingers open along y.
 """
 
 import math
@@ -21,16 +21,19 @@ Point = Sequence[float] | NDArray[np.float64]
 """Three coordinates, or two on the table, in m."""
 
 BASE = (-0.615, 0.0, 0.0)
-"""Where the arm stands, in m; the table's top is the plane z = 0."""
+"""Position of the arm's base in m; the table's top is the plane z = 0."""
 
 HOME = (-0.30, 0.0, 0.26)
-"""Gripper's place at the start of demonstration and execution, clear of all objects, in m."""
+"""Gripper's position when demonstration and live part begin, clear of all objects, in m."""
 
 REST_QPOS = (0.0, math.pi / 8, 0.0, -math.pi * 5 / 8, 0.0, math.pi * 3 / 4, math.pi / 4)
-"""Joint positions from which the search for the home pose starts, in rad."""
+"""Joint positions in rad from which the solver searches for the home pose."""
 
 ROD = 0.006
 """Radius of the stick that the gripper holds in some families, in m."""
+
+HELD = 0.03
+"""A finger that is open less than this, in m, may hold something."""
 
 SPEED = 0.25  # m/s, at the middle of a move
 SLOW = 0.12  # m/s, close to objects
@@ -41,15 +44,10 @@ GRIP = 5  # time steps until the fingers have closed or opened
 
 
 class Arm:
-    """The arm as the scripts see it.
+    """The arm, as scripts command it; `action` is the commanded action, `(8,) float32`.
 
-    Args:
-        articulation: sapien's articulation of the Panda.
-        pace: Factor to the speed of all moves.
-        stick: Length of the stick in the gripper, in m; positions are those of its tip.
-
-    Attributes:
-        action: The commanded action, `(8,) float32`.
+    `pace` scales the speed of all moves. With a `stick` of some length in m, positions are those
+    of its tip.
     """
 
     def __init__(self, articulation: Any, pace: float, stick: float):
@@ -59,8 +57,7 @@ class Arm:
         self._tcp = next(i for i, name in enumerate(names) if name.endswith("panda_hand_tcp"))
         self._limits = np.array(articulation.qlimits[:7], dtype=np.float64)
         self._mask = np.array([1] * 7 + [0] * (articulation.dof - 7), dtype=np.int32)
-        self._pace = pace
-        self._stick = stick
+        self._pace, self._stick = pace, stick
         rest = np.zeros(articulation.dof)
         rest[:7] = REST_QPOS
         self.home_qpos = self._solve(np.array(HOME), 0.0, rest)
@@ -74,7 +71,7 @@ class Arm:
         self._gripper = -1.0 if self._stick else 1.0
         self._command()
 
-    # --- what the arm does now -----------------------------------------------------------------
+    # --- current state -------------------------------------------------------------------------
 
     @property
     def state(self) -> NDArray[np.float32]:
@@ -90,7 +87,7 @@ class Arm:
 
     @property
     def opening(self) -> float:
-        """Way of one finger, 0 closed to 0.04 m open."""
+        """Distance that one finger is open, 0 to 0.04 m."""
         return float(self._robot.qpos[7])
 
     # --- scripts ---------------------------------------------------------------------------------
@@ -101,7 +98,7 @@ class Arm:
             yield
 
     def move(self, to: Point, yaw: float | None = None, speed: float = SPEED) -> Script:
-        """Move in a straight line, slower at both ends, `speed` in m/s at the middle."""
+        """Move in a straight line, slower at both ends; `speed` in m/s is that of the middle."""
         start, turn = self._goal, 0.0 if yaw is None else yaw - self._yaw
         way = np.asarray(to, dtype=np.float64) - start
         first_yaw = self._yaw
@@ -122,18 +119,18 @@ class Arm:
         yield from self.wait(GRIP)
 
     def pick(self, at: Point, yaw: float = 0.0, lift: float = CLEARANCE) -> Script:
-        """Grasp what is at a point, from above, and lift it by `lift`, in m."""
+        """Grasp the object at a point from above, and lift it by `lift`, in m."""
         yield from self.go_above(at, yaw)
         yield from self.take(at, yaw, lift)
 
     def go_above(self, at: Point, yaw: float = 0.0) -> Script:
-        """Go to where `take` begins."""
+        """Move to where `take` begins."""
         x, y, z = at
         yield from self.move((x, y, max(z + CLEARANCE, self._goal[2])), yaw)
         yield from self.move((x, y, z + CLEARANCE), yaw)
 
     def take(self, at: Point, yaw: float = 0.0, lift: float = CLEARANCE) -> Script:
-        """Go down to what is at a point below, grasp it, and lift it by `lift`, in m."""
+        """Move down to the object at a point, grasp it, and lift it by `lift`, in m."""
         x, y, z = at
         if self._gripper < 0:
             yield from self.grip(close=False)
@@ -143,20 +140,20 @@ class Arm:
         yield from self.move((x, y, z + lift), yaw, SLOW)
 
     def put(self, at: Point, yaw: float | None = None) -> Script:
-        """Bring what is held to a point, let go of it there, and withdraw upwards."""
+        """Bring the held object to a point, release it there, and move up."""
         x, y, z = at
         yield from self.move((x, y, z + CLEARANCE), yaw)
         yield from self.lower(at)
         yield from self.move((x, y, z + CLEARANCE))
 
     def lower(self, at: Point) -> Script:
-        """Go down to a point with what is held and let go of it."""
+        """Lower the held object to a point and release it."""
         yield from self.move(at, speed=SLOW)
         yield from self.wait(SETTLE)
         yield from self.grip(close=False)
 
     def press(self, top: Point, depth: float = 0.015) -> Script:
-        """Press a button, the middle of its top given, with the closed gripper; withdraw."""
+        """Press a button, `top` being the middle of its top, with the closed gripper."""
         x, y, z = top
         yield from self.move((x, y, z + CLEARANCE), 0.0)
         yield from self.grip(close=True)
@@ -165,12 +162,12 @@ class Arm:
         yield from self.move((x, y, z + CLEARANCE))
 
     def rise(self, height: float) -> Script:
-        """Go straight up to a height at least."""
+        """Move straight up to at least a height."""
         x, y, z = self._goal
         yield from self.move((x, y, max(z, height)))
 
     def go_home(self) -> Script:
-        """Withdraw upwards, then go to the home pose with the gripper open."""
+        """Move up, then to the home pose, and open the gripper."""
         yield from self.rise(0.18)
         yield from self.move(HOME, 0.0)
         if not self._stick and self._gripper < 0:
@@ -196,11 +193,10 @@ class Arm:
         arm = np.asarray(qpos[:7])
         inside = (self._limits[:, 0] <= arm) & (arm <= self._limits[:, 1])
         if not found or not inside.all():
-            reason = (
-                "no solution" if not found else f"joint {int(np.argmin(inside)) + 1} at its limit"
-            )
+            joint = int(np.argmin(inside)) + 1
+            reason = f"joint {joint} at its limit" if found else "no solution"
             raise RolloutError(
-                f"the arm cannot bring its gripper to {np.round(tcp, 3).tolist()} m, turned by "
+                f"the arm cannot reach {np.round(tcp, 3).tolist()} m, rotated by "
                 f"{math.degrees(yaw):.0f}°: {reason}",
                 "Keep targets within 0.3 to 0.72 m of the arm's base and clear of its limits.",
             )
@@ -208,5 +204,5 @@ class Arm:
 
 
 def eased(part: float) -> float:
-    """A part of the time, 0 to 1, as a part of the way: slower at both ends."""
+    """Map a fraction of the time to a fraction of the path: slower at both ends."""
     return part * part * (3 - 2 * part)

@@ -1,6 +1,6 @@
-"""Whether this machine can draw: run as a program, it draws a picture and says on which devices.
+"""The renderer; run as a program, it renders an image and prints the devices that can do so.
 
-Light, as the check is asked often: ManiSkill and torch are not imported.
+ManiSkill and torch are not imported, so that this check is fast.
 """
 
 import re
@@ -12,7 +12,7 @@ import sapien
 from robomme_interference_data.errors import NoRendererError
 
 SHADERS = Path(__file__).parent / "shaders"
-"""Folder of the suite's own shaders. Those that sapien brings take ten seconds to compile."""
+"""Folder of the suite's shaders. Those of sapien take ten seconds to compile."""
 
 
 def make_renderer() -> sapien.render.RenderSystem:
@@ -28,7 +28,7 @@ def make_renderer() -> sapien.render.RenderSystem:
 
 
 def main() -> None:
-    """Draw a picture of nothing; print the devices that can, or why it is not possible."""
+    """Render an empty scene; print the devices that can render, or why none can."""
     try:
         sapien.render.set_camera_shader_dir(str(SHADERS))
         scene = sapien.Scene([make_renderer()])

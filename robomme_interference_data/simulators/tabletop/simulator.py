@@ -1,4 +1,4 @@
-"""The embedded suite as a simulator: nine families in one environment, an episode at a time."""
+"""The embedded suite as a `Simulator`."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -30,14 +30,19 @@ POLICIES = ("oracle", "guess", "recall")
 
 
 class TabletopSimulator(Simulator):
-    """See `Simulator`. Keep to one in a process: an executor's workers are for more.
+    """The simulator embedded in this project; see `Simulator`. Make only one per process.
 
     Args:
-        cameras: Names of the cameras to draw; fewer are faster. Without any, episodes run several
-            times as fast: for policies that do not look.
-        shift: How the live scene differs from that of the demonstration: `none`, or such as
-            `light:2`. It is only seen: states, judgements and built-in policies stay what they
-            are.
+        cameras: Names of the cameras to render. Fewer are faster; without any, episodes run
+            several times as fast.
+        shift: How the live scene looks different from the demonstration: `none`, or a kind and
+            strength such as `light:2`. It changes images only, not states, judgments or built-in
+            policies.
+
+    Raises:
+        InvalidOptionError: A camera or the shift is unknown.
+        MissingExtraError: The extra `sim` is not installed.
+        NoRendererError: This machine cannot render.
     """
 
     name = "tabletop"
@@ -52,26 +57,26 @@ class TabletopSimulator(Simulator):
 
     def __init__(self, cameras: Sequence[str] = CAMERAS, shift: str = NO_SHIFT):
         self._cameras = choose_cameras(cameras)
-        wanted = parse_shift(shift)
+        parsed_shift = parse_shift(shift)
         make: Any = load_extra(f"{__package__}.env", "TabletopEnv", "the tabletop simulator", "sim")
-        # Pictures come straight from the cameras, so ManiSkill need not make observations too.
+        # Images come straight from the cameras, so ManiSkill makes no observations.
         self.env = make(render=bool(cameras), obs_mode="none")
-        self.env.shift = wanted
-        self.env.observe(self._cameras)  # the first picture is slow: shaders are compiled
+        self.env.shift = parsed_shift
+        self.env.observe(self._cameras)  # the first image is slow: shaders are compiled
 
     @classmethod
     def episodes(cls) -> list[EpisodeId]:
-        """List the suite's episodes."""
+        """Return the suite's episodes."""
         return episode_ids()
 
     @classmethod
     def other_answer(cls, episode: EpisodeId) -> int:
-        """Return the number of another answer than an episode's own; they take turns."""
+        """Return the number of another answer; over the episodes they occur equally often."""
         return other_answer(episode)
 
     @classmethod
     def scene(cls, family: str, seed: int, difficulty: str) -> Family | None:
-        """Return the scene of a seed, to be looked at and not played."""
+        """Return the scene of a seed; see `Simulator.scene`."""
         return known_scene(family, seed, difficulty)
 
     def act(self, policy: str, known: Mapping[int, str] | None = None) -> NDArray[np.float32]:
@@ -82,17 +87,17 @@ class TabletopSimulator(Simulator):
         return self.env.act(policy, known)
 
     def subgoal(self) -> Subgoal:
-        """Return what is to be done next, as the scene stands; see `Simulator.subgoal`."""
+        """Return the next subgoal; see `Simulator.subgoal`."""
         self._running()
         return self.env.subgoal()
 
     def follow_subgoal(self, subgoal: Subgoal | None) -> NDArray[np.float32]:
-        """Return the next action of the script that obeys; see `Simulator.follow_subgoal`."""
+        """Return the next action towards a subgoal; see `Simulator.follow_subgoal`."""
         self._running()
         return self.env.follow_subgoal(subgoal)
 
     def views(self, shifts: Iterable[Shift]) -> Iterator[Observation]:
-        """Yield what is seen now as under each of several shifts; see `Simulator.views`."""
+        """Yield the current observation under each shift; see `Simulator.views`."""
         self._running()
         for shift in shifts:
             self.env.show(shift)
@@ -100,7 +105,7 @@ class TabletopSimulator(Simulator):
         self.env.show(self.env.shift)
 
     def close(self) -> None:
-        """Release the scene; further calls but `close` are errors."""
+        """Release the scene; afterwards, every method except `close` raises."""
         super().close()
         self.env.close()
 

@@ -1,4 +1,4 @@
-"""The nine task families: a file each."""
+"""The nine task families; those that share a scene share a file."""
 
 from functools import lru_cache
 
@@ -12,60 +12,38 @@ from robomme_interference_data.simulators.tabletop.family import Family
 
 from .insert_peg import InsertPeg
 from .move_cube import MoveCube
-from .pattern_lock import PatternLock
-from .route_stick import RouteStick
-from .video_place_button import (
-    VideoPlaceButton,
-)
-from .video_place_order import VideoPlaceOrder
+from .stick import PatternLock, RouteStick
+from .video_place import VideoPlaceButton, VideoPlaceOrder
 from .video_repick import VideoRepick
-from .video_unmask import VideoUnmask
-from .video_unmask_swap import VideoUnmaskSwap
+from .video_unmask import VideoUnmask, VideoUnmaskSwap
 
-_FAMILIES: dict[str, type[Family]] = {
-    each.__name__: each
-    for each in (
-        VideoRepick,
-        VideoPlaceOrder,
-        VideoPlaceButton,
-        VideoUnmask,
-        VideoUnmaskSwap,
-        MoveCube,
-        InsertPeg,
-        PatternLock,
-        RouteStick,
-    )
-}
+_CLASSES: tuple[type[Family], ...] = (
+    *(VideoRepick, VideoPlaceOrder, VideoPlaceButton, VideoUnmask, VideoUnmaskSwap),
+    *(MoveCube, InsertPeg, PatternLock, RouteStick),
+)
+_FAMILIES = {each.__name__: each for each in _CLASSES}
 
 
 def draw_episode(family: str, seed: int, difficulty: str) -> Family:
-    """Return the episode of a seed, its hidden answer apart; nothing is simulated."""
-    return family_class(family)(difficulty, RandomState(seed))
+    """Return the scene of a seed; nothing is simulated."""
+    if family not in _FAMILIES:
+        raise UnknownNameError.among("family", family, "tabletop", _FAMILIES)
+    return _FAMILIES[family](difficulty, RandomState(seed))
+
+
+_cached_episode = lru_cache(256)(draw_episode)
 
 
 def known_scene(family: str, seed: int, difficulty: str) -> Family | None:
-    """Return the episode of a seed as `draw_episode` does; None if the suite has none such."""
-    if family not in _FAMILIES or difficulty not in DIFFICULTIES:
-        return None
-    return _drawn(family, seed, difficulty)
-
-
-@lru_cache(256)
-def _drawn(family: str, seed: int, difficulty: str) -> Family:
-    return draw_episode(family, seed, difficulty)
-
-
-def family_class(name: str) -> type[Family]:
-    """Return the class of a task family."""
-    if name not in _FAMILIES:
-        raise UnknownNameError.among("family", name, "tabletop", _FAMILIES)
-    return _FAMILIES[name]
+    """Return a shared scene that must not be played; None for an unknown family or difficulty."""
+    known = family in _FAMILIES and difficulty in DIFFICULTIES
+    return _cached_episode(family, seed, difficulty) if known else None
 
 
 def other_answer(episode: EpisodeId) -> int:
     """Return the number of an answer that an episode's scene allows and that is not its own.
 
-    Over episodes they take turns, as own answers do.
+    Over the episodes, the other answers occur equally often.
     """
     seed = seed_of(episode)
     count = len(draw_episode(episode.family, seed, difficulty_of(seed)).answers)

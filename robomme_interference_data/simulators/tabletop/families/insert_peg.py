@@ -8,12 +8,12 @@ from numpy.random import RandomState
 from numpy.typing import NDArray
 
 from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.simulators.tabletop.bodies import COLORS, SceneBuilder
 from robomme_interference_data.simulators.tabletop.family import Family, Option, Step
-from robomme_interference_data.simulators.tabletop.kit import COLOURS, Kit
+from robomme_interference_data.simulators.tabletop.layout import row
 from robomme_interference_data.simulators.tabletop.motion import SLOW, Arm, Script
-from robomme_interference_data.simulators.tabletop.stage import row
 
-LENGTH, GRIP = 0.14, 0.04  # m: a peg, and from its middle to where it is held
+LENGTH, GRIP = 0.14, 0.04  # m: a peg, and from its middle to where it is grasped
 HOLE, DEPTH = 0.036, 0.08  # m, of the box
 LIFTED = 0.03  # m, height of the peg's middle
 HEAD, TAIL = 1, -1
@@ -23,11 +23,19 @@ _SIDES = {LEFT: "left", RIGHT: "right"}
 
 
 class InsertPeg(Family):
-    """One of several pegs is grasped at one end and inserted into one side of a box.
+    """The arm grasps one of several pegs at one end and inserts it into one side of a box.
 
-    An answer is `(peg, end, side)`: its number, the end that is held, the side of the box.
+    An answer is `(peg, end, side)`: the peg's number, its grasped end, the side of the box.
     """
 
+    goal = (
+        "insert the same peg as in the video, held at the same end, into the same side of the box"
+    )
+    question = (
+        "Which peg was inserted, held at which end, from which side? Each picture shows a way "
+        "from where a peg is held to where it goes in."
+    )
+    steps = 2
     table = (0.40, 0.28, 0.56)
     pegs_at = (2, 3, 4)
 
@@ -38,31 +46,19 @@ class InsertPeg(Family):
         self.tails = [str(n) for n in rng.permutation(["red", "green", "blue", "purple"])][:count]
         self.answers = list(product(range(count), (HEAD, TAIL), (LEFT, RIGHT)))
 
-    def build(self, kit: Kit) -> None:
-        self.box = kit.socket(self.box_at, (0.55, 0.40, 0.25), HOLE, DEPTH)
+    def build(self, builder: SceneBuilder) -> None:
+        self.box = builder.socket(self.box_at, (0.55, 0.40, 0.25), HOLE, DEPTH)
         self.pegs = [
-            kit.peg(spot, COLOURS["yellow"], COLOURS[tail], LENGTH)
+            builder.peg(spot, COLORS["yellow"], COLORS[tail], LENGTH)
             for spot, tail in zip(self.spots, self.tails, strict=True)
         ]
 
-    def goals(self) -> tuple[str, ...]:
-        return (
-            "insert the same peg as in the video, held at the same end, into the same side of the "
-            "box",
-        )
-
-    def told(self, answer: tuple[int, int, int]) -> tuple[str, ...]:
+    def answer_texts(self, answer: tuple[int, int, int]) -> tuple[str, ...]:
         number, end, side = answer
         return (
             f"takes peg {number}",
             f"holds it at its {_ENDS[end]}",
             f"inserts it from the {_SIDES[side]}",
-        )
-
-    def question(self) -> str:
-        return (
-            "Which peg was inserted, held at which end, from which side? Each picture shows a way "
-            "from where a peg is held to where it goes in."
         )
 
     def option(self, choice: tuple[int, int, int]) -> Option:
@@ -77,9 +73,6 @@ class InsertPeg(Family):
         yield from self.solve(arm, answer)
         yield from arm.grip(close=False)
         yield from arm.go_home()
-
-    def steps(self) -> int:
-        return 2
 
     def step(self, answer: tuple[int, int, int], number: int) -> Step:
         peg, end, side = answer
@@ -102,11 +95,11 @@ class InsertPeg(Family):
 
     def insert(self, arm: Arm, end: int, side: int) -> Script:
         x, y, _ = self.box.p
-        free = GRIP + LENGTH / 2  # from the grip to the end that goes in
+        free = GRIP + LENGTH / 2  # from the grip to the end that is inserted
         yaw = math.copysign(math.pi / 2, end * side)
         ready = y + side * (DEPTH / 2 + 0.03 + free)
         yield from arm.move((x, ready, 0.16), yaw)
-        self.showing = (0, 1, 2)  # and it stays in the box, to be seen there
+        self.showing = (0, 1, 2)  # the peg stays visible in the box
         yield from arm.move((x, ready, self.box.size), speed=SLOW)
         yield from arm.wait(3)
         yield from arm.move((x, y + side * (DEPTH / 2 - 0.05 + free), self.box.size), speed=0.06)
@@ -130,6 +123,6 @@ class InsertPeg(Family):
         return Status.ONGOING
 
     def inserted(self, point: NDArray[np.float64], side: int) -> float:
-        """How deep a point is in the hole, in m from its mouth at a side; below 0 if outside."""
+        """Return how deep a point is in the hole, in m from its mouth; below 0 if outside."""
         x, y, z = point - self.box.p - (0, 0, self.box.size)
         return DEPTH / 2 - side * y if max(abs(x), abs(z)) < HOLE / 2 else -1.0

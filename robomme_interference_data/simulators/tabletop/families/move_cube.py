@@ -7,15 +7,15 @@ from numpy.random import RandomState
 from numpy.typing import NDArray
 
 from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.simulators.tabletop.bodies import CUBE, SceneBuilder
 from robomme_interference_data.simulators.tabletop.family import Family, Option, Step
-from robomme_interference_data.simulators.tabletop.kit import CUBE, Kit
+from robomme_interference_data.simulators.tabletop.layout import distance_to_segment, is_near
 from robomme_interference_data.simulators.tabletop.motion import SLOW, Arm, Script
-from robomme_interference_data.simulators.tabletop.stage import is_near, off_line
 
 Vector = NDArray[np.float64]
 
 HANDLE, CROSS = 0.17, 0.065  # m, of the hook
-STILL, SLACK = 1e-5, 0.002  # m: a cube at rest in a step; its way in wrong manners, in all
+STILL, SLACK = 1e-5, 0.002  # m: motion per step of a resting cube; total motion in wrong manners
 _WORDS = {
     "push": "pushes the cube with the closed gripper",
     "grasp": "grasps the cube",
@@ -30,37 +30,34 @@ BESIDE = 0.034  # m, from the middle of the handle to the middle of the cube
 
 
 class MoveCube(Family):
-    """A cube goes to the target: pushed with the closed gripper, grasped and placed, or hooked."""
+    """The arm moves a cube to the target: it pushes it, grasps it, or hooks it."""
 
+    goal = "move the cube to the target in the same manner as in the video"
+    question = "In which manner was the cube moved to the target?"
+    steps = 1
     table = (0.86, 0.83, 0.76)
-    spread = (0.02, 0.05, 0.08)  # m, how far cube and target may lie off the middle
+    spread = (0.02, 0.05, 0.08)  # m, how far cube and target may lie from the middle
 
     def draw(self, rng: RandomState) -> None:
         wide = self.spread[self.level]
-        # The way leads across the front camera's view, so that no hand hides the cube on it.
+        # The path crosses the front camera's view, so that the hand does not hide the cube.
         self.cube_at = np.array([-0.05, 0.10]) + rng.uniform(-1, 1, 2) * (wide, 0.02)
         self.target_at = np.array([-0.05, -0.055]) + rng.uniform(-1, 1, 2) * (wide, 0.02)
         way = self.target_at - self.cube_at
         self.way = np.append(way / np.linalg.norm(way), 0.0)
-        self.turn = math.atan2(-way[1], -way[0])  # of a gripper whose x points back along the way
+        self.turn = math.atan2(-way[1], -way[0])  # yaw at which x points back along the path
         self.answers = ["push", "grasp", "hook"]
-        self.moved: dict[str, float] = {}  # m, the cube's way in each manner
+        self.moved: dict[str, float] = {}  # m, by manner, how far the cube has moved
         self.manner, self.opening = "", 0.04
 
-    def build(self, kit: Kit) -> None:
-        self.cube = kit.cube(self.cube_at, "orange", self.turn)
-        self.target = kit.target(self.target_at, (0.20, 0.45, 0.75), 0.04)
-        self.hook = kit.hook((-0.20, -0.23), (0.25, 0.55, 0.50), HANDLE, CROSS)
+    def build(self, builder: SceneBuilder) -> None:
+        self.cube = builder.cube(self.cube_at, "orange", self.turn)
+        self.target = builder.target(self.target_at, (0.20, 0.45, 0.75), 0.04)
+        self.hook = builder.hook((-0.20, -0.23), (0.25, 0.55, 0.50), HANDLE, CROSS)
         self.last = self.cube.p
 
-    def goals(self) -> tuple[str, ...]:
-        return ("move the cube to the target in the same manner as in the video",)
-
-    def told(self, answer: str) -> tuple[str, ...]:
+    def answer_texts(self, answer: str) -> tuple[str, ...]:
         return (_WORDS[answer],)
-
-    def question(self) -> str:
-        return "In which manner was the cube moved to the target?"
 
     def option(self, choice: str) -> Option:
         return Option(_WORDS[choice])
@@ -69,22 +66,16 @@ class MoveCube(Family):
         yield from arm.wait(20)
         yield from self.solve(arm, answer)
         if answer == "hook":
-            yield from arm.grip(close=False)  # leaves it on the table, to be seen there
+            yield from arm.grip(close=False)  # the hook stays visible on the table
         else:
             self.showing = ()
         yield from arm.go_home()
-
-    def steps(self) -> int:
-        return 1
 
     def step(self, answer: str, number: int) -> Step:
         do = {"push": self.push, "grasp": self.grasp, "hook": self.use_hook}[answer]
         start, end = self.cube.p, self.target.p
         tool = (self.hook.point(HANDLE / 2, 0, 0),) if answer == "hook" else ()
         return Step(_STEPS[answer], (start, *tool, end), lambda arm: do(arm, start, end))
-
-    def progress(self) -> int:
-        return 0
 
     def push(self, arm: Arm, start: Vector, end: Vector) -> Script:
         behind = start - 0.055 * self.way
@@ -130,16 +121,17 @@ class MoveCube(Family):
         return Status.SUCCESS if there and released and answer in self.moved else Status.ONGOING
 
     def name_manner(self, arm: Arm) -> str:
-        """How the cube is being moved now: as an answer says, or "open", by open fingers."""
+        """Return how the cube is moved now: an answer, or "open" for open fingers."""
         ends = ((0.0, 0.0), (HANDLE, 0.0), (HANDLE, CROSS))
         end, corner, tip = (self.hook.point(x, y, 0) for x, y in ends)
-        beside = min(off_line(self.cube.p, end, corner), off_line(self.cube.p, corner, tip))
-        if beside < 0.045 and off_line(arm.tip, end, corner) < 0.03:
+        hook = (end, corner), (corner, tip)
+        beside = min(distance_to_segment(self.cube.p, *part) for part in hook)
+        if beside < 0.045 and distance_to_segment(arm.tip, end, corner) < 0.03:
             return "hook"
         if math.dist(self.cube.p, arm.tip) < 0.01 and (
             abs(arm.opening - CUBE / 2) < 0.003 or arm.opening < self.opening - 0.001
         ):
             return "grasp"  # the fingers hold it, or are closing on it
         if self.manner == "grasp" and not self.cube.touched:
-            return "grasp"  # let go, it still falls
+            return "grasp"  # released, it still falls
         return "push" if arm.opening < 0.01 else "open"

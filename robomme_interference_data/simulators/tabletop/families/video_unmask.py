@@ -1,4 +1,4 @@
-"""VideoUnmask: remember which container hides a cube."""
+"""VideoUnmask and VideoUnmaskSwap: remember which container hides a cube."""
 
 from collections.abc import Sequence
 from itertools import chain, islice, permutations, product
@@ -6,22 +6,28 @@ from itertools import chain, islice, permutations, product
 from numpy.random import RandomState
 
 from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.simulators.tabletop.bodies import (
+    CUBE,
+    SIDE,
+    Body,
+    Placement,
+    SceneBuilder,
+)
 from robomme_interference_data.simulators.tabletop.family import Family, Option, Step
-from robomme_interference_data.simulators.tabletop.kit import CUBE, SIDE, Body, Kit, Place
-from robomme_interference_data.simulators.tabletop.motion import Arm, Script
-from robomme_interference_data.simulators.tabletop.stage import along, row, shuffled
+from robomme_interference_data.simulators.tabletop.layout import along, row, shuffled
+from robomme_interference_data.simulators.tabletop.motion import HELD, Arm, Script
+from robomme_interference_data.simulators.tabletop.swaps import SwapFamily
 
-HIGH = 0.72  # m, above what the cameras see
-FALL, SEEN = 55, 49  # time steps: of the containers' way down, and until they hide the cubes
+HIGH = 0.72  # m, above the cameras' view
+FALL, SEEN = 55, 49  # time steps in which the containers descend, and until they hide the cubes
 LIFTED = 0.05  # m, of the right container
-OPEN = 0.03  # m, way of a finger that holds nothing
-PEEKED = 0.010  # m, of a wrong one: its cube comes into sight at 0.02
+PEEKED = 0.010  # m, of a wrong one: its cube becomes visible at 0.02
 
 
 class VideoUnmask(Family):
-    """Cubes lie in the open; opaque containers come down over them; lift the right one.
+    """Opaque containers descend over cubes; the task is to lift the right one.
 
-    An answer names the container of each colour that is asked for, in that order.
+    An answer is the container of each color that the goal asks for, in that order.
     """
 
     table = (0.60, 0.44, 0.28)
@@ -31,36 +37,31 @@ class VideoUnmask(Family):
 
     def draw(self, rng: RandomState) -> None:
         count = self.containers[self.level]
-        colours = [str(colour) for colour in rng.permutation(["red", "green", "blue"])]
-        self.asked = colours[: 2 if self.level == 2 else 1]
-        self.colours = colours
+        colors = [str(color) for color in rng.permutation(["red", "green", "blue"])]
+        self.asked = colors[: 2 if self.level == 2 else 1]
+        hiding = (f"pick up the container that hides the {color} cube" for color in self.asked)
+        self.goal = ", put it down, then ".join(hiding)
+        self.question = f"Which of the marked containers hides the {self.asked[0]} cube?"
+        self.steps = 2 * len(self.asked)
+        self.colors = colors
         self.spots = row(rng, count, -0.04, 0.105, zigzag=0.02)
         self.order = shuffled(rng, count)
         self.answers = list(permutations(range(count), len(self.asked)))
         self.found, self.held = 0, False
 
-    def build(self, kit: Kit) -> None:
-        self.shells = [kit.container(spot, self.shell) for spot in self.spots]
-        self.cubes = [kit.cube(spot, c) for spot, c in zip(self.spots, self.colours, strict=False)]
-
-    def goals(self) -> tuple[str, ...]:
-        first, *then = self.asked
-        text = f"pick up the container that hides the {first} cube"
-        for colour in then:
-            text += f", put it down, then pick up the container that hides the {colour} cube"
-        return (text,)
+    def build(self, builder: SceneBuilder) -> None:
+        self.shells = [builder.container(spot, self.shell) for spot in self.spots]
+        cubes = zip(self.spots, self.colors, strict=False)
+        self.cubes = [builder.cube(spot, color) for spot, color in cubes]
 
     def covered(self, answer: Sequence[int]) -> list[int]:
-        """The containers that hide a cube, in the order of `colours`: those asked for, others."""
+        """Return the containers that hide a cube, in the order of `colors`."""
         rest = [number for number in self.order if number not in answer]
-        return [*answer, *rest][: len(self.colours)]
+        return [*answer, *rest][: len(self.colors)]
 
-    def told(self, answer: Sequence[int]) -> tuple[str, ...]:
+    def answer_texts(self, answer: Sequence[int]) -> tuple[str, ...]:
         cubes = (f"the {c} cube at place {n}" for c, n in zip(self.asked, answer, strict=True))
         return (f"shows {' and '.join(cubes)}",)
-
-    def question(self) -> str:
-        return f"Which of the marked containers hides the {self.asked[0]} cube?"
 
     def choice(self, answer: Sequence[int]) -> int:
         return answer[0]
@@ -71,12 +72,12 @@ class VideoUnmask(Family):
     def demonstrate(self, arm: Arm, answer: Sequence[int]) -> Script:
         self.under = dict(zip(self.covered(answer), self.cubes, strict=True))
         for number, cube in self.under.items():
-            cube.home = Place((*self.spots[number], CUBE / 2))
+            cube.home = Placement((*self.spots[number], CUBE / 2))
             cube.restore()
         for body in (*self.shells, *self.cubes):
             body.hold(True)
         for shell in self.shells:
-            shell.put(Place((*shell.home.p[:2], HIGH)))
+            shell.put(Placement((*shell.home.p[:2], HIGH)))
         cover = self.cover()
         self.showing = (0,)
         yield from chain(arm.wait(45), islice(cover, SEEN))
@@ -84,15 +85,12 @@ class VideoUnmask(Family):
         yield from chain(cover, arm.wait(50))
 
     def cover(self) -> Script:
-        """The containers come down."""
-        ways = [along(shell, shell.home, FALL) for shell in self.shells]
-        for places in zip(*ways, strict=True):
-            for shell, place in zip(self.shells, places, strict=True):
-                shell.put(place)
+        """Lower the containers."""
+        paths = [along(shell, shell.home, FALL) for shell in self.shells]
+        for placements in zip(*paths, strict=True):
+            for shell, placement in zip(self.shells, placements, strict=True):
+                shell.put(placement)
             yield
-
-    def steps(self) -> int:
-        return 2 * len(self.asked)
 
     def step(self, answer: Sequence[int], number: int) -> Step:
         shell = self.shells[answer[number // 2]]
@@ -121,11 +119,32 @@ class VideoUnmask(Family):
             if number not in (*done, answer[self.found]) and rim(shell) > PEEKED:
                 return Status.FAIL
         lifted = self.shells[answer[self.found]].p[2] > LIFTED
-        self.held = lifted or (self.held and arm.opening < OPEN)
+        self.held = lifted or (self.held and arm.opening < HELD)
         self.found += lifted
         return Status.SUCCESS if self.found == len(answer) else Status.ONGOING
 
 
 def rim(shell: Body) -> float:
-    """Height of the highest corner of a container's open side, in m: a tipped one counts too."""
+    """Return the height in m of the highest corner of a container's open side."""
     return max(float(shell.point(x, y, 0)[2]) for x, y in product((-SIDE, SIDE), repeat=2))
+
+
+class VideoUnmaskSwap(SwapFamily, VideoUnmask):
+    """As VideoUnmask, then containers swap places in pairs, once, twice or three times.
+
+    Of three containers one stays; of four and five each ends elsewhere.
+    """
+
+    gap = 0.078
+
+    def draw(self, rng: RandomState) -> None:
+        super().draw(rng)
+        self.count = len(self.spots)
+        self.draw_swaps(rng)
+
+    def demonstrate(self, arm: Arm, answer: Sequence[int]) -> Script:
+        yield from super().demonstrate(arm, answer)
+        cubes = {number: [cube] for number, cube in self.under.items()}
+        groups = [[shell, *cubes.get(number, ())] for number, shell in enumerate(self.shells)]
+        yield from self.swap(arm, groups, 1)
+        yield from arm.wait(10)

@@ -1,7 +1,7 @@
-"""ManiSkill as far as RoboMME differs with it: the fork that RoboMME asks for, or another one.
+"""The parts of ManiSkill that matter to RoboMME: of its fork, or of another version.
 
 `STAND_IN_MANI_SKILL` says which: `fork` (by default), `index` as the package index has it, or
-`strange`, which nothing can mend.
+`strange`, which cannot be patched.
 """
 
 import os

@@ -1,6 +1,6 @@
 """RoboMME's interface without its physics: for the interpreter that the tests make.
 
-Like the real one it returns lists, prints to stdout, in colour, gives another episode at a second
+Like the real one it returns lists, prints to stdout, in color, gives another episode at a second
 reset of the same environment, makes environments of episodes that do not exist, and lets an episode
 go on for one step more than it is told.
 """

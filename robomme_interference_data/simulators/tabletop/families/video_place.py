@@ -1,0 +1,196 @@
+"""VideoPlaceButton and VideoPlaceOrder: remember on which target a cube was placed when."""
+
+from abc import abstractmethod
+from collections.abc import Iterable
+from itertools import permutations
+from typing import ClassVar
+
+from numpy.random import RandomState
+
+from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.simulators.tabletop.bodies import CUBE, SceneBuilder
+from robomme_interference_data.simulators.tabletop.family import Option, Step
+from robomme_interference_data.simulators.tabletop.layout import is_near, push_down, row, shuffled
+from robomme_interference_data.simulators.tabletop.motion import HELD, Arm, Script
+from robomme_interference_data.simulators.tabletop.swaps import SwapFamily
+
+RADIUS = 0.035  # m, of a target
+WHEN = ("before", "after")
+ORDINALS = ("first", "second", "third")
+
+
+class PlaceFamily(SwapFamily):
+    """Cubes, identical targets, and a goal to place one cube on the right target.
+
+    In hard episodes all targets swap places after the demonstration.
+
+    Attributes:
+        asked: Which of the targets that the cube visits the goal asks for, from 0.
+        times: Texts of when the cube visits each target.
+    """
+
+    asked: int
+    times: ClassVar[tuple[str, ...]]
+    question = "Which of the marked targets does the goal mean?"
+    steps = 2
+    pace = 1.6
+    targets_at = (3, 4, 5)
+    colors_at = (1, 2, 3)
+    row_of_targets = 0.01  # m, their x
+    gap = 0.075
+    bow = 0.0  # m, how much nearer to the arm the outer targets are
+    paint = (0.80, 0.30, 0.55)
+
+    def draw(self, rng: RandomState) -> None:
+        self.count = self.targets_at[self.level]
+        colors = self.colors_at[self.level]
+        names = [str(name) for name in rng.permutation(["red", "green", "blue"])]
+        self.colors = names[:colors]  # the goal asks for the first one
+        flat = row(rng, self.count, self.row_of_targets, 0.1)
+        self.target_spots = [(x - self.bow * (y / 0.2) ** 2, y) for x, y in flat]
+        self.cube_spots = row(rng, colors, -0.18, 0.12)
+        self.order = shuffled(rng, self.count)
+        if self.level == 2:
+            self.draw_swaps(rng)
+        self.answers = list(range(self.count))
+        self.held = False
+
+    def build(self, builder: SceneBuilder) -> None:
+        self.targets = [builder.target(spot, self.paint, RADIUS) for spot in self.target_spots]
+        cubes = zip(self.cube_spots, self.colors, strict=True)
+        self.cubes = [builder.cube(spot, color) for spot, color in cubes]
+
+    @abstractmethod
+    def visits(self, answer: int) -> tuple[int, ...]:
+        """Return the targets that the cube visits, in order."""
+
+    def visit_texts(self, visits: Iterable[int]) -> tuple[str, ...]:
+        """Return a text per visit."""
+        steps = zip(visits, self.times, strict=True)
+        return tuple(f"puts the {self.colors[0]} cube on target {n} {time}" for n, time in steps)
+
+    def answer_texts(self, answer: int) -> tuple[str, ...]:
+        return self.visit_texts(self.visits(answer))
+
+    def option(self, choice: int) -> Option:
+        return Option("", ((*self.target_spots[choice], 0.0),))
+
+    def lessons(self) -> Iterable[tuple[int, tuple[str, ...]]]:
+        orders = permutations(range(self.count), len(self.times))
+        return ((visits[self.asked], self.visit_texts(visits)) for visits in orders)
+
+    def place(self, arm: Arm, cube: int, target: int, part: int) -> Script:
+        """Move a cube to a target; the first cube shows a part of the answer there."""
+        yield from arm.pick(self.cubes[cube].p)
+        if cube == 0:
+            self.showing = (part,)
+        yield from self.put(arm, target)
+
+    def put(self, arm: Arm, target: int) -> Script:
+        """Put the held cube on a target."""
+        x, y, _ = self.targets[target].p
+        yield from arm.put((x, y, CUBE / 2 + 0.004))
+
+    def swap_targets(self, arm: Arm) -> Script:
+        """Return the cubes to their first positions, then swap the targets."""
+        yield from arm.go_home()
+        for cube in self.cubes:
+            cube.restore()
+        self.showing = ()
+        yield from arm.wait(15)
+        yield from self.swap(arm, [[target] for target in self.targets], len(self.times))
+
+    def step(self, answer: int, number: int) -> Step:
+        if number == 0:
+            text, at = f"pick up the {self.colors[0]} cube at <point>", self.cubes[0].p
+            return Step(text, (at,), lambda arm: arm.pick(self.cubes[0].p))
+        text = "put it on the target at <point>"
+        return Step(text, (self.targets[answer].p,), lambda arm: self.put(arm, answer))
+
+    def progress(self) -> int:
+        return int(self.held)
+
+    def judge(self, arm: Arm, answer: int) -> Status:
+        cube = self.cubes[0]
+        self.held = cube.p[2] > CUBE or (self.held and arm.opening < HELD)
+        if cube.p[2] > CUBE or arm.opening < HELD:
+            return Status.ONGOING
+        for number, target in enumerate(self.targets):
+            if is_near(cube, target, RADIUS):
+                return Status.SUCCESS if number == answer else Status.FAIL
+        return Status.ONGOING
+
+
+class VideoPlaceButton(PlaceFamily):
+    """The arm places cubes on targets, presses a button, and places them again."""
+
+    table = (0.72, 0.78, 0.70)
+    button_at = (-0.20, 0.22)
+    times = ("before the button is pressed", "after the button is pressed")
+
+    def draw(self, rng: RandomState) -> None:
+        super().draw(rng)
+        self.asked = WHEN.index(str(rng.choice(WHEN)))
+        self.goal = (
+            f"put the {self.colors[0]} cube on the target where it was right {WHEN[self.asked]} "
+            "the button was pressed"
+        )
+
+    def build(self, builder: SceneBuilder) -> None:
+        super().build(builder)
+        self.button = builder.button(self.button_at)
+
+    def visits(self, answer: int) -> tuple[int, ...]:
+        other = next(number for number in self.order if number != answer)
+        return (answer, other) if self.asked == 0 else (other, answer)
+
+    def demonstrate(self, arm: Arm, answer: int) -> Script:
+        before, after = self.visits(answer)
+        others = [number for number in self.order if number not in (before, after)]
+        yield from arm.wait(15)
+        for cube, number in enumerate([before, *others][: len(self.cubes)]):
+            yield from self.place(arm, cube, number, 0)
+        yield from arm.press(self.button.home.p)
+        # The second cube moves to the target that the first one left; a third one stays.
+        for cube, number in enumerate([after, before][: len(self.cubes)]):
+            yield from self.place(arm, cube, number, 1)
+        yield from self.swap_targets(arm)
+
+    def react(self, arm: Arm) -> None:
+        push_down(self.button, arm)
+
+
+class VideoPlaceOrder(PlaceFamily):
+    """The arm places a cube on three targets in sequence."""
+
+    table = (0.30, 0.36, 0.52)
+    paint = (0.95, 0.72, 0.15)
+    colors_at = (1, 2, 2)
+    times = ORDINALS
+    row_of_targets = 0.03
+    bow = 0.04
+
+    def draw(self, rng: RandomState) -> None:
+        super().draw(rng)
+        self.asked = int(rng.randint(3))
+        cube, ordinal = self.colors[0], ORDINALS[self.asked]
+        self.goal = f"put the {cube} cube on the {ordinal} target it was placed on"
+
+    def build(self, builder: SceneBuilder) -> None:
+        super().build(builder)
+        builder.panel((-0.18, 0), (0.045, 0.15), (0.20, 0.24, 0.36))
+
+    def visits(self, answer: int) -> tuple[int, ...]:
+        visits = [number for number in self.order if number != answer]
+        visits.insert(self.asked, answer)
+        return tuple(visits[:3])
+
+    def demonstrate(self, arm: Arm, answer: int) -> Script:
+        first = self.visits(answer)
+        # A second cube visits other targets, clear of where the first one stays.
+        second = [number for number in self.order if number != first[-1]][:3]
+        yield from arm.wait(10)
+        for cube, visits in zip(range(len(self.cubes)), (first, second), strict=False):
+            for part, number in enumerate(visits):
+                yield from self.place(arm, cube, number, part)
+        yield from self.swap_targets(arm)
