@@ -1,7 +1,7 @@
 """Source `frames`: a documented folder layout, for recordings of any robot.
 
-`docs/reference/sources.md` describes it: `frames.parquet` with one row per frame (`frames_table.py`), and for
-each camera and episode either a video file or a folder of PNG images.
+`frames.parquet` has one row per frame, and each camera and episode has either a video file or a
+folder of PNG images; see `docs/how-to/your-own-recordings.md`.
 """
 
 from collections.abc import Generator, Iterator

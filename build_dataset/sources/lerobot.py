@@ -1,6 +1,6 @@
 """Source `lerobot`: a LeRobot dataset, v3.0 or v2.1, in a folder or on the Hub.
 
-Read with pyarrow and PyAV alone. `docs/reference/sources.md` describes the columns and the families file.
+Read with pyarrow and PyAV alone; `docs/reference/sources.md` describes columns and families.
 """
 
 from collections.abc import Generator

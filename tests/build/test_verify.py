@@ -517,7 +517,7 @@ def test_leaks_in_the_pool(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("condition", "source", "role", "leaks"),
+    ("condition", "sources", "role", "leaks"),
     [
         ("held-k1", "MoveCube/test/0", "filler", []),
         ("held-k1", "MoveCube/test/1", "filler", ["not a train episode"]),
@@ -526,55 +526,38 @@ def test_leaks_in_the_pool(tmp_path: Path) -> None:
         ("stale-k0", "MoveCube/test/0/1", "contradiction", []),
         ("stale-k0", "MoveCube/test/0", "contradiction", ["not a train episode"]),
         ("misled-k0", "MoveCube/test/1/1", "contradiction", ["not a train episode"]),
+        ("before-k1", "MoveCube/train/1", "distractor", ["same family"]),
+        ("before-k1", "InsertPeg/test/1", "distractor", ["not a train episode"]),
+        ("before-k1", "InsertPeg/val/1", "filler", ["not a train episode"]),
+        ("before-k1", "InsertPeg/test/1", "lesson", ["not a train episode"]),
+        ("before-k1", "InsertPeg/train/0 InsertPeg/train/0", "distractor", ["repeated unit"]),
+        ("before-k1", "MoveCube/test/0", "filler", ["not a train episode"]),
+        ("before-k1", "MoveCube/test/0/1", "contradiction", ["not a train episode"]),
     ],
 )
-def test_what_kinds_may_hold(
-    own_buffers: Path, condition: str, source: str, role: str, leaks: list[str]
+def test_leaks_in_a_buffer(
+    own_buffers: Path, condition: str, sources: str, role: str, leaks: list[str]
 ) -> None:
-    """Under the first condition, one session more is added, of what some kinds alone may hold."""
-    header = own_buffers / "manifests/manifest.json"
+    """A buffer of the first condition, renamed, gets further sessions."""
+    header = own_buffers / HEADER
     header.write_text(header.read_text().replace('"k0"', f'"{condition}"'))
 
     def change(table: pa.Table) -> pa.Table:
         names, rows = table["condition"].to_pylist(), table["sessions"].to_pylist()
         number = names.index("k0", 5)  # MoveCube's
-        more = {"source": source, "family": source.split("/", maxsplit=1)[0], "role": role}
-        rows[number].append(rows[number][0] | more)
-        frames = table["history_frames"].to_pylist()
-        frames[number] *= 2
+        frames, lesson = table["history_frames"].to_pylist(), rows[number][0]
+        for source in sources.split():
+            more = {"source": source, "family": source.split("/", maxsplit=1)[0], "role": role}
+            rows[number].append(lesson | more)
+        frames[number] *= len(rows[number])
         names = [condition if name == "k0" else name for name in names]
         changed = put(put(table, "sessions", rows), "history_frames", frames)
         return put(changed, "condition", names)
 
     edit(own_buffers / ROWS, change)
-    assert [leak.kind for leak in audit_buffer_set(load_buffer_set(own_buffers)).leaks] == leaks
-
-
-@pytest.mark.parametrize(
-    ("source", "role", "kind"),
-    [
-        ("MoveCube/train/1", "distractor", "same family"),
-        ("InsertPeg/test/1", "distractor", "not a train episode"),
-        ("InsertPeg/val/1", "filler", "not a train episode"),
-        ("InsertPeg/test/1", "lesson", "not a train episode"),
-        ("twice", "distractor", "repeated unit"),
-        ("MoveCube/test/0", "filler", "not a train episode"),
-        ("MoveCube/test/0/1", "contradiction", "not a train episode"),
-    ],
-)
-def test_leaks_in_a_buffer(own_buffers: Path, source: str, role: str, kind: str) -> None:
-    def change(table: pa.Table) -> pa.Table:
-        rows = table["sessions"].to_pylist()
-        place = table["condition"].to_pylist().index("k3", 5)  # MoveCube's
-        first, second = rows[place][1:3]
-        wanted = first["source"] if source == "twice" else source
-        second |= {"source": wanted, "family": wanted.split("/")[0], "role": role}
-        return put(table, "sessions", rows)
-
-    edit(own_buffers / ROWS, change)
-    leaks = audit_buffer_set(load_buffer_set(own_buffers)).leaks
-    assert [leak.kind for leak in leaks] == [kind]
-    assert leaks[0].where.startswith("MoveCube/test/0 under k3")
+    found = audit_buffer_set(load_buffer_set(own_buffers)).leaks
+    assert [leak.kind for leak in found] == leaks
+    assert all(leak.where.startswith("MoveCube/test/0 under") for leak in found)
 
 
 def test_a_header_without_a_condition_of_the_rows(own_buffers: Path) -> None:
