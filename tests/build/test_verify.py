@@ -164,7 +164,9 @@ def test_info_that_is_wrong(own_buffers: Path, before: str, after: str) -> None:
     info = own_buffers / "distractors" / "meta" / "info.json"
     assert before in info.read_text()
     info.write_text(info.read_text().replace(before, after))
-    expect(own_buffers, "info.json: does not have", "observation.state|is too long|not a valid path")
+    expect(
+        own_buffers, "info.json: does not have", "observation.state|is too long|not a valid path"
+    )
 
 
 @pytest.mark.parametrize(
