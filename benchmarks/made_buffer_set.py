@@ -22,6 +22,7 @@ from robomme_interference_data.build_dataset.manifests import (
     plan_manifests,
     write_manifests,
 )
+from robomme_interference_data.build_dataset.sources import Robot
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,
@@ -36,6 +37,7 @@ from robomme_interference_data.storage.encode import CODECS, VideoEncoder
 SIDE, LESSON = 32, 8
 CAMERAS = (FRONT, WRIST)
 FEATURES = {FRONT: (SIDE, SIDE, 3), WRIST: (SIDE, SIDE, 3), STATE: (8,)}
+ROBOT = Robot().with_names(FEATURES)
 CODEC = CODECS["av1-lossless"]
 
 
@@ -63,7 +65,7 @@ def _write_dataset(root: Path, kind: str, count: int) -> None:
             random = np.random.default_rng(record.episode_index)
             stats = {camera: _statistics(random, record.length) for camera in CAMERAS}
             vectors = _vectors(random.random((record.length, 8), np.float32))
-            episodes.append(StoredEpisode(record, FEATURES, videos, stats, vectors))
+            episodes.append(StoredEpisode(record, FEATURES, videos, stats, vectors, ROBOT))
         for _ in write_lerobot(root, kind, episodes, FEATURES, CODEC):
             pass
     complete_dataset(root, records, identity_of(records, kind, "1.0.0", CODEC.name, ()), {})

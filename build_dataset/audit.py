@@ -1,4 +1,4 @@
-"""Audit the distractors of a buffer set: how units are used, and whether anything leaks."""
+"""Audit the distractors of a buffer set: the use of units, and leaks."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -24,13 +24,7 @@ from robomme_interference_data.viz.tables import Table
 
 @dataclass(frozen=True)
 class Leak:
-    """Material in a buffer or pool that tells more, or other, than a distractor may.
-
-    Attributes:
-        kind: `same family`, `other family`, `repeated unit`, `not a train episode`, `same scene`
-            or `identical frames`.
-        where: The buffer or the episodes.
-    """
+    """Content of a buffer or of the pool that reveals more than a distractor may; its location."""
 
     kind: str
     where: str
@@ -38,45 +32,41 @@ class Leak:
 
 @dataclass
 class Audit:
-    """How often what is used.
+    """Use of units by condition over all queries, and leaks.
 
-    Attributes:
-        uses: For each condition, how often each unit of the pool is used over all queries, 0
-            included.
-        places: For each condition, how often each family of a unit stands at each place among
-            the units of a buffer, from 1.
-        leaks: All leaks found.
+    `uses` has the uses of each unit, `positions` those of each family at each position (from 1)
+    among the units of a buffer.
     """
 
     uses: dict[str, dict[EpisodeId, int]]
-    places: dict[str, dict[int, Counter[str]]] = field(default_factory=dict)
+    positions: dict[str, dict[int, Counter[str]]] = field(default_factory=dict)
     leaks: list[Leak] = field(default_factory=list)
 
     @property
     def fullest(self) -> str:
         """The condition whose buffers hold the most units."""
-        return max(self.uses, key=lambda name: len(self.places.get(name, {})))
+        return max(self.uses, key=lambda name: len(self.positions.get(name, {})))
 
     def tables(self) -> tuple[Table, Table]:
-        """Return the uses of a unit by condition, and the families at each place."""
+        """Return the uses of a unit by condition, and the families at each position."""
         counts = "units:count min:count mean:ratio max:count"
         rows = ((name, *_usage(uses.values())) for name, uses in self.uses.items())
         uses = Table.make("uses", "Uses of a unit", f"condition {counts} unused:count", rows)
-        places = self.places.get(self.fullest, {})
+        positions = self.positions.get(self.fullest, {})
         families: dict[str, list[int]] = {}
         for unit, count in sorted(self.uses[self.fullest].items()):
             families.setdefault(unit.family, []).append(count)
-        numbered = " ".join(f"{place}:count" for place in sorted(places))
+        numbered = " ".join(f"{position}:count" for position in sorted(positions))
         mix = (
-            (family, *_usage(found)[:4], *(places[place][family] for place in sorted(places)))
-            for family, found in families.items()
+            (family, *_usage(used)[:4], *(positions[one][family] for one in sorted(positions)))
+            for family, used in families.items()
         )
         return uses, Table.make(
             "families",
             f"Families of the units under {self.fullest}",
             f"family {counts} {numbered}",
             mix,
-            "Columns 1, 2, …: buffers with the family at that place among their units.",
+            "Columns 1, 2, …: buffers with the family at that position among their units.",
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -91,8 +81,8 @@ class Audit:
 
 
 def _usage(counts: Any) -> tuple[Any, ...]:
-    found = list(counts)
-    return len(found), min(found), mean(found), max(found), found.count(0)
+    numbers = list(counts)
+    return len(numbers), min(numbers), mean(numbers), max(numbers), numbers.count(0)
 
 
 def audit_buffer_set(buffer_set: BufferSet) -> Audit:
@@ -107,13 +97,12 @@ def audit_buffer_set(buffer_set: BufferSet) -> Audit:
         if uses is None:
             path = buffer_set.files.path(MANIFEST_PATH)
             raise FormatError.damaged(path, f"{manifest.condition} is not among its conditions")
-        places = audit.places.setdefault(manifest.condition, {})
+        positions = audit.positions.setdefault(manifest.condition, {})
         drawn: Counter[EpisodeId] = Counter()
         kind = parse_condition(manifest.condition).kind
         for session in manifest.sessions:
             where = f"{manifest}: {session.source}"
-            own = _of_the_query(session, manifest, kind)
-            if session.source.split != "train" and not own:  # whatever its role
+            if session.source.split != "train" and not _is_query(session, manifest, kind):
                 audit.leaks.append(Leak("not a train episode", where))
             if session.role != "distractor":
                 continue
@@ -124,12 +113,12 @@ def audit_buffer_set(buffer_set: BufferSet) -> Audit:
                 audit.leaks.append(Leak("repeated unit", where))
             uses[session.source] = uses.get(session.source, 0) + 1
             drawn[session.source] += 1
-            places.setdefault(drawn.total(), Counter())[session.family] += 1
+            positions.setdefault(drawn.total(), Counter())[session.family] += 1
     return audit
 
 
-def _of_the_query(session: SessionEntry, manifest: BufferManifest, kind: Kind) -> bool:
-    """Whether a session shows the query's own scene, as its kind of condition says it may."""
+def _is_query(session: SessionEntry, manifest: BufferManifest, kind: Kind) -> bool:
+    """Return whether a session shows the query's scene, as its kind of condition permits."""
     role, source = session.role, session.source
     if role == "contradiction":
         return CONTRADICTIONS in kind.needs and (
@@ -143,7 +132,7 @@ def _pool_leaks(units: Sequence[EpisodeRecord], queries: Sequence[EpisodeRecord]
     for unit in units:
         if unit.episode_id.split != "train":
             yield Leak("not a train episode", f"unit {unit.episode_id}")
-    # The same scene under another split or number: official seeds name the scene.
+    # Official seeds identify a scene across splits and numbers.
     scenes: dict[tuple[str | None, str, int | None], EpisodeId] = {
         (query.simulator, query.episode_id.family, query.seed): query.episode_id
         for query in queries

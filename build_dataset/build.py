@@ -1,9 +1,8 @@
-"""Build a dataset: list, stage with an executor, write with LeRobot, complete, give the name.
+"""Build a dataset: stage episodes with an executor, write them with LeRobot, complete, rename.
 
-Whatever happens, the output folder is either absent or complete: everything is made in a hidden
-folder beside it and renamed at the end. An interrupted build goes on from its staged episodes. A
-dataset that is there grows by the episodes that it lacks: those that it has are neither read nor
-encoded again.
+The output folder is always either absent or complete: everything is made in a hidden folder beside
+it and renamed at the end. An interrupted build resumes from its staged episodes. An existing
+dataset is extended by the episodes that it lacks; the others are neither read nor encoded again.
 """
 
 import os
@@ -32,33 +31,13 @@ from robomme_interference_data.storage.staging import replace_folder, staging_di
 from .config import BuildPlan
 from .existing import ExistingDataset, open_existing
 from .identity import complete_dataset, identity_of
-from .lerobot_writer import (
-    StoredEpisode,
-    load_lerobot,
-    require_lerobot,
-    write_lerobot,
-)
-from .stage import (
-    Staged,
-    StageTask,
-    Task,
-    keep_staged,
-    read_staged,
-    staged_name,
-)
+from .lerobot_writer import StoredEpisode, load_lerobot, require_lerobot, write_lerobot
+from .stage import Staged, StageTask, Task, keep_staged, read_staged, staged_name
 
 
 @dataclass(frozen=True)
 class BuildResult:
-    """What a build made.
-
-    Attributes:
-        out: The dataset.
-        episodes: Stored episodes.
-        frames: Stored frames.
-        added: How many of the episodes are new.
-        skipped: Ids of episodes that yielded nothing, and why.
-    """
+    """Result of a build; `skipped` has the episodes that yielded nothing, with the reasons."""
 
     out: Path
     episodes: int
@@ -70,22 +49,15 @@ class BuildResult:
 def build_dataset(
     plan: BuildPlan, out: Path, executor: Executor, progress: WorkProgress
 ) -> BuildResult:
-    """Build one of a buffer set's datasets as a LeRobot v3 dataset, or let one grow.
-
-    Args:
-        plan: What to build.
-        out: Folder of the dataset; made by the build.
-        executor: Who stages the episodes.
-        progress: Where to show how far the build is.
-    """
+    """Build or extend one of a buffer set's datasets, a LeRobot v3 dataset in the folder `out`."""
     require_lerobot()
     get_codec(plan.codec)
-    out = out.resolve()  # a folder cannot be given the name of a link, or "."
+    out = out.resolve()  # a folder cannot be renamed to a link, or "."
     try:
         str(out).encode()
     except UnicodeEncodeError:
         raise InvalidOptionError.expected(
-            "out", str(out), "a path in UTF-8: LeRobot's writer can use no other"
+            "buffer_set", str(out), "a path in UTF-8, as LeRobot's writer needs"
         ) from None
     with staging_dir(out) as work:
         existing = open_existing(out, plan)
@@ -110,10 +82,10 @@ def _stage(
     executor: Executor,
     progress: WorkProgress,
 ) -> None:
-    """Stage episodes, and add each to those that are stored, which it must fit, or skipped."""
-    limit = plan.time_limit or max(source.time_limit for source in plan.sources)
+    """Stage episodes, and add each to `stored` or `skipped`."""
+    limit = plan.time_limit_s or max(source.time_limit_s for source in plan.sources)
 
-    def place(one: Task) -> Path:
+    def folder(one: Task) -> Path:
         return work / "episodes" / staged_name(plan, one)
 
     def take(one: Task, staged: Staged, *, before: bool, node: str | None = None) -> None:
@@ -121,42 +93,49 @@ def _stage(
         if staged.skipped is not None:
             skipped[str(staged.episode_id)] = staged.skipped
         else:
-            stored.append(staged.stored(place(one)))
+            stored.append(staged.stored(folder(one)))
             _check_alike(stored[0], stored[-1])
 
     missing = []
     progress.start("Reading and encoding", len(todo))
     for one in todo:
-        done = read_staged(place(one))
+        done = read_staged(folder(one))
         if done is None:
             missing.append(one)
         else:
             take(one, done, before=True)
     failures: list[Outcome] = []
-    # Closed before anybody looks at what is staged: an error would keep the workers running.
+    # Closing ends the workers, also after an error.
     with closing(executor.run(StageTask(plan), missing, time_limit=limit)) as outcomes:
         for outcome in outcomes:
             if outcome.error is None:
-                keep_staged(place(outcome.task), outcome.value, outcome.files)
+                keep_staged(folder(outcome.task), outcome.value, outcome.files)
                 take(outcome.task, outcome.value, before=False, node=outcome.node)
                 continue
             failures.append(outcome)
             if isinstance(outcome.error, InvalidOptionError | MissingExtraError):
-                break  # the others will say the same
+                break  # the others would fail alike
     if failures:
         raise _failure(failures, len(todo))
 
 
 def _check_alike(one: StoredEpisode, other: StoredEpisode) -> None:
     """Check that two episodes can be in one dataset; one may lack actions."""
-    both = one.features.keys() & other.features.keys()
-    if (one.features.keys() ^ other.features.keys()) - {ACTION} or any(
-        one.features[name] != other.features[name] for name in both
-    ):
+    optional = {ACTION} - (one.features.keys() & other.features.keys())
+    first, second = (
+        (
+            {name: shape for name, shape in episode.features.items() if name not in optional},
+            {name: v for name, v in episode.robot.names.items() if name not in optional},
+            episode.robot.fps,
+            episode.robot.type,
+        )
+        for episode in (one, other)
+    )
+    if first != second:
         raise SourceError(
             f"{one.record.episode_id} and {other.record.episode_id} cannot be in one dataset: "
-            f"their features are {one.features} and {other.features}",
-            "Choose `cameras` that all have, build the sources apart, or choose another `out`.",
+            f"their features, value names, frame rates and robot types are {first} and {second}",
+            "Choose `cameras` that all have, or build the sources into separate buffer sets.",
         )
 
 
@@ -172,8 +151,8 @@ def _failure(failures: Sequence[Outcome], total: int) -> InterferenceError:
     more = f"\n  … and {len(failures) - 10} more" if len(failures) > 10 else ""
     return BuildError(
         f"{len(failures)} of {total} episodes failed:\n" + "\n".join(lines) + more,
-        "The others are kept. Mend these or leave them out (`families`, `episodes`), then run the "
-        "same command again.",
+        "The others are kept. Correct these or leave them out (`families`, `episodes`), then run "
+        "the same command again.",
     )
 
 
@@ -186,7 +165,7 @@ def _write(
     skipped: dict[str, str],
     progress: WorkProgress,
 ) -> None:
-    """Write the whole dataset in canonical order, and give it its name."""
+    """Write the whole dataset in canonical order, and rename it to `out`."""
     if not stored:
         reasons = "; ".join(f"{name}: {why}" for name, why in list(skipped.items())[:5])
         raise SourceError(
@@ -194,7 +173,7 @@ def _write(
             "Check `families`, `split` and `episodes` against the sources.",
         )
     ordered = sorted(stored, key=lambda one: one.record.episode_id)
-    # Actions are kept only where all episodes have them: buffers do not show them.
+    # Actions are stored only if all episodes have them: buffers do not hold them.
     acted = all(ACTION in one.features for one in ordered)
     features = {n: s for n, s in ordered[0].features.items() if acted or n != ACTION}
     with progress.status("Loading lerobot"):
@@ -204,11 +183,10 @@ def _write(
     progress.start("Writing the LeRobot dataset", len(ordered))
     for _ in write_lerobot(made, plan.kind, ordered, features, get_codec(plan.codec)):
         progress.advance(1)
-    records = [_placed(one.record, index, features) for index, one in enumerate(ordered)]
-    told = {canonical_json(source.provenance): source.provenance for source in plan.sources}
-    if existing:
-        told |= {canonical_json(one): one for one in existing.dataset.identity.sources}
-    sources = [one for _, one in sorted(told.items())]
+    records = [_numbered(one.record, index, features) for index, one in enumerate(ordered)]
+    provenances = [source.provenance for source in plan.sources]
+    provenances += existing.dataset.identity.sources if existing else ()
+    sources = [one for _, one in sorted({canonical_json(p): p for p in provenances}.items())]
     identity = identity_of(records, plan.kind, plan.version, plan.codec, sources)
     with progress.status("Hashing"):
         complete_dataset(made, records, identity, skipped)
@@ -216,7 +194,7 @@ def _write(
     replace_folder(made, out)
 
 
-def _placed(record: EpisodeRecord, index: int, features: Collection[str]) -> EpisodeRecord:
-    """Return a record at its place in a dataset with these features."""
+def _numbered(record: EpisodeRecord, index: int, features: Collection[str]) -> EpisodeRecord:
+    """Return the record of an episode with this index in a dataset with these features."""
     kept = {name: digest for name, digest in record.feature_sha256.items() if name in features}
     return replace(record, episode_index=index, feature_sha256=kept)

@@ -1,5 +1,6 @@
-"""Commands that make buffer sets and check them: `build …`, `verify`, `audit`."""
+"""Commands that build and check buffer sets: `build …`, `new-buffer-set`, `verify`, `audit`."""
 
+from collections.abc import Sized
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -36,85 +37,79 @@ if TYPE_CHECKING:
     from robomme_interference_data.storage.files import Files
 
 app = App(
-    help="Build a buffer set's datasets, demonstrations and distractor units first, and manifests.",
-    epilog="""Flow: record or download episodes, build the datasets and the manifests, verify.
+    help="Build a buffer set: its datasets and its manifests.",
+    epilog="""Build everything at once, then verify it:
 
 ```
 robomme-interference build all my-buffers --source robomme-h5:recordings/
 robomme-interference verify my-buffers
-robomme-interference show my-buffers MoveCube/train/0 k3 --out strip.png
 ```
 
-`build all` is these three, with S=my-buffers:
+`build all` runs these three:
 
 ```
-robomme-interference build demonstrations $S --source robomme-h5:recordings/
-robomme-interference build distractors $S --source robomme-h5:recordings/
-robomme-interference build manifests $S --conditions no-history,k0,k1,k3,k7
+robomme-interference build demonstrations my-buffers --source robomme-h5:recordings/
+robomme-interference build distractors my-buffers --source robomme-h5:recordings/
+robomme-interference build manifests my-buffers --conditions no-history,k0,k1,k3,k7
 ```
 """,
 )
 
 _KEPT = "Finished episodes are kept"
-_TOLD = 10
-"""Episodes that are named when they are left out."""
-
+_MAX_SKIPPED = 10
+"""Skipped episodes to print."""
 
 _DATASETS = {
-    DEMONSTRATIONS: r"""Build the query episodes' demonstrations, with the first live observation.
+    DEMONSTRATIONS: r"""Build the query episodes' demonstrations and their first live observations.
 
-    Stopped with Ctrl-C, or killed, a build goes on where it was when the command is run again. A
-    dataset that is there grows by what it lacks.
-
-    Examples:
-    ```
-    robomme-interference build demonstrations S --source robomme-h5:recordings/ --split test
-    robomme-interference build demonstrations S --source tabletop --split test --episodes 0-4 \
-        --cameras front
-    ```
-    """,
-    DISTRACTORS: r"""Build distractor units: 32 frames of each episode, raw indices 0, 8, …, 248.
-
-    Episodes of fewer than 249 raw frames yield no unit; they are listed in meta/build_report.json.
+    After an interruption, re-run the same command to resume. An existing dataset is extended.
 
     Examples:
     ```
-    robomme-interference build distractors S --source lerobot:NAMESPACE/NAME
-    robomme-interference build distractors S --source robomme-h5:recordings/ --source frames:mine/ \
-        --cameras front
+    robomme-interference build demonstrations my-buffers --source robomme-h5:h5/ --split test
+    robomme-interference build demonstrations my-buffers --source tabletop --episodes 0-4
     ```
     """,
-    RAW_DISTRACTORS: """Build distractor units at full rate, for raw-k<n>: 256 raw frames each.
+    DISTRACTORS: r"""Build distractor units: 32 frames per episode, raw indices 0, 8, …, 248.
 
-    Take the episodes of the distractors: a buffer's units must all be there.
+    Episodes of fewer than 249 raw frames yield no unit; meta/build_report.json lists them.
+
+    Examples:
+    ```
+    robomme-interference build distractors my-buffers --source lerobot:NAMESPACE/NAME
+    robomme-interference build distractors my-buffers --source tabletop --source frames:mine/
+    ```
+    """,
+    RAW_DISTRACTORS: """Build distractor units at full rate, 256 raw frames each, for raw-k<n>.
+
+    Use the episodes of the distractors: every unit of a buffer needs its raw unit.
 
     Example:
     ```
-    robomme-interference build distractors-raw S --source tabletop
+    robomme-interference build distractors-raw my-buffers --source tabletop
     ```
     """,
-    CONTRADICTIONS: r"""Build contradicting lessons: the same scene, another answer.
+    CONTRADICTIONS: """Build contradicting lessons: the same scene with another answer (tabletop).
 
-    For stale-k<n> and misled-k<n>. Take the query episodes. Only tabletop can play them: elsewhere,
-    scene and answer come together.
+    For stale-k<n> and misled-k<n>. Use the query episodes.
 
     Example:
     ```
-    robomme-interference build contradictions S --source tabletop --split test --episodes 0-4
+    robomme-interference build contradictions my-buffers --source tabletop --split test
     ```
     """,
-    SHIFTED: r"""Build what query episodes look like under each shift, for retrieval-score.
+    SHIFTED: """Build the query episodes' views under each shift, for retrieval-score (tabletop).
 
-    Nine frames of each episode: the first live view under light, camera and clutter, each at
-    strengths 1, 2 and 3. Take the query episodes; build manifests and index the buffer set afterwards.
+    Nine frames per episode: the first live view under light, camera and clutter shifts of strengths
+    1, 2 and 3. Use the query episodes; build the manifests and the index afterwards.
 
     Example:
     ```
-    robomme-interference build shifted S --source tabletop --split test --episodes 0-4
+    robomme-interference build shifted my-buffers --source tabletop --split test --episodes 0-4
     ```
     """,
 }
-"""Kind of dataset to the help of the command that builds it."""
+"""Kind of dataset to the help of its command."""
 
 
 def _add_command(kind: str, text: str) -> None:
@@ -132,12 +127,8 @@ for _kind, _text in _DATASETS.items():
 
 @app.command()
 @with_settings
-def manifests(
-    buffer_set: Annotated[Path, typer.Argument(help="Folder with the datasets.")],
-    config: PlanConfig,
-    as_json: AsJson = False,
-) -> None:
-    """Plan the history buffers of all query episodes: the same inputs give the same bytes.
+def manifests(buffer_set: BufferSetFolder, config: PlanConfig, as_json: AsJson = False) -> None:
+    """Plan the history buffers of all query episodes.
 
     Example:
     ```
@@ -149,14 +140,10 @@ def manifests(
 
 
 @app.command()
-def questions(
-    buffer_set: Annotated[Path, typer.Argument(help="Folder of the buffer set.")],
-    as_json: AsJson = False,
-) -> None:
-    """Make the questions about the past that `ask` asks: one a query, with a marked picture.
+def questions(buffer_set: BufferSetFolder, as_json: AsJson = False) -> None:
+    """Make a question about the past for each query, with a marked picture, for `ask` (tabletop).
 
-    Only for demonstrations of tabletop, of which the possible answers are known. Rows and pictures
-    are in questions.parquet; the same buffer set gives the same bytes.
+    Writes questions.parquet.
 
     Example:
     ```
@@ -171,10 +158,10 @@ def questions(
     if not buffer_set.is_dir():
         raise MissingFileError(
             f"there is no folder {buffer_set}",
-            "A buffer set on the Hub is fetched first: robomme-interference fetch NAME --to FOLDER",
+            "Fetch a buffer set from the Hub first: robomme-interference fetch NAME --to FOLDER",
         )
     with (
-        graceful_interrupt("The buffer set is as it was"),
+        graceful_interrupt("The buffer set is unchanged"),
         WorkProgress(unit="questions") as progress,
     ):
         opened = load_buffer_set(buffer_set)
@@ -193,12 +180,10 @@ def questions(
 @app.command(name="all")
 @with_settings
 def build_all(config: AllConfig, plan: PlanConfig, as_json: AsJson = False) -> None:
-    r"""Build demonstrations, distractors and manifests from the same sources.
+    r"""Build demonstrations, distractors and manifests, and the datasets that conditions need.
 
-    Conditions that need further datasets get them.
-
-    Filters choose the query episodes; the units are of all families' train episodes, or of those
-    that --unit-episodes names.
+    The filters choose the query episodes. Units come from the train episodes of all families, or
+    from those of --unit-episodes.
 
     Examples:
     ```
@@ -209,8 +194,8 @@ def build_all(config: AllConfig, plan: PlanConfig, as_json: AsJson = False) -> N
     """
     with graceful_interrupt(_KEPT):
         steps = plan_all(config, plan)
-        taken = " and ".join(f"{kind} of {len(step.tasks):,}" for kind, step in steps.items())
-        print_status(f"Recorded episodes to take: {taken}")
+        taken = ", ".join(f"{kind} {len(step.tasks):,}" for kind, step in steps.items())
+        print_status(f"Recorded episodes: {taken}")
         for kind, step in steps.items():
             _build(step, config.buffer_set / kind, config, as_json=False)
         _plan(config.buffer_set, plan, as_json=as_json)
@@ -219,10 +204,10 @@ def build_all(config: AllConfig, plan: PlanConfig, as_json: AsJson = False) -> N
 
 @with_settings
 def new_buffer_set(config: NewConfig, plan: PlanConfig, as_json: AsJson = False) -> None:
-    r"""Build a buffer set of your own for demonstrations that are published: units and manifests.
+    r"""Build units and manifests for published demonstrations: a buffer set of your own.
 
-    The units are of the sources' train episodes, whatever robot or simulator they are of; their
-    cameras and sizes must be those of the demonstrations. Ends with an audit; fails on a leak.
+    Units come from the train episodes of the sources, of any robot or simulator with the cameras
+    and image sizes of the demonstrations. Ends with an audit, and fails on a leak.
 
     Examples:
     ```
@@ -233,9 +218,7 @@ def new_buffer_set(config: NewConfig, plan: PlanConfig, as_json: AsJson = False)
     """
     with graceful_interrupt(_KEPT):
         base, units = plan_new(config, plan)
-        print_status(
-            f"Demonstrations: {base.files.describe()}; episodes to take: {len(units.tasks):,}"
-        )
+        print_status(f"Demonstrations: {base.files.describe()}; units from {len(units.tasks):,}")
         _build(units, config.buffer_set / DISTRACTORS, config, as_json=False)
         _plan(config.buffer_set, plan, as_json=as_json, base=base.files)
         audit(config.buffer_set)
@@ -249,12 +232,12 @@ def _build(plan: BuildPlan, out: Path, workers: WorkersConfig, *, as_json: bool)
 
     with WorkProgress(unit="episodes") as progress:
         result = build_dataset(plan, out, make_executor(workers), progress)
-    done = f"{result.added} added" if result.added else "was built before"
-    print_status(f"{out}: {done}; {result.episodes} episodes, {result.frames:,} frames")
-    for name, why in sorted(result.skipped.items())[:_TOLD]:
-        print_status(f"  left out {name}: {why}")
-    if len(result.skipped) > _TOLD:
-        print_status(f"  … {len(result.skipped)} left out in all: {out}/{REPORT_PATH}")
+    added = f"{result.added} added" if result.added else "nothing to add"
+    print_status(f"{out}: {added}; {result.episodes} episodes, {result.frames:,} frames")
+    for name, reason in sorted(result.skipped.items())[:_MAX_SKIPPED]:
+        print_status(f"  skipped {name}: {reason}")
+    if len(result.skipped) > _MAX_SKIPPED:
+        print_status(f"  … {len(result.skipped)} skipped in all: {out}/{REPORT_PATH}")
     if as_json:
         print_json({**vars(result), "out": str(result.out)})
 
@@ -267,31 +250,28 @@ def _plan(
 
     from .manifests import in_folder, plan_manifests, write_manifests
 
-    limit = position_limit(config)
-    places = in_folder(buffer_set) | ({} if base is None else {DEMONSTRATIONS: base})
-    plan = plan_manifests(places, config.conditions, config.seed, limit)
+    files = in_folder(buffer_set) | ({} if base is None else {DEMONSTRATIONS: base})
+    plan = plan_manifests(files, config.conditions, config.seed, position_limit(config))
     with WorkProgress(unit="buffers") as progress:
         total = len(plan.demonstrations) * len(plan.conditions)
         progress.start("Planning buffers", total)
         for done in write_manifests(plan, buffer_set):
             progress.advance(done)
-    counts = load_buffer_set(buffer_set).header.counts
+    counts, out = load_buffer_set(buffer_set).header.counts, buffer_set / MANIFESTS
     if as_json:
-        print_json({"out": str(buffer_set / MANIFESTS), **counts})
+        print_json({"out": str(out), **counts})
     else:
-        print_status(
-            f"{buffer_set / MANIFESTS}: {counts['buffers']:,} buffers of {counts['queries']:,} queries"
-        )
+        print_status(f"{out}: {counts['buffers']:,} buffers of {counts['queries']:,} queries")
 
 
 def verify(
     buffer_set: BufferSetFolder,
     decode: Annotated[
-        bool, typer.Option(help="Decode all frames; without, files, tables and rules are checked.")
+        bool, typer.Option(help="Also decode all frames and check their hashes (slow).")
     ] = True,
     as_json: AsJson = False,
 ) -> None:
-    """Recompute every hash and rule of a buffer set and name each violation; fails if there is one.
+    """Recompute every hash and rule of a buffer set and list the violations; fails if there is one.
 
     Example:
     ```
@@ -313,20 +293,13 @@ def verify(
         for violation in violations:
             echo(f"{violation.where}: {violation.what}")
         what = "hashes and rules" if decode else "files, tables and rules (frames not decoded)"
-        print_status(
-            f"{len(violations)} violation{'s' * (len(violations) > 1)}"
-            if violations
-            else f"All {what} of {buffer_set} hold."
-        )
+        print_status(_count(violations, "violation") or f"All {what} of {buffer_set} hold.")
     if violations:
         raise typer.Exit(1)
 
 
-def audit(
-    buffer_set: BufferSetFolder,
-    as_json: AsJson = False,
-) -> None:
-    """Print how often units are used and where families stand; fails on any leak.
+def audit(buffer_set: BufferSetFolder, as_json: AsJson = False) -> None:
+    """Print how often units are used and at which positions families occur; fails on a leak.
 
     Example:
     ```
@@ -345,10 +318,10 @@ def audit(
         echo(tables_text(report.tables()) + "\n")
         for leak in report.leaks:
             echo(f"LEAK, {leak.kind}: {leak.where}")
-        print_status(
-            f"{len(report.leaks)} leak{'s' * (len(report.leaks) > 1)}"
-            if report.leaks
-            else "No leaks."
-        )
+        print_status(_count(report.leaks, "leak") or "No leaks.")
     if report.leaks:
         raise typer.Exit(1)
+
+
+def _count(items: Sized, what: str) -> str:
+    return f"{len(items)} {what}{'s' * (len(items) > 1)}" if items else ""

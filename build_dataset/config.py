@@ -1,4 +1,4 @@
-"""What is asked of a build: its settings, and the plan that follows from them."""
+"""The settings of a build, and the plan that follows from them."""
 
 import dataclasses
 import os
@@ -12,6 +12,7 @@ from robomme_interference_data.constants import (
     CONTRADICTIONS,
     DEMONSTRATIONS,
     DISTRACTORS,
+    LESSONS,
     POSITION_LIMIT,
     SHIFTED,
     SPLITS,
@@ -36,91 +37,113 @@ _CPUS = os.cpu_count() or 1
 
 @dataclass(frozen=True)
 class BuildConfig(WorkersConfig):
-    """What to build of which recordings, and how."""
+    """Settings of a build of one dataset."""
 
     source: tuple[str, ...] = setting(
         whole=True,
         metavar="SOURCE",
         help="robomme-h5:FOLDER, lerobot:FOLDER, lerobot:NAMESPACE/NAME[@REVISION], frames:FOLDER, "
-        "tabletop, robomme (demonstrations only) or sample[:FAMILY,…]; repeated for several.",
+        "tabletop, robomme (demonstrations only) or sample[:FAMILY,…]; repeat for several.",
     )
     buffer_set: Path = setting(
         name="-", metavar="BUFFER_SET", help="Folder of the buffer set to create or extend."
     )
-    families: tuple[str, ...] = setting((), help="Families to take; all by default.")
-    split: str | None = setting(None, help="Only train, val or test.", shown="units: train")
-    episodes: str | None = setting(None, help="Numbers to take, such as 0-49 or 0,3,10-12.")
-    cameras: tuple[str, ...] = setting((), help="Cameras to store, such as front; default: all.")
-    codec: str = setting(
-        "av1-lossless", help="av1-lossless (bit-exact) or lerobot-default (smaller, lossy)."
+    families: tuple[str, ...] = setting((), help="Families; default: all.", group="Episodes")
+    split: str | None = setting(
+        None, help="train, val or test.", shown="all; for units train", group="Episodes"
     )
-    version: str = setting("1.0.0", help="Version that the dataset carries.")
-    time_limit: float | None = setting(
+    episodes: str | None = setting(
+        None, help="Episode indices, such as 0-49 or 0,3,10-12; default: all.", group="Episodes"
+    )
+    cameras: tuple[str, ...] = setting(
+        (), help="Cameras to store, such as front; default: all.", group="Encoding"
+    )
+    codec: str = setting(
+        "av1-lossless",
+        help="av1-lossless (bit-exact) or lerobot-default (smaller, lossy).",
+        group="Encoding",
+    )
+    version: str = setting("1.0.0", help="Version of the dataset.", group="Encoding")
+    time_limit_s: float | None = setting(
         None,
-        help="Seconds that one episode may take before it is tried once more.",
+        help="Seconds for one episode; a slower one is retried once.",
         shown="300 on tabletop and sample, else 1800",
+        group="Execution",
     )
     columns: tuple[str, ...] = setting(
-        (), metavar="NAME=COLUMN,…", help="lerobot sources: where columns are named otherwise."
+        (),
+        metavar="NAME=COLUMN,…",
+        help="Source lerobot: columns without a usual name, such as front=top_image.",
+        group="Sources",
     )
     families_file: Path | None = setting(
-        None, help="lerobot sources: file that names each episode's family."
+        None,
+        help="Source lerobot: CSV file with each episode's family and, if needed, exec_start_idx.",
+        group="Sources",
     )
     robomme_python: str | None = setting(
-        None, help="Source robomme: interpreter that has RoboMME.", env="ROBOMME_PYTHON"
+        None,
+        help="Source robomme: Python interpreter with RoboMME.",
+        env="ROBOMME_PYTHON",
+        group="Sources",
     )
     _: KW_ONLY
-    workers: int = setting(_CPUS, help="Worker processes.", shown="all processors")
+    workers: int = setting(_CPUS, help="Worker processes.", shown="all CPUs", group="Execution")
 
 
 @dataclass(frozen=True)
 class AllConfig(BuildConfig):
-    """What to build a whole buffer set of."""
+    """Settings of a build of a whole buffer set."""
 
     unit_episodes: str | None = setting(
-        None, help="Numbers of the train episodes that give units, such as 0-3; default: all."
+        None,
+        help="Indices of the train episodes that units are cut from, such as 0-3; default: all.",
+        group="Episodes",
     )
     shifted: bool = setting(
-        False, help="Also what query episodes look like under each shift (tabletop)."
+        False, help="Also build the query episodes' views under each shift (tabletop only)."
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class NewConfig(BuildConfig):
-    """What to build a buffer set of for demonstrations that are published."""
+    """Settings of a build of a buffer set for published demonstrations."""
 
     demonstrations: str = setting(
-        metavar="NAME", help="Repository of the demonstrations, namespace/name[@REVISION]."
+        metavar="NAME", help="Repository of the demonstrations, NAMESPACE/NAME[@REVISION]."
     )
 
 
 @dataclass(frozen=True)
 class PlanConfig:
-    """Which buffers to plan."""
+    """Settings of a buffer set's manifests."""
 
     conditions: tuple[str, ...] = setting(
         DEFAULT_CONDITIONS,
-        help="Conditions to plan buffers for, such as no-history,k0,k7,before-k7; all kinds: "
-        "robomme-interference conditions.",
+        help="Conditions, such as no-history,k0,k7,before-k7; `robomme-interference conditions` "
+        "lists all kinds.",
+        group="Conditions",
     )
-    seed: int = setting(0, help="Seed of the draw.")
+    seed: int = setting(0, help="Seed of the draw of distractor units.", group="Conditions")
     position_limit: str = setting(
-        str(POSITION_LIMIT), help="Positions that systems hold for history and rollout, or none."
+        str(POSITION_LIMIT),
+        help="Most positions that a policy has for history and rollout, or none.",
+        group="Conditions",
     )
 
 
 @dataclass(frozen=True)
 class BuildPlan:
-    """A `BuildConfig` whose sources are open; or made without one.
+    """A build with open sources; from a `BuildConfig`, or made directly.
 
     Attributes:
         kind: Name of the dataset in a buffer set, such as `demonstrations`.
-        sources: Where to read.
-        tasks: The episodes to store: number of the source, and episode.
+        sources: The sources.
+        tasks: The episodes to store: index of the source, and episode.
         cameras: Cameras to store; None for all.
         codec: Name of the video settings.
         version: Version of the dataset.
-        time_limit: Seconds that one episode may take; None for the sources' own.
+        time_limit_s: Limit in seconds for one episode; None for the sources' defaults.
     """
 
     kind: str
@@ -129,24 +152,21 @@ class BuildPlan:
     cameras: tuple[str, ...] | None = None
     codec: str = "av1-lossless"
     version: str = "1.0.0"
-    time_limit: float | None = None
+    time_limit_s: float | None = None
 
 
 def plan_all(config: AllConfig, plan: PlanConfig) -> dict[str, BuildPlan]:
-    """Plan the datasets of a buffer set, and check all that can be known before anything is read."""
-    every = dataclasses.replace(config, families=(), episodes=config.unit_episodes, split="train")
+    """Plan the datasets of a buffer set, and check everything known before episodes are read."""
+    units = dataclasses.replace(config, families=(), episodes=config.unit_episodes, split="train")
     names = [*datasets_of(in_order(plan.conditions)), *[SHIFTED] * config.shifted]
-    plans = {name: plan_build(name, every if name in UNITS else config) for name in names}
+    plans = {name: plan_build(name, units if name in UNITS else config) for name in names}
     queries = (episode.id for _, episode in plans[DEMONSTRATIONS].tasks)
     _check_plans(queries, plans, config.buffer_set, plan)
     return plans
 
 
 def plan_new(config: NewConfig, plan: PlanConfig) -> "tuple[Dataset, BuildPlan]":
-    """Open published demonstrations, and plan units for them; see `plan_all`.
-
-    The units have the cameras of the demonstrations, unless some are asked for.
-    """
+    """Open published demonstrations, and plan units with their cameras; see `plan_all`."""
     from robomme_interference_data.data.dataset import Dataset
     from robomme_interference_data.storage.hub import HubFiles, locate
 
@@ -157,9 +177,9 @@ def plan_new(config: NewConfig, plan: PlanConfig) -> "tuple[Dataset, BuildPlan]"
         raise InvalidOptionError.expected(
             "demonstrations",
             config.demonstrations,
-            "demonstrations that are published",
-            "A published buffer set's card names the repository of its demonstrations. For "
-            "demonstrations in a folder, build distractors and manifests beside it.",
+            "published demonstrations",
+            "The card of a published buffer set names their repository. For demonstrations in a "
+            "folder, build distractors and manifests beside them.",
         )
     check_needs(in_order(plan.conditions), in_folder(config.buffer_set))
     cameras = config.cameras or base.cameras
@@ -170,71 +190,64 @@ def plan_new(config: NewConfig, plan: PlanConfig) -> "tuple[Dataset, BuildPlan]"
 
 
 def _check_plans(
-    queries: Iterable[EpisodeId], plans: dict[str, BuildPlan], out: Path, plan: PlanConfig
+    queries: Iterable[EpisodeId], plans: dict[str, BuildPlan], root: Path, plan: PlanConfig
 ) -> None:
     from robomme_interference_data.schema.draw import UnitPool
 
     from .existing import open_existing
-    from .manifests import check_place
+    from .manifests import check_manifests_folder
 
-    conditions = in_order(plan.conditions)
     position_limit(plan)
     pool = UnitPool(episode.id for _, episode in plans[DISTRACTORS].tasks)
     for query in {one.family: one for one in queries}.values():
-        for condition in conditions:
-            condition.sessions(_Unread(query, pool))
+        for condition in in_order(plan.conditions):
+            condition.sessions(_UnreadSessions(query, pool))
     for kind, one in plans.items():
-        open_existing(out.resolve() / kind, one)
-    check_place(out)
+        open_existing(root.resolve() / kind, one)
+    check_manifests_folder(root)
 
 
 @dataclass(frozen=True)
-class _Unread:
-    """The sessions of a query before anything is read: whether units are enough."""
+class _UnreadSessions:
+    """Sessions of a query before its data is read: drawing them checks that units suffice."""
 
     query: EpisodeId
     pool: "UnitPool"
 
     def lesson(self, part: str = "lesson") -> SessionEntry:
-        return _unread("lesson", self.query)
-
-    def units(self, k: int, dataset: str = DISTRACTORS) -> Sequence[SessionEntry]:
-        return [_unread("distractor", unit) for unit in self.pool.draw(self.query, k)]
-
-    def own_units(self, k: int) -> Sequence[SessionEntry]:
-        return [_unread("distractor", unit) for unit in self.pool.draw_own(self.query, k)]
+        source = self.query
+        return SessionEntry("lesson", source.family, source, "", "", 0, 0, UNIT_FRAMES, 1, "")
 
     def contradiction(self) -> SessionEntry:
-        return _unread("contradiction", self.query)
+        return self.lesson()
 
+    def units(self, k: int, dataset: str = DISTRACTORS) -> Sequence[SessionEntry]:
+        return [self.lesson() for _ in self.pool.draw(self.query, k)]
 
-def _unread(role: str, source: EpisodeId) -> SessionEntry:
-    return SessionEntry(role, source.family, source, "", "", 0, 0, UNIT_FRAMES, 1, "")
+    def own_units(self, k: int) -> Sequence[SessionEntry]:
+        return [self.lesson() for _ in self.pool.draw_own(self.query, k)]
 
 
 def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
     """Open the sources and plan one dataset."""
     from robomme_interference_data.storage.encode import get_codec
 
+    from .frame_selection import unmarked_error
     from .sources import open_source
 
     get_codec(config.codec)
-    if config.time_limit is not None and not config.time_limit > 0:
-        raise InvalidOptionError.expected("time_limit", config.time_limit, "seconds, above 0")
-    make_executor(config)  # refuses what it may not be
+    if config.time_limit_s is not None and not config.time_limit_s > 0:
+        raise InvalidOptionError.expected("time_limit_s", config.time_limit_s, "a positive number")
+    make_executor(config)  # checks its settings
     numbers = None if config.episodes is None else parse_numbers(config.episodes)
-    pairs = [text.partition("=") for text in config.columns]
-    if not all(name and equals and column for name, equals, column in pairs):
-        raise InvalidOptionError.expected(
-            "columns", config.columns, "NAME=COLUMN, such as front=image"
-        )
+    columns = _columns(config.columns)
     sources = tuple(
         open_source(
             text,
-            columns={name: column for name, _, column in pairs},
+            shifted=kind == SHIFTED,
+            columns=columns,
             families_file=config.families_file,
             robomme_python=config.robomme_python,
-            shifted=kind == SHIFTED,
         )
         for text in config.source
     )
@@ -242,12 +255,14 @@ def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
         if kind in UNITS and not source.whole:
             raise InvalidOptionError(
                 f"{text} plays demonstrations only, and distractor units need whole episodes",
-                "Build the two datasets apart, the distractors from RoboMME's own training "
-                "recordings.",
+                "Build the distractors from RoboMME's training recordings.",
                 "build distractors BUFFER_SET --source robomme-h5:FOLDER",
             )
     split = config.split or ("train" if kind in UNITS else None)
     tasks = list_episodes(sources, families=config.families, split=split, numbers=numbers)
+    unmarked = next((one for _, one in tasks if not one.marked), None)
+    if kind in LESSONS and unmarked is not None:
+        raise unmarked_error().about(unmarked.id)
     if kind == CONTRADICTIONS:
         tasks = tuple((number, sources[number].contradict(one)) for number, one in tasks)
     return BuildPlan(
@@ -257,8 +272,26 @@ def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
         cameras=tuple(sorted(config.cameras)) or None,
         codec=config.codec,
         version=config.version,
-        time_limit=config.time_limit,
+        time_limit_s=config.time_limit_s,
     )
+
+
+def _columns(texts: Sequence[str]) -> dict[str, str]:
+    columns: dict[str, str] = {}
+    for text in texts:
+        name, _, column = text.partition("=")
+        if not name or not column:
+            raise InvalidOptionError.expected(
+                "columns", text, "NAME=COLUMN, such as front=top_image"
+            )
+        if name in columns:
+            raise InvalidOptionError(
+                f"columns names two columns for {name!r}: {columns[name]!r} and {column!r}",
+                "Give one.",
+                option="columns",
+            )
+        columns[name] = column
+    return columns
 
 
 def list_episodes(
@@ -268,29 +301,22 @@ def list_episodes(
     split: str | None = None,
     numbers: Iterable[int] | None = None,
 ) -> "tuple[tuple[int, SourceEpisode], ...]":
-    """List the episodes of sources that pass all filters, in canonical order.
-
-    Args:
-        sources: The sources.
-        families: Their families; none for all.
-        split: `train`, `val` or `test`; None for all.
-        numbers: Their indices; None for all.
-    """
+    """List the episodes of sources that pass all filters, in canonical order."""
     listed = [(number, one) for number, source in enumerate(sources) for one in source.episodes()]
     known = {one.id.family for _, one in listed}
-    wanted = set(families) or known
-    for family in sorted(wanted - known):
+    chosen_families = set(families) or known
+    for family in sorted(chosen_families - known):
         raise InvalidOptionError.one_of("families", family, sorted(known))
     if split is not None and split not in SPLITS:
         raise InvalidOptionError.one_of("split", split, SPLITS)
-    indices = None if numbers is None else set(numbers)
+    chosen_indices = None if numbers is None else set(numbers)
     chosen = sorted(
         (
             (number, one)
             for number, one in listed
-            if one.id.family in wanted
+            if one.id.family in chosen_families
             and split in (None, one.id.split)
-            and (indices is None or one.id.index in indices)
+            and (chosen_indices is None or one.id.index in chosen_indices)
         ),
         key=lambda item: item[1].id.sort_key,
     )
@@ -298,12 +324,13 @@ def list_episodes(
         if one.id == other.id:
             raise SourceError(
                 f"{one.id} is recorded twice (in source {first + 1} and source {second + 1})",
-                "Leave one out with `families`, `split` or `episodes`, or take fewer sources.",
+                "Leave one out with `families`, `split` or `episodes`, or give fewer sources.",
             )
     if not chosen:
         raise SourceError(
-            f"no episode is left of the {len(listed)} that are listed",
-            "Check `families`, `split` and `episodes` against the sources.",
+            f"none of the sources' {len(listed)} episodes matches `families`, `split` and "
+            "`episodes`",
+            "Choose others.",
         )
     return tuple(chosen)
 

@@ -1,10 +1,10 @@
-"""Select the frames of a recorded episode that a dataset stores, while they are read: pure.
+"""Select the frames of a recorded episode that a dataset stores, while they are read.
 
 A demonstration is every raw frame of the demonstration section and then the first live
 observation. A distractor unit is the first 256 raw frames of an episode subsampled at stride 8:
-32 frames, raw indices 0, 8, …, 248 (paper, section "The history buffer", footnote); a raw one all
-of them, 249 at least, so that every unit has one. Nothing is read beyond the last frame that is
-needed.
+32 frames, raw indices 0, 8, …, 248 (paper, section "The history buffer", footnote); a raw unit has
+all of them, 249 at least, so that every unit has a raw one. No frame after the last needed one is
+read.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -24,18 +24,24 @@ from .sources.base import Frame
 
 
 class NothingToStore(Exception):
-    """An episode yields nothing; the text says why."""
+    """An episode yields nothing; the message is the reason."""
+
+
+def unmarked_error() -> SourceError:
+    """Return the error for an episode whose demonstration has no known end."""
+    return SourceError(
+        "the source does not mark which frames are the demonstration",
+        "Demonstrations need a column is_demo or exec_start_idx in the source, or exec_start_idx "
+        "in `families_file`; `columns` names another column, as in is_demo=NAME. Distractor units "
+        "can be built without.",
+    )
 
 
 def select_demonstration(frames: Iterable[Frame]) -> Iterator[Frame]:
     """Yield the frames of the demonstration, and then the first live observation."""
     for lesson, frame in enumerate(frames):
         if frame.is_demonstration is None:
-            raise SourceError(
-                "the source does not mark which frames are the demonstration",
-                "Demonstrations need an is_demo flag or an exec_start_idx column; `columns` gives "
-                "its name, as in is_demo=NAME. Distractor units can be built without.",
-            )
+            raise unmarked_error()
         if not frame.is_demonstration and lesson == 0:
             raise NothingToStore("no demonstration frame")
         yield frame
@@ -63,4 +69,4 @@ FRAME_SELECTORS: dict[str, Callable[[Iterable[Frame]], Iterator[Frame]]] = {
     SHIFTED: iter,
     **{kind: partial(select_unit, unit=unit) for kind, unit in UNITS.items()},
 }
-"""Kind of dataset to what it stores of an episode; of views under shifts, all that is streamed."""
+"""Kind of dataset to the frames that it stores of an episode."""

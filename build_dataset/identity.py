@@ -1,10 +1,10 @@
-"""What makes a LeRobot dataset one of ours: per-episode columns, identity, report, SHA-256 sums.
+"""Complete a LeRobot dataset: add per-episode columns, identity, report and SHA-256 sums.
 
-LeRobot 0.6 offers no way to hand per-episode columns to its writer, but reads any that stand in
+LeRobot 0.6 has no interface for writing per-episode columns, but reads all columns of
 `meta/episodes`: `LeRobotDatasetMetadata.filter_episodes` can select by them. So they are added
-there. LeRobot's tools that merge datasets or change their features and tasks carry them along;
-those that delete episodes or split a dataset drop them, and refuse the lossless codec. What loading
-reads is a copy of that table without LeRobot's statistics, which are most of its bytes.
+there. LeRobot's tools that merge datasets or change their features and tasks keep them; those that
+delete episodes or split a dataset drop them, and do not accept the lossless codec. Loading reads a
+copy of that table without LeRobot's statistics, which are most of its bytes.
 """
 
 import json
@@ -46,23 +46,23 @@ from robomme_interference_data.storage.files import (
 )
 from robomme_interference_data.storage.parquet import open_parquet, writing
 
-_LEROBOTS = ("episode_index", "length")
+_LEROBOT_FIELDS = ("episode_index", "length")
 """Fields of a record that LeRobot writes."""
 
 
 def listed_files(root: Path) -> list[str]:
-    """Return the files of a dataset whose SHA-256 is recorded: all but the list and what it names.
+    """Return the files of a dataset whose SHA-256 is recorded in it.
 
-    An index has a list of its own; so have the manifests, which a published buffer set has beside its
-    units, and the questions, which are made anew to be checked. What people put beside a dataset
-    has none: README, LICENSE, cards with `parts.json`, and hidden files.
+    The identity holds that of the sums. An index has its own hashes. The manifests and questions of
+    a published buffer set, which lie beside its units, are checked by planning them again. Files
+    that people add have none: README, LICENSE, cards with `parts.json`, and hidden files.
     """
-    own = (IDENTITY_PATH, SUMS_PATH)
+    unlisted = (IDENTITY_PATH, SUMS_PATH)
     beside = re.compile(
         rf"(README|LICENSE|croissant)[^/]*|{QUESTIONS_PATH}|{PARTS_PATH}|\..*"
         rf"|({INDEX_DIR}|{MANIFESTS})/.*"
     )
-    return [path for path in all_files(root) if path not in own and not beside.fullmatch(path)]
+    return [path for path in all_files(root) if path not in unlisted and not beside.fullmatch(path)]
 
 
 def identity_of(
@@ -73,7 +73,7 @@ def identity_of(
     sources: Iterable[dict[str, Any]],
     sums: str = "",
 ) -> DatasetIdentity:
-    """Return the identity of a dataset with these episodes; see `DatasetIdentity`."""
+    """Return the identity of a dataset with these episodes."""
     families = Counter(record.episode_id.family for record in records)
     features = {name for record in records for name in record.feature_sha256}
     cameras = sorted(name for name in features if name.startswith(CAMERA_PREFIX))
@@ -99,13 +99,9 @@ def complete_dataset(
     identity: DatasetIdentity,
     skipped: dict[str, str],
 ) -> None:
-    """Complete a dataset that LeRobot's writer has finished.
+    """Complete a dataset that LeRobot's writer has finished; fills in `sums` of the identity.
 
-    Args:
-        root: The dataset.
-        records: Its episodes.
-        identity: Its identity; `sums` follows from the files.
-        skipped: Ids of episodes that yielded nothing, and why.
+    `skipped` maps the ids of episodes that yielded nothing to the reasons.
     """
     _add_columns(root, records)
     _sort_statistics(root / STATS_PATH)
@@ -120,7 +116,7 @@ class SkippedEpisode:
     """An episode that yielded nothing."""
 
     episode_id: Annotated[EpisodeId, "Its id."]
-    why: Annotated[str, "Why it yielded nothing."]
+    why: Annotated[str, "The reason."]
 
 
 @dataclass(frozen=True)
@@ -134,12 +130,7 @@ class BuildReport:
 
 
 def report_of(identity: DatasetIdentity, skipped: dict[str, str]) -> dict[str, Any]:
-    """Return the build report of a dataset as plain values.
-
-    Args:
-        identity: The dataset.
-        skipped: Ids of episodes that yielded nothing, and why.
-    """
+    """Return the build report of a dataset as plain values; see `complete_dataset`."""
     return {
         "format_version": FORMAT_VERSION,
         "kind": identity.kind,
@@ -154,13 +145,13 @@ def _add_columns(root: Path, records: Sequence[EpisodeRecord]) -> None:
     table = pa.concat_tables([open_parquet(path).read() for path in paths]).combine_chunks()
     table = table.sort_by("episode_index")
     for name in ("meta/episodes/chunk_index", "meta/episodes/file_index"):
-        place = table.schema.get_field_index(name)
-        table = table.set_column(place, name, pa.array([0] * len(table), pa.int64()))
+        position = table.schema.get_field_index(name)
+        table = table.set_column(position, name, pa.array([0] * len(table), pa.int64()))
     schema = arrow_schema(EpisodeRecord, sorted(records[0].feature_sha256))
-    own = to_table(records, schema)
+    added = to_table(records, schema)
     for field in schema:
-        if field.name not in _LEROBOTS:
-            table = table.append_column(field, own[field.name])
+        if field.name not in _LEROBOT_FIELDS:
+            table = table.append_column(field, added[field.name])
     for path in paths:
         path.unlink()
     _write_table(paths[0], table)
@@ -169,10 +160,10 @@ def _add_columns(root: Path, records: Sequence[EpisodeRecord]) -> None:
 
 
 def _write_table(path: Path, table: pa.Table) -> None:
-    """Write a table that is read whole: of over a hundred columns, what skips rows is a burden.
+    """Write a table that is always read whole, as one row group without statistics.
 
-    Most of it are SHA-256 sums, no two the same, to which a dictionary would only add numbers. It
-    is written once and fetched with the first buffer, so it is compressed as well as can be.
+    Most of it are distinct SHA-256 sums, so dictionaries would only add bytes. It is fetched with
+    the first buffer, so it is compressed as well as possible.
     """
     with writing(path) as file:
         pq.write_table(
@@ -188,7 +179,7 @@ def _write_table(path: Path, table: pa.Table) -> None:
 
 
 def _sort_statistics(path: Path) -> None:
-    """Sort the features: LeRobot writes them in the order of a set, which differs between runs."""
+    """Sort the features: LeRobot writes them in set order, which differs between runs."""
     statistics = json.loads(path.read_text(encoding="utf-8"))
     text = json.dumps(statistics, indent=4, sort_keys=True, allow_nan=False)
     write_text(path, text + "\n")

@@ -1,4 +1,4 @@
-"""Statistics of images, as LeRobot stores them, and those that a dataset has of its episodes."""
+"""Statistics of images, as LeRobot stores them."""
 
 import math
 from typing import Any
@@ -12,11 +12,15 @@ from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import FormatError, MissingFileError
 from robomme_interference_data.storage.parquet import RowSpan, reading
 
-STATISTICS = ("min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99")
-"""Names of the statistics in LeRobot's order, which is that of its columns."""
+QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+
+STATISTICS = ("min", "max", "mean", "std", "count", *QUANTILES)
+"""Names of the statistics in the order of LeRobot's columns."""
 
 Statistics = dict[str, dict[str, NDArray[Any]]]
 """Feature to name of a statistic to its values."""
+
+_STEP = 4
 
 
 class ImageStats:
@@ -26,15 +30,12 @@ class ImageStats:
     makes them exact on those pixels, and the same on every machine.
     """
 
-    _STEP = 4
-    _QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
-
     def __init__(self) -> None:
         self._counts = np.zeros((3, 256), np.int64)
 
     def add(self, image: NDArray[np.uint8]) -> None:
-        """Count a frame, `(H, W, 3) uint8`."""
-        pixels = image[:: self._STEP, :: self._STEP]
+        """Count the pixels of a frame, `(H, W, 3) uint8`."""
+        pixels = image[::_STEP, ::_STEP]
         for channel in range(3):
             self._counts[channel] += np.bincount(pixels[..., channel].ravel(), minlength=256)
 
@@ -45,17 +46,18 @@ class ImageStats:
         mean = (self._counts * values).sum(axis=1) / total
         variance = (self._counts * (values[None] - mean[:, None]) ** 2).sum(axis=1) / total
         cumulated = self._counts.cumsum(axis=1)
-        stats = {
+        quantiles = {
+            name: np.argmax(cumulated >= quantile * total[:, None], axis=1).astype(np.float64)
+            for name, quantile in QUANTILES.items()
+        }
+        return {
             "min": np.argmax(self._counts > 0, axis=1).astype(np.float64),
             "max": 255.0 - np.argmax(self._counts[:, ::-1] > 0, axis=1),
             "mean": mean,
             "std": np.sqrt(variance),
             "count": np.array([int(total[0])]),
+            **quantiles,
         }
-        for quantile in self._QUANTILES:
-            reached = cumulated >= quantile * total[:, None]
-            stats[f"q{round(quantile * 100):02d}"] = np.argmax(reached, axis=1).astype(np.float64)
-        return stats
 
 
 def episode_table(dataset: Dataset) -> pa.Table:
@@ -71,26 +73,30 @@ def episode_table(dataset: Dataset) -> pa.Table:
 def episode_statistics(table: pa.Table) -> list[Statistics]:
     """Return the statistics of each episode in LeRobot's table, images on the scale 0 to 1."""
     columns = [name for name in table.column_names if name.startswith("stats/")]
-    found: list[Statistics] = []
+    episodes: list[Statistics] = []
     for row in table.select(columns).to_pylist():
-        found.append({})
+        episodes.append({})
         for column, values in row.items():
             feature, _, name = column.removeprefix("stats/").rpartition("/")
             try:
                 numbers = np.ravel(np.asarray(values, np.int64 if name == "count" else np.float64))
             except (TypeError, ValueError):
                 raise FormatError.damaged(EPISODES_DIR, f"{column} is {values}") from None
-            found[-1].setdefault(feature, {})[name] = numbers
-    return found
+            episodes[-1].setdefault(feature, {})[name] = numbers
+    return episodes
 
 
 def before_scaling(name: str, values: NDArray[Any]) -> NDArray[Any]:
-    """Return what LeRobot divided by 255 when it stored a statistic of images, bit for bit."""
+    """Return the values of an image statistic before LeRobot divided them by 255, bit for bit.
+
+    LeRobot divides again when it writes an extended dataset; of a lossy one, the frames that the
+    statistics were computed from no longer exist.
+    """
     if name == "count":
         return values
-    found = []
+    scaled = []
     for value in values.tolist():
         near = value * 255
         steps = (near, math.nextafter(near, math.inf), math.nextafter(near, -math.inf))
-        found.append(next((one for one in steps if one / 255 == value), near))
-    return np.array(found)
+        scaled.append(next((one for one in steps if one / 255 == value), near))
+    return np.array(scaled)

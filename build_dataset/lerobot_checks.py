@@ -1,6 +1,6 @@
 """Check LeRobot's own files in a dataset against its episodes and its data.
 
-A file whose SHA-256 is the recorded one can still hold wrong values, if it was written so.
+A file with the recorded SHA-256 can still hold wrong values, if it was written so.
 """
 
 from collections.abc import Iterator, Mapping
@@ -24,7 +24,7 @@ from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.files import read_json
 from robomme_interference_data.storage.lerobot import LeRobotFiles
 
-from .image_stats import STATISTICS, Statistics, episode_statistics, episode_table
+from .image_stats import QUANTILES, STATISTICS, Statistics, episode_statistics, episode_table
 
 _TOLERANCE_S = 1e-4
 """LeRobot's own tolerance of timestamps, in seconds."""
@@ -34,7 +34,7 @@ _FRAME_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_in
 
 
 def lerobot_violations(dataset: Dataset) -> Iterator[tuple[str, str]]:
-    """Yield the file or episode, and what is not so."""
+    """Yield each violation: the file or episode, and what is wrong."""
     yield from _info(dataset)
     table = episode_table(dataset)
     yield from _columns(dataset, table.column_names)
@@ -43,11 +43,10 @@ def lerobot_violations(dataset: Dataset) -> Iterator[tuple[str, str]]:
     tasks = dataset.lerobot.tasks
     if list(tasks.values()) != list(range(len(tasks))):
         yield TASKS_PATH, f"task_index is {list(tasks.values())[:5]}; expected 0, 1, …"
-    used = {record.goal for record in dataset.records()}
-    if set(tasks) != used:
+    if set(tasks) != {record.goal for record in dataset.records()}:
         yield TASKS_PATH, "does not list the goals of the episodes, each once"
     first = 0
-    places: dict[str, int] = {}
+    users: dict[str, int] = {}
     for record in dataset.records():
         row = dataset.lerobot.row(record.episode_index)
         expected: dict[str, Any] = {
@@ -63,18 +62,18 @@ def lerobot_violations(dataset: Dataset) -> Iterator[tuple[str, str]]:
             if not _equal(row.get(name), value):
                 what = f"{name} of {record.episode_id} is {row.get(name)}; expected {value}"
                 yield EPISODES_DIR, what
-        place = dataset.lerobot.locate(record.episode_index)
-        for path in (place.data, *(path for path, _ in place.videos.values())):
-            other = places.setdefault(path, record.episode_index)
+        location = dataset.lerobot.locate(record.episode_index)
+        for path in (location.data, *(path for path, _ in location.videos.values())):
+            other = users.setdefault(path, record.episode_index)
             if other != record.episode_index:
                 yield path, f"is shared by episodes {other} and {record.episode_index}"
         try:
-            for path, _ in place.videos.values():
+            for path, _ in location.videos.values():
                 dataset.files.path(path)
-            own = statistics[record.episode_index]
-            yield from _rows(dataset, record.episode_index, first, tasks.get(record.goal), own)
+            stored = statistics[record.episode_index]
+            yield from _rows(dataset, record.episode_index, first, tasks.get(record.goal), stored)
         except InterferenceError as error:
-            yield place.data, error.message
+            yield location.data, error.message
         first += record.length
 
 
@@ -92,20 +91,20 @@ def _columns(dataset: Dataset, names: list[str]) -> Iterator[tuple[str, str]]:
     features = (*dataset.features, *_FRAME_COLUMNS)
     statistics = {f"stats/{feature}/{name}" for feature in features for name in STATISTICS}
     copy, table = dataset.lerobot.table, LeRobotFiles(dataset.files).table
-    yield from _differing(EPISODES_DIR, names, lean | statistics)
-    yield from _differing(RECORDS_PATH, copy.column_names, lean)
+    yield from _names(EPISODES_DIR, names, lean | statistics)
+    yield from _names(RECORDS_PATH, copy.column_names, lean)
     for name in lean & {*copy.column_names} & {*table.column_names}:
         if copy[name] != table[name]:
-            yield RECORDS_PATH, f"column {name} is not that of {EPISODES_DIR}"
+            yield RECORDS_PATH, f"column {name} differs from that of {EPISODES_DIR}"
         elif name in records.names and copy.schema.field(name).type != records.field(name).type:
             kind = records.field(name).type
             yield RECORDS_PATH, f"column {name} is of type {copy[name].type}; expected {kind}"
 
 
-def _differing(where: str, found: list[str], expected: set[str]) -> Iterator[tuple[str, str]]:
-    for name in sorted(expected.symmetric_difference(found)):
-        yield where, f"column {name} {'is missing' if name in expected else 'is too many'}"
-    if len({*found}) < len(found):
+def _names(where: str, names: list[str], expected: set[str]) -> Iterator[tuple[str, str]]:
+    for name in sorted(expected.symmetric_difference(names)):
+        yield where, f"{name} is {'missing' if name in expected else 'undeclared'}"
+    if len({*names}) < len(names):
         yield where, "has two columns of one name"
 
 
@@ -120,18 +119,15 @@ def _info(dataset: Dataset) -> Iterator[tuple[str, str]]:
     for name, value in expected.items():
         if info.get(name) != value:
             yield INFO_PATH, f"{name} is {info.get(name)}; expected {value}"
-    yield from _differing(
-        INFO_PATH, [*dataset.lerobot.features], {*dataset.features, *_FRAME_COLUMNS}
-    )
+    yield from _names(INFO_PATH, [*dataset.lerobot.features], {*dataset.features, *_FRAME_COLUMNS})
 
 
 def _total_statistics(dataset: Dataset, episodes: list[Statistics]) -> Iterator[tuple[str, str]]:
     """Check that the statistics of the dataset follow from those of its episodes."""
     stats = read_json(dataset.files.path(STATS_PATH))
-    features = (*dataset.features, *_FRAME_COLUMNS)
-    for name in sorted({*features}.symmetric_difference(stats)):
-        yield STATS_PATH, f"{name} {'is missing' if name in features else 'is too many'}"
-    for name in {*features} & stats.keys():
+    features = {*dataset.features, *_FRAME_COLUMNS}
+    yield from _names(STATS_PATH, [*stats], features)
+    for name in features & stats.keys():
         try:
             expected = _aggregated([one[name] for one in episodes])
             same = stats[name].keys() == expected.keys() and all(
@@ -141,70 +137,64 @@ def _total_statistics(dataset: Dataset, episodes: list[Statistics]) -> Iterator[
         except (AttributeError, KeyError, TypeError, ValueError):
             same = False
         if not same:
-            yield STATS_PATH, f"{name} is not what follows from the statistics of the episodes"
+            yield STATS_PATH, f"{name} does not follow from the statistics of the episodes"
 
 
 def _aggregated(episodes: list[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the statistics of all episodes from those of each, as LeRobot does."""
+    """Return the statistics of all episodes, like LeRobot, which is not needed to verify."""
     values = {name: np.stack([one[name] for one in episodes]) for name in STATISTICS}
-    counts = values["count"]
-
-    def weighted(parts: Any) -> Any:
-        return (parts * counts).sum(axis=0) / counts.sum(axis=0)
-
-    found = {name: weighted(values[name]) for name in STATISTICS}
-    variances = values["std"] ** 2 + (values["mean"] - found["mean"]) ** 2
-    return found | {
+    weights = values["count"] / values["count"].sum(axis=0)
+    total = {name: (values[name] * weights).sum(axis=0) for name in STATISTICS}
+    variances = values["std"] ** 2 + (values["mean"] - total["mean"]) ** 2
+    return total | {
         "min": values["min"].min(axis=0),
         "max": values["max"].max(axis=0),
-        "std": np.sqrt(weighted(variances)),
-        "count": counts.sum(axis=0),
+        "std": np.sqrt((variances * weights).sum(axis=0)),
+        "count": values["count"].sum(axis=0),
     }
 
 
-def differing_statistics(found: Mapping[str, Any], values: Any) -> list[str]:
-    """Return the names of statistics that are not those of values, `(T, D)`.
+def _differing_statistics(stored: Mapping[str, Any], values: Any) -> Iterator[str]:
+    """Yield the names of stored statistics that are not those of values, `(T, D)`.
 
-    LeRobot computes them with 32 bits, and quantiles from a histogram of 5,000 bins.
+    LeRobot computes them in 32 bits, and quantiles from a histogram of 5,000 bins.
     """
     lowest, highest = values.min(axis=0), values.max(axis=0)
     largest = 1 + np.abs(values).max(axis=0)
+    fine, binned = 1e-6 * largest, 1e-6 * largest + 1e-3 * (highest - lowest)
     expected = {
-        "min": lowest,
-        "max": highest,
-        "mean": values.mean(axis=0),
-        "std": values.std(axis=0),
+        "min": (lowest, fine),
+        "max": (highest, fine),
+        "mean": (values.mean(axis=0), fine),
+        "std": (values.std(axis=0), 1e-3 * largest),
+        "count": (np.array([len(values)]), 0),
     }
-    expected["count"] = np.array([len(values)])
-    for name in STATISTICS[5:]:
-        expected[name] = np.quantile(values, int(name[1:]) / 100, axis=0, method="inverted_cdf")
-    tolerance = {name: 1e-6 * largest for name in expected} | {"count": 0, "std": 1e-3 * largest}
-    tolerance |= {name: 1e-6 * largest + 1e-3 * (highest - lowest) for name in STATISTICS[5:]}
-    return [
-        name
-        for name in STATISTICS
-        if np.shape(found.get(name, ())) != np.shape(expected[name])
-        or not (np.abs(found[name] - expected[name]) <= tolerance[name]).all()
-    ]
+    for name, quantile in QUANTILES.items():
+        expected[name] = np.quantile(values, quantile, axis=0, method="inverted_cdf"), binned
+    for name, (value, tolerance) in expected.items():
+        found = stored.get(name, np.empty(0))
+        if found.shape != value.shape or not (np.abs(found - value) <= tolerance).all():
+            yield name
 
 
 def _rows(
     dataset: Dataset, index: int, first: int, task: int | None, statistics: Statistics
 ) -> Iterator[tuple[str, str]]:
-    """Check the columns that LeRobot adds to every frame, and the statistics of all."""
+    """Check the columns that LeRobot adds to every frame, and the statistics of all columns."""
     rows = dataset.lerobot.rows(index)
     path = dataset.lerobot.locate(index).data
     frames = np.arange(len(rows))
     vectors = [name for name in dataset.features if not name.startswith(CAMERA_PREFIX)]
-    yield from _differing(path, rows.names, {*vectors, *_FRAME_COLUMNS})
+    yield from _names(path, rows.names, {*vectors, *_FRAME_COLUMNS})
     values = {name: dataset.lerobot.vectors(index, name).astype(float) for name in vectors}
-    for name, expected in (
-        ("index", first + frames),
-        ("task_index", np.full(len(rows), -1 if task is None else task)),
-    ):
-        values[name] = expected[:, None]
-        if not np.array_equal(rows.scalars(name), expected):
-            yield path, f"{name} of episode {index} is not {expected[0]} to {expected[-1]}"
+    values["index"] = (first + frames)[:, None]
+    if task is not None:  # else the list of tasks is a violation
+        values["task_index"] = np.full((len(rows), 1), task)
+    for name in ("index", "task_index"):
+        if name in values and not np.array_equal(rows.scalars(name), values[name][:, 0]):
+            start, stop = values[name][0, 0], values[name][-1, 0]
+            expected = f"{start} to {stop}" if name == "index" else f"{start} in all frames"
+            yield path, f"{name} of episode {index} is not {expected}"
     times = rows.table(["timestamp"])["timestamp"]
     if not pa.types.is_floating(times.type):
         yield path, f"timestamp of episode {index} is of type {times.type}"
@@ -213,11 +203,11 @@ def _rows(
     values |= {"frame_index": frames[:, None], "episode_index": np.full((len(rows), 1), index)}
     values["timestamp"] = frames[:, None] / dataset.lerobot.fps
     for name, value in values.items():
-        for one in differing_statistics(statistics.get(name, {}), value):
+        for one in _differing_statistics(statistics.get(name, {}), value):
             yield EPISODES_DIR, f"stats/{name}/{one} of episode {index} is not that of its data"
 
 
-def _equal(found: Any, expected: Any) -> bool:
+def _equal(stored: Any, expected: Any) -> bool:
     if isinstance(expected, float):
-        return isinstance(found, float) and abs(found - expected) <= _TOLERANCE_S
-    return bool(found == expected)
+        return isinstance(stored, float) and abs(stored - expected) <= _TOLERANCE_S
+    return bool(stored == expected)

@@ -1,7 +1,7 @@
-"""Plan the buffers of a buffer set: for every query episode and every condition, what it holds.
+"""Plan the buffers of a buffer set, one for every query episode and condition.
 
-Rules 5 and 8 of the protocol; what a condition holds is `schema/conditions.py`, what sessions there
-are `data/query_sessions.py`.
+Rules 5 and 8 of the protocol. `schema/conditions.py` defines the content of a condition, and
+`data/query_sessions.py` provides the sessions.
 """
 
 import shutil
@@ -50,18 +50,12 @@ from robomme_interference_data.storage.parquet import writing
 from robomme_interference_data.storage.staging import staging_dir
 
 _BATCH = 1024
-"""Rows in a row group: few bytes find one buffer."""
+"""Rows in a row group: finding one buffer reads few bytes."""
 
 
 @dataclass(frozen=True)
 class ManifestPlan:
-    """All that decides the manifests.
-
-    Attributes:
-        source: The datasets of the buffer set, and the seed of the draw.
-        conditions: For which buffers are planned, in order.
-        position_limit: Longest history plus rollout that the systems hold; None for no limit.
-    """
+    """Everything that determines the manifests; a position limit of None is no limit."""
 
     source: SessionSource
     conditions: tuple[Condition, ...]
@@ -79,43 +73,36 @@ class ManifestPlan:
 
 
 def in_folder(root: Path) -> dict[str, Files]:
-    """Return where the datasets of a buffer set lie that is built in a folder."""
-    further = (name for name in OPTIONAL_DATASETS if (root / name / IDENTITY_PATH).is_file())
-    return {name: LocalFiles(root / name) for name in (DEMONSTRATIONS, DISTRACTORS, *further)}
+    """Return the datasets of the buffer set that is built in a folder, by name."""
+    optional = (name for name in OPTIONAL_DATASETS if (root / name / IDENTITY_PATH).is_file())
+    return {name: LocalFiles(root / name) for name in (DEMONSTRATIONS, DISTRACTORS, *optional)}
 
 
 def plan_manifests(
-    places: Mapping[str, Files],
+    files: Mapping[str, Files],
     conditions: Sequence[str | Condition] = DEFAULT_CONDITIONS,
     seed: int = 0,
     position_limit: int | None = POSITION_LIMIT,
 ) -> ManifestPlan:
-    """Check that the datasets of a buffer set and the options fit each other.
-
-    Args:
-        places: Where the datasets of the buffer set lie, by name; see `in_folder`.
-        conditions: For which buffers are planned.
-        seed: Seed of the draw.
-        position_limit: See `ManifestPlan`.
-    """
+    """Check that the datasets of a buffer set, by name, and the options fit each other."""
     ordered = in_order(conditions)
-    check_needs(ordered, places)
+    check_needs(ordered, files)
     opened = {}
-    for name, files in places.items():
-        opened[name] = dataset = Dataset(files)
+    for name, one in files.items():
+        opened[name] = dataset = Dataset(one)
         if dataset.kind != name:
             raise InvalidOptionError(
-                f"{files.describe()} is a dataset of {dataset.kind}",
-                f"Put the {name} there.",
-                f"build {name} --source KIND:PATH --out {files.location}",
+                f"{one.describe()} is a dataset of {dataset.kind}; expected {name}",
+                f"Move it away, and build the {name} in its place.",
+                f"build {name} BUFFER_SET --source KIND:PATH",
             )
     _check_features(opened)
     for name in UNITS.keys() & opened.keys():
         splits = {record.episode_id.split for record in opened[name].records()}
         if splits != {"train"}:
             raise SourceError(
-                "distractor units must come from train episodes, so that no query's own scene "
-                f"leaks into another buffer; found {', '.join(sorted(splits))}",
+                "distractor units must come from train episodes, so that no query's scene leaks "
+                f"into another buffer; found {', '.join(sorted(splits))}",
                 f'Build the {name} with split="train".',
             )
     if SHIFTED in opened:
@@ -123,49 +110,44 @@ def plan_manifests(
     return ManifestPlan(SessionSource(opened, seed), ordered, position_limit)
 
 
-def check_needs(conditions: Iterable[Condition], there: Collection[str]) -> None:
-    """Check that a buffer set has the datasets that conditions need.
-
-    Args:
-        conditions: The conditions.
-        there: Names of the datasets that it has.
-    """
+def check_needs(conditions: Iterable[Condition], available: Collection[str]) -> None:
+    """Check that the available datasets are all that conditions need."""
     for condition in conditions:
         for name in condition.kind.needs:
-            if name not in there:
+            if name not in available:
                 raise SourceError(
                     f"{condition} needs the dataset {name}, which the buffer set lacks",
                     f"Build it first, or leave {condition} out.",
-                    f"build {name} --source KIND:PATH --out BUFFER_SET/{name}",
+                    f"build {name} BUFFER_SET --source KIND:PATH",
                 )
 
 
 def _check_features(datasets: Mapping[str, Dataset]) -> None:
     """Check that sessions of all datasets can follow one another in a buffer."""
-    shown = {
+    stored = {
         name: {feature: s for feature, s in one.features.items() if feature != ACTION}
         for name, one in datasets.items()
     }
-    for name, features in shown.items():
-        if features != shown[DEMONSTRATIONS]:
+    for name, features in stored.items():
+        if features != stored[DEMONSTRATIONS]:
             raise SourceError(
                 "sessions of the datasets cannot follow one another in a buffer: the "
-                f"demonstrations have {shown[DEMONSTRATIONS]}, the {name} {features}",
+                f"demonstrations have {stored[DEMONSTRATIONS]}, the {name} {features}",
                 "Build all with the same `cameras`, from sources with the same sizes.",
             )
 
 
 def _check_scenes(shifted: Dataset, base: Dataset) -> None:
-    """Check that views under shifts are of the scenes of the demonstrations, and of all."""
-    found, wanted = ([*one.identity.sources] for one in (shifted, base))
-    why = f"was built from {found}, the demonstrations from {wanted}"
-    if all(one in wanted for one in found):
-        there, asked = ({r.episode_id for r in one.records()} for one in (shifted, base))
-        why = f"lacks {min(asked - there)}" if asked - there else ""
-    if why:
+    """Check that the views under shifts show the scenes of all demonstrations."""
+    sources, expected = ([*one.identity.sources] for one in (shifted, base))
+    views, queries = ({r.episode_id for r in one.records()} for one in (shifted, base))
+    problem = f"lacks {min(queries - views)}" if queries - views else ""
+    if not all(one in expected for one in sources):
+        problem = f"was built from {sources}, the demonstrations from {expected}"
+    if problem:
         raise SourceError(
-            f"{shifted.files.describe()} {why}",
-            "Build it of all query episodes, or remove it.",
+            f"{shifted.files.describe()} {problem}",
+            "Build it from all query episodes, or remove it.",
             f"build {SHIFTED}",
         )
 
@@ -174,50 +156,43 @@ def planned_buffers(plan: ManifestPlan) -> Iterator[BufferManifest]:
     """Yield the manifests of all buffers: queries in canonical order, conditions as planned."""
     for record in sorted(plan.demonstrations.records(), key=lambda one: one.episode_id.sort_key):
         sessions = QuerySessions(plan.source, record)
-        # The largest first: fewer units begin those that are drawn for it.
+        # The largest first: smaller draws are the beginning of it.
         buffers = {one.name: sessions.buffer(one) for one in reversed(plan.conditions)}
         for condition in plan.conditions:
-            _check_length(buffers[condition.name], plan.position_limit)
-            yield buffers[condition.name]
+            manifest, limit = buffers[condition.name], plan.position_limit
+            needed = manifest.history_frames + MAX_STEPS
+            if limit is not None and needed > limit:  # rule 8
+                raise HistoryTooLongError(
+                    f"{manifest} needs {needed} positions ({manifest.history_frames} history "
+                    f"frames + {MAX_STEPS} steps); the limit is {limit}",
+                    'Leave out the condition, or set position_limit="none" for systems without a '
+                    "limit.",
+                )
+            yield manifest
 
 
-def _check_length(manifest: BufferManifest, limit: int | None) -> None:
-    """Check that a buffer and its rollout fit the systems' position embeddings (rule 8)."""
-    needed = manifest.history_frames + MAX_STEPS
-    if limit is not None and needed > limit:
-        raise HistoryTooLongError(
-            f"{manifest} needs {needed} positions ({manifest.history_frames} history frames + "
-            f"{MAX_STEPS} steps); the released servers hold {limit}",
-            'Leave out that condition, or set position_limit="none" for systems without a limit.',
-        )
-
-
-def check_place(root: Path) -> None:
-    """Check that nothing else lies where the manifests of a buffer set are to be."""
+def check_manifests_folder(root: Path) -> None:
+    """Check that the manifests folder of a buffer set holds nothing else."""
     out = root.resolve() / MANIFESTS
-    strangers = {path.name for path in out.glob("[!.]*")} - {MANIFEST_ROWS, MANIFEST_HEADER}
-    if (strangers and not (out / MANIFEST_HEADER).is_file()) or out.is_file():
-        raise BuildError(
-            f"{out} exists and holds no manifests, but {min(strangers, default='is a file')}"
-        )
+    other = {path.name for path in out.glob("[!.]*")} - {MANIFEST_ROWS, MANIFEST_HEADER}
+    if (other and not (out / MANIFEST_HEADER).is_file()) or out.is_file():
+        what = f"holds {min(other)}" if other else "is a file"
+        raise BuildError(f"{out} exists and {what}; expected a folder with manifests only")
 
 
 def write_manifests(plan: ManifestPlan, root: Path) -> Iterator[int]:
     """Write the manifests of a buffer set; yields the number of buffers done after each batch.
 
-    Whenever it is interrupted, the buffer set has either the earlier manifests or the new ones: until
-    `manifest.json` is replaced, the new rows lie beside the old ones under a name that it tells.
-
-    Args:
-        plan: What to write.
-        root: The buffer set; manifests of an earlier run are replaced.
+    After an interruption at any time, the buffer set has either the old manifests or the new ones:
+    the new rows are first stored beside the old ones, under a name that follows from the new
+    `manifest.json`.
     """
     out = root.resolve() / MANIFESTS
     rows, header = out / MANIFEST_ROWS, out / MANIFEST_HEADER
     with staging_dir(out) as work:
         try:
             out.mkdir(exist_ok=True)
-            check_place(root)
+            check_manifests_folder(root)
             written = work / rows.name
             counts = yield from _write_rows(plan, written)
             made = _header(plan, counts, sha256_file(written))
@@ -226,14 +201,14 @@ def write_manifests(plan: ManifestPlan, root: Path) -> Iterator[int]:
             written.replace(pending)
             (work / header.name).replace(header)
             pending.replace(rows)
-            for leftover in out.glob(".*.parquet"):  # of a run that was interrupted
+            for leftover in out.glob(".*.parquet"):  # of an interrupted run
                 leftover.unlink()
         finally:
             shutil.rmtree(work, ignore_errors=True)
 
 
 def _write_rows(plan: ManifestPlan, path: Path) -> Generator[int, None, dict[str, int]]:
-    """Write all rows; yields the number of buffers after each batch, and returns the counts."""
+    """Write all rows; yields the number of buffers of each batch, and returns the counts."""
     schema = arrow_schema(BufferManifest)
     buffers = sessions = 0
     with (

@@ -20,14 +20,10 @@ Spot = tuple[float, float]
 
 
 def picture(view: NDArray[np.uint8], marks: Sequence[Sequence[Pixel]]) -> NDArray[np.uint8]:
-    """Return a first live view with options marked and lettered, `(H, W, 3) uint8`, larger.
+    """Return an enlarged first live view with options marked and lettered, `(H, W, 3) uint8`.
 
-    Options of one point have their letters over it; options of several points, which are paths, a
-    drawing each; without points the picture is the view.
-
-    Args:
-        view: The view, `(H, W, 3) uint8`.
-        marks: Of each option the points, (y, x) in pixels of the view.
+    An option of one point has its letter over it. Options of several points are paths: each gets
+    its own drawing. Without points, the picture is the view.
     """
     if not all(marks):
         return _enlarged(view, 2)
@@ -46,12 +42,12 @@ def picture(view: NDArray[np.uint8], marks: Sequence[Sequence[Pixel]]) -> NDArra
         for letter, path in zip(LETTERS, marks, strict=False)
     ]
     tiles += [np.full_like(tiles[0], 255)] * (len(tiles) % 2)
-    rows = [np.concatenate(tiles[place : place + 2], 1) for place in range(0, len(tiles), 2)]
+    rows = [np.concatenate(tiles[first : first + 2], 1) for first in range(0, len(tiles), 2)]
     return np.concatenate(rows)
 
 
 def _window(view: NDArray[np.uint8], points: Sequence[Pixel]) -> tuple[int, int, int]:
-    """Return top, left and side of the square of a view that has points well inside."""
+    """Return top, left and side of a square of the view, with the points well inside."""
     low, high = np.min(points, 0), np.max(points, 0)
     side = min(int((high - low).max()) + 2 * _MARGIN, *view.shape[:2])
     top, left = (
@@ -68,22 +64,22 @@ def _tile(part: NDArray[np.uint8], letter: str, path: Sequence[Spot]) -> NDArray
     """
     image = Image.fromarray(part)
     draw = ImageDraw.Draw(image)
-    for colour, wide in ((_INK, 9), (_PATH, 5)):
-        draw.line(list(path), fill=colour, width=wide, joint="curve")
-        _arrow(draw, path, colour, wide)
+    for color, wide in ((_INK, 9), (_PATH, 5)):
+        draw.line(list(path), fill=color, width=wide, joint="curve")
+        _arrow(draw, path, color, wide)
         x, y = path[0]
-        draw.ellipse((x - wide - 2, y - wide - 2, x + wide + 2, y + wide + 2), fill=colour)
+        draw.ellipse((x - wide - 2, y - wide - 2, x + wide + 2, y + wide + 2), fill=color)
     numbers: dict[Spot, list[str]] = {}
     for number, point in enumerate(path, 1):
         numbers.setdefault(point, []).append(str(number))
-    for (x, y), those in numbers.items() if len(path) > 2 else ():
-        _text(draw, ",".join(those), (x, y - 22))
+    for (x, y), labels in numbers.items() if len(path) > 2 else ():
+        _text(draw, ",".join(labels), (x, y - 22))
     _letter(draw, letter, (30, 30))
     draw.rectangle((0, 0, image.width - 1, image.height - 1), outline=_PAPER, width=2)
     return np.asarray(image)
 
 
-def _arrow(draw: Any, points: Sequence[Spot], colour: str, wide: int) -> None:
+def _arrow(draw: Any, points: Sequence[Spot], color: str, wide: int) -> None:
     (x0, y0), (x1, y1) = points[-2:]
     way = math.atan2(y1 - y0, x1 - x0)
     size = 2 * wide + 6
@@ -91,7 +87,7 @@ def _arrow(draw: Any, points: Sequence[Spot], colour: str, wide: int) -> None:
         (x1 + size * math.cos(way + turn), y1 + size * math.sin(way + turn))
         for turn in (0.0, 2.4, -2.4)
     ]
-    draw.polygon(corners, fill=colour)
+    draw.polygon(corners, fill=color)
 
 
 def _letter(draw: Any, letter: str, at: Spot) -> None:

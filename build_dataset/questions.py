@@ -1,4 +1,4 @@
-"""Make the questions about the past of a buffer set: what is asked, and what stands for an answer."""
+"""Make the questions about the past of a buffer set."""
 
 import dataclasses
 import hashlib
@@ -21,14 +21,14 @@ from robomme_interference_data.storage.encode import png
 from robomme_interference_data.storage.parquet import writing
 
 _MOST, _DRAWN = 5, 4
-"""Options of a question at most; and of one whose scene allows more answers."""
+"""Most options of a question; if the scene has more answers, the number that is drawn."""
 
 Marks = Sequence[Sequence[Pixel]]
-"""Of each option the points, (y, x) in pixels of the first live view; none where words tell it."""
+"""The points of each option, (y, x) in pixels of the first live view; none if words describe it."""
 
 
 def make_questions(buffer_set: BufferSet) -> Iterator[Question]:
-    """Make the questions of a buffer set, in canonical order; the same buffer set gives the same bytes."""
+    """Make the questions of a buffer set, in canonical order."""
     module = "robomme_interference_data.build_dataset.question_pictures"
     picture = load_extra(module, "picture", "build questions", "retrieval")
     for question, marks in planned_questions(buffer_set):
@@ -37,14 +37,14 @@ def make_questions(buffer_set: BufferSet) -> Iterator[Question]:
         if view.shape != (side, side, 3):
             raise BuildError(
                 f"the first live view of {question.episode_id} has {view.shape[1]}×{view.shape[0]} "
-                f"pixels; where things are is known in {side}×{side}",
+                f"pixels; expected {side}×{side}, in which the positions of objects are known",
                 "Build the demonstrations with the simulator itself.",
             )
         yield dataclasses.replace(question, picture=png(picture(view, marks)))
 
 
 def planned_questions(buffer_set: BufferSet) -> Iterator[tuple[Question, Marks]]:
-    """Yield the questions of a buffer set without their pictures, and what is marked on these."""
+    """Yield the questions of a buffer set without their pictures, and the marks on these."""
     revision = buffer_set.datasets[DEMONSTRATIONS].identity.revision
     for episode in sorted(buffer_set.episode_ids):
         yield _planned(buffer_set.query(episode), revision)
@@ -58,7 +58,7 @@ def write_questions(questions: Sequence[Question], folder: Path) -> Path:
         writing(out) as file,
         pq.ParquetWriter(file, schema, compression="none", write_page_checksum=True) as writer,
     ):
-        for one in questions:  # a row group each: the pictures are compressed already
+        for one in questions:  # one row group each: the pictures are already compressed
             writer.write_table(to_table([one], schema))
     return out
 
@@ -67,11 +67,11 @@ def _planned(query: Query, revision: str) -> tuple[Question, Marks]:
     scene, seed, name = recorded_scene(query), query.seed, str(query.episode_id)
     if scene is None or seed is None:
         raise BuildError(
-            f"{name} is of the simulator {query.simulator!r}, of whose episodes the possible "
-            "answers are not known",
-            "Questions need demonstrations of a simulator that knows them, such as tabletop.",
+            f"{name} was recorded with the simulator {query.simulator!r}, which does not list the "
+            "possible answers",
+            "Questions need demonstrations of a simulator that does, such as tabletop.",
         )
-    numbers: dict[Any, int] = {}  # choice to the first answer that stands for it
+    numbers: dict[Any, int] = {}  # choice to its first answer
     for number, answer in enumerate(scene.answers):
         numbers.setdefault(scene.choice(answer), number)
     right = scene.choice(scene.own_answer(seed))

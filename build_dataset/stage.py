@@ -1,7 +1,7 @@
-"""Stage one episode: cut and encode it while it is read, decode it again, record its hashes.
+"""Stage one episode: select and encode its frames while it is read, decode them again, hash them.
 
-A staged episode is handed to the build, which keeps it in a folder that appears under its final
-name only when it is complete: an interrupted build goes on from the folders that it finds.
+The build keeps a staged episode in a folder, which gets its final name only when it is complete:
+an interrupted build resumes from these folders.
 """
 
 import hashlib
@@ -10,13 +10,13 @@ import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, FPS, LESSONS, STATE
+from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, LESSONS, STATE
 from robomme_interference_data.errors import BuildError, InterferenceError, SourceError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
@@ -36,37 +36,31 @@ from .config import BuildPlan
 from .frame_selection import FRAME_SELECTORS, NothingToStore
 from .image_stats import STATISTICS, ImageStats
 from .lerobot_writer import StoredEpisode
-from .sources import Frame, Recording, SourceEpisode
+from .sources import Frame, Recording, Robot, SourceEpisode
 
 _RECORD = "record.json"
-_LAYOUT = 5
+_LAYOUT = 6
 """Version of a staged episode's folder."""
 
 Task = tuple[int, SourceEpisode]
-"""The number of its source, and an episode."""
+"""Index of the source, and episode."""
 
 
 @dataclass(frozen=True)
 class Staged:
-    """What is known of a staged episode.
-
-    Attributes:
-        skipped: Why the episode yields nothing; None if it yields something.
-        record: What a dataset says of it, at whatever place; None if it yields nothing.
-        features: Shape of one value by feature.
-        stats: Image statistics by feature, see `ImageStats`.
-    """
+    """Metadata of a staged episode; `skipped` is the reason if it yields nothing."""
 
     episode_id: EpisodeId
-    skipped: str | None
-    record: EpisodeRecord | None
-    features: dict[str, tuple[int, ...]]
-    stats: dict[str, dict[str, tuple[float, ...]]]
+    skipped: str | None = None
+    record: EpisodeRecord | None = None
+    features: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    stats: dict[str, dict[str, tuple[float, ...]]] = field(default_factory=dict)
+    robot: Robot | None = None
 
     def stored(self, folder: Path) -> StoredEpisode:
-        """Return the episode, which yields something, in the folder that it was staged in."""
-        assert self.record is not None
-        # In this order whether it was staged just now or read again: columns follow it.
+        """Return the episode, which yields something, with its files in `folder`."""
+        assert self.record is not None and self.robot is not None
+        # LeRobot's columns follow this order.
         stats = {
             feature: {name: np.array(values[name]) for name in STATISTICS}
             for feature, values in self.stats.items()
@@ -75,12 +69,17 @@ class Staged:
             values["count"] = values["count"].astype(np.int64)
         videos = {feature: folder / f"{feature}.mp4" for feature in stats}
         return StoredEpisode(
-            self.record, self.features, videos, stats, lambda name: np.load(folder / f"{name}.npy")
+            self.record,
+            self.features,
+            videos,
+            stats,
+            lambda name: np.load(folder / f"{name}.npy"),
+            self.robot,
         )
 
 
 def staged_name(plan: BuildPlan, task: Task) -> str:
-    """Return the name of a staged episode's folder: a hash of all that decides it."""
+    """Return the name of a staged episode's folder: a hash of all that decides its content."""
     number, episode = task
     codec = get_codec(plan.codec)
     content = {
@@ -96,16 +95,12 @@ def staged_name(plan: BuildPlan, task: Task) -> str:
 
 @dataclass(frozen=True)
 class StageTask:
-    """Stages one episode after the other, as a task of an executor.
-
-    Attributes:
-        plan: What to build.
-    """
+    """Stages episodes one by one, as a task of an executor."""
 
     plan: BuildPlan
 
     def __call__(self, task: Task, worker: Worker) -> Staged:
-        """Cut, encode and check one episode, send its files, and return what is known of it."""
+        """Stage one episode, send its files, and return its metadata."""
         number, episode = task
         with tempfile.TemporaryDirectory(dir=worker.folder) as name:
             folder = Path(name)
@@ -121,19 +116,19 @@ class StageTask:
         return staged
 
     def close(self) -> None:
-        """Release what sources hold."""
+        """Close the sources."""
         for source in self.plan.sources:
             source.close()
 
     def _write(self, episode: EpisodeId, recording: Recording, folder: Path) -> Staged:
         codec = get_codec(self.plan.codec)
-        writer = _Writer(codec, folder)
+        writer = _Writer(codec, folder, recording.robot.fps)
         try:
             for frame in FRAME_SELECTORS[self.plan.kind](recording.frames):
                 writer.add(frame)
         except NothingToStore as reason:
             writer.close()
-            return Staged(episode, str(reason), None, {}, {})
+            return Staged(episode, str(reason))
         writer.close()
         start = writer.length - 1 if self.plan.kind in LESSONS else None
         spans = {} if start is None else lesson_spans(start)
@@ -146,7 +141,7 @@ class StageTask:
                 "Please report this with the versions of the libraries.",
                 "doctor",
             )
-        # Of a lossy codec, what a reader gets is what is hashed.
+        # The hashes are those of the decoded frames, which a lossy codec changes.
         record = EpisodeRecord(
             episode_index=0,
             episode_id=episode,
@@ -165,11 +160,12 @@ class StageTask:
             feature: {name: tuple(map(float, values)) for name, values in one.result().items()}
             for feature, one in writer.stats.items()
         }
-        return Staged(episode, None, record, writer.features, stats)
+        robot = recording.robot.with_names(writer.features)
+        return Staged(episode, None, record, writer.features, stats, robot)
 
 
 def keep_staged(folder: Path, staged: Staged, files: Mapping[str, bytes]) -> None:
-    """Write a staged episode and its files into a folder, which appears when it is complete."""
+    """Write a staged episode and its files into a folder, which appears complete."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
     try:
@@ -185,17 +181,16 @@ def keep_staged(folder: Path, staged: Staged, files: Mapping[str, bytes]) -> Non
 
 
 def read_staged(folder: Path) -> Staged | None:
-    """Return what is known of the episode that a folder holds; None if there is no such folder."""
+    """Return the metadata of the episode staged in a folder; None if there is no such folder."""
     path = folder / _RECORD
     return read_header(path, Staged) if path.is_file() else None
 
 
 class _Writer:
-    """The files of a staged episode while they are written; all maps are by feature."""
+    """Writes the files of a staged episode; all maps are by feature."""
 
-    def __init__(self, codec: Codec, folder: Path):
-        self._codec = codec
-        self._folder = folder
+    def __init__(self, codec: Codec, folder: Path, fps: int):
+        self._codec, self._folder, self._fps = codec, folder, fps
         self._encoders: dict[str, VideoEncoder] = {}
         self._vectors: dict[str, list[NDArray[np.float32]]] = {}
         self.features: dict[str, tuple[int, ...]] = {}
@@ -204,7 +199,7 @@ class _Writer:
         self.length = 0
 
     def add(self, frame: Frame) -> None:
-        """Take the next frame, which must be as the first one and hold finite numbers."""
+        """Add the next frame, which must have the first one's shapes and finite numbers."""
         images = {CAMERA_PREFIX + camera: image for camera, image in frame.images.items()}
         vectors = {STATE: frame.state} | ({} if frame.action is None else {ACTION: frame.action})
         if not self.length:
@@ -224,7 +219,7 @@ class _Writer:
                 raise SourceError(
                     f"{name} of stored frame {self.length} is {value.tolist()}; expected finite "
                     "float32 numbers",
-                    "Mend the recording, or leave the episode out with `episodes`.",
+                    "Correct the recording, or leave the episode out with `episodes`.",
                 )
             self._vectors[name].append(value)
             self.digests.update(name, value)
@@ -240,7 +235,7 @@ class _Writer:
         """Decode the videos; return digests over spans of frames, vectors among them."""
         digests = SpanDigester(spans)
         for name in self._encoders:
-            images = iter_frames(self._folder / f"{name}.mp4", 0, self.length, FPS)
+            images = iter_frames(self._folder / f"{name}.mp4", 0, self.length, self._fps)
             for index, image in enumerate(images):
                 digests.update(name, index, image)
         for name, values in self._vectors.items():
@@ -257,7 +252,9 @@ class _Writer:
                     f"{name} holds images {image.shape} {image.dtype}; expected (H, W, 3) uint8"
                 )
             path = self._folder / f"{name}.mp4"
-            self._encoders[name] = VideoEncoder(path, self._codec, FPS, len(image), image.shape[1])
+            self._encoders[name] = VideoEncoder(
+                path, self._codec, self._fps, len(image), image.shape[1]
+            )
             self.stats[name] = ImageStats()
         self._vectors = {name: [] for name in vectors}
         self.features = {name: value.shape for name, value in (images | vectors).items()}

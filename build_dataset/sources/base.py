@@ -1,18 +1,21 @@
-"""What every source of recorded episodes serves."""
+"""The interface of a source of recorded episodes."""
 
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robomme_interference_data.constants import DIFFICULTIES
+from robomme_interference_data.constants import DIFFICULTIES, FPS
 from robomme_interference_data.errors import SourceError, nearest
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EvidenceSpan
+
+_PANDA = ("joint_1", "joint_2", "joint_3", "joint_4", "joint_5", "joint_6", "joint_7", "gripper")
+"""Joint positions in rad; gripper: opening in m in a state, −1 closed to 1 open in an action."""
 
 
 @dataclass(frozen=True)
@@ -25,8 +28,7 @@ class Frame:
             the gripper opening in m.
         action: Action of this time step, `(A,) float32`, or None if actions were not recorded;
             RoboMME's has 8 values: 7 absolute joint targets in rad, gripper −1 closed to 1 open.
-        is_demonstration: Whether the frame belongs to the demonstration; None if the source
-            does not say.
+        is_demonstration: Whether the frame belongs to the demonstration; None if unknown.
     """
 
     images: dict[str, NDArray[np.uint8]]
@@ -37,16 +39,42 @@ class Frame:
 
 @dataclass(frozen=True)
 class SourceEpisode:
-    """A recorded episode, as its source lists it: nothing of it was read yet.
+    """A recorded episode in a source's list; its frames are not read yet.
 
     Attributes:
         id: Episode id.
-        key: Where the source finds the episode again, and what changes if the recording does
-            (such as a file's time and size): must be picklable.
+        key: How the source finds the episode; changes with the recording (it holds, for example,
+            the file's time and size). Must be picklable.
+        marked: False if the source knows that it cannot tell where the demonstration ends.
     """
 
     id: EpisodeId
     key: Any = field(default=None, compare=False)
+    marked: bool = field(default=True, compare=False)
+
+
+@dataclass(frozen=True)
+class Robot:
+    """The robot of an episode; all episodes of a dataset have the same one.
+
+    Attributes:
+        fps: Frames per second.
+        type: Name of the robot, as in LeRobot's `robot_type`, or None.
+        names: `observation.state` and `action` to the names of their values, where known.
+    """
+
+    fps: int = FPS
+    type: str | None = None
+    names: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def with_names(self, features: Mapping[str, Sequence[int]]) -> "Robot":
+        """Return the robot with a name for every value of every vector among the features."""
+        sizes = {name: shape[0] for name, shape in features.items() if len(shape) == 1}
+        default = {
+            name: _PANDA if size == len(_PANDA) else tuple(f"value_{n}" for n in range(size))
+            for name, size in sizes.items()
+        }
+        return replace(self, names=default | self.names)
 
 
 @dataclass(frozen=True)
@@ -57,12 +85,13 @@ class Recording:
         goals: Wordings of the goal; at least one.
         seed: Seed of the simulator, or None if not recorded.
         difficulty: `easy`, `medium` or `hard`, or None if not recorded.
-        simulator: `robomme`, `tabletop`, or what the source names; None for real robots.
-        exact: False if the frames were lossily compressed before they came here.
+        simulator: `robomme`, `tabletop`, or another name; None for real robots.
+        exact: False if the frames were ever lossily compressed.
         frames: The frames in order, a bounded number in memory at a time. Closing it early
             releases the files.
         evidence: Which frames of the demonstration show the hidden answer, part by part; None
-            where the source does not say.
+            if unknown.
+        robot: The robot.
     """
 
     goals: tuple[str, ...]
@@ -72,12 +101,13 @@ class Recording:
     exact: bool
     frames: Generator[Frame]
     evidence: tuple[EvidenceSpan, ...] | None = None
+    robot: Robot = Robot()
 
     def __post_init__(self) -> None:
         if not self.goals or not all(goal.strip() for goal in self.goals):
             raise SourceError(
                 f"the goal is {' and '.join(map(repr, self.goals)) or 'missing'}",
-                "Say it in words.",
+                "Describe the goal in words.",
             )
         if self.difficulty not in (None, *DIFFICULTIES):
             raise SourceError(
@@ -87,86 +117,76 @@ class Recording:
 
 
 class Source(Protocol):
-    """A place with recorded episodes, to be inherited from. Picklable: workers get a copy each.
+    """A set of recorded episodes; base class of all sources. Picklable: each worker gets a copy.
 
     Attributes:
-        provenance: What a dataset built from it records about it, `kind` among it; the same on
-            every machine (no local paths), e.g. a Hub repository with its commit.
-        time_limit: Seconds that reading and storing one episode may take, by default.
-        whole: Whether episodes go on after the first live observation, as units need.
+        provenance: What a dataset built from the source records about it, including its `kind`;
+            the same on every machine (no local paths), e.g. a Hub repository with its commit.
+        time_limit_s: Default limit in seconds for reading and storing one episode.
+        whole: Whether episodes continue after the first live observation, as units require.
     """
 
     provenance: dict[str, Any]
-    time_limit: float = 1800.0
+    time_limit_s: float = 1800.0
     whole: bool = True
 
     def episodes(self) -> list[SourceEpisode]:
         """List all episodes, in the canonical order of their ids.
 
         Raises:
-            SourceError: The recordings cannot be used; says which, why and what to do.
+            SourceError: The recordings cannot be used; names which, why and what to do.
         """
         ...
 
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
-        """Open an episode that `episodes` listed. What it holds is known by reading it.
+        """Open an episode that `episodes` listed.
 
         Args:
             episode: The episode.
-            cameras: Names of the cameras that are wanted: no others are read; None for all.
+            cameras: Names of the cameras to read; None for all.
 
         Raises:
             InvalidOptionError: The episode has no such camera.
-            SourceError, MissingFileError, FormatError, HubError: The
-                recording cannot be read, or, while it is read, breaks off. Which episode it is
-                need not be said.
+            SourceError, MissingFileError, FormatError, HubError: The recording cannot be opened
+                or, later, read to its end. The message need not name the episode.
         """
         ...
 
     def contradict(self, episode: SourceEpisode) -> SourceEpisode:
-        """Return the episode in the very scene of one that `episodes` listed, with another answer.
+        """Return the episode in the same scene as a listed one, with another answer.
 
         Raises:
             SourceError: The source cannot make it.
         """
         raise SourceError(
-            f"no contradicting lesson of {episode.id}: in what {self.provenance['kind']} gives, "
-            "scene and answer come together",
-            "Conditions with contradicting lessons, stale-k<n> and misled-k<n>, are for the source "
-            "tabletop, which draws them apart.",
+            f"no contradicting lesson of {episode.id}: the source {self.provenance['kind']} cannot "
+            "play the same scene with another answer",
+            "Conditions with contradicting lessons, stale-k<n> and misled-k<n>, need the source "
+            "tabletop.",
         )
 
     def close(self) -> None:
-        """Release what is held from one episode to the next: nothing, unless a source says so."""
+        """Release what the source keeps between episodes."""
         return
 
 
 def file_state(path: Path) -> tuple[int, int] | None:
-    """Return what changes when a file, or a folder of files, does; None if there is none.
-
-    Returns:
-        The latest time of change in ns, and the size in bytes.
-    """
+    """Return the latest change in ns and the size in bytes of a file or of a folder's files."""
     if not path.exists():
         return None
-    found = [file.stat() for file in (path.iterdir() if path.is_dir() else [path])]
-    latest = max((one.st_mtime_ns for one in found), default=0)
-    return latest, sum(one.st_size for one in found)
+    files = [file.stat() for file in (path.iterdir() if path.is_dir() else [path])]
+    return max((one.st_mtime_ns for one in files), default=0), sum(one.st_size for one in files)
 
 
 def demonstration_length(flags: ArrayLike, what: str) -> int:
-    """Return the number of demonstration frames of an episode.
-
-    Args:
-        flags: Whether each frame belongs to the demonstration, `(T,) bool`.
-        what: What says so, for the message.
-    """
-    shown = np.asarray(flags, bool)
-    length = int(shown.sum())
-    if shown[length:].any():
+    """Return the number of demonstration frames from `what`, a flag for each frame."""
+    marked = np.asarray(flags, bool)
+    length = int(marked.sum())
+    if marked[length:].any():
         raise SourceError(
             f"{what} is true in {length} frames, not all of them at the beginning",
-            "A demonstration comes first and in one piece: mend the recording, or leave it out.",
+            "A demonstration is the first part of its episode: correct the recording, or leave it "
+            "out.",
         )
     return length
 
@@ -177,14 +197,10 @@ def compose(
     actions: NDArray[np.float32] | None,
     lesson: int | None,
 ) -> Generator[Frame]:
-    """Yield the frames of an episode whose images and vectors lie apart.
+    """Yield the frames of an episode whose images and vectors are stored apart.
 
-    Args:
-        streams: Camera name to its images in order; each is exhausted after the last frame, so
-            that it may tell that it had more, and is closed however the reading ends.
-        states: `(T, S) float32`.
-        actions: `(T, A) float32`, or None if not recorded.
-        lesson: Number of demonstration frames; None if the source does not say.
+    Each stream is exhausted after the last frame, so that it can report surplus images, and is
+    closed even if reading stops early. `lesson` is the number of demonstration frames, if known.
     """
     with ExitStack() as stack:
         for stream in streams.values():

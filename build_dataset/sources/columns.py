@@ -1,77 +1,101 @@
-"""Which column of a LeRobot dataset is the front camera, the wrist camera, the state, …."""
+"""Which column of a LeRobot dataset is which camera, the state, the action, …."""
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
-from robomme_interference_data.errors import InvalidOptionError, SourceError, UnknownNameError
+from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, STATE
+from robomme_interference_data.errors import (
+    InvalidOptionError,
+    SourceError,
+    UnknownNameError,
+    nearest,
+)
 from robomme_interference_data.simulators.base import CAMERAS
 
+_CAMERA = re.compile(r"[A-Za-z0-9][\w-]*", re.ASCII)
 _USUAL = {
     "front": ("observation.images.front", "image", "observation.images.image"),
     "wrist": ("observation.images.wrist", "wrist_image", "observation.images.wrist_image"),
-    "state": ("observation.state", "state"),
-    "action": ("action", "actions"),
+    "state": (STATE, "state"),
+    "action": (ACTION, "actions"),
     "is_demo": ("is_demo",),
     "exec_start_idx": ("exec_start_idx",),
     "subgoal": ("simple_subgoal", "grounded_subgoal"),
 }
-"""Names by which each is looked for, in this order: LeRobot's and this project's usual ones, then
-those of `lerobot/robomme` and `Yinpei/robomme_data_lerobot`."""
-
-_REQUIRED = ("front", "state")
+"""Columns of each logical name, in order of preference: LeRobot's and this project's usual names,
+then those of `lerobot/robomme` and `Yinpei/robomme_data_lerobot`."""
 
 
-def resolve_columns(
-    features: Mapping[str, Mapping[str, Any]], given: Mapping[str, str] | None, place: str
+def find_columns(
+    features: Mapping[str, Mapping[str, Any]], given: Mapping[str, str], where: str
 ) -> dict[str, str]:
-    """Find the columns of a dataset.
+    """Return logical name to column, of all columns that are used; `given` ones take precedence.
 
-    Args:
-        features: `features` of the dataset's `info.json`.
-        given: Logical name to column, for those that are not named as usual.
-        place: The dataset in words, for messages.
-
-    Returns:
-        Logical name to column, of those that the dataset has: `front` and `state` at least.
+    Every further column of color images is a camera of its own name.
     """
-    given = given or {}
-    for name in given:
-        if name not in _USUAL:
-            raise InvalidOptionError.one_of(f"columns {name}={given[name]}: name", name, _USUAL)
-    found = {}
+    columns = dict(given)
     for name, usual in _USUAL.items():
-        column = given.get(name) or next((one for one in usual if one in features), None)
-        if column is None and name in _REQUIRED:
-            raise SourceError(
-                f"{place} has no column named {' or '.join(usual)} for {name!r}; its columns are: "
-                f"{', '.join(sorted(features))}",
-                f"Name it in `columns`: {name}=COLUMN",
-            )
-        if column is None:
-            continue
+        free = [one for one in usual if one in features]
+        if name in CAMERAS:
+            free = [one for one in free if one not in given.values()]
+        if name not in given and free:
+            columns[name] = free[0]
+    for column, feature in features.items():
+        if column not in columns.values() and _unmet("", feature) is None:
+            columns[column.removeprefix(CAMERA_PREFIX)] = column
+    for name, column in columns.items():
         if column not in features:
-            raise UnknownNameError.among(f"columns {name}: column", column, place, features)
-        kind, shape = features[column]["dtype"], tuple(features[column]["shape"])
-        expected = _unmet(name, kind, shape)
-        if expected:
+            raise UnknownNameError.among(f"columns {name}: column", column, where, features)
+        if expected := _unmet(name, features[column]):
+            kind, shape = features[column]["dtype"], tuple(features[column]["shape"])
+            guess = "" if name in _USUAL else nearest(name, _USUAL, more="")
             raise SourceError(
-                f"{place}: column {column!r} holds {kind} of the shape {shape}; {name!r} needs "
+                f"{where}: column {column!r} holds {kind} of the shape {shape}; {name!r} needs "
                 f"{expected}",
-                f"Name the right one in `columns`: {name}=COLUMN",
+                f"Name the right one in `columns`: {name}=COLUMN. {guess}",
             )
-        found[name] = column
-    return found
+    cameras = camera_names(columns)
+    for name in cameras:
+        if not _CAMERA.fullmatch(name):
+            raise InvalidOptionError(
+                f"{where}: {name!r} is no camera name; expected letters, digits, - and _",
+                f"Name the camera in `columns`: NAME={columns[name]}",
+            )
+    if "state" not in columns or not cameras:
+        name, what = ("front", "camera") if not cameras else ("state", "robot state")
+        raise SourceError(
+            f"{where} has no {what}; its columns are: {', '.join(sorted(features))}",
+            f"Name its column in `columns`: {name}=COLUMN",
+        )
+    return columns
 
 
-def _unmet(name: str, kind: str, shape: tuple[int, ...]) -> str | None:
-    """Return what a column should hold, if it does not."""
-    if name in CAMERAS:
-        colours = len(shape) == 3 and 3 in (shape[0], shape[2])
-        fits, expected = colours and kind in ("video", "image"), "images or video, three channels"
-    elif name in ("state", "action"):
-        fits, expected = len(shape) == 1 and kind.startswith("float"), "a vector of floats a frame"
+def camera_names(columns: Mapping[str, str]) -> tuple[str, ...]:
+    """Return those logical names that are cameras."""
+    return tuple(name for name in columns if name in CAMERAS or name not in _USUAL)
+
+
+def value_names(feature: Mapping[str, Any]) -> tuple[str, ...] | None:
+    """Return the names of a vector's values, if the dataset has one for each."""
+    names = feature.get("names")
+    if isinstance(names, dict) and len(names) == 1:  # older datasets: {"motors": [...]}
+        [names] = names.values()
+    if not isinstance(names, list) or not all(isinstance(one, str) for one in names):
+        return None
+    return tuple(names) if len(set(names)) == len(names) == feature["shape"][0] else None
+
+
+def _unmet(name: str, feature: Mapping[str, Any]) -> str | None:
+    """Return what the column of a logical name should hold, if it does not."""
+    kind, shape = feature["dtype"], feature["shape"]
+    if name in ("state", "action"):
+        fits, expected = len(shape) == 1 and kind.startswith("float"), "a vector of floats"
     elif name == "subgoal":
-        fits, expected = kind == "string", "a text a frame"
-    else:
+        fits, expected = kind == "string", "text"
+    elif name in ("is_demo", "exec_start_idx"):
         fits, expected = kind == "bool" or "int" in kind, "booleans or whole numbers"
+    else:
+        colors = len(shape) == 3 and 3 in (shape[0], shape[2])
+        fits, expected = colors and kind in ("video", "image"), "images or video, three channels"
     return None if fits else expected

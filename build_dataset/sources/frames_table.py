@@ -1,4 +1,4 @@
-"""The table of a frames folder: `frames.parquet`, one row a frame."""
+"""The table of a frames folder: `frames.parquet`, one row per frame."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,25 +17,12 @@ from robomme_interference_data.storage.parquet import RowSpan, is_listed
 from .base import demonstration_length
 
 TABLE = "frames.parquet"
-"""Name of the table in a frames folder."""
-
-_SEE = "docs/sources.md describes the table, with an example that writes one."
+LAYOUT = "docs/how-to/your-own-recordings.md describes the layout, with an example that writes it."
 
 
 @dataclass(frozen=True)
 class EpisodeRows:
-    """An episode as the table tells it; small and picklable.
-
-    Attributes:
-        start: Its first row.
-        length: Its rows, which are its frames.
-        lesson: Frames with `is_demo`; None if the table has no such column.
-        goal: The goal in words.
-        seed: Seed of the simulator, or None.
-        difficulty: `easy`, `medium`, `hard`, or None.
-        simulator: Its name, or None.
-        exact: Whether the frames are the recorded pixels; None if not told.
-    """
+    """An episode in the table: first row, rows, demonstration frames, and its values, if any."""
 
     start: int
     length: int
@@ -57,20 +44,18 @@ def _is_vector(kind: pa.DataType) -> bool:
     return is_listed(kind) and bool(pa.types.is_floating(kind.value_type))
 
 
-_COLUMNS: dict[str, tuple[Callable[[pa.DataType], bool], str]] = {
-    "episode_id": (_is_text, "text such as MoveCube/train/3"),
-    "frame_index": (pa.types.is_integer, "whole numbers"),
-    "state": (_is_vector, "lists of floats"),
-    "goal": (_is_text, "text"),
-    "action": (_is_vector, "lists of floats"),
-    "is_demo": (pa.types.is_boolean, "true or false"),
-    "seed": (pa.types.is_integer, "whole numbers"),
-    "difficulty": (_is_text, "text"),
-    "simulator": (_is_text, "text"),
-    "exact": (pa.types.is_boolean, "true or false"),
+_TEXT = _is_text, "text"
+_VECTOR = _is_vector, "lists of floats"
+_NUMBER = pa.types.is_integer, "whole numbers"
+_FLAG = pa.types.is_boolean, "true or false"
+_REQUIRED: dict[str, tuple[Callable[[pa.DataType], bool], str]] = {
+    "episode_id": _TEXT,
+    "frame_index": _NUMBER,
+    "state": _VECTOR,
+    "goal": _TEXT,
 }
-_REQUIRED = ("episode_id", "frame_index", "state", "goal")
-_MAY_BE_EMPTY = ("seed", "difficulty", "simulator", "exact")
+_NULLABLE = {"seed": _NUMBER, "difficulty": _TEXT, "simulator": _TEXT, "exact": _FLAG}
+_COLUMNS = {**_REQUIRED, "action": _VECTOR, "is_demo": _FLAG, **_NULLABLE}
 
 
 def read_frames_table(path: Path) -> dict[EpisodeId, EpisodeRows]:
@@ -78,9 +63,12 @@ def read_frames_table(path: Path) -> dict[EpisodeId, EpisodeRows]:
     try:
         table = RowSpan(path).table()
     except FormatError as error:
-        raise SourceError(error.message, _SEE) from None
-    _check_columns(path, table)
-    found: dict[EpisodeId, EpisodeRows] = {}
+        raise SourceError(error.message, LAYOUT) from None
+    if not table.num_rows:
+        raise SourceError(f"{path} has no rows", LAYOUT)
+    if problem := _column_problem(table):
+        raise SourceError(f"{path}: {problem}", LAYOUT)
+    episodes: dict[EpisodeId, EpisodeRows] = {}
     names = np.array(table["episode_id"].to_pylist(), dtype=object)
     cuts = [0, *(np.flatnonzero(names[1:] != names[:-1]) + 1).tolist(), len(names)]
     for start, stop in pairwise(cuts):
@@ -88,35 +76,33 @@ def read_frames_table(path: Path) -> dict[EpisodeId, EpisodeRows]:
             name = EpisodeId.parse(names[start])
         except InvalidIdError as error:
             raise SourceError(f"{path}, row {start}: {error.message}", error.hint) from None
-        if name in found:
+        if name in episodes:
             raise SourceError(
-                f"{path}: the rows of {name} are not together: they go on in row {start}",
-                "Sort the table by episode_id and frame_index before it is written.",
+                f"{path}: the rows of {name} are not together: row {start} is another part",
+                "Sort the table by episode_id and frame_index.",
             )
-        found[name] = _episode(f"{path}: {name}", table.slice(start, stop - start), start)
-    return found
+        episodes[name] = _episode(f"{path}: {name}", table.slice(start, stop - start), start)
+    return episodes
 
 
-def _check_columns(path: Path, table: pa.Table) -> None:
-    if not table.num_rows:
-        raise SourceError(f"{path} has no rows", _SEE)
+def _column_problem(table: pa.Table) -> str | None:
+    """Return what is wrong with the columns of a table, if anything."""
     for name in table.column_names:
         if name not in _COLUMNS:
-            raise SourceError(
-                f"{path}: unknown column {name!r}; known are {', '.join(_COLUMNS)}",
-                f"Leave it out or rename it. {nearest(name, _COLUMNS, more='')}",
-            )
+            guess = nearest(name, _COLUMNS, more="")
+            return f"unknown column {name!r}; known are {', '.join(_COLUMNS)}. {guess}"
     for name, (fits, expected) in _COLUMNS.items():
         if name not in table.column_names:
             if name in _REQUIRED:
-                raise SourceError(f"{path}: column {name!r} is missing", _SEE)
+                return f"column {name!r} is missing"
             continue
         kind = table.schema.field(name).type
         if not fits(kind):
-            raise SourceError(f"{path}: column {name!r} holds {kind}; expected {expected}", _SEE)
-        if table[name].null_count and name not in _MAY_BE_EMPTY:
+            return f"column {name!r} holds {kind}; expected {expected}"
+        if table[name].null_count and name not in _NULLABLE:
             row = pc.index(pc.is_null(table[name]), True).as_py()
-            raise SourceError(f"{path}: column {name!r} has no value in row {row}", _SEE)
+            return f"column {name!r} has no value in row {row}"
+    return None
 
 
 def _episode(where: str, rows: pa.Table, start: int) -> EpisodeRows:
@@ -125,19 +111,18 @@ def _episode(where: str, rows: pa.Table, start: int) -> EpisodeRows:
     if len(wrong):
         raise SourceError(
             f"{where}: frame_index in row {start + int(wrong[0])} is {numbers[wrong[0]]}; "
-            f"expected {wrong[0]}, for it counts from 0 without gaps",
-            "Sort the table by episode_id and frame_index, and add the frames that are missing "
-            "or number them again.",
+            f"expected {wrong[0]}: it counts from 0 without gaps",
+            "Sort the table by episode_id and frame_index, and add missing frames.",
         )
     values: dict[str, Any] = {}
-    for column in ("goal", *_MAY_BE_EMPTY):
-        found = pc.unique(rows[column]).to_pylist() if column in rows.column_names else [None]
-        if len(found) != 1:
+    for column in ("goal", *_NULLABLE):
+        distinct = pc.unique(rows[column]).to_pylist() if column in rows.column_names else [None]
+        if len(distinct) != 1:
             raise SourceError(
-                f"{where} has several values of {column!r}: {', '.join(map(repr, found[:3]))}",
-                "Give all rows of an episode the same one, or make two episodes of it.",
+                f"{where} has several values of {column!r}: {', '.join(map(repr, distinct[:3]))}",
+                "An episode has one: make two episodes of it.",
             )
-        values[column] = found[0]
+        values[column] = distinct[0]
     marked = "is_demo" in rows.column_names
     lesson = demonstration_length(rows["is_demo"], f"{where}: is_demo") if marked else None
     return EpisodeRows(start, len(rows), lesson, **values)

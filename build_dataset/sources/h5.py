@@ -10,28 +10,19 @@ import re
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, override
 
+import h5py
 import numpy as np
 
-from robomme_interference_data.errors import InterferenceError, MissingExtraError, SourceError
+from robomme_interference_data.errors import InterferenceError, SourceError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.evidence import spans_of_texts
 from robomme_interference_data.simulators.base import choose_cameras
 from robomme_interference_data.simulators.registry import OFFICIAL
 
-from .base import (
-    Frame,
-    Recording,
-    Source,
-    SourceEpisode,
-    demonstration_length,
-    file_state,
-)
+from .base import Frame, Recording, Source, SourceEpisode, demonstration_length, file_state
 from .robomme_families import ROBOMME
-
-if TYPE_CHECKING:
-    import h5py
 
 _FILE = re.compile(r"record_dataset_(?P<family>.+)\.h5")
 _CAMERAS = {"front": "front_rgb", "wrist": "wrist_rgb"}
@@ -43,18 +34,12 @@ _SEEDS = (("val", 1_000_000, 10_000), ("test", 500_000, 10_000), ("train", 0, 10
 
 
 def identify(family: str, seeds: dict[int, int | None]) -> dict[int, EpisodeId]:
-    """Tell split and index of the official recordings in a file, from their numbers and seeds.
+    """Return the ids of the recordings in a file, by their numbers; `seeds` may be unknown.
 
     RoboMME's seeds are fixed: `1000·code + 100·index + attempt` in train, `10000·code + …` from
     500,000 on in test and from 1,000,000 on in val (its `env_metadata` folder; a few val seeds are
-    100 higher). So a recording says what split it is of, and whether its file counts from 0 or 1.
-
-    Args:
-        family: Task family.
-        seeds: Number of each episode in the file to its seed, or None if not recorded.
-
-    Returns:
-        Number to id; split `train` where there is no seed.
+    100 higher). So a seed shows the split, and whether the file counts from 0 or 1. Without a seed
+    the split is train.
     """
     known = ROBOMME.get(family)
     splits, votes = {}, []
@@ -64,23 +49,16 @@ def identify(family: str, seeds: dict[int, int | None]) -> dict[int, EpisodeId]:
         if seed is not None and known is not None:
             votes.append(number - (value - least - scale * known.code) // 100)
     first = 0
-    if 0 not in seeds:  # else numbers are indices, whatever the seeds say
+    if 0 not in seeds:  # else numbers are indices, regardless of seeds
         first = max((0, 1), key=lambda one: (votes.count(one), one in seeds))
     return {number: EpisodeId(family, splits[number], number - first) for number in seeds}
 
 
 class H5Source(Source):
-    """A folder of `record_dataset_<Family>.h5` files.
+    """A folder of `record_dataset_<Family>.h5` files, or one such file."""
 
-    Args:
-        folder: The folder, or one such file.
-    """
-
-    def __init__(self, folder: Path):
-        try:
-            import h5py  # noqa: F401
-        except ImportError:
-            raise MissingExtraError.needs("reading RoboMME recordings", "h5py", "build") from None
+    def __init__(self, location: str):
+        folder = Path(location).expanduser()
         self.provenance = {"kind": "robomme-h5"}
         candidates = [folder] if folder.is_file() else sorted(folder.glob("*.h5"))
         self._files = {
@@ -92,21 +70,21 @@ class H5Source(Source):
                 "Point to the folder of RoboMME's recordings: robomme-h5:FOLDER",
             )
 
+    @override
     def episodes(self) -> list[SourceEpisode]:
-        """List all episodes; see `Source.episodes`."""
-        found = []
+        listed = []
         for family, path in self._files.items():
             with _opened(path) as file:
                 numbers = _numbers(file, "episode_")
                 if not numbers:
                     raise SourceError(f"{path} holds no episode_<N> group", _AGAIN)
                 ids = identify(family, {n: _seed(file[f"episode_{n}"]) for n in numbers})
-            place = str(path.resolve()), file_state(path)
-            found += [SourceEpisode(ids[n], (n, *place)) for n in numbers]
-        return sorted(found, key=lambda episode: episode.id)
+            key = str(path.resolve()), file_state(path)
+            listed += [SourceEpisode(ids[n], (n, *key)) for n in numbers]
+        return sorted(listed, key=lambda episode: episode.id)
 
+    @override
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
-        """Open an episode; see `Source.read`."""
         number, path, _ = episode.key
         where = f"{path}: episode_{number}"
         with _opened(path) as file, _complete(where):
@@ -117,10 +95,10 @@ class H5Source(Source):
             flags = [bool(group[f"timestep_{step}/info/is_video_demo"][()]) for step in steps]
             lesson = demonstration_length(flags, f"is_video_demo in {where}")
             setup, first = group["setup"], group[f"timestep_{steps[0]}/obs"]
-            there = tuple(camera for camera, name in _CAMERAS.items() if name in first)
-            if not there:
+            available = tuple(camera for camera, name in _CAMERAS.items() if name in first)
+            if not available:
                 raise SourceError(f"{where} has no {' or '.join(_CAMERAS.values())}", _AGAIN)
-            chosen = choose_cameras(cameras, there)
+            chosen = choose_cameras(cameras, available)
             texts = (_subgoal(group[f"timestep_{step}/info"]) for step in steps[:lesson])
             return Recording(
                 goals=tuple(_text(goal) for goal in np.atleast_1d(setup["task_goal"][()])),
@@ -145,9 +123,7 @@ def _complete(where: object) -> Iterator[None]:
 
 
 @contextmanager
-def _opened(path: str | Path) -> Iterator["h5py.File"]:
-    import h5py
-
+def _opened(path: str | Path) -> Iterator[h5py.File]:
     with _complete(path), h5py.File(path, "r") as file:
         yield file
 
@@ -157,9 +133,9 @@ def _frames(
 ) -> Generator[Frame]:
     with _opened(path) as file:
         for count, step in enumerate(steps):
-            place = f"episode_{number}/timestep_{step}"
-            with _complete(f"{path}: {place}"):
-                observation = file[f"{place}/obs"]
+            group = f"episode_{number}/timestep_{step}"
+            with _complete(f"{path}: {group}"):
+                observation = file[f"{group}/obs"]
                 # The gripper has two fingers that move alike; RoboMME's own loaders keep the
                 # first. `gripper_state` is float64 for some families, `joint_action` for all.
                 gripper = np.atleast_1d(observation["gripper_state"][()])[:1]
@@ -167,22 +143,22 @@ def _frames(
                 frame = Frame(
                     images={camera: observation[_CAMERAS[camera]][()] for camera in cameras},
                     state=state.astype(np.float32),
-                    action=file[f"{place}/action/joint_action"][()].astype(np.float32),
+                    action=file[f"{group}/action/joint_action"][()].astype(np.float32),
                     is_demonstration=count < lesson,
                 )
             yield frame
 
 
-def _numbers(group: "h5py.Group", prefix: str) -> list[int]:
+def _numbers(group: h5py.Group, prefix: str) -> list[int]:
     suffixes = [key.removeprefix(prefix) for key in group if key.startswith(prefix)]
     return sorted(int(suffix) for suffix in suffixes if suffix.isdigit())
 
 
-def _seed(group: "h5py.Group") -> int | None:
+def _seed(group: h5py.Group) -> int | None:
     return int(group["setup/seed"][()]) if "setup/seed" in group else None
 
 
-def _subgoal(info: "h5py.Group") -> str:
+def _subgoal(info: h5py.Group) -> str:
     name = next((one for one in _SUBGOALS if one in info), None)
     return _text(info[name][()]) if name else ""
 

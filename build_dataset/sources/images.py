@@ -1,7 +1,7 @@
-"""Images of recordings: which kept every pixel.
+"""Which recorded images are exact, and how they are decoded.
 
-A recording counts as exact only where that is certain: PNG images, or video of RGB pixels with a
-codec, or options, that lose nothing. Converting to YUV alone already changes 8-bit RGB values.
+A recording counts as exact only if that is certain: PNG images, or video of RGB pixels with a
+lossless codec or lossless options. Converting to YUV alone already changes 8-bit RGB values.
 """
 
 from collections.abc import Generator, Iterable
@@ -24,11 +24,7 @@ _TRUE = ("1", "true", "yes")
 
 
 def probe_video(path: Path) -> tuple[float, bool]:
-    """Read the header of a video file.
-
-    Returns:
-        Frames per second, and whether codec and pixel format alone make the video exact.
-    """
+    """Return a video's frame rate, and whether codec and pixel format alone make it exact."""
     hint = "Write it again with a constant frame rate, for example with codec ffv1 in a .mkv file."
     try:
         with open_video(path) as (_, stream):
@@ -38,16 +34,15 @@ def probe_video(path: Path) -> tuple[float, bool]:
     except InterferenceError as error:
         raise SourceError(error.message, hint) from None
     if not rate:
-        raise SourceError(f"{path} does not say its frame rate", hint)
+        raise SourceError(f"{path} has no frame rate", hint)
     return float(rate), exact
 
 
 def info_is_exact(info: dict[str, Any]) -> bool:
-    """Tell whether a video is exact by what LeRobot's `info.json` says of it.
+    """Return whether a video is exact, from its feature's `info` in LeRobot's `info.json`.
 
-    Args:
-        info: The feature's `info`: `video.codec`, `video.pix_fmt` and, since LeRobot 0.4, the
-            encoder's options (`video.crf`, `video.extra_options`).
+    That has `video.codec`, `video.pix_fmt` and, since LeRobot 0.4, the encoder's options
+    (`video.crf`, `video.extra_options`).
     """
     if info.get("video.pix_fmt") not in _RGB_FORMATS:
         return False
@@ -65,25 +60,23 @@ def info_is_exact(info: dict[str, Any]) -> bool:
 
 def _options(extra: dict[str, Any]) -> dict[str, str]:
     """Return all encoder options as one map; `aom-params` and the like are `a=1:b=2` lists."""
-    found: dict[str, str] = {}
+    options: dict[str, str] = {}
     for name, value in extra.items():
         text = str(value).lower()
         if name.endswith("-params"):
             parts = (part.partition("=") for part in text.split(":"))
-            found.update((key, setting) for key, _, setting in parts)
+            options.update((key, setting) for key, _, setting in parts)
         else:
-            found[name] = text
-    return found
+            options[name] = text
+    return options
 
 
 def decode_images(
     encoded: Iterable[tuple[object, bytes]], exact: bool
 ) -> Generator[NDArray[np.uint8]]:
-    """Decode the images of an episode in order, `(H, W, 3) uint8` RGB, one in memory.
+    """Decode images one by one, `(H, W, 3) uint8` RGB; `exact` ones must be PNG.
 
-    Args:
-        encoded: Where each image lies, for messages, and its bytes.
-        exact: Whether the episode counts as exact: its images must be PNG then.
+    Each comes with its location for messages.
     """
     for where, data in encoded:
         try:

@@ -1,9 +1,9 @@
-"""RoboMME's sixteen families: how their seeds, their recordings and their goals tell them apart.
+"""RoboMME's sixteen families, which seeds, recordings and goals distinguish.
 
 A goal's rule names words that every wording has and, where two families share those, words that
-it never has. Colours, numbers, order of clauses, case and punctuation are free, so that older and
-newer wordings of the recordings pass. The rules are ours, made to tell the families apart;
-`VideoUnmask` and `VideoUnmaskSwap` have the same goals in RoboMME and cannot be told apart.
+it never has. Colors, numbers, order of clauses, case and punctuation are free, so that older and
+newer wordings of the recordings pass. The rules are ours;
+`VideoUnmask` and `VideoUnmaskSwap` have the same goals in RoboMME, which cannot distinguish them.
 """
 
 import re
@@ -11,14 +11,9 @@ from typing import NamedTuple
 
 
 class _Family(NamedTuple):
-    """A family.
+    """A family: number in RoboMME's seeds, block of 100 in its LeRobot datasets, and goal patterns.
 
-    Attributes:
-        code: Its number in RoboMME's seeds.
-        block: Place of its 100 episodes in RoboMME's LeRobot datasets, which have no family column
-            (`lerobot/robomme`, `Yinpei/robomme_data_lerobot`).
-        has: Patterns that a goal must all have.
-        lacks: Patterns of which a goal may have none.
+    A goal must have all of `has` and none of `lacks`.
     """
 
     code: int

@@ -1,13 +1,13 @@
 """Source `sample`: made-up episodes, to try everything without recordings or a simulator.
 
-A gripper moves over a table with cubes; every family has its own table colour and path.
-The sample says nothing about any benchmark. Only integers and exact fractions are used, so that
-every machine makes the same pixels.
+A gripper moves over a table with cubes; every family has its own table color and path. Only
+integers and exact fractions are used, so that every machine makes the same pixels.
 """
 
 import hashlib
 from collections.abc import Generator
 from dataclasses import replace
+from typing import override
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,7 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.simulators.base import choose_cameras
 
-from .base import (
-    Frame,
-    Recording,
-    Source,
-    SourceEpisode,
-)
+from .base import Frame, Recording, Source, SourceEpisode
 
 _CUBES = ((200, 40, 40), (40, 160, 60), (50, 80, 200))
 _EPISODES = {"train": 3, "test": 1}
@@ -34,37 +29,34 @@ _SHORT = 200
 class SampleSource(Source):
     """Three train episodes and a test episode of each family.
 
-    In a contradicting lesson the gripper goes the other way round.
-
-    Args:
-        families: Names of the families, which need not be the benchmark's.
-        size: Height and width of the images in pixels, a multiple of 16.
+    In a contradicting lesson the gripper goes the other way round. `families` are separated by
+    commas, by default the benchmark's; `size` in pixels is a multiple of 16.
     """
 
-    time_limit = 300.0
+    time_limit_s = 300.0
 
-    def __init__(self, families: tuple[str, ...] = FAMILIES, size: int = 256):
-        self._families = families
+    def __init__(self, families: str = "", size: int = 256):
+        self._families = tuple(families.split(",")) if families else FAMILIES
         self._size = size
         self.provenance = {"kind": "sample", "size": size}
 
+    @override
     def episodes(self) -> list[SourceEpisode]:
-        """List all episodes; see `Source.episodes`."""
         ids = [
             EpisodeId(family, split, index)
             for family in self._families
             for split, count in _EPISODES.items()
             for index in range(count)
         ]
-        # The same episode of another place among the families looks different.
+        # An episode's look depends on its family's position.
         return [SourceEpisode(one, self._families.index(one.family)) for one in sorted(ids)]
 
+    @override
     def contradict(self, episode: SourceEpisode) -> SourceEpisode:
-        """Return an episode in the same scene with another answer; see `Source.contradict`."""
         return replace(episode, id=replace(episode.id, answer=1))
 
+    @override
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
-        """Make an episode up; see `Source.read`."""
         name = episode.id
         number = episode.key
         scene = _Scene(name, number, self._size)
@@ -74,8 +66,8 @@ class SampleSource(Source):
         frames = scene.frames(_SHORT if short else _FRAMES, lesson, chosen)
         goal = f"watch the video carefully, then do the {name.family} task again"
         difficulty = DIFFICULTIES[name.index % 3]
-        told = (goal,), scene.seed, difficulty, "sample"
-        return Recording(*told, True, frames, scene.evidence(lesson))
+        evidence = scene.evidence(lesson)
+        return Recording((goal,), scene.seed, difficulty, "sample", True, frames, evidence)
 
 
 class _Scene:
@@ -118,8 +110,8 @@ class _Scene:
     def front(self, step: int) -> NDArray[np.uint8]:
         """Draw the front view, `(size, size, 3) uint8`."""
         image: NDArray[np.uint8] = self._table.astype(np.uint8)
-        for place, colour in zip(self._cubes, _CUBES, strict=True):
-            self._box(image, place, (12, 12), colour)
+        for place, color in zip(self._cubes, _CUBES, strict=True):
+            self._box(image, place, (12, 12), color)
         column, row = self._gripper(step)
         self._box(image, (column, row // 2), (5, row // 2), (235, 235, 235))
         self._box(image, (column, row), (14, 6), (60, 60, 70))
@@ -140,15 +132,15 @@ class _Scene:
     def _box(
         self,
         image: NDArray[np.uint8],
-        centre: tuple[int, int],
+        center: tuple[int, int],
         half: tuple[int, int],
-        colour: tuple[int, int, int],
+        color: tuple[int, int, int],
     ) -> None:
-        """Fill a box: column and row of its centre, and half its width and height."""
-        (column, row), (width, height) = centre, half
+        """Fill a box: column and row of its center, and half its width and height."""
+        (column, row), (width, height) = center, half
         edges = (row - height, row + height, column - width, column + width)
         top, bottom, left, right = (max(0, edge * self.size // 256) for edge in edges)
-        image[top:bottom, left:right] = colour
+        image[top:bottom, left:right] = color
 
 
 def _triangle(step: int, period: int, height: int) -> int:

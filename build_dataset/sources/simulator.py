@@ -1,8 +1,8 @@
-"""Sources that are simulators: they play the episodes while these are read."""
+"""Sources that are simulators: they play each episode while it is read."""
 
 from collections.abc import Callable, Generator
 from dataclasses import replace
-from typing import Any
+from typing import Any, override
 
 import numpy as np
 
@@ -16,69 +16,60 @@ from robomme_interference_data.simulators.base import (
 )
 from robomme_interference_data.simulators.registry import make_simulator, simulator_class
 
-from .base import (
-    Frame,
-    Recording,
-    Source,
-    SourceEpisode,
-)
+from .base import Frame, Recording, Source, SourceEpisode
 
 
 class SimulatorSource(Source):
     """The episodes of the nine families that have demonstrations.
 
-    An episode is the demonstration, the first live observation and, where the simulator can play
-    it out, what the oracle does until the episode ends. RoboMME tells no actions of its
-    demonstrations, and has no oracle: its episodes end with the first live observation.
-
-    Args:
-        name: Name of the simulator.
-        python: Its own interpreter, if it has one.
+    An episode is the demonstration, the first live observation and, where the simulator has an
+    oracle, what the oracle does until the episode ends. RoboMME has none, and does not record the
+    actions of its demonstrations. `robomme_python` is its interpreter.
     """
 
-    def __init__(self, name: str, python: str | None = None):
+    def __init__(self, name: str, robomme_python: str | None = None):
         self.name = name
         self._class = simulator_class(name)
         self.whole = self._class.scripted
-        self.time_limit = self._class.episode_s
-        # The same episode of another version of the suite is another one.
+        self.time_limit_s = self._class.episode_s
+        # Another version of the suite has other episodes.
         version = self._class.suite_version
         self.provenance = {"kind": name, **({} if version is None else {"suite_version": version})}
-        self._options = {"python": python} if "python" in self._class.settings else {}
+        self._options = {"python": robomme_python} if "python" in self._class.settings else {}
         self._simulator: Simulator | None = None
         self._cameras: tuple[str, ...] = ()
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_simulator": None}
 
+    @override
     def episodes(self) -> list[SourceEpisode]:
-        """List all episodes."""
         return [SourceEpisode(one, self.provenance) for one in sorted(self._class.episodes())]
 
+    @override
     def contradict(self, episode: SourceEpisode) -> SourceEpisode:
-        """Return an episode in the same scene with another answer; see `Source.contradict`."""
         other = self._class.other_answer(episode.id)
         if other is None:
             return super().contradict(episode)
         return SourceEpisode(replace(episode.id, answer=other), episode.key)
 
+    @override
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
-        """Begin to play an episode; see `Source.read`."""
         simulator = self._open(choose_cameras(cameras))
         lesson, first, info = simulator.reset(str(episode.id))
         act = (lambda: simulator.act("oracle")) if self.whole else None
         frames = _play(simulator, lesson, first, act)
-        told = info.goals, info.seed, info.difficulty, info.simulator
-        return Recording(*told, True, frames, lesson.evidence)
+        known = info.goals, info.seed, info.difficulty, info.simulator
+        return Recording(*known, True, frames, lesson.evidence)
 
+    @override
     def close(self) -> None:
-        """End the simulator."""
         if self._simulator is not None:
             self._simulator.close()
             self._simulator = None
 
     def _open(self, cameras: tuple[str, ...]) -> Simulator:
-        """Return the simulator that draws these cameras: it is made once and kept."""
+        """Return the simulator with these cameras, which is kept for the next episode."""
         if self._simulator is None or self._cameras != cameras:
             self.close()
             self._simulator = make_simulator(self.name, cameras=cameras, **self._options)
@@ -89,8 +80,8 @@ class SimulatorSource(Source):
 class ShiftedSource(SimulatorSource):
     """The first live views of a simulator's episodes under each shift, instead of its frames."""
 
+    @override
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
-        """Begin to look at an episode; see `Source.read`."""
         simulator = self._open(choose_cameras(cameras))
         _, _, info = simulator.reset(str(episode.id), demonstration=False)
         frames = (Frame(seen.images, seen.state, None, False) for seen in simulator.views(SHIFTS))
@@ -103,10 +94,10 @@ def _play(
     first: Observation,
     act: Callable[[], Any] | None,
 ) -> Generator[Frame]:
-    told = len(lesson.actions) == len(lesson)
+    recorded = len(lesson.actions) == len(lesson)
     for index in range(len(lesson)):
-        images = {camera: shown[index] for camera, shown in lesson.images.items()}
-        action = lesson.actions[index] if told else None
+        images = {camera: frames[index] for camera, frames in lesson.images.items()}
+        action = lesson.actions[index] if recorded else None
         yield Frame(images, lesson.states[index], action, True)
     if act is None:
         yield Frame(first.images, first.state, None, False)

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from robomme_interference_data.build_dataset.config import (
     plan_all,
     plan_build,
 )
-from robomme_interference_data.build_dataset.sources import Source
+from robomme_interference_data.build_dataset.sources import Robot, Source
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import (
@@ -126,6 +127,20 @@ def test_episodes_with_and_without_actions_mix(tmp_path: Path) -> None:
     assert contents(out) == contents(tmp_path / "at once")
 
 
+def test_a_dataset_is_of_one_robot_and_keeps_what_it_is(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    robot = Robot(15, "aloha", {"observation.state": tuple("abcdefgh")})
+    build(out, MadeUpSource({"A/train/0": (260, None)}, robot=robot))
+    assert build(out, MadeUpSource({"A/train/1": (260, None)}, robot=robot)).added == 1
+    info = read_json(out / "meta/info.json")
+    assert (info["fps"], info["robot_type"]) == (15, "aloha")
+    assert info["features"]["observation.state"]["names"] == list("abcdefgh")
+    assert info["features"]["action"]["names"][-1] == "gripper"
+    for other in (replace(robot, fps=10), replace(robot, type=None), Robot(15, "aloha")):
+        with pytest.raises(SourceError, match="cannot be in one dataset"):
+            build(out, MadeUpSource({"A/train/2": (260, None)}, robot=other))
+
+
 TABLETOP = {"kind": "tabletop", "suite_version": 1}
 
 
@@ -140,9 +155,9 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("source", "options", "told"),
     [
-        ({}, {"codec": "lerobot-default"}, "was built otherwise"),
-        ({}, {"version": "2.0.0"}, "was built otherwise"),
-        ({}, {"kind": "demonstrations"}, "was built otherwise"),
+        ({}, {"codec": "lerobot-default"}, "with other settings"),
+        ({}, {"version": "2.0.0"}, "with other settings"),
+        ({}, {"kind": "demonstrations"}, "with other settings"),
         ({"cameras": ("front", "wrist")}, {}, "cannot be in one dataset"),
         ({"provenance": TABLETOP | {"suite_version": 2}}, {}, "suite_version"),
     ],
@@ -154,7 +169,7 @@ def test_a_dataset_that_was_built_otherwise_is_left_as_it_is(
     other = MadeUpSource({"A/train/1": (260, 5)}, **source)
     with pytest.raises(InterferenceError, match=told) as caught:
         build(built, other, **options)
-    assert "otherwise" not in told or "Choose another `out`" in str(caught.value.hint)
+    assert "settings" not in told or "Choose another `buffer_set`" in str(caught.value.hint)
     assert contents(built) == before
 
 
@@ -228,7 +243,7 @@ def test_canonical_order_and_source_numbers() -> None:
 
 
 def test_filters() -> None:
-    source = SampleSource(("MoveCube", "X"), size=32)
+    source = SampleSource("MoveCube,X", size=32)
     assert listed(source, split="test") == [(0, "MoveCube/test/0"), (0, "X/test/0")]
     found = listed(source, families=("X",), numbers=(1, 2))
     assert found == [(0, "X/train/1"), (0, "X/train/2")]
@@ -272,9 +287,10 @@ def test_views_under_shifts_are_of_the_queries(tmp_path: Path) -> None:
         ({"workers": 0}, {}, InvalidOptionError),
         ({"codec": "h264"}, {}, InvalidOptionError),
         ({"episodes": "3-1"}, {}, InvalidOptionError),
-        ({"time_limit": 0.0}, {}, InvalidOptionError),
-        ({"time_limit": float("nan")}, {}, InvalidOptionError),
+        ({"time_limit_s": 0.0}, {}, InvalidOptionError),
+        ({"time_limit_s": float("nan")}, {}, InvalidOptionError),
         ({"columns": ("front",)}, {}, InvalidOptionError),
+        ({"columns": ("front=a", "front=b")}, {}, InvalidOptionError),
         ({}, {"conditions": ("k0", "k0")}, InvalidOptionError),
         ({}, {"conditions": ("x3",)}, InvalidIdError),
         ({}, {"position_limit": "many"}, InvalidOptionError),

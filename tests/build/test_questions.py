@@ -269,13 +269,6 @@ def test_the_digest_is_of_all_that_is_asked() -> None:
 # --- pictures ----------------------------------------------------------------------------------
 
 
-def test_without_marks_the_view_is_enlarged() -> None:
-    view = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)
-    found = picture(view, [(), ()])
-    assert found.shape == (4, 6, 3)
-    assert np.array_equal(found[::2, ::2], view) and np.array_equal(found[1::2, 1::2], view)
-
-
 def near(image: Any, point: tuple[int, int], way: int = 21) -> Any:
     y, x = point
     return image[y - way : y + way, x - way : x + way]
@@ -321,13 +314,6 @@ def test_paths_have_a_drawing_each(options: int, shape: tuple[int, int]) -> None
         assert yellow[3] == [False, True]
 
 
-def test_paths_at_the_edge_of_the_view_are_whole() -> None:
-    found = picture(GREY, [((2, 3), (250, 251)), ((2, 251), (250, 3))])
-    assert found.shape == (256, 512, 3)  # the whole view, which cannot be enlarged twice
-    for tile, point in ((found[:, :256], (126, 127)), (found[:, 256:], (126, 127))):
-        assert tuple(tile[point]) == (255, 232, 0)
-
-
 def test_a_picture_is_what_the_view_shows(made: list[Made]) -> None:
     """The pixels beside marks and letters are the view's: here each family's first question."""
     view = np.random.default_rng(0).integers(0, 256, GREY.shape, dtype=np.uint8)
@@ -348,24 +334,16 @@ def test_a_picture_is_what_the_view_shows(made: list[Made]) -> None:
 
 
 @pytest.mark.parametrize(
-    "changes",
-    [
-        {"simulator": "robomme"},
-        {"simulator": None},
-        {"seed": None},
-        {"seed": -1},
-        {"difficulty": None},
-        {"difficulty": "extreme"},
-    ],
+    "changes", [{"simulator": "robomme"}, {"simulator": None}, {"seed": -1}, {"difficulty": None}]
 )
 def test_only_tabletops_episodes_have_questions(changes: dict[str, Any]) -> None:
-    with pytest.raises(BuildError, match="MoveCube/test/0 .* possible answers are not known"):
+    with pytest.raises(BuildError, match="MoveCube/test/0 .*does not list the possible answers"):
         list(make_questions(buffer_set_of(EpisodeId("MoveCube", "test", 0), **changes)))
 
 
 def test_views_of_another_size_are_refused() -> None:
     wide = np.zeros((240, 320, 3), np.uint8)
-    with pytest.raises(BuildError, match="320×240 pixels; where things are is known in 256×256"):
+    with pytest.raises(BuildError, match="320×240 pixels; expected 256×256"):
         list(make_questions(buffer_set_of(EpisodeId("MoveCube", "test", 0), view=wide)))
 
 
@@ -386,14 +364,12 @@ def test_the_command_makes_them(root: Path, run: Any) -> None:
     assert bare(read_questions(load_buffer_set(root)).values()) == bare(
         read_questions(load_buffer_set(TABLETOP)).values()
     )
-    code, out, err = run("build", "questions", root)
-    assert (code, out) == (0, "") and f"{len(QUERIES)} questions" in err
 
 
 def test_other_demonstrations_are_refused(run: Any) -> None:
     code, out, err = run("build", "questions", GOLDEN)
     assert (code, out) == (1, "")
-    assert "of the simulator 'sample'" in err and "Traceback" not in err
+    assert "the simulator 'sample'" in err and "Traceback" not in err
     assert not (GOLDEN / QUESTIONS_PATH).exists()
 
 

@@ -10,12 +10,8 @@ from support.damage import flipped_bits
 from support.recordings import EPISODES, check_recording, write_h5
 
 from robomme_interference_data.build_dataset.sources import Recording, open_source
-from robomme_interference_data.build_dataset.sources.h5 import identify
-from robomme_interference_data.errors import (
-    InvalidIdError,
-    MissingExtraError,
-    SourceError,
-)
+from robomme_interference_data.build_dataset.sources.h5 import H5Source, identify
+from robomme_interference_data.errors import InvalidIdError, MissingExtraError, SourceError
 from robomme_interference_data.schema.records import EvidenceSpan
 
 h5py = pytest.importorskip("h5py")
@@ -175,12 +171,13 @@ def test_no_family_and_no_h5py(path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     path.rename(path.with_stem("record_dataset_Move Cube"))
     with pytest.raises(InvalidIdError, match="'Move Cube' is not a family name"):
         read(path.parent)
+    monkeypatch.delitem(sys.modules, H5Source.__module__)
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(MissingExtraError, match=r"needs h5py(.|\n)*data\[build\]"):
         read(path.parent)
 
 
-# --- numbers, buffer sets and seeds -------------------------------------------------------------------
+# --- numbers, splits and seeds -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -196,7 +193,7 @@ def test_no_family_and_no_h5py(path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         # val: 1,000,000 + 10,000 · code + 100 · index + attempt; a few are 100 higher
         ("RouteStick", {5: 1_160_500, 6: 1_160_700, 7: 1_160_700}, "val/5 val/6 val/7"),
         ("RouteStick", {1: 1_160_100, 2: 1_160_100, 3: 1_160_200}, "val/0 val/1 val/2"),
-        # one file with several buffer sets
+        # one file with several splits
         ("MoveCube", {1: 14_000, 2: 640_100, 3: 1_140_200}, "train/0 test/1 val/2"),
         # no seeds, or a family that RoboMME does not have: numbering says it
         ("MoveCube", {1: None, 4: None}, "train/0 train/3"),

@@ -1,6 +1,5 @@
 """LeRobot datasets as sources: what they say of an episode, by which names, and refusals."""
 
-import json
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +19,8 @@ from support.recordings import (
     make_episode,
 )
 
-from robomme_interference_data.build_dataset.sources import Recording, open_source
+from robomme_interference_data.build_dataset.config import BuildConfig, plan_build
+from robomme_interference_data.build_dataset.sources import Recording, Robot, open_source
 from robomme_interference_data.build_dataset.sources.robomme_families import BLOCKS
 from robomme_interference_data.errors import (
     FormatError,
@@ -110,8 +110,10 @@ def test_1600_episodes_are_named_by_block_and_quickly(tmp_path: Path) -> None:
         open_source(f"lerobot:{root}").episodes()
     assert "`families_file`" in str(caught.value.hint)
     families = [name.split("/")[0] for _, (name, _) in sorted(found.items())]
-    names = tmp_path / "families.json"
-    names.write_text(json.dumps(dict(enumerate([*families[:950], "InsertPeg", *families[951:]]))))
+    families[950] = "InsertPeg"
+    names = tmp_path / "families.csv"
+    lines = [f"{number},{family}" for number, family in enumerate(families)]
+    names.write_text("\n".join(["episode_index,family", *lines]))
     listed = open_source(f"lerobot:{root}", families_file=names).episodes()
     ids = {episode.key[0]: str(episode.id) for episode in listed}
     assert (ids[950], ids[1000]) == ("InsertPeg/train/0", "InsertPeg/train/1")
@@ -119,7 +121,7 @@ def test_1600_episodes_are_named_by_block_and_quickly(tmp_path: Path) -> None:
 
 def test_families_that_are_not_told_or_do_not_fit(tmp_path: Path) -> None:
     root = write_lerobot(tmp_path / "nameless", episode_id=None)
-    with pytest.raises(SourceError, match=r"of what family its 3 episodes(.|\n)*`families_file`"):
+    with pytest.raises(SourceError, match=r"families of the 3 episodes(.|\n)*`families_file`"):
         read(root)
     root = write_lerobot(tmp_path / "towel", one(make_episode(0, 2, "fold the towel")))
     with pytest.raises(SourceError, match="it fits no family of RoboMME"):
@@ -135,18 +137,48 @@ def test_columns_by_other_names(v21: Path) -> None:
     images = {"front": known.images["wrist"], "wrist": known.images["front"]}
     expected = replace(known, images=images, action=known.state)
     check_recording(read(v21, columns=given), expected)
-    edit_info(v21, lambda info: info["features"].pop("image"))
-    with pytest.raises(
-        SourceError, match=r"no column named .* or image(.|\n)*front=COLUMN"
-    ) as raised:
+    edit_info(v21, lambda info: [info["features"].pop(one) for one in ("image", "wrist_image")])
+    with pytest.raises(SourceError, match=r"has no camera(.|\n)*front=COLUMN") as raised:
         read(v21)
-    assert "actions, exec_start_idx, is_demo, state, wrist_image" in raised.value.message
+    assert "actions, exec_start_idx, is_demo, state" in raised.value.message
+
+
+def test_another_robot_keeps_its_cameras_rate_names_and_type(tmp_path: Path) -> None:
+    cameras = ("front", "left", "right")
+    episode = make_episode(1, 4, MOVE, 2, cameras=cameras)
+    root = write_lerobot(tmp_path, one(episode))
+    names = {"motors": [f"m{number}" for number in range(8)]}
+    changes: dict[str, Any] = {"fps": 15, "robot_type": "aloha"}
+    edit_info(root, lambda i: i["features"]["action"].update(names=names), **changes)
+    recording = read(root)
+    assert recording.robot == Robot(15, "aloha", {"action": tuple(names["motors"])})
+    check_recording(recording, episode)
+    top = read(root, columns={"top": "observation.images.front"})
+    assert set(next(top.frames).images) == {"top", "left", "right"}
+    with pytest.raises(InvalidOptionError, match="is no camera name"):
+        read(root, columns={"../x": "observation.images.front"})
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_families_file_can_mark_the_demonstrations(tmp_path: Path, version: str) -> None:
+    root = write_lerobot(tmp_path / "d", one(), version=version, marked=False, episode_id=None)
+    config = BuildConfig(source=(f"lerobot:{root}",), buffer_set=tmp_path / "out")
+    file = tmp_path / "families.csv"
+    file.write_text("episode_index,family\n0,MoveCube\n")
+    named = replace(config, families_file=file)
+    assert plan_build("distractors", named).tasks
+    with pytest.raises(SourceError, match=r"MoveCube/train/0(.|\n)*is_demo(.|\n)*exec_start_idx"):
+        plan_build("demonstrations", named)  # before anything is read
+    file.write_text("episode_index,family,exec_start_idx\n0,MoveCube,3\n")
+    assert plan_build("demonstrations", named).tasks
+    shown = [frame.is_demonstration for frame in read(root, families_file=file).frames]
+    assert shown == [True] * 3 + [False]
 
 
 @pytest.mark.parametrize(
     ("columns", "error", "message"),
     [
-        ({"fornt": "image"}, InvalidOptionError, "'fornt' is none of(.|\n)*'front'"),
+        ({"is_dem": "is_demo"}, SourceError, "'is_dem' needs images(.|\n)*'is_demo'"),
         ({"front": "imge"}, UnknownNameError, "'imge' is not in(.|\n)*'image'"),
         ({"front": "state"}, SourceError, "'state' holds float32 .*'front' needs images"),
         ({"state": "image"}, SourceError, "'image' holds image .*needs a vector of floats"),

@@ -36,7 +36,7 @@ def read(source: Any, cameras: tuple[str, ...] | None = None) -> Recording:
 def test_an_episode_of_the_tabletop(made: list[Double]) -> None:
     source = open_source("tabletop")
     assert source.provenance == {"kind": "tabletop", "suite_version": SUITE_VERSION}
-    assert (source.time_limit, source.whole) == (300, True)  # seconds
+    assert (source.time_limit_s, source.whole) == (300, True)  # seconds
     recording = read(source)
     told = (recording.seed, recording.difficulty, recording.simulator, recording.exact)
     assert (recording.goals, told) == (("goal", "other"), (9, "easy", "tabletop", True))
@@ -57,7 +57,7 @@ def test_an_episode_of_the_tabletop(made: list[Double]) -> None:
 def test_robomme_plays_demonstrations_only_and_tells_no_actions(made: list[Double]) -> None:
     source = open_source("robomme", robomme_python="/opt/python")
     assert source.provenance == {"kind": "robomme"}
-    assert (source.time_limit, source.whole) == (1800, False)
+    assert (source.time_limit_s, source.whole) == (1800, False)
     frames = list(read(source).frames)
     assert [frame.is_demonstration for frame in frames] == [True] * 5 + [False]
     assert [frame.action for frame in frames] == [None] * 6

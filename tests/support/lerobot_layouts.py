@@ -16,6 +16,8 @@ NAMES = {
     "v3.0": {
         "front": "observation.images.front",
         "wrist": "observation.images.wrist",
+        "left": "observation.images.left",
+        "right": "observation.images.right",
         "state": "observation.state",
         "action": "action",
     },

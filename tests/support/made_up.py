@@ -10,7 +10,13 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from robomme_interference_data.build_dataset.identity import identity_of
-from robomme_interference_data.build_dataset.sources import Frame, Recording, Source, SourceEpisode
+from robomme_interference_data.build_dataset.sources import (
+    Frame,
+    Recording,
+    Robot,
+    Source,
+    SourceEpisode,
+)
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     IDENTITY_PATH,
@@ -87,7 +93,7 @@ class MadeUpSource(Source):
         lengths: Frames of each episode, of them demonstration: `{"MoveCube/test/0": (20, 5)}`.
         wrong: Of an episode, frame number to what is returned in its place, or raised.
         actions: Whether frames have actions.
-        evidence: What every episode says that it shows.
+        evidence: Evidence of every episode.
     """
 
     lengths: dict[str, tuple[int, int | None]]
@@ -95,6 +101,7 @@ class MadeUpSource(Source):
     actions: bool = True
     cameras: tuple[str, ...] = ("front",)
     evidence: tuple[EvidenceSpan, ...] | None = None
+    robot: Robot = field(default_factory=Robot)
     provenance: dict[str, Any] = field(default_factory=lambda: {"kind": "made-up"})
 
     def episodes(self) -> list[SourceEpisode]:
@@ -107,7 +114,7 @@ class MadeUpSource(Source):
         chosen = choose_cameras(cameras, self.cameras)
         frames = self._frames(str(episode.id), chosen)
         told = (f"do {episode.id}",), 7, "easy", "made-up"
-        return Recording(*told, True, frames, self.evidence)
+        return Recording(*told, True, frames, self.evidence, self.robot)
 
     def _frames(self, name: str, cameras: tuple[str, ...]) -> Generator[Frame]:
         length, lesson = self.lengths[name]

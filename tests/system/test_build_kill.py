@@ -31,15 +31,8 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[BuildServer]:
 
 def command(out: Path, workers: int = 2) -> list[str]:
     """Build six units and one that is too short, of small cameras."""
-    options = ["--cameras", "front", "--workers", str(workers)]
-    return [
-        "build",
-        "distractors",
-        str(out.parent),
-        "--source",
-        "sample:MoveCube,PatternLock",
-        *options,
-    ]
+    options = f"--source sample:MoveCube,PatternLock --cameras front --workers {workers}"
+    return ["build", "distractors", str(out.parent), *options.split()]
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +45,7 @@ def undisturbed(
     finished = server.run(*command(out, workers=1))
     assert finished.code == 0, finished.stderr
     assert "5 added; 5 episodes, 160 frames" in finished.stderr
-    assert "left out MoveCube/train/1: 200 raw frames" in finished.stderr
+    assert "skipped MoveCube/train/1: 200 raw frames" in finished.stderr
     return contents(out), time.monotonic() - begin
 
 
@@ -107,11 +100,16 @@ def test_stopped_at_random_moments(
     assert [path.name for path in out.parent.iterdir()] == ["distractors"]
 
 
-def test_a_build_that_is_terminated_tells_how_to_go_on(server: BuildServer, tmp_path: Path) -> None:
-    pid = server.start(*command(tmp_path / "distractors", workers=1))
-    end = time.monotonic() + 60
-    while not staged(tmp_path / "distractors") and time.monotonic() < end:
+def started(server: BuildServer, out: Path) -> int:
+    """Start a build, and return its process once it has staged an episode."""
+    pid, end = server.start(*command(out, workers=1)), time.monotonic() + 60
+    while not staged(out) and time.monotonic() < end:
         time.sleep(0.01)
+    return pid
+
+
+def test_a_terminated_build_prints_how_to_resume(server: BuildServer, tmp_path: Path) -> None:
+    pid = started(server, tmp_path / "distractors")
     os.kill(pid, signal.SIGTERM)
     finished = server.wait(pid)
     assert finished.code == 143, finished.stderr
@@ -124,10 +122,7 @@ def test_a_build_that_is_terminated_tells_how_to_go_on(server: BuildServer, tmp_
 def test_a_worker_that_is_killed_is_replaced(
     server: BuildServer, undisturbed: tuple[dict[str, bytes], float], tmp_path: Path
 ) -> None:
-    pid = server.start(*command(tmp_path / "distractors", workers=1))
-    end = time.monotonic() + 60
-    while not staged(tmp_path / "distractors") and time.monotonic() < end:
-        time.sleep(0.01)
+    pid = started(server, tmp_path / "distractors")
     workers = [p for p, text in server.survivors(0).items() if "multiprocessing-fork" in text]
     for worker in workers:
         os.kill(worker, signal.SIGKILL)

@@ -77,9 +77,9 @@ def write(root: Path, stored: str) -> None:
 def test_a_dataset_of_lerobots_is_read_as_lerobot_does(
     lerobot: Any, tmp_path: Path, stored: str
 ) -> None:
-    root, names = tmp_path / "dataset", tmp_path / "families.json"
+    root, names = tmp_path / "dataset", tmp_path / "families.csv"
     write(root, stored)
-    names.write_text('{"0": "MoveCube", "1": "MoveCube"}')
+    names.write_text("episode_index,family\n0,MoveCube\n1,MoveCube\n")
     source = LeRobotSource(str(root), families_file=names)
     theirs = lerobot.LeRobotDataset("test/small", root=root, video_backend="pyav")
     row = 0

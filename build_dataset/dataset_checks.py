@@ -1,0 +1,218 @@
+"""Recompute every hash and every rule of one of a buffer set's datasets."""
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import (
+    CAMERA_PREFIX,
+    DISTRACTORS,
+    IDENTITY_PATH,
+    INDEX_DIR,
+    INDEX_HEADER,
+    LESSONS,
+    MANIFEST_HEADER,
+    MANIFESTS,
+    REPORT_PATH,
+    SHIFTED,
+    UNIT_MIN_RAW_FRAMES,
+    UNITS,
+)
+from robomme_interference_data.data.dataset import Dataset
+from robomme_interference_data.data.embeddings import IndexHeader, index_folder
+from robomme_interference_data.errors import InterferenceError, visible
+from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.schema.manifest import ManifestHeader
+from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.schema.shifts import SHIFTS
+from robomme_interference_data.storage.arrays import combine
+from robomme_interference_data.storage.encode import CODECS
+from robomme_interference_data.storage.files import all_files, read_header, read_json, sha256_file
+
+from .identity import BuildReport, identity_of, listed_files, report_of
+from .image_stats import ImageStats, Statistics, episode_statistics, episode_table
+from .lerobot_checks import lerobot_violations
+
+UNLISTED = "is not listed"
+HEADER = f"{MANIFESTS}/{MANIFEST_HEADER}"
+
+
+@dataclass(frozen=True)
+class Violation:
+    """Something in a buffer set that differs from its records or from the rules.
+
+    Attributes:
+        where: File, episode or buffer.
+        what: The value found, and the expected one.
+    """
+
+    where: str
+    what: str
+
+
+def caught(where: str, violations: Iterable[Violation]) -> Iterator[Violation]:
+    """Yield violations; an error on the way is the last one."""
+    try:
+        yield from violations
+    except InterferenceError as error:
+        yield Violation(where, error.message)
+
+
+def dataset_violations(
+    name: str, dataset: Dataset, header: ManifestHeader, progress: WorkProgress | None
+) -> Iterator[Violation]:
+    """Check a dataset; decode it and show that only with `progress`."""
+    yield from _files(name, dataset, header)
+    records = list(dataset.records())
+    yield from _identity(name, dataset, records, header)
+    yield from _report(name, dataset, records)
+    yield from (Violation(f"{name}/{where}", what) for where, what in lerobot_violations(dataset))
+    statistics = None if progress is None else episode_statistics(episode_table(dataset))
+    for record in records:
+        where = f"{name} {record.episode_id}"
+        yield from _record(where, name, record)
+        if progress is not None and statistics is not None:
+            stored = statistics[record.episode_index]
+            yield from caught(where, _episode(where, dataset, record, stored))
+            progress.advance(record.length)
+
+
+def _files(name: str, dataset: Dataset, header: ManifestHeader) -> Iterator[Violation]:
+    """Check every byte of a dataset: identity, list of sums, and all files in it."""
+    files, root = dataset.files, dataset.files.snapshot()
+    if sha256_file(files.path(IDENTITY_PATH)) != header.datasets[name].identity:
+        yield Violation(f"{name}/{IDENTITY_PATH}", f"does not have the SHA-256 of {HEADER}")
+    sums = dataset.sums()
+    # A fetched buffer set has one dataset at its root, and the others in folders there.
+    others = tuple(f"{other}/" for other in header.datasets if other != name)
+    existing = {path for path in listed_files(root) if not path.startswith(others)}
+    for path in sorted(sums.keys() | existing):
+        if path not in sums:
+            yield Violation(f"{name}/{path}", UNLISTED)
+        elif problem := _file_problem(root, path):
+            yield Violation(f"{name}/{path}", problem)
+        elif sha256_file(files.path(path)) != sums[path]:
+            yield Violation(f"{name}/{path}", "does not have the recorded SHA-256")
+
+
+def _file_problem(root: Path, path: str) -> str | None:
+    """Return why a listed file cannot be read as a file of its dataset, if so."""
+    folders = [root / folder for folder in Path(path).parents if folder != Path()]
+    if linked := [folder for folder in folders if folder.is_symlink()]:
+        return f"is in {linked[-1].relative_to(root)}, a link; expected a folder"
+    if (root / path).is_file():
+        return None
+    return "is not a regular file" if (root / path).exists() else "is missing"
+
+
+def _identity(
+    name: str, dataset: Dataset, records: list[EpisodeRecord], header: ManifestHeader
+) -> Iterator[Violation]:
+    stored, where = dataset.identity, f"{name}/{IDENTITY_PATH}"
+    made = identity_of(records, name, stored.version, stored.codec, stored.sources, stored.sums)
+    for field, value in (vars(made) | {"cameras": dataset.cameras}).items():
+        if getattr(stored, field) != value:
+            what = f"{field} is {getattr(stored, field)}; the episodes give {value}"
+            yield Violation(where, what)
+    if stored.codec not in CODECS:
+        yield Violation(where, f"codec {stored.codec!r} is unknown")
+    recorded = header.datasets[name]
+    for field in ("kind", "version", "revision"):
+        if getattr(recorded, field) != getattr(stored, field):
+            what = f"{field} of the {name} is {getattr(recorded, field)}; the dataset has "
+            yield Violation(HEADER, f"{what}{getattr(stored, field)}")
+
+
+def _report(name: str, dataset: Dataset, records: list[EpisodeRecord]) -> Iterator[Violation]:
+    where = f"{name}/{REPORT_PATH}"
+    report = read_header(dataset.files.path(REPORT_PATH), BuildReport)
+    skipped = {str(one.episode_id): one.why for one in report.skipped}
+    if read_json(dataset.files.path(REPORT_PATH)) != report_of(dataset.identity, skipped):
+        yield Violation(where, "does not have the counts of the dataset, or is not in order")
+    if stored := skipped.keys() & {str(record.episode_id) for record in records}:
+        yield Violation(where, f"{min(stored)} is skipped, and in the dataset")
+    if any(visible(reason) != reason for reason in skipped.values()):
+        yield Violation(where, "has control characters")
+
+
+def _record(where: str, name: str, record: EpisodeRecord) -> Iterator[Violation]:
+    start = record.exec_start_idx
+    lessons = {name in LESSONS, start is not None, record.span_sha256 is not None}
+    if len(lessons) > 1:
+        yield Violation(where, f"exec_start_idx is {start}")
+        return
+    if start is not None:
+        expected = range(start + 1, start + 2)
+    elif name == SHIFTED:
+        expected = range(len(SHIFTS), len(SHIFTS) + 1)
+    else:
+        most, stride = UNITS[name]
+        expected = range((UNIT_MIN_RAW_FRAMES - 1) // stride + 1, most + 1)
+    if record.length not in expected:
+        yield Violation(where, f"holds {record.length} frames, not {expected[-1]}")
+
+
+def _episode(
+    where: str, dataset: Dataset, record: EpisodeRecord, statistics: Statistics
+) -> Iterator[Violation]:
+    recorded, spans = record.feature_sha256, record.spans
+    images: defaultdict[str, ImageStats] = defaultdict(ImageStats)
+
+    def count(feature: str, value: NDArray[Any]) -> None:
+        if feature.startswith(CAMERA_PREFIX):
+            images[feature].add(value)
+
+    session, *parts = dataset.digests(
+        record.episode_index, [record.session, *spans.values()], count
+    )
+    codec = CODECS.get(dataset.identity.codec)
+    for feature, counted in images.items() if codec and codec.exact else ():
+        for name, value in counted.result().items():
+            stored = statistics.get(feature, {}).get(name, np.empty(0))
+            # Compared as LeRobot scales them: different means can become one number.
+            if not np.array_equal(stored, value if name == "count" else value / 255):
+                yield Violation(where, f"stats/{feature}/{name} is not that of its frames")
+    for feature in sorted(session.keys() | recorded.keys()):
+        if session.get(feature) != recorded.get(feature):
+            yield Violation(where, f"{feature} does not have the recorded SHA-256")
+    for (name, (start, stop)), part in zip(spans.items(), parts, strict=True):
+        if combine(part) != getattr(record.span_sha256, name, None):
+            what = f"frames {start} to {stop - 1} ({name}) do not have the recorded SHA-256"
+            yield Violation(where, what)
+
+
+def index_violations(name: str, dataset: Dataset, units: Dataset | None) -> Iterator[Violation]:
+    """Check the embeddings beside a dataset, of any encoders and cameras."""
+    root = dataset.files.snapshot() / INDEX_DIR
+    folders: set[str] = set()
+    for path in all_files(root):
+        folder, _, file = path.partition("/")
+        if not file:
+            yield Violation(f"{name}/{INDEX_DIR}/{path}", UNLISTED)
+        elif not path.startswith("."):  # an index that is being made
+            folders.add(f"{INDEX_DIR}/{folder}")
+            if not (root / path).is_file():
+                yield Violation(f"{name}/{INDEX_DIR}/{path}", "is a broken link, or no file")
+    for folder in sorted(folders):
+        yield from caught(f"{name}/{folder}", _index(name, dataset, folder, units))
+
+
+def _index(name: str, dataset: Dataset, folder: str, units: Dataset | None) -> Iterator[Violation]:
+    where = f"{name}/{folder}"
+    header = read_header(dataset.files.path(f"{folder}/{INDEX_HEADER}"), IndexHeader)
+    encoder, camera = header.encoder.name, header.camera
+    if index_folder(encoder, camera) != folder:
+        yield Violation(where, f"holds the embeddings of {encoder}, camera {camera}")
+        return
+    lengths = {record.episode_index: record.length for record in dataset.records()}
+    dataset.index(encoder, camera).check(lengths, units=name == DISTRACTORS)
+    with suppress(InterferenceError):  # reported where the units are checked
+        made = dataset.index(encoder, camera).made
+        if units is not None and units.index(encoder, camera).made != made:
+            yield Violation(where, f"was made with another encoder than that of the {DISTRACTORS}")
