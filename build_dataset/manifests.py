@@ -33,7 +33,6 @@ from robomme_interference_data.data.manifest_table import pending_rows
 from robomme_interference_data.data.query_sessions import QuerySessions, SessionSource
 from robomme_interference_data.errors import (
     BuildError,
-    HistoryTooLongError,
     InvalidOptionError,
     SourceError,
 )
@@ -185,7 +184,7 @@ def _check_length(manifest: BufferManifest, limit: int | None) -> None:
     """Check that a buffer and its rollout fit the systems' position embeddings (rule 8)."""
     needed = manifest.history_frames + MAX_STEPS
     if limit is not None and needed > limit:
-        raise HistoryTooLongError(
+        raise InvalidOptionError(
             f"{manifest} needs {needed} positions ({manifest.history_frames} history frames + "
             f"{MAX_STEPS} steps); the released servers hold {limit}",
             'Leave out that condition, or set position_limit="none" for systems without a limit.',

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import PAPER_ENCODER
 from robomme_interference_data.data.embeddings import EncoderRecord, Remedy, encoder_id
-from robomme_interference_data.errors import InvalidOptionError, MissingIndexError
+from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.runtime.specs import Kind, Registry
 from robomme_interference_data.storage.files import canonical_json
 
@@ -68,7 +68,7 @@ def encoder_digest(encoder: Encoder) -> str:
 def check_encoder(recorded: EncoderRecord, encoder: Encoder, remedy: Remedy) -> None:
     """Check that this encoder made the embeddings of an index; `remedy` makes them again."""
     if recorded.sha256 != encoder_digest(encoder):
-        raise MissingIndexError(
+        raise MissingFileError(
             f"the stored embeddings of {encoder.name!r} come from another version of the encoder: "
             "its weights, settings, preprocessing or code differ",
             *remedy,

@@ -287,7 +287,7 @@ class Buffer:
             `(T, D) float32`, each of length 1, in the buffer's order; a new array.
 
         Raises:
-            MissingIndexError, FormatError: See `SplitIndex`.
+            MissingFileError, FormatError: See `SplitIndex`.
         """
         index = self.index(encoder, camera)
         parts: list[NDArray[np.float32]] = [np.empty((0, index.size), np.float32)]
@@ -302,7 +302,7 @@ class Buffer:
         For grading without a simulator: in a rollout, what the robot sees is embedded then.
 
         Raises:
-            MissingIndexError, FormatError: See `SplitIndex`.
+            MissingFileError, FormatError: See `SplitIndex`.
         """
         place = self.query.first_frame
         span = place.dataset, place.episode_index, place.frame, place.frame + 1

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import DISTRACTORS
-from robomme_interference_data.errors import MissingIndexError
+from robomme_interference_data.errors import MissingFileError
 
 from .embeddings import EncoderRecord, Remedy
 
@@ -53,13 +53,13 @@ class BufferSetIndex:
     def __init__(self, datasets: Mapping[str, "Dataset"], encoder: str, camera: str = "front"):
         if DISTRACTORS not in datasets:
             what = f"a buffer set without {DISTRACTORS} has nothing to centre embeddings on"
-            raise MissingIndexError(what)
+            raise MissingFileError(what)
         self._indexes = {name: one.index(encoder, camera) for name, one in datasets.items()}
         self._units = units = self._indexes[DISTRACTORS]
         for name, index in self._indexes.items():
             if index.made != units.made:
                 places = (datasets[one].files.describe() for one in (name, DISTRACTORS))
-                raise MissingIndexError(
+                raise MissingFileError(
                     f"the embeddings of encoder {encoder!r} were made differently in "
                     f"{' and in '.join(places)}",
                     *index.remedy,

@@ -219,8 +219,8 @@ class Dataset:
 
         Raises:
             UnknownNameError: There is no such camera.
-            MissingIndexError: The dataset has no embeddings of this encoder and camera.
-            MissingIndexError: They were made of other data, or with another encoder.
+            MissingFileError: The dataset has no embeddings of this encoder and camera.
+            MissingFileError: They were made of other data, or with another encoder.
             FormatError: They are of an unknown version, or damaged.
         """
         if not isinstance(encoder, str):

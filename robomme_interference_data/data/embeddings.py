@@ -27,7 +27,6 @@ from robomme_interference_data.errors import (
     FormatError,
     InvalidOptionError,
     MissingFileError,
-    MissingIndexError,
     UnknownNameError,
 )
 from robomme_interference_data.schema.codec import to_dict
@@ -189,21 +188,21 @@ class EmbeddingIndex:
         try:
             path = files.path(f"{self._folder}/{INDEX_HEADER}")
         except MissingFileError:
-            raise MissingIndexError(f"{root} has no embeddings of {of}", *self.remedy) from None
+            raise MissingFileError(f"{root} has no embeddings of {of}", *self.remedy) from None
         try:
             self.header = read_header(path, IndexHeader)
         except FormatError as error:
             raise FormatError(error.message, *self.remedy) from None
         made = self.header.encoder.name, self.header.camera
         if made != (encoder_id(encoder), camera):
-            raise MissingIndexError(
+            raise MissingFileError(
                 f"the embeddings in {self._place} are of encoder {made[0]!r} and "
                 f"camera {made[1]!r}; expected {encoder_id(encoder)!r} and {camera!r}",
                 f"Give the encoder as {made[0]!r}. {self.remedy.hint}",
                 self.remedy.command,
             )
         if self.header.revision != revision:
-            raise MissingIndexError(
+            raise MissingFileError(
                 f"the embeddings of {of} in {root} were made of data with "
                 f"revision {self.header.revision[:12]}…; the data now has {revision[:12]}…",
                 *self.remedy,

@@ -20,7 +20,6 @@ from robomme_interference_data.data.query_sessions import QuerySessions, Session
 from robomme_interference_data.errors import (
     BuildError,
     FormatError,
-    HistoryTooLongError,
     InvalidOptionError,
     MissingFileError,
     SourceError,
@@ -200,7 +199,7 @@ def test_the_position_limit(tmp_path: Path, limit: int, fits: bool) -> None:
     if fits:
         assert len(list(planned_buffers(plan))) == 8
         return
-    with pytest.raises(HistoryTooLongError, match="under k1 needs 1365 positions") as caught:
+    with pytest.raises(InvalidOptionError, match="under k1 needs 1365 positions") as caught:
         list(planned_buffers(plan))
     assert 'position_limit="none"' in str(caught.value.hint)
 

@@ -16,7 +16,7 @@ from support.retrieval import FRAMES, QUIET, Interrupted, TwoSums, files_of, mak
 from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.data.buffer_set_index import normalised
 from robomme_interference_data.data.embeddings import EmbeddingIndex
-from robomme_interference_data.errors import BuildError, MissingIndexError
+from robomme_interference_data.errors import BuildError, MissingFileError
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.segment import typical_cosine
@@ -143,7 +143,7 @@ def test_an_interrupted_run_goes_on(indexed: Path, own_buffers: Path) -> None:
     # Three lessons of four batches each, then units of two: one is done, and half of the next.
     with pytest.raises(KeyboardInterrupt):
         make_index(own_buffers, Interrupted(after=15))
-    with pytest.raises(MissingIndexError):
+    with pytest.raises(MissingFileError):
         load_buffer(QUERIES[0], "k0", buffer_set=own_buffers).embeddings("thumbnail")
     assert make_index(own_buffers) == [0, FRAMES[1] - 32]
     assert files_of(own_buffers) == files_of(indexed)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import FPS
-from robomme_interference_data.errors import RolloutError
+from robomme_interference_data.errors import RunError
 
 Script = Iterator[None]
 
@@ -199,7 +199,7 @@ class Arm:
             reason = (
                 "no solution" if not found else f"joint {int(np.argmin(inside)) + 1} at its limit"
             )
-            raise RolloutError(
+            raise RunError(
                 f"the arm cannot bring its gripper to {np.round(tcp, 3).tolist()} m, turned by "
                 f"{math.degrees(yaw):.0f}°: {reason}",
                 "Keep targets within 0.3 to 0.72 m of the arm's base and clear of its limits.",
