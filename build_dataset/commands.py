@@ -238,7 +238,7 @@ def new_buffer_set(config: NewConfig, plan: PlanConfig, as_json: AsJson = False)
         )
         _build(units, config.buffer_set / DISTRACTORS, config, as_json=False)
         _plan(config.buffer_set, plan, as_json=as_json, base=base.files)
-        audit(config.buffer_set)
+        audit(str(config.buffer_set))
     print_status(f"Next: robomme-interference publish {config.buffer_set} --repo-id NAMESPACE/NAME")
 
 

@@ -311,7 +311,7 @@ def _index(name: str, dataset: Dataset, folder: str, units: Dataset | None) -> I
     lengths = {record.episode_index: record.length for record in dataset.records()}
     dataset.index(*made).check(lengths, units=name == DISTRACTORS)
     with suppress(InterferenceError):  # which is told where the units are checked
-        if units is not None and units.index(*made).made != dataset.index(*made).made:
+        if units is not None and units.index(*made).key != dataset.index(*made).key:
             yield Violation(where, f"was made with another encoder than that of the {DISTRACTORS}")
 
 

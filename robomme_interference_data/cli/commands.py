@@ -130,7 +130,7 @@ def show(
         print_status(f"{out} written")
     manifest, evidence = buffer.manifest, buffer.evidence
     if as_json:
-        spans = None if evidence is None else [one.told() for one in evidence]
+        spans = None if evidence is None else [one.to_dict() for one in evidence]
         print_json(to_dict(manifest) | {"evidence": spans})
         return
     table = Table.make(

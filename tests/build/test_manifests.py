@@ -147,7 +147,7 @@ def test_datasets_that_conditions_need(tmp_path: Path) -> None:
     write_metadata(root / "contradictions", "contradictions", records)
     plan = plan_manifests(in_folder(root), ("stale-k1",))
     assert list(plan.datasets) == ["demonstrations", "distractors", "contradictions"]
-    with pytest.raises(SourceError, match=r"contradictions does not hold \w+/test/0"):
+    with pytest.raises(SourceError, match=r"contradictions lacks \w+/test/0"):
         list(planned_buffers(plan))
     queries = [record("demonstrations", "PatternLock/test/1")]
     one = made_up(tmp_path / "one", queries=queries)

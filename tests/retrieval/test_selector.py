@@ -27,11 +27,11 @@ def test_what_identifies_a_selector(indexed: Path) -> None:
         index = buffer.index("thumbnail")
         assert Selector("thumbnail").identity(buffer) == {
             "encoder": "thumbnail",
-            "fingerprint": index.encoder.sha256,
+            "fingerprint": index.units.header.encoder.sha256,
             "camera": "front",
             "method": "max",
             "boundary": "adaptive",
-            "threshold": (1 + index.typical_cosine) / 2,
+            "threshold": (1 + index.units.typical_cosine) / 2,
         }
     fixed = Selector("thumbnail", rule="mean/0.5").identity(buffer)
     assert (fixed["method"], fixed["boundary"], fixed["threshold"]) == ("mean", 0.5, 0.5)
