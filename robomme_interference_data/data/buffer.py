@@ -165,18 +165,18 @@ class Buffer:
 
     def _fetch(self, cameras: Iterable[Sequence[str]], query: Sequence[str] | None = None) -> None:
         """Download states and the given cameras of each session, all files of a dataset at once."""
-        wanted: dict[Dataset, list[tuple[int, Sequence[str]]]] = {}
+        episodes_of: dict[Dataset, list[tuple[int, Sequence[str]]]] = {}
         for entry, names in zip(self.manifest.sessions, cameras, strict=True):
             dataset = self._datasets[entry.dataset]
-            wanted.setdefault(dataset, []).append((entry.episode_index, names))
+            episodes_of.setdefault(dataset, []).append((entry.episode_index, names))
         if query is not None:
             record = self.query.record
-            wanted.setdefault(self.query.dataset, []).append((record.episode_index, query))
-        for dataset, episodes in wanted.items():  # lazily: local datasets need no paths
+            episodes_of.setdefault(self.query.dataset, []).append((record.episode_index, query))
+        for dataset, episodes in episodes_of.items():  # lazily: local datasets need no paths
             dataset.files.fetch(path for one in episodes for path in dataset.files_of(*one))
 
     def frames(self, camera: str = "front") -> NDArray[np.uint8]:
-        """Decode all frames of a camera, sessions side by side on several threads.
+        """Decode all frames of a camera, on several threads.
 
         Args:
             camera: Name of the camera, with or without `observation.images.`.

@@ -330,7 +330,7 @@ class BufferSet:
 
     @cached_property
     def _keys(self) -> dict[str, list[str | None]]:
-        """The columns by which buffers are found."""
+        """The columns that identify and filter buffers."""
         keys: dict[str, list[str | None]] = self._rows.table([*_KEYS]).to_pydict()
         for column, values in keys.items():
             if not all(value is None or isinstance(value, str) for value in values):

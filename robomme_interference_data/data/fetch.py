@@ -19,11 +19,7 @@ from robomme_interference_data.constants import (
     QUESTIONS_PATH,
     SHIFTED,
 )
-from robomme_interference_data.errors import (
-    HashMismatchError,
-    InvalidOptionError,
-    MissingFileError,
-)
+from robomme_interference_data.errors import HashMismatchError, InvalidOptionError, MissingFileError
 from robomme_interference_data.ids import parse_numbers
 from robomme_interference_data.schema.settings import setting
 from robomme_interference_data.storage.files import atomic_path

@@ -25,7 +25,7 @@ class Question:
 
     episode_id: Annotated[EpisodeId, "The query episode."]
     revision: Annotated[str, "Revision of the demonstrations that it was made for."]
-    text: Annotated[str, "What is asked, beside the goal."]
+    text: Annotated[str, "The question, in addition to the goal."]
     options: Annotated[
         tuple[str, ...],
         "The options in words, in the order of `LETTERS`; empty where only the picture shows one.",

@@ -23,11 +23,7 @@ from support.buffer_sets import (
 )
 
 from robomme_interference_data import Buffer, DecodedCache, SessionEntry, load_buffer_set
-from robomme_interference_data.errors import (
-    HashMismatchError,
-    InvalidOptionError,
-    UnknownNameError,
-)
+from robomme_interference_data.errors import HashMismatchError, InvalidOptionError, UnknownNameError
 from robomme_interference_data.storage.files import LocalFiles
 
 BUFFER_SET = load_buffer_set(GOLDEN)
@@ -257,9 +253,7 @@ def test_unknown_camera(camera: str, hint: str) -> None:
         assert caught.value.hint == hint
 
 
-def test_a_stream_fetches_its_files_before_the_first_chunk(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_stream_fetches_its_files_before_the_first_chunk(monkeypatch: pytest.MonkeyPatch) -> None:
     made, fetched = buffer("k3"), []
     monkeypatch.setattr(LocalFiles, "fetch", lambda files, paths: fetched.append(sorted(paths)))
     stream = made.stream(8, ("front",), range(60, 90))  # of the first two units
