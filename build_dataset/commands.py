@@ -55,6 +55,8 @@ robomme-interference build manifests my-buffers --conditions no-history,k0,k1,k3
 """,
 )
 
+_Folder = Annotated[Path, typer.Argument(metavar="BUFFER_SET", help="Folder of the buffer set.")]
+
 _KEPT = "Finished episodes are kept"
 _MAX_SKIPPED = 10
 """Skipped episodes to print."""
@@ -127,7 +129,7 @@ for _kind, _text in _DATASETS.items():
 
 @app.command()
 @with_settings
-def manifests(buffer_set: BufferSetFolder, config: PlanConfig, as_json: AsJson = False) -> None:
+def manifests(buffer_set: _Folder, config: PlanConfig, as_json: AsJson = False) -> None:
     """Plan the history buffers of all query episodes.
 
     Example:
@@ -140,7 +142,7 @@ def manifests(buffer_set: BufferSetFolder, config: PlanConfig, as_json: AsJson =
 
 
 @app.command()
-def questions(buffer_set: BufferSetFolder, as_json: AsJson = False) -> None:
+def questions(buffer_set: _Folder, as_json: AsJson = False) -> None:
     """Make a question about the past for each query, with a marked picture, for `ask` (tabletop).
 
     Writes questions.parquet.
@@ -221,7 +223,7 @@ def new_buffer_set(config: NewConfig, plan: PlanConfig, as_json: AsJson = False)
         print_status(f"Demonstrations: {base.files.describe()}; units from {len(units.tasks):,}")
         _build(units, config.buffer_set / DISTRACTORS, config, as_json=False)
         _plan(config.buffer_set, plan, as_json=as_json, base=base.files)
-        audit(config.buffer_set)
+        audit(str(config.buffer_set))
     print_status(f"Next: robomme-interference publish {config.buffer_set} --repo-id NAMESPACE/NAME")
 
 

@@ -213,6 +213,6 @@ def _index(name: str, dataset: Dataset, folder: str, units: Dataset | None) -> I
     lengths = {record.episode_index: record.length for record in dataset.records()}
     dataset.index(encoder, camera).check(lengths, units=name == DISTRACTORS)
     with suppress(InterferenceError):  # reported where the units are checked
-        made = dataset.index(encoder, camera).made
-        if units is not None and units.index(encoder, camera).made != made:
+        made = dataset.index(encoder, camera).key
+        if units is not None and units.index(encoder, camera).key != made:
             yield Violation(where, f"was made with another encoder than that of the {DISTRACTORS}")

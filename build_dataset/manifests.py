@@ -28,12 +28,11 @@ from robomme_interference_data.constants import (
     SHIFTED,
     UNITS,
 )
+from robomme_interference_data.data.buffer_set import pending_rows
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.data.manifest_table import pending_rows
 from robomme_interference_data.data.query_sessions import QuerySessions, SessionSource
 from robomme_interference_data.errors import (
     BuildError,
-    HistoryTooLongError,
     InvalidOptionError,
     SourceError,
 )
@@ -162,7 +161,7 @@ def planned_buffers(plan: ManifestPlan) -> Iterator[BufferManifest]:
             manifest, limit = buffers[condition.name], plan.position_limit
             needed = manifest.history_frames + MAX_STEPS
             if limit is not None and needed > limit:  # rule 8
-                raise HistoryTooLongError(
+                raise InvalidOptionError(
                     f"{manifest} needs {needed} positions ({manifest.history_frames} history "
                     f"frames + {MAX_STEPS} steps); the limit is {limit}",
                     'Leave out the condition, or set position_limit="none" for systems without a '

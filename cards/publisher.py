@@ -7,12 +7,11 @@ import logging
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from hashlib import sha256
 from typing import Any
 
 from robomme_interference_data.constants import PARTS_PATH
 from robomme_interference_data.errors import FormatError, MissingFileError, PublishError
-from robomme_interference_data.storage.files import canonical_json, indented_json, read_json
+from robomme_interference_data.storage.files import digest_json, indented_json, read_json
 from robomme_interference_data.storage.hub import HubFiles
 from robomme_interference_data.viz.tables import Table
 
@@ -98,7 +97,7 @@ class RepoPlan:
 
 def digest(value: Any) -> str:
     """Return the digest of a part: SHA-256 of its plain values as JSON."""
-    return sha256(canonical_json(value).encode(errors="backslashreplace")).hexdigest()
+    return digest_json([value])
 
 
 def plan_table(plans: Iterable[RepoPlan]) -> Table:

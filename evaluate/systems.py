@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from robomme_interference_data.constants import MAX_STEPS, POSITION_LIMIT
-from robomme_interference_data.errors import HistoryTooLongError, InvalidIdError, UnknownNameError
+from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, UnknownNameError
 from robomme_interference_data.schema.conditions import NO_HISTORY
 
 _FREE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
@@ -226,7 +226,7 @@ def check_history(system: System, frames: Mapping[str, int]) -> None:
         if limit is not None and count + MAX_STEPS > limit
     ]
     if over:
-        raise HistoryTooLongError(
+        raise InvalidOptionError(
             f"{system.name} numbers {limit} positions: {MAX_STEPS} steps leave no room for a "
             f"history of {', '.join(over)}",
             "Leave out those conditions or episodes, or run a system without such a limit.",

@@ -96,14 +96,15 @@ def index(
     from .encoders import make_encoder
     from .index import build_index, look_on_hub
 
-    paths = [buffer_set / IDENTITY_PATH, *sorted(buffer_set.glob(f"*/{IDENTITY_PATH}"))]
+    folder = Path(buffer_set)
+    paths = [folder / IDENTITY_PATH, *sorted(folder.glob(f"*/{IDENTITY_PATH}"))]
     roots = [path.parent.parent for path in paths if path.is_file()]
     if not roots:
         raise MissingFileError(
             f"{buffer_set} is neither a buffer set nor a dataset of this package",
             f"Build one: robomme-interference build all {buffer_set} --source KIND:PATH",
         )
-    planned = load_buffer_set(buffer_set) if (buffer_set / MANIFEST_PATH).is_file() else None
+    planned = load_buffer_set(buffer_set) if (folder / MANIFEST_PATH).is_file() else None
     image_encoder = make_encoder(config.encoder, device=config.device, batch=config.batch)
     with graceful_interrupt("Finished episodes are kept"), WorkProgress(quiet=as_json) as progress:
         reports = build_index(
@@ -288,7 +289,7 @@ def calibrate(
 
 
 def _measured(
-    buffer_set: Path,
+    buffer_set: str,
     encoder: str,
     camera: str,
     shift: str,

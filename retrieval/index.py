@@ -24,18 +24,18 @@ from robomme_interference_data.constants import (
     INDEX_HEADER,
 )
 from robomme_interference_data.data.buffer_set import BufferSet
-from robomme_interference_data.data.buffer_set_index import normalised
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.embeddings import (
-    CENTRE_FILE,
+    CENTER_FILE,
     INDEX_SUMS,
     EmbeddingIndex,
     EncoderRecord,
     IndexHeader,
-    centre_of,
+    center_of,
     encoder_id,
     episode_file,
     index_folder,
+    normalized,
 )
 from robomme_interference_data.errors import (
     BuildError,
@@ -243,12 +243,12 @@ class _IndexBuilder:
         names = [episode_file(episode) for episode in range(len(self.lengths))]
         if self.units:
             if encoder.centred:
-                centre = centre_of(map(np.load, self.features))
-                write_array(made / CENTRE_FILE, centre)
+                centre = center_of(map(np.load, self.features))
+                write_array(made / CENTER_FILE, centre)
             typical = typical_cosine(
-                len(names), lambda episode: normalised(np.load(self.features[episode]), centre)
+                len(names), lambda episode: normalized(np.load(self.features[episode]), centre)
             )
-        written = names if centre is None else [*names, CENTRE_FILE]
+        written = names if centre is None else [*names, CENTER_FILE]
         write_text(made / INDEX_SUMS, format_sums(made, written))
         header = IndexHeader(
             format_version=FORMAT_VERSION,

@@ -161,7 +161,7 @@ def measure(
         buffer.sessions,
         adjacent_cosines(embeddings),
         cosines(embeddings, buffer.query_embedding(encoder, camera) if query is None else query),
-        buffer.index(encoder, camera).typical_cosine,
+        buffer.index(encoder, camera).units.typical_cosine,
         lambda span: closest_cosines(buffer.embeddings(encoder, camera), span),
         buffer.evidence,
     )

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import CAMERA_PREFIX
 from robomme_interference_data.data.buffer import Buffer
-from robomme_interference_data.data.buffer_set_index import BufferSetIndex
-from robomme_interference_data.data.embeddings import index_folder
+from robomme_interference_data.data.embeddings import BufferSetIndex, index_folder
 from robomme_interference_data.errors import InvalidOptionError
 
 from .encoders import check_encoder, make_encoder, published_threshold
@@ -53,12 +52,12 @@ class Selector:
         """
         index = self._index(buffer)
         return {
-            "encoder": index.encoder.name,
-            "fingerprint": index.encoder.sha256,
+            "encoder": index.units.header.encoder.name,
+            "fingerprint": index.units.header.encoder.sha256,
             "camera": self.camera,
             "method": self.rule.method,
             "boundary": self.rule.boundary,
-            "threshold": self.rule.threshold(index.typical_cosine),
+            "threshold": self.rule.threshold(index.units.typical_cosine),
         }
 
     def select(self, buffer: Buffer, image: NDArray[np.uint8]) -> NDArray[np.int64]:
@@ -82,5 +81,5 @@ class Selector:
     def _index(self, buffer: Buffer) -> BufferSetIndex:
         """Return the index of the buffer set, which this encoder has to have made."""
         index = buffer.index(self._encoder.name, self.camera)
-        check_encoder(index.encoder, self._encoder, index.remedy)
+        check_encoder(index.units.header.encoder, self._encoder, index.units.remedy)
         return index

@@ -1,15 +1,15 @@
-"""Numbers and names fixed by the protocol, and every path inside a dataset or buffer set."""
+"""Constants of the protocol, and every path inside a dataset, buffer set or run."""
 
 from typing import NamedTuple
 
 FORMAT_VERSION = 1
-"""Version of the files that this package writes; a reader refuses one that it does not know."""
+"""Version of the file format; readers reject others."""
 
 PROTOCOL_VERSION = 1
-"""Version of the rules by which a rollout is run; rows of different versions never mix."""
+"""Version of the rollout rules; rows of different versions never mix."""
 
 RULE_VERSION = 1
-"""Version of the rule that draws distractor units for a query (see `draw.py`)."""
+"""Version of the rule that draws distractor units (see `draw.py`)."""
 
 # --- protocol (paper, section "The Benchmark") -----------------------------------------------
 
@@ -31,16 +31,16 @@ SPLITS = ("train", "val", "test")
 DIFFICULTIES = ("easy", "medium", "hard")
 
 MAX_K = 63
-"""Most sessions that a condition adds to the lesson (ours; the paper's most is 7)."""
+"""Most sessions that a condition adds to the lesson (ours; the paper uses up to 7)."""
 
 UNIT_FRAMES = 32
 """Stored frames in a distractor unit."""
 
 UNIT_STRIDE = 8
-"""Raw frames from one stored frame of a unit to the next."""
+"""Raw frames between stored frames of a unit."""
 
 UNIT_MIN_RAW_FRAMES = (UNIT_FRAMES - 1) * UNIT_STRIDE + 1
-"""Raw frames that an episode needs to yield a unit: indices 0, 8, …, 248, so 249."""
+"""Raw frames needed for a unit with the indices 0, 8, …, 248: 249."""
 
 MAX_STEPS = 1300
 """Executed steps after which a rollout times out."""
@@ -49,16 +49,16 @@ POSITION_LIMIT = 4096
 """Steps for which released MME-VLA servers hold position embeddings."""
 
 ACTION_CHUNK = 16
-"""Actions of a chunk that are executed before the policy is asked again."""
+"""Actions of a chunk that are executed before the next call of the policy."""
 
 SAMPLE_FRAMES = 32
-"""Frames that FrameSamp keeps of its whole history."""
+"""Frames in the memory of FrameSamp."""
 
 FPS = 10
 """Recorded frames per second."""
 
 KEY_FRAMES = 16
-"""Frames from one key frame of an exact video to the next; threads decode whole such spans."""
+"""Frames per key frame of an exact video; threads decode multiples of them."""
 
 # --- features of a dataset -------------------------------------------------------------------
 
@@ -84,28 +84,27 @@ INDEX_HEADER = "index.json"
 PAPER_ENCODER = "google/siglip-so400m-patch14-384"
 """Model that embeds frames in the paper; its index is `index/siglip`."""
 
-# --- paths inside a buffer set ----------------------------------------------------------------------
+# --- paths inside a buffer set ------------------------------------------------------------------
 
 DEMONSTRATIONS = "demonstrations"
 DISTRACTORS = "distractors"
 RAW_DISTRACTORS = "distractors-raw"
-"""The same episodes as the distractors', 256 frames at full rate."""
+"""The episodes of the distractors, 256 frames at full rate."""
 CONTRADICTIONS = "contradictions"
-"""Lessons in the scenes of the queries, with other answers."""
+"""Lessons in the scenes of the queries with other answers."""
 SHIFTED = "shifted"
-"""What the queries look like under shifts: a frame each, in the order of `shifts.SHIFTS`."""
+"""First live views of the queries under shifts: a frame for each of `shifts.SHIFTS`."""
 
 LESSONS = (DEMONSTRATIONS, CONTRADICTIONS)
-"""Whose episodes are lessons, with the query frame after them; those of
-`UNITS` are units."""
+"""Datasets of lessons followed by their query frame."""
 
 
 class Unit(NamedTuple):
-    """What a distractor unit is cut of a recorded episode: raw frames 0, stride, and so on.
+    """Size of a distractor unit: raw frames 0, stride, and so on.
 
     Attributes:
-        frames: Stored frames; fewer at full rate, if the episode ends before.
-        stride: Raw frames from one stored frame to the next.
+        frames: Stored frames; fewer at full rate if the episode is shorter.
+        stride: Raw frames between stored frames.
     """
 
     frames: int
@@ -116,17 +115,18 @@ UNITS = {
     DISTRACTORS: Unit(UNIT_FRAMES, UNIT_STRIDE),
     RAW_DISTRACTORS: Unit(UNIT_FRAMES * UNIT_STRIDE, 1),
 }
-"""Of what the units of a dataset are."""
+"""Datasets of units, with the size of a unit."""
 
 OPTIONAL_DATASETS = (RAW_DISTRACTORS, CONTRADICTIONS, SHIFTED)
-"""Datasets that a buffer set may lack; on the Hub they are folders of its repository."""
+"""Datasets that a buffer set may lack; on the Hub, folders of its repository."""
 
 DATASETS = (DEMONSTRATIONS, DISTRACTORS, *OPTIONAL_DATASETS)
-"""Names of a buffer set's datasets, which are their kinds."""
+"""Names, and kinds, of a buffer set's datasets."""
+
 QUESTIONS_PATH = "questions.parquet"
-"""Questions about the past, which a buffer set may have."""
+"""Questions about the past; optional."""
 PARTS_PATH = "parts.json"
-"""Digests of what a published version holds, by which the next one is numbered."""
+"""Digests of a published version's content, from which the next version number follows."""
 
 MANIFESTS = "manifests"
 MANIFEST_HEADER = "manifest.json"
@@ -138,4 +138,4 @@ MANIFEST_PATH = f"{MANIFESTS}/{MANIFEST_HEADER}"
 RUN_HEADER = "run.json"
 RUN_RECORD = "rollouts.jsonl"
 RUN_TABLES = ("rollouts.parquet", "rollouts.csv")
-"""Exported from the record when a run ends."""
+"""Exported from the record at the end of a run."""

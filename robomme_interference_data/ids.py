@@ -1,4 +1,4 @@
-"""Episode ids, and lists of episode numbers: parse and format are inverses of each other."""
+"""Parse and format episode ids and lists of episode numbers."""
 
 import operator
 import re
@@ -20,20 +20,20 @@ _FAMILY_RANK = {family: rank for rank, family in enumerate(FAMILIES)}
 class EpisodeId:
     """The name of an episode, `<Family>/<split>/<index>`, e.g. `VideoRepick/test/7`.
 
-    A fourth part, `VideoRepick/test/7/2`, is for the same scene played with answer 2 instead of its
-    own: a contradicting lesson.
+    A fourth part, as in `VideoRepick/test/7/2`, denotes a contradicting lesson: the same scene
+    played with answer 2.
 
-    Ids sort by family (the nine of the benchmark first, in the paper's order, then others by
-    name), split and index as a number: the canonical order of everything that is written.
+    Ids sort by family (the benchmark's in the paper's order, then others by name), split and
+    index. This is the canonical order of all stored data.
 
     Args:
         family: Task family: a letter, then letters, digits, `_`, `.` or `-`.
         split: `train`, `val` or `test`.
         index: Number of the episode within family and split, from 0.
-        answer: Number of the answer that it is played with, from 0; None for its own.
+        answer: Number of the played answer, from 0; None for the scene's correct answer.
 
     Raises:
-        InvalidIdError: A part is not as described.
+        InvalidIdError: A part is invalid.
     """
 
     family: str
@@ -45,24 +45,21 @@ class EpisodeId:
         if not isinstance(self.family, str) or not _FAMILY.fullmatch(self.family):
             raise InvalidIdError(
                 f"{self.family!r} is not a family name",
-                "A family is a letter followed by letters, digits, '_', '.' or '-', such as "
-                "VideoRepick.",
+                "Expected a letter, then letters, digits, '_', '.' or '-', such as VideoRepick.",
             )
         if self.split not in SPLITS:
             raise InvalidIdError(
                 f"{self.split!r} is not a split; expected one of {', '.join(SPLITS)}",
                 nearest(str(self.split), SPLITS),
             )
-        numbers = {"episode index": self.index}
-        if self.answer is not None:
-            numbers["answer"] = self.answer
-        for what, number in numbers.items():
+        answer = 0 if self.answer is None else self.answer
+        for what, number in (("episode index", self.index), ("answer", answer)):
             if type(number) is not int or not 0 <= number < 10**18:
-                raise InvalidIdError(f"{number!r} is not an {what}", "Those are numbers from 0 on.")
+                raise InvalidIdError(f"{number!r} is not an {what}", "Expected an integer from 0.")
 
     @classmethod
     def parse(cls, text: "str | EpisodeId") -> Self:
-        """Read an id from text; an id is returned as it is.
+        """Parse an id from text; an id is returned unchanged.
 
         Raises:
             InvalidIdError: The text is not `<Family>/<split>/<index>`.
@@ -78,12 +75,12 @@ class EpisodeId:
         return cls(parts[0], parts[1], *map(int, parts[2:]))
 
     def __str__(self) -> str:
-        own = f"{self.family}/{self.split}/{self.index}"
-        return own if self.answer is None else f"{own}/{self.answer}"
+        text = f"{self.family}/{self.split}/{self.index}"
+        return text if self.answer is None else f"{text}/{self.answer}"
 
     @property
     def scene(self) -> "EpisodeId":
-        """The same scene with its own answer."""
+        """Id of the same scene with the correct answer."""
         return EpisodeId(self.family, self.split, self.index)
 
     @property
@@ -98,13 +95,7 @@ class EpisodeId:
 
 
 def whole_number(option: str, given: Any, expected: str) -> int:
-    """Return an argument that is to be a whole number, Python's or numpy's, and no boolean.
-
-    Args:
-        option: Name of the argument.
-        given: The argument.
-        expected: What it is to be, for the message.
-    """
+    """Return an integer argument, Python's or numpy's, but not a boolean; else raise an error."""
     try:
         if not isinstance(given, bool):
             return operator.index(given)
@@ -114,16 +105,12 @@ def whole_number(option: str, given: Any, expected: str) -> int:
 
 
 def parse_numbers(text: str) -> tuple[int, ...]:
-    """Read episode numbers such as `0-49` or `0,3,10-12`; both ends are included.
-
-    Returns:
-        The numbers, ascending, each once.
-    """
+    """Parse episode numbers such as `0-49` or `0,3,10-12`, ends included; ascending, each once."""
     return tuple(sorted({number for span in _spans(text) for number in span}))
 
 
 def count_numbers(text: str) -> int:
-    """Count what `parse_numbers` would read, without reading it; what comes twice counts twice."""
+    """Count the numbers in such a text without listing them; repeated numbers count repeatedly."""
     return sum(map(len, _spans(text)))
 
 
@@ -134,20 +121,20 @@ def _spans(text: str) -> list[range]:
         if match is None or int(match[2] or match[1]) < int(match[1]):
             raise InvalidOptionError(
                 f"{text!r} is not a list of episode numbers: {part.strip()!r}",
-                "Expected numbers and spans with commas between them, such as 0-49 or 0,3,10-12.",
+                "Expected numbers and ranges separated by commas, such as 0-49 or 0,3,10-12.",
             )
         spans.append(range(int(match[1]), int(match[2] or match[1]) + 1))
         count += len(spans[-1])
         if count > _MOST_NUMBERS:
             raise InvalidOptionError(
-                f"{text!r} is not a list of episode numbers: over {_MOST_NUMBERS:,} of them",
-                "Give the episodes that there are, such as 0-49.",
+                f"{text!r} is not a list of episode numbers: it has over {_MOST_NUMBERS:,}",
+                "Give existing episodes, such as 0-49.",
             )
     return spans
 
 
 def format_numbers(numbers: Iterable[int]) -> str:
-    """Write ascending numbers as `parse_numbers` reads them."""
+    """Format ascending numbers for `parse_numbers`."""
     spans: list[list[int]] = []
     for number in numbers:
         if spans and spans[-1][1] == number - 1:

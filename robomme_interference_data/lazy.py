@@ -1,7 +1,4 @@
-"""Import on first use: the public names of packages, and modules that need an extra.
-
-The command line and workers import packages first, and need few of their names.
-"""
+"""Import on first use: public names of packages, and modules that need an extra."""
 
 from collections.abc import Callable, Mapping
 from importlib import import_module
@@ -11,11 +8,9 @@ from robomme_interference_data.errors import MissingExtraError
 
 
 def lazy_exports(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """Return a package's `__getattr__`, which imports the module of a name, and no other.
+    """Return a package's `__getattr__`, which imports only the module of the requested name.
 
-    Args:
-        package: Its `__name__`.
-        modules: Module, relative or absolute, to the names it provides, separated by spaces.
+    `modules` maps modules, relative or absolute, to their public names, separated by spaces.
     """
     module_of = {name: module for module, names in modules.items() for name in names.split()}
 
@@ -28,13 +23,9 @@ def lazy_exports(package: str, modules: Mapping[str, str]) -> Callable[[str], An
 
 
 def load_extra(module: str, name: str, what: str, extra: str) -> Callable[..., Any]:
-    """Import a module of ours that needs libraries of an extra, and return a name of it.
+    """Import `name` from a module of this package that needs the libraries of an extra.
 
-    Args:
-        module: Its full name.
-        name: The name.
-        what: What needs it, for the message.
-        extra: The extra, such as `evaluate`.
+    `what` needs them, for the message.
     """
     try:
         loaded = import_module(module)

@@ -14,9 +14,9 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidMes
 from websockets.sync.client import ClientConnection, connect
 
 from robomme_interference_data.errors import (
+    FormatError,
     PolicyServerError,
     ServerKeepaliveError,
-    WireError,
 )
 
 from .wire import pack, unpack
@@ -252,7 +252,7 @@ class ServerConnection:
                 if isinstance(answer, dict):
                     return answer
                 what, hint = f" answers with a {type(answer).__name__}, not a map", None
-            except WireError as error:
+            except FormatError as error:
                 what, hint = f": {error.message}", None
         self.close()
         raise PolicyServerError(f"policy server {self.name}{what}", hint)

@@ -186,7 +186,7 @@ def _choose_device(device: str | None) -> str:
 def find_policy(path: str) -> tuple[Path, str]:
     """Return the folder with a policy's files, and what names it: with its commit, on the Hub."""
     files = locate(path, "model")
-    folder, name = files.snapshot(*_FILES), files.describe()
+    folder, name = files.snapshot(*_FILES), files.location
     missing = [one for one in _NEEDED if not (folder / one).is_file()]
     if missing:
         raise MissingFileError(

@@ -11,7 +11,7 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import WireError
+from robomme_interference_data.errors import FormatError
 
 _KINDS = "biufSU"
 """Of NumPy data in messages: booleans, numbers, and texts of fixed length."""
@@ -33,10 +33,10 @@ def pack(message: Any) -> bytes:
     """
     try:
         return msgpack.packb(message, default=_pack_numpy)
-    except WireError:
+    except FormatError:
         raise
     except (TypeError, ValueError, OverflowError) as error:
-        raise WireError(f"a message cannot be sent: {error}", _NOTHING_ELSE) from error
+        raise FormatError(f"a message cannot be sent: {error}", _NOTHING_ELSE) from error
 
 
 def unpack(data: bytes) -> Any:
@@ -46,17 +46,17 @@ def unpack(data: bytes) -> Any:
     """
     try:
         return msgpack.unpackb(data, object_hook=_unpack_numpy, ext_hook=_refuse_extension)
-    except WireError:
+    except FormatError:
         raise
     except _NOT_READ as error:
         reason = str(error) or type(error).__name__
-        raise WireError(f"{len(data)} bytes are not a message: {reason}") from error
+        raise FormatError(f"{len(data)} bytes are not a message: {reason}") from error
 
 
 def _pack_numpy(value: Any) -> dict[bytes, Any]:
     if not isinstance(value, np.ndarray | np.generic):
         kind = type(value).__name__
-        raise WireError(f"a message cannot hold a {kind}: {value!r:.80}", _NOTHING_ELSE)
+        raise FormatError(f"a message cannot hold a {kind}: {value!r:.80}", _NOTHING_ELSE)
     _checked(value.dtype)
     if isinstance(value, np.generic):
         return {b"__npgeneric__": True, b"data": value.item(), b"dtype": value.dtype.str}
@@ -83,9 +83,9 @@ def _unpack_numpy(value: dict[Any, Any]) -> Any:
 
 def _checked(dtype: np.dtype[Any]) -> np.dtype[Any]:
     if dtype.kind not in _KINDS or dtype.shape or (dtype.kind == "f" and dtype.itemsize > 8):
-        raise WireError(f"a message cannot hold NumPy data of dtype {dtype}", _NOTHING_ELSE)
+        raise FormatError(f"a message cannot hold NumPy data of dtype {dtype}", _NOTHING_ELSE)
     return dtype
 
 
 def _refuse_extension(code: int, data: bytes) -> Any:
-    raise WireError(f"a message holds msgpack's extension type {code}", _NOTHING_ELSE)
+    raise FormatError(f"a message holds msgpack's extension type {code}", _NOTHING_ELSE)

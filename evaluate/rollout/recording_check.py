@@ -6,7 +6,7 @@ import numpy as np
 
 from robomme_interference_data.constants import STATE
 from robomme_interference_data.data.query import Query
-from robomme_interference_data.errors import RolloutError
+from robomme_interference_data.errors import RunError
 from robomme_interference_data.simulators.base import Demonstration, EpisodeInfo, Observation
 
 STATE_TOLERANCE = 0.01
@@ -41,7 +41,7 @@ def check_episode(
             f"{STATE_TOLERANCE}"
         )
     if wrong:
-        raise RolloutError(
+        raise RunError(
             f"{query.episode_id}: {'; '.join(wrong)}",
             "The dataset was recorded with another version of the simulator: build it again, or "
             "install the version that recorded it.",
@@ -57,19 +57,19 @@ def check_lesson(
     """
     dataset, episode, frames = query.dataset, query.record.episode_index, query.lesson_frames
     if not np.array_equal(dataset.read_vectors(episode, STATE, 0, frames), played.states):
-        raise RolloutError(f"{query.episode_id}: the lesson's states are not the simulator's")
+        raise RunError(f"{query.episode_id}: the lesson's states are not the simulator's")
     for camera in dataset.cameras:
         if camera not in first.images:
             continue
         recorded = dataset.iter_frames(episode, camera, 0, frames)
         for number, (ours, theirs) in enumerate(zip(recorded, played.images[camera], strict=True)):
             if not np.array_equal(ours, theirs):
-                raise RolloutError(
+                raise RunError(
                     f"{query.episode_id}: frame {number} of the lesson's {camera} camera is not "
                     "what the simulator shows",
                     "Another renderer or machine made the dataset; the states agree.",
                 )
         if views and not np.array_equal(query.frame(camera), first.images[camera]):
-            raise RolloutError(
+            raise RunError(
                 f"{query.episode_id}: the first live {camera} view is not the recorded one"
             )

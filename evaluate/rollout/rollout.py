@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import ACTION_CHUNK, MAX_STEPS
 from robomme_interference_data.data.buffer import Buffer, Chunk
 from robomme_interference_data.data.buffer_set import BufferSet
-from robomme_interference_data.errors import InvalidOptionError, PolicyError, RolloutError
+from robomme_interference_data.errors import InvalidOptionError, PolicyError, RunError
 from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.kind import Run, stored_count
@@ -119,7 +119,7 @@ def run_rollout(
     live = _Live(run.config, policy, simulator, writer, clock, clip, worker)
     status, steps = live.run(first, info.goal)
     if status is Status.ERROR:
-        raise RolloutError(f"the {config.simulator} simulator reported an error at step {steps}")
+        raise RunError(f"the {config.simulator} simulator reported an error at step {steps}")
     times: dict[str, Any] = {name: round(value, 4) for name, value in clock.items()}
     return run.row(
         item,

@@ -88,9 +88,9 @@ def run_evaluation(
 
     Raises:
         UnknownNameError, InvalidOptionError, InvalidIdError: A setting is not what it may be.
-        HistoryTooLongError: A buffer exceeds the system's position limit.
+        InvalidOptionError: A buffer exceeds the system's position limit.
         MissingFileError: The buffer set is not there, or has no questions.
-        RunFolderError: `out` holds another run, or something else.
+        RunError: `out` holds another run, or something else.
         PolicyError: The policy cannot be made.
         PolicyServerError: A policy server cannot be reached, or no longer any of them; another run
             drives it; or it is not what the system's is.

@@ -17,7 +17,7 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
 from robomme_interference_data.constants import FORMAT_VERSION, RUN_HEADER, RUN_RECORD, RUN_TABLES
-from robomme_interference_data.errors import FormatError, RunFolderError, first_line, visible
+from robomme_interference_data.errors import FormatError, RunError, first_line, visible
 from robomme_interference_data.schema.codec import arrow_schema, from_dict, to_dict, to_table
 from robomme_interference_data.schema.rollouts import FINAL, Rollout, Status
 from robomme_interference_data.storage.files import (
@@ -195,11 +195,11 @@ def open_log(
     if there == [RUN_RECORD] and not (folder / RUN_RECORD).stat().st_size:
         there = []  # a full disk, or a kill, came before the header
     if there and RUN_HEADER not in there:
-        raise RunFolderError(
+        raise RunError(
             f"{folder} holds other files ({', '.join(there[:3])}) and no {RUN_HEADER}",
             "Set `out` to a new folder.",
         )
-    busy = RunFolderError(
+    busy = RunError(
         f"another process is writing {folder}", "Wait for it to end, or set another `out`."
     )
     with file_lock(folder / ".lock", busy):
@@ -208,7 +208,7 @@ def open_log(
             header = RunHeader(FORMAT_VERSION, dict(identity), buffer_set)
             write_json(folder / RUN_HEADER, to_dict(header))
         elif not resume:
-            raise RunFolderError(
+            raise RunError(
                 f"{folder} holds a run already", "Set another `out`, or leave out `no_resume`."
             )
         header, rows = read_run(folder)
@@ -221,7 +221,7 @@ def read_run(folder: Path) -> tuple[RunHeader, dict[WorkItem, Rollout]]:
     """Read a run: its header, standing as its record says, and its rows."""
     for name in (RUN_HEADER, RUN_RECORD):
         if not (folder / name).is_file():
-            raise RunFolderError(
+            raise RunError(
                 f"{folder} holds no run: {name} is missing",
                 "Give a folder that an evaluation wrote, all of it.",
             )
@@ -280,7 +280,7 @@ def check_same_run(folder: Path, found: Mapping[str, Any], wanted: Mapping[str, 
         if there.get(name) != here.get(name)
     ]
     if told:
-        raise RunFolderError(
+        raise RunError(
             f"{folder} holds another run: {'; '.join(told)}",
             f"Set another `out`, or the settings of the run that is there (see {RUN_HEADER}).",
         )

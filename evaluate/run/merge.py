@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from robomme_interference_data.errors import RunFolderError
+from robomme_interference_data.errors import RunError
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.rollouts import TIMING_COLUMNS, Rollout
 from robomme_interference_data.storage.files import LocalFiles
@@ -52,7 +52,7 @@ def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
     in rows is the first run's; by its revision it is the same buffer set in all.
 
     Raises:
-        RunFolderError: A folder holds no run, or another one than the first; `out` is taken.
+        RunError: A folder holds no run, or another one than the first; `out` is taken.
         FormatError: Files of a run are damaged, or links that lead out of its folder.
     """
     folders, target = [Path(folder) for folder in shards], Path(out)
@@ -61,7 +61,7 @@ def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
     for folder, (header, _) in zip(folders, runs, strict=True):
         check_same_run(folder, header.identity, first.identity)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise RunFolderError(f"{target} is there already", "Give a new folder.")
+        raise RunError(f"{target} is there already", "Give a new folder.")
     found: dict[WorkItem, tuple[Rollout, Path]] = {}
     duplicates: dict[WorkItem, bool] = {}
     for folder, (_, rows) in zip(folders, runs, strict=True):

@@ -1,16 +1,15 @@
 """Image encoders by name: their interface, and what is known without their weights."""
 
-from hashlib import sha256
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import PAPER_ENCODER
-from robomme_interference_data.data.embeddings import EncoderRecord, Remedy, encoder_id
-from robomme_interference_data.errors import InvalidOptionError, MissingIndexError
+from robomme_interference_data.data.embeddings import EncoderRecord, encoder_id
+from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.runtime.specs import Kind, Registry
-from robomme_interference_data.storage.files import canonical_json
+from robomme_interference_data.storage.files import digest_json
 
 ENCODERS = Registry(
     "encoder",
@@ -62,13 +61,13 @@ class Encoder(Protocol):
 
 def encoder_digest(encoder: Encoder) -> str:
     """Return the hash of an encoder's fingerprint."""
-    return sha256(canonical_json(encoder.fingerprint).encode()).hexdigest()
+    return digest_json([encoder.fingerprint])
 
 
-def check_encoder(recorded: EncoderRecord, encoder: Encoder, remedy: Remedy) -> None:
+def check_encoder(recorded: EncoderRecord, encoder: Encoder, remedy: tuple[str, str]) -> None:
     """Check that this encoder made the embeddings of an index; `remedy` makes them again."""
     if recorded.sha256 != encoder_digest(encoder):
-        raise MissingIndexError(
+        raise MissingFileError(
             f"the stored embeddings of {encoder.name!r} come from another version of the encoder: "
             "its weights, settings, preprocessing or code differ",
             *remedy,

@@ -27,7 +27,7 @@ _LIST: dict[str, Any] = {"callback": split_commas, "metavar": "NAME,…"}
 
 AsJson = Annotated[bool, typer.Option("--json", help="Write JSON to standard output.")]
 BufferSetFolder = Annotated[
-    Path, typer.Argument(metavar="BUFFER_SET", help="Folder of the buffer set.")
+    str, typer.Argument(metavar="BUFFER_SET", help="Folder of the buffer set, or NAMESPACE/NAME.")
 ]
 QueryName = Annotated[str, typer.Argument(help="Episode id, such as VideoRepick/test/7.")]
 ConditionName = Annotated[str, typer.Argument(help="Condition, such as k3.")]

@@ -1,15 +1,14 @@
 """One of a buffer set's datasets, on disk or on the Hub: demonstrations, distractor units, ….
 
-A LeRobot dataset in which every episode has files of its own, with our columns in `meta/episodes`,
-a lean copy of that table in `meta/interference.parquet`, and its identity in
+It is a LeRobot dataset in which every episode has its own files, with our columns in
+`meta/episodes`, a smaller copy of that table in `meta/interference.parquet`, and its identity in
 `meta/interference.json`.
 """
 
-import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,36 +36,36 @@ from robomme_interference_data.schema.records import DatasetIdentity, EpisodeRec
 from robomme_interference_data.storage.arrays import SpanDigester, combine
 from robomme_interference_data.storage.files import (
     Files,
-    canonical_json,
+    digest_json,
     read_header,
     read_sums,
     sha256_file,
 )
 from robomme_interference_data.storage.lerobot import LeRobotFiles
 
-from .embeddings import EmbeddingIndex
+if TYPE_CHECKING:
+    from .embeddings import EmbeddingIndex
 
 
 def camera_feature(camera: str) -> str:
-    """Return the feature name of a camera, whether `observation.images.` is given or not."""
+    """Return the feature name of a camera, with or without `observation.images.`."""
     if not isinstance(camera, str):
         raise InvalidOptionError.expected("camera", camera, "the name of one, such as 'front'")
     return CAMERA_PREFIX + camera.removeprefix(CAMERA_PREFIX)
 
 
 def revision_of(records: Iterable[EpisodeRecord]) -> str:
-    """Return the SHA-256 over episode records, which is the revision of a dataset of them."""
-    revision = hashlib.sha256()
-    for record in records:
-        revision.update(canonical_json(to_dict(record)).encode(errors="backslashreplace") + b"\n")
-    return revision.hexdigest()
+    """Return the revision of a dataset: the SHA-256 over its episode records."""
+    return digest_json(map(to_dict, records), end="\n")
 
 
 class Dataset:
-    """One of a buffer set's datasets; which, its `kind` says.
+    """One of a buffer set's datasets.
 
-    Args:
-        files: How to reach the files.
+    Attributes:
+        files: Access to its files, the only argument.
+        lerobot: Its LeRobot part.
+        identity: Content of `meta/interference.json`.
 
     Raises:
         MissingFileError: `meta/info.json` or `meta/interference.json` is missing.
@@ -75,7 +74,7 @@ class Dataset:
 
     def __init__(self, files: Files):
         self.files = files
-        with suppress(MissingFileError):  # which is told below, as what it means
+        with suppress(MissingFileError):  # reported below
             files.fetch((INFO_PATH, IDENTITY_PATH, RECORDS_PATH))
         self.lerobot = LeRobotFiles(files, [RECORDS_PATH])
         try:
@@ -85,15 +84,16 @@ class Dataset:
                 f"{files.describe()} is a LeRobot dataset, but not one of history sessions: "
                 f"{IDENTITY_PATH} is missing",
                 "Build one from it.",
-                f"build distractors DIR --source lerobot:{files.describe()}",
+                f"build distractors DIR --source lerobot:{files.location}",
             ) from None
         self.identity = read_header(path, DatasetIdentity)
+        self._name = files.describe()
         self._indexes: dict[tuple[str, str], EmbeddingIndex] = {}
         self._records: dict[int, EpisodeRecord] = {}
         self._checked = False
 
     def __repr__(self) -> str:
-        return f"Dataset({self.kind}, {self.files.describe()}, episodes={len(self)})"
+        return f"Dataset({self.kind}, {self._name}, episodes={len(self)})"
 
     def __len__(self) -> int:
         return len(self.lerobot)
@@ -113,18 +113,18 @@ class Dataset:
         """Shape of one value by feature name: cameras `(H, W, 3)`, vectors `(D,)`.
 
         Raises:
-            FormatError: `info.json` tells other shapes, or no states.
+            FormatError: `info.json` has other shapes, or no states.
         """
-        found = {
+        shapes = {
             name: self.lerobot.shape(name)
             for name, feature in self.lerobot.features.items()
             if feature["dtype"] == "video" or name in (STATE, ACTION)
         }
-        for name in (STATE, *({ACTION} & found.keys())):
-            if len(found.get(name, ())) != 1:
-                what = f"{INFO_PATH} tells no vectors {name}, but {found.get(name)}"
-                raise FormatError.damaged(self.files.describe(), what)
-        return found
+        for name in (STATE, *({ACTION} & shapes.keys())):
+            if len(shapes.get(name, ())) != 1:
+                what = f"{INFO_PATH}: {name} has shape {shapes.get(name)}; expected (D,)"
+                raise FormatError.damaged(self._name, what)
+        return shapes
 
     @cached_property
     def cameras(self) -> tuple[str, ...]:
@@ -149,42 +149,36 @@ class Dataset:
         """
         record = self._records.get(episode_index)
         if record is None:
-            row, where = self.lerobot.row(episode_index), self.files.describe()
-            record = self._records[episode_index] = from_dict(EpisodeRecord, row, where)
+            row = self.lerobot.row(episode_index)
+            record = self._records[episode_index] = from_dict(EpisodeRecord, row, self._name)
         return record
 
     def records(self) -> Iterator[EpisodeRecord]:
         """Yield the records of all episodes, by episode index."""
         if len(self._records) < len(self):
-            where = self.files.describe()
             for index, row in enumerate(self.lerobot.table.to_pylist()):
-                self._records[index] = from_dict(EpisodeRecord, row, where)
+                self._records[index] = from_dict(EpisodeRecord, row, self._name)
         return (self._records[index] for index in range(len(self)))
 
     def check_records(self) -> None:
         """Check the records of all episodes against the revision; once.
 
         Raises:
-            HashMismatchError: They are others.
+            HashMismatchError: They differ.
         """
         if not self._checked and revision_of(self.records()) != self.revision:
             raise HashMismatchError(
-                f"the episode records of {self.files.describe()} are not those of its revision",
+                f"the episode records of {self._name} are not those of its revision",
                 "The data is damaged: download or build it again.",
                 "verify BUFFER_SET",
             )
         self._checked = True
 
     def session(self, role: str, record: EpisodeRecord) -> SessionEntry:
-        """Return the session that an episode of the dataset is: a whole lesson, or a unit.
-
-        Args:
-            role: What it is to a query, one of `records.ROLES`.
-            record: The episode's record.
-        """
+        """Return the session of an episode, a whole lesson or a unit, in one of `ROLES`."""
         name, sha256 = record.episode_id, combine(record.feature_sha256)
-        place = self.kind, self.revision, record.episode_index
-        return SessionEntry(role, name.family, name, *place, *record.session, 1, sha256)
+        stored = self.kind, self.revision, record.episode_index
+        return SessionEntry(role, name.family, name, *stored, *record.session, 1, sha256)
 
     def index_of(self, episode: EpisodeId) -> int:
         """Return the number of an episode in the dataset, by its id.
@@ -192,25 +186,25 @@ class Dataset:
         Raises:
             UnknownNameError: The dataset does not hold it; offers the nearest id.
         """
-        found = self._places.get(str(episode))
-        if found is None:
-            where = f"the {self.kind} of {self.files.describe()}"
-            raise UnknownNameError.among("episode", str(episode), where, self._places)
-        return found
+        index = self._index_by_id.get(str(episode))
+        if index is None:
+            where = f"the {self.kind} of {self._name}"
+            raise UnknownNameError.among("episode", str(episode), where, self._index_by_id)
+        return index
 
     @cached_property
-    def _places(self) -> dict[str, int]:
+    def _index_by_id(self) -> dict[str, int]:
         if "episode_id" not in self.lerobot.table.column_names:
-            raise FormatError.damaged(self.files.describe(), "its episodes have no episode_id")
+            raise FormatError.damaged(self._name, "its episodes have no episode_id")
         ids = self.lerobot.table["episode_id"].to_pylist()
         return {str(text): index for index, text in enumerate(ids)}
 
     def files_of(self, episode_index: int, cameras: Iterable[str]) -> list[str]:
         """Return the paths of the files that hold an episode's vectors and the given cameras."""
-        place = self.lerobot.locate(episode_index)
-        return [place.data, *(place.videos[self._camera(camera)][0] for camera in cameras)]
+        stored = self.lerobot.locate(episode_index)
+        return [stored.data, *(stored.videos[self._camera(camera)][0] for camera in cameras)]
 
-    def index(self, encoder: str, camera: str = "front") -> EmbeddingIndex:
+    def index(self, encoder: str, camera: str = "front") -> "EmbeddingIndex":
         """Return the embeddings of the stored frames, opened once.
 
         Args:
@@ -219,10 +213,12 @@ class Dataset:
 
         Raises:
             UnknownNameError: There is no such camera.
-            MissingIndexError: The dataset has no embeddings of this encoder and camera.
-            MissingIndexError: They were made of other data, or with another encoder.
+            MissingFileError: The dataset has no embeddings of this encoder and camera, or they
+                were made of other data or with another encoder.
             FormatError: They are of an unknown version, or damaged.
         """
+        from .embeddings import EmbeddingIndex
+
         if not isinstance(encoder, str):
             raise InvalidOptionError.expected("encoder", encoder, "its name, such as 'thumbnail'")
         key = encoder, self._camera(camera)
@@ -269,12 +265,9 @@ class Dataset:
         spans: Sequence[tuple[int, int]],
         watch: Callable[[str, NDArray[Any]], None] | None = None,
     ) -> list[dict[str, str]]:
-        """Decode an episode once; return the digests by feature of spans of it, end excluded.
+        """Decode an episode once and return the digests by feature of its spans, ends excluded.
 
-        Args:
-            episode_index: The episode.
-            spans: First frame, and the one after the last, of each span.
-            watch: Called with each feature and value on the way.
+        `watch` is called with each feature and value on the way.
         """
         first, last = min(start for start, _ in spans), max(stop for _, stop in spans)
         running = SpanDigester(spans)
@@ -291,20 +284,19 @@ class Dataset:
         return running.digests()
 
     def sums(self) -> dict[str, str]:
-        """Return the recorded SHA-256 of every file but the indexes', by relative path.
+        """Return the recorded SHA-256 by relative path of every file except embedding indexes.
 
         Raises:
-            FormatError: The list is not the one that the identity names.
+            FormatError: The list does not have the SHA-256 in the identity.
         """
         path = self.files.path(SUMS_PATH)
         if sha256_file(path) != self.identity.sums:
-            raise FormatError.damaged(path, f"not the SHA-256 that {IDENTITY_PATH} says")
+            raise FormatError.damaged(path, f"not the SHA-256 in {IDENTITY_PATH}")
         return read_sums(path)
 
     def _camera(self, camera: str) -> str:
         name = camera_feature(camera)
         if name not in self.features:
-            where = self.files.describe()
             plain = camera.removeprefix(CAMERA_PREFIX)
-            raise UnknownNameError.among("camera", plain, where, self.cameras)
+            raise UnknownNameError.among("camera", plain, self._name, self.cameras)
         return name

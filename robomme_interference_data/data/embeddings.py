@@ -1,17 +1,16 @@
-"""What an encoder makes of a dataset's stored frames: the index that lies beside them.
+"""Image features stored beside a dataset (its index), and the embeddings computed from them.
 
-An index is made by `robomme-interference index` (the retrieval area); reading it needs numpy
-only. It depends on its dataset, the encoder and the camera alone; `split_index.py` makes
-embeddings of it. Every episode has a file of its own. `docs/format.md` lists them.
+`robomme-interference index` writes an index; reading one needs only numpy. An index depends on its
+dataset, encoder and camera. Every episode has its own file. `docs/format.md` lists the files.
+Only this module turns features into embeddings, both of stored frames and of live images.
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from hashlib import sha256
 from pathlib import Path, PurePath
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     DATASETS,
+    DISTRACTORS,
     INDEX_DIR,
     INDEX_HEADER,
     PAPER_ENCODER,
@@ -27,7 +27,6 @@ from robomme_interference_data.errors import (
     FormatError,
     InvalidOptionError,
     MissingFileError,
-    MissingIndexError,
     UnknownNameError,
 )
 from robomme_interference_data.schema.codec import to_dict
@@ -35,27 +34,30 @@ from robomme_interference_data.storage.arrays import read_array
 from robomme_interference_data.storage.files import (
     Files,
     LocalFiles,
-    canonical_json,
+    digest_json,
     read_header,
     read_sums,
     sha256_file,
 )
 
-CENTRE_FILE = "centre.npy"
+if TYPE_CHECKING:
+    from .dataset import Dataset
+
+CENTER_FILE = "centre.npy"
 INDEX_SUMS = "SHA256SUMS"
 
-_LONGEST = 1 << 14
-"""Values in an embedding, at most: a held frame's is repeated in a buffer; SigLIP's have 1152."""
+_MAX_SIZE = 1 << 14
+"""Most values in an embedding, which a held frame repeats in a buffer; SigLIP has 1152."""
 
 
 @dataclass(frozen=True)
 class EncoderRecord:
-    """What an index records of its encoder.
+    """What an index records about its encoder.
 
     Attributes:
-        name: As `encoder_id` has it.
-        fingerprint: What determines the features: model, weights, preprocessing, code.
-        sha256: Over the fingerprint; only embeddings that share it are compared.
+        name: As `encoder_id` returns it.
+        fingerprint: Everything that determines the features: model, weights, preprocessing, code.
+        sha256: Digest of the fingerprint; only embeddings with the same digest are compared.
     """
 
     name: str
@@ -68,15 +70,15 @@ class IndexHeader:
     """`index.json`, written last: without it there is no index.
 
     Attributes:
-        format_version: Of the files.
+        format_version: Version of the file format.
         encoder: The encoder.
-        computed: Device, precision and batch: they may change the last bits.
-        camera: Name of the camera that was embedded.
+        computed: Device, precision and batch size, which may change the last bits.
+        camera: Name of the embedded camera.
         revision: Revision of the dataset.
-        frames: Frames in all.
-        size: Values of a frame.
-        typical_cosine: Of distractor units: median cosine of two frames of different ones, centred
-            if the encoder is. None of other datasets.
+        frames: Number of frames.
+        size: Values per frame.
+        typical_cosine: For distractor units, the median cosine of two frames of different units,
+            centered if the encoder is; None for other datasets.
         sums: SHA-256 of `SHA256SUMS`, which lists the other files.
         sha256: SHA-256 of the canonical JSON of all other fields.
     """
@@ -93,31 +95,24 @@ class IndexHeader:
     sha256: str = ""
 
     def __post_init__(self) -> None:
-        if not 0 < self.size <= _LONGEST:
-            raise FormatError(f"size {self.size}; expected 1 to {_LONGEST}")
+        if not 0 < self.size <= _MAX_SIZE:
+            raise FormatError(f"size {self.size}; expected 1 to {_MAX_SIZE}")
 
     def digest(self) -> str:
-        """Return what `sha256` must be."""
-        fields = {name: one for name, one in to_dict(self).items() if name != "sha256"}
-        text = canonical_json(fields).encode(errors="backslashreplace")  # as files are written
-        return sha256(text).hexdigest()
+        """Return the correct value of `sha256`."""
+        return digest_json([{k: one for k, one in to_dict(self).items() if k != "sha256"}])
 
 
 def episode_file(episode_index: int) -> str:
-    """Return where an episode's features lie inside the folder of an index."""
+    """Return the path of an episode's features inside an index folder."""
     return f"chunk-{episode_index // 1000:03d}/episode-{episode_index:06d}.npy"
 
 
 def encoder_id(encoder: str) -> str:
-    """Return what an encoder is called wherever its model lies, without a revision.
+    """Return an encoder's name without the revision and the folder of its model.
 
-    Args:
-        encoder: Name of the encoder: `thumbnail`, `siglip`, or `siglip:` and the id of a model,
-            with `@revision` or without, or its folder.
-
-    Returns:
-        `thumbnail`; `siglip` for the paper's model; `siglip:google/siglip2-base-patch16-224`;
-        `siglip:NAME` for a folder of that name.
+    `siglip:google/siglip2-base-patch16-224@main` keeps its id, `siglip:/models/my-siglip` (an
+    existing folder) becomes `siglip:my-siglip`, and the paper's model is `siglip`.
     """
     kind, _, model = encoder.partition(":")
     if not kind:
@@ -131,16 +126,9 @@ def encoder_id(encoder: str) -> str:
 
 
 def index_folder(encoder: str, camera: str = "front") -> str:
-    """Return where the index of an encoder and a camera lies inside a dataset.
+    """Return the folder of an index inside a dataset, such as `index/thumbnail@wrist`.
 
-    Args:
-        encoder: Name of the encoder, see `encoder_id`; the last part of a model's id becomes part
-            of the folder's name.
-        camera: Camera, with or without `observation.images.`.
-
-    Returns:
-        `index/thumbnail`, `index/siglip`, `index/siglip-siglip2-base-patch16-224`,
-        `index/thumbnail@wrist`, …
+    Of a model's id, only the last part is used: `index/siglip-siglip2-base-patch16-224`.
     """
     kind, colon, model = encoder_id(encoder).partition(":")
     name = f"{kind}-{PurePath(model).name}" if colon else kind
@@ -149,110 +137,103 @@ def index_folder(encoder: str, camera: str = "front") -> str:
     return f"{INDEX_DIR}/{'@'.join(re.sub(r'[^A-Za-z0-9._-]+', '-', part) for part in parts)}"
 
 
-def centre_of(episodes: Iterable[NDArray[np.float16]]) -> NDArray[np.float32]:
-    """Return what frames have in common: the mean of each episode's mean, `(D,) float32`.
-
-    Args:
-        episodes: Features of each episode, `(T, D) float16`.
-    """
+def center_of(episodes: Iterable[NDArray[np.float16]]) -> NDArray[np.float32]:
+    """Return the mean of each episode's mean, `(D,) float32`, of features `(T, D) float16`."""
     means = [features.mean(axis=0, dtype=np.float64) for features in episodes if len(features)]
     return np.asarray(sum(means) / max(len(means), 1), np.float32)
 
 
-class Remedy(NamedTuple):
-    """How embeddings are made: hint and command of an error."""
+def normalized(
+    features: NDArray[Any], center: NDArray[np.float32] | None = None
+) -> NDArray[np.float32]:
+    """Turn features `(T, D)` into embeddings of length 1, `(T, D) float32`, less a center `(D,)`.
 
-    hint: str
-    command: str
+    Features are first rounded as an index stores them, so that equal images have equal embeddings,
+    stored or live. A row that is zero after centering stays zero.
+    """
+    values = features.astype(np.float16, copy=False).astype(np.float32)
+    if center is not None:
+        values -= center
+    lengths = np.sqrt(np.einsum("td,td->t", values, values))
+    values /= np.where(lengths > 0, lengths, 1)[:, None]
+    return values
 
 
 class EmbeddingIndex:
-    """The features of every stored frame of a dataset, of one camera and one encoder.
+    """The features of every stored frame of a dataset, for one camera and one encoder.
 
-    Args:
-        files: The dataset's files.
-        revision: The dataset's identity, `Dataset.revision`.
-        encoder: Name of the encoder, see `encoder_id`.
-        camera: Camera, with or without `observation.images.`.
+    `remedy` is the hint and the command of errors: how to make the index.
     """
 
     def __init__(self, files: Files, revision: str, encoder: str, camera: str = "front"):
         self._files = files
         self._checked: set[str] = set()
         self._folder = index_folder(encoder, camera)
-        root = files.describe()
-        self._place = f"{root}/{self._folder}"
+        self._path_shown = f"{files.describe()}/{self._folder}"
         camera = camera.removeprefix(CAMERA_PREFIX)
-        of = f"encoder {encoder!r}" + ("" if camera == "front" else f" and camera {camera!r}")
-        option = "" if camera == "front" else f" --camera {camera}"
-        self.remedy = _remedy(files, f"--encoder {encoder}{option}")
+        self.remedy = _remedy(files, encoder, camera)
         try:
             path = files.path(f"{self._folder}/{INDEX_HEADER}")
         except MissingFileError:
-            raise MissingIndexError(f"{root} has no embeddings of {of}", *self.remedy) from None
+            raise MissingFileError(
+                f"{files.describe()} has no embeddings of encoder {encoder!r} and camera "
+                f"{camera!r}",
+                *self.remedy,
+            ) from None
         try:
             self.header = read_header(path, IndexHeader)
         except FormatError as error:
             raise FormatError(error.message, *self.remedy) from None
-        made = self.header.encoder.name, self.header.camera
-        if made != (encoder_id(encoder), camera):
-            raise MissingIndexError(
-                f"the embeddings in {self._place} are of encoder {made[0]!r} and "
-                f"camera {made[1]!r}; expected {encoder_id(encoder)!r} and {camera!r}",
-                f"Give the encoder as {made[0]!r}. {self.remedy.hint}",
-                self.remedy.command,
-            )
-        if self.header.revision != revision:
-            raise MissingIndexError(
-                f"the embeddings of {of} in {root} were made of data with "
-                f"revision {self.header.revision[:12]}…; the data now has {revision[:12]}…",
+        recorded = self.header.encoder.name, self.header.camera, self.header.revision
+        expected = encoder_id(encoder), camera, revision
+        if recorded != expected:
+            shown = "encoder {!r}, camera {!r}, data with revision {:.12}…"
+            raise MissingFileError(
+                f"the embeddings in {self._path_shown} are of {shown.format(*recorded)}; expected "
+                f"{shown.format(*expected)}",
                 *self.remedy,
             )
 
     @property
-    def made(self) -> tuple[str, int]:
-        """What indexes share whose frames are compared: the encoder, and so the size."""
+    def key(self) -> tuple[str, int]:
+        """Only the embeddings of indexes with equal keys are compared."""
         return self.header.encoder.sha256, self.header.size
 
     @cached_property
-    def centre(self) -> NDArray[np.float32] | None:
-        """What is taken off features before they are normalised, see `centre_of`.
+    def center(self) -> NDArray[np.float32] | None:
+        """What is subtracted from features before they are normalized, see `center_of`.
 
-        Only in an index of distractor units, and None there too if the encoder is not centred.
+        None except in an index of distractor units by an encoder that is centered.
         """
-        if CENTRE_FILE not in self._sums:
+        if CENTER_FILE not in self._sums:
             return None
-        return self._array(CENTRE_FILE, (self.header.size,), np.float32)
+        return self._array(CENTER_FILE, (self.header.size,), np.float32)
 
     @property
     def typical_cosine(self) -> float:
-        """What `IndexHeader` says of distractor units."""
+        """`IndexHeader.typical_cosine` of distractor units."""
         if self.header.typical_cosine is None:
             raise self._damaged(f"{INDEX_HEADER} has no typical cosine")
         return self.header.typical_cosine
 
     def span(self, episode_index: int, start: int, stop: int) -> NDArray[np.float16]:
-        """Return the features of stored frames `start` to `stop` (excluded) of an episode.
-
-        Returns:
-            `(stop - start, size) float16`, as the encoder gave them, rounded; a new array.
-        """
+        """Return the features of stored frames `start` to `stop` (excluded), `(T, D) float16`."""
         name = episode_file(episode_index)
-        found = self._array(name, (-1, self.header.size), np.float16) if name in self._sums else ()
-        if not 0 <= start <= stop <= len(found):
+        features: NDArray[np.float16] = np.empty((0, self.header.size), np.float16)
+        if name in self._sums:
+            features = self._array(name, (-1, self.header.size), np.float16)
+        if not 0 <= start <= stop <= len(features):
             raise UnknownNameError(
                 f"frames {start} to {stop - 1} of episode {episode_index} are not in "
-                f"{self._place}, which has {len(found)} frames of that episode",
+                f"{self._path_shown}, which has {len(features)} frames of that episode",
                 *self.remedy,
             )
-        return np.asarray(found)[start:stop].copy()
+        return features[start:stop].copy()
 
     def check(self, lengths: dict[int, int], *, units: bool) -> None:
-        """Read all of it: every file against its SHA-256, and the frames of every episode.
+        """Check every file against its SHA-256, and the number of frames of every episode.
 
-        Args:
-            lengths: Stored frames of each episode of the dataset.
-            units: Whether the dataset is of distractor units.
+        `lengths` has the stored frames by episode; `units` is true for distractor units.
         """
         header, typical = self.header, self.header.typical_cosine
         finite = typical is None or np.isfinite(typical)
@@ -260,14 +241,14 @@ class EmbeddingIndex:
             raise self._damaged(f"{INDEX_HEADER} does not have the SHA-256 that it records")
         if (typical is not None) != units:
             raise self._damaged(f"the typical cosine is {typical}")
-        expected = {*map(episode_file, lengths), *([CENTRE_FILE] if units else [])}
+        expected = {*map(episode_file, lengths), *([CENTER_FILE] if units else [])}
         listed = {name.removeprefix(f"{self._folder}/") for name in self._files.list(self._folder)}
         known = {*self._sums, INDEX_HEADER, INDEX_SUMS}
         if extra := sorted(listed ^ known | (self._sums.keys() - expected)):
             raise self._damaged(f"{extra[0]} is missing, or too many")
-        found = centre_of(self.span(episode, 0, length) for episode, length in lengths.items())
-        if self.centre is not None and not np.array_equal(self.centre, found):
-            raise self._damaged(f"{CENTRE_FILE} is not the mean of the episodes")
+        center = center_of(self.span(episode, 0, length) for episode, length in lengths.items())
+        if self.center is not None and not np.array_equal(self.center, center):
+            raise self._damaged(f"{CENTER_FILE} is not the mean of the episodes")
         if header.frames != sum(lengths.values()):
             raise self._damaged(f"{header.frames} frames; the dataset has {sum(lengths.values())}")
 
@@ -275,13 +256,13 @@ class EmbeddingIndex:
     def _sums(self) -> dict[str, str]:
         path = self._path(INDEX_SUMS)
         if sha256_file(path) != self.header.sums:
-            raise self._damaged(f"{INDEX_SUMS} does not have the SHA-256 of {INDEX_HEADER}")
+            raise self._damaged(f"{INDEX_SUMS} does not have the SHA-256 in {INDEX_HEADER}")
         return read_sums(path)
 
     def _array(self, name: str, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
         path, first = self._path(name), name not in self._checked
         if first and sha256_file(path) != self._sums[name]:
-            raise self._damaged(f"{name} does not have the SHA-256 of {INDEX_SUMS}")
+            raise self._damaged(f"{name} does not have the SHA-256 in {INDEX_SUMS}")
         try:
             array = read_array(path, dtype, shape)
         except FormatError as error:
@@ -298,17 +279,53 @@ class EmbeddingIndex:
             raise self._damaged(error.message) from None
 
     def _damaged(self, what: str) -> FormatError:
-        return FormatError(f"{self._place}: {what}", *self.remedy)
+        return FormatError(f"{self._path_shown}: {what}", *self.remedy)
 
 
-def _remedy(files: Files, options: str) -> Remedy:
-    """Return how a dataset gets an index; a buffer set's are indexed together."""
-    if not isinstance(files, LocalFiles):
-        hint = (
-            f"Fetch {files.describe()} to a folder and embed its frames, or ask its publisher to "
-            "add embeddings."
-        )
-        return Remedy(hint, f"index FOLDER {options}")
-    root = files.root
-    buffer_set = root.parent if root.name in DATASETS else root
-    return Remedy("Embed the frames of all its datasets (again).", f"index {buffer_set} {options}")
+class BufferSetIndex:
+    """The indexes of a buffer set's datasets, for one encoder and camera.
+
+    Args:
+        datasets: The datasets that are needed, among them the distractor units, whose index
+            (`units`) has the center and the typical cosine of all.
+        encoder: Name of the encoder, such as `thumbnail`.
+        camera: Name of the camera, with or without `observation.images.`.
+    """
+
+    def __init__(self, datasets: Mapping[str, "Dataset"], encoder: str, camera: str = "front"):
+        if DISTRACTORS not in datasets:
+            raise MissingFileError(f"embeddings need the {DISTRACTORS}, which are missing")
+        self._indexes = {name: one.index(encoder, camera) for name, one in datasets.items()}
+        self.units = self._indexes[DISTRACTORS]
+        for name, index in self._indexes.items():
+            if index.key != self.units.key:
+                locations = (datasets[one].files.describe() for one in (name, DISTRACTORS))
+                raise MissingFileError(
+                    f"the embeddings of encoder {encoder!r} were made differently in "
+                    f"{' and in '.join(locations)}",
+                    *index.remedy,
+                )
+
+    @property
+    def size(self) -> int:
+        """Values in an embedding."""
+        return self.units.header.size
+
+    def embed(self, features: NDArray[Any]) -> NDArray[np.float32]:
+        """Return the embeddings, `(T, size) float32`, of features that the encoder computed."""
+        return normalized(features, self.units.center)
+
+    def span(self, dataset: str, episode_index: int, start: int, stop: int) -> NDArray[np.float32]:
+        """Return the embeddings of stored frames `start` to `stop` (excluded), `(T, size)`."""
+        return self.embed(self._indexes[dataset].span(episode_index, start, stop))
+
+
+def _remedy(files: Files, encoder: str, camera: str) -> tuple[str, str]:
+    """Return how a dataset gets an index; those of a buffer set are indexed together."""
+    hint, folder = "Embed the frames of all its datasets (again).", "FOLDER"
+    if isinstance(files, LocalFiles):
+        folder = str(files.root.parent if files.root.name in DATASETS else files.root)
+    else:
+        hint = f"Fetch {files.describe()} and embed its frames, or ask its publisher to."
+    option = "" if camera == "front" else f" --camera {camera}"
+    return hint, f"index {folder} --encoder {encoder}{option}"

@@ -1,10 +1,11 @@
-"""Read the frames of a buffer's sessions: side by side on threads, or one by one; with a cache."""
+"""Decode the frames of a buffer's sessions, in parallel or one by one, with an optional cache."""
 
 import math
 import os
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import groupby, repeat
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,35 +14,30 @@ from robomme_interference_data.constants import KEY_FRAMES
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.schema.manifest import Session, SessionEntry
 from robomme_interference_data.schema.sampling import runs
-from robomme_interference_data.storage.cache import DecodedCache, frames_sha256
 
 from .dataset import Dataset, camera_feature
 
-_PIECE = 8 * KEY_FRAMES
-"""Frames that one thread decodes at a time."""
+if TYPE_CHECKING:
+    from robomme_interference_data.storage.cache import DecodedCache
 
-_MOST_BYTES = 16 << 30
-"""Bytes of frames that are held at once, at most: a short video may hold many large frames."""
+_PIECE = 8 * KEY_FRAMES
+"""Frames that a thread decodes at a time."""
+
+_MAX_BYTES = 16 << 30
+"""Most bytes of frames in memory at once: a small video file may hold many large frames."""
 
 
 class FrameReader:
-    """Reads frames of sessions, from a cache where it has them.
+    """Reads frames of sessions, from the cache if possible, on `threads` (None: one per CPU).
 
-    Args:
-        sessions: The sessions in their places.
-        datasets: The datasets that hold them, by name.
-        cache: Keeps decoded frames; None for no cache.
-        threads: Threads that decode side by side; None for one per processor.
-
-    Attributes:
-        verified: Whether what the cache holds is compared with its digest.
+    If `verified`, frames from the cache are compared with their digest.
     """
 
     def __init__(
         self,
         sessions: Sequence[Session],
         datasets: Mapping[str, Dataset],
-        cache: DecodedCache | None,
+        cache: "DecodedCache | None",
         threads: int | None,
     ):
         self._sessions = sessions
@@ -65,34 +61,36 @@ class FrameReader:
         for start, stop in runs(chosen):
             yield from self._iter_frames(camera, start, stop)
 
-    def _recorded(self, entry: SessionEntry) -> dict[str, str] | None:
-        """Return the recorded digests of a session by feature; None if none are recorded."""
-        record = self._datasets[entry.dataset].record(entry.episode_index)
-        return record.digests(entry.start, entry.stop)
-
     def _cached(
         self, entry: SessionEntry, camera: str
     ) -> tuple[str | None, NDArray[np.uint8] | None]:
-        """Return what the cache calls a session's frames, if it may keep them; and those it has."""
-        recorded = None if self._cache is None else self._recorded(entry)
-        if self._cache is None or recorded is None:
+        """Return a session's key in the cache, None if it cannot be cached, and its frames."""
+        dataset = self._datasets[entry.dataset]
+        if self._cache is None:
             return None, None
-        name = recorded.get(camera_feature(camera), "")
-        shape = (entry.stop - entry.start, *self._datasets[entry.dataset].shape(camera))
-        return name, self._cache.get(name, shape, verify=self.verified)
+        digests = dataset.record(entry.episode_index).digests(entry.start, entry.stop)
+        if digests is None:
+            return None, None
+        key = digests.get(camera_feature(camera), "")
+        shape = (entry.stop - entry.start, *dataset.shape(camera))
+        return key, self._cache.get(key, shape, verify=self.verified)
 
-    def _keep(self, name: str | None, frames: NDArray[np.uint8]) -> None:
-        # Under their own digest only: another buffer set may hold the frames that are called so.
-        if self._cache is not None and name is not None and frames_sha256(frames) == name:
-            self._cache.put(name, frames)
+    def _keep(self, key: str | None, frames: NDArray[np.uint8]) -> None:
+        if self._cache is None or key is None:
+            return
+        from robomme_interference_data.storage.cache import frames_sha256
+
+        # Only under their true digest: another buffer set may hold the frames with that digest.
+        if frames_sha256(frames) == key:
+            self._cache.put(key, frames)
 
     def _start_reading(
         self, session: Session, camera: str, out: NDArray[np.uint8], pool: ThreadPoolExecutor
     ) -> Callable[[], None]:
-        """Start to read a session into its place in `out`; the result waits until it is done."""
+        """Start to read a session into its part of `out`; call the result to wait for the end."""
         entry, target = session.entry, out[session.start : session.stop]
         dataset, length = self._datasets[entry.dataset], entry.stop - entry.start
-        name, cached = self._cached(entry, camera)
+        key, cached = self._cached(entry, camera)
         piece = _PIECE if self._threads > 1 else length
         shown = target.reshape(length, entry.repeat, *target.shape[1:])  # a view
 
@@ -112,40 +110,40 @@ class FrameReader:
             for one in reading:
                 one.result()
             if cached is None:
-                self._keep(name, shown[:, 0])
+                self._keep(key, shown[:, 0])
 
         return finish
 
     def _iter_frames(self, camera: str, start: int, stop: int) -> Generator[NDArray[np.uint8]]:
         """Yield frames `start` to `stop` (excluded), `(H, W, 3) uint8`, in order."""
         for session in self._sessions:
-            places = range(max(start, session.start), min(stop, session.stop))
-            if not places:
+            indices = range(max(start, session.start), min(stop, session.stop))
+            if not indices:
                 continue
             entry, dataset = session.entry, self._datasets[session.entry.dataset]
-            stored = [(place - session.start) // entry.repeat for place in places]
-            name, whole = self._cached(entry, camera)
+            stored = [(index - session.start) // entry.repeat for index in indices]
+            key, whole = self._cached(entry, camera)
             frames: Iterator[NDArray[np.uint8]]
-            if name is None:
+            if key is None:
                 first, last = entry.start + stored[0], entry.start + stored[-1] + 1
                 frames = dataset.iter_frames(entry.episode_index, camera, first, last)
             else:
                 if whole is None:
-                    whole = room_for(entry.stop - entry.start, dataset.shape(camera))
+                    whole = allocate_frames(entry.stop - entry.start, dataset.shape(camera))
                     dataset.read_frames(entry.episode_index, camera, entry.start, whole)
-                    self._keep(name, whole)
+                    self._keep(key, whole)
                 frames = iter(whole[stored[0] : stored[-1] + 1])
             for frame, (_, shown) in zip(frames, groupby(stored), strict=True):
                 yield from repeat(frame, len(list(shown)))
 
 
-def room_for(frames: int, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """Return an array for so many frames, `(T, H, W, 3) uint8`, unless they are too large."""
+def allocate_frames(frames: int, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """Return an array for frames, `(T, H, W, 3) uint8`, unless it would be too large."""
     size = frames * math.prod(shape)
-    if size > _MOST_BYTES:
+    if size > _MAX_BYTES:
         raise FormatError(
-            f"{frames} frames of shape {shape} take {size:,} bytes; at most {_MOST_BYTES:,} are "
-            "held at once",
-            "Take them in chunks, without a cache: buffer.stream(64)",
+            f"{frames} frames of shape {shape} need {size:,} bytes; at most {_MAX_BYTES:,} are "
+            "allocated at once",
+            "Read them in chunks, without a cache: buffer.stream(64)",
         )
     return np.empty((frames, *shape), np.uint8)

@@ -1,47 +1,50 @@
-"""Open a buffer set, load a buffer: from a folder, or from the Hub."""
+"""Open a buffer set and load a buffer, from a folder or from the Hub."""
 
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from robomme_interference_data.constants import MANIFEST_PATH
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.ids import EpisodeId, whole_number
 from robomme_interference_data.schema.conditions import Condition
-from robomme_interference_data.storage.cache import DecodedCache, default_cache_folder
 from robomme_interference_data.storage.hub import locate
 
 from .buffer import Buffer
 from .buffer_set import BufferSet
+
+if TYPE_CHECKING:
+    from robomme_interference_data.storage.cache import DecodedCache
 
 
 def load_buffer_set(
     buffer_set: str | os.PathLike[str],
     *,
     revision: str | None = None,
-    cache: bool | str | os.PathLike[str] | DecodedCache = False,
+    cache: "bool | str | os.PathLike[str] | DecodedCache" = False,
     threads: int | None = None,
 ) -> BufferSet:
     """Open a buffer set, to list, filter and load its buffers.
 
     Args:
-        buffer_set: Folder with `demonstrations/`, `distractors/` and `manifests/`; or a repository on
-            the Hub, `namespace/name`.
+        buffer_set: A folder with `demonstrations/`, `distractors/` and `manifests/`; or, as text,
+            a repository on the Hub, `namespace/name`. An existing folder takes precedence.
         revision: Branch, tag or commit of the repository, such as `data-1.0.0`.
-        cache: Where to keep decoded frames for the next time: a cache, a folder for one of
-            20 GiB, or True for the folder `~/.cache/robomme-interference`.
-        threads: Threads that decode side by side; None for one per processor.
+        cache: Where decoded frames are kept for the next time: a `DecodedCache`, a folder for one
+            of 20 GiB, or True for the folder `~/.cache/robomme-interference`.
+        threads: Threads that decode in parallel; None for one per CPU.
 
     Raises:
-        MissingFileError: The folder is not a buffer set.
+        MissingFileError: The folder is missing or is not a buffer set.
         FormatError: Its files are damaged, or of another format version.
-        InvalidOptionError: An argument is not what it may be.
+        InvalidOptionError: An argument has an invalid value.
+        HubError: The repository is unknown, needs permission, or cannot be reached.
     """
-    files = locate(
-        _place("buffer_set", buffer_set, "a folder, or namespace/name"), revision=revision
-    )
+    _check_location("buffer_set", buffer_set, "a folder, or namespace/name")
+    files = locate(buffer_set, revision=revision)
     if threads is not None:
-        expected = "a number from 1, or None"
+        expected = "an integer from 1, or None"
         threads = whole_number("threads", threads, expected)
         if threads < 1:
             raise InvalidOptionError.expected("threads", threads, expected)
@@ -50,8 +53,7 @@ def load_buffer_set(
     except MissingFileError as error:
         raise MissingFileError(
             f"{files.describe()} is not a buffer set: {MANIFEST_PATH} is missing",
-            "Point to the folder that holds demonstrations/, distractors/ and manifests/, or make "
-            "one.",
+            "Give a folder with demonstrations/, distractors/ and manifests/, or build one.",
             "build all BUFFER_SET --source KIND:PATH",
         ) from error
 
@@ -65,57 +67,57 @@ def load_buffer(
     k: int | None = None,
     verify: bool = False,
     cameras: Sequence[str] | None = None,
-    cache: bool | str | os.PathLike[str] | DecodedCache = False,
+    cache: "bool | str | os.PathLike[str] | DecodedCache" = False,
     threads: int | None = None,
 ) -> Buffer:
     """Load the history buffer of one query episode.
 
-    Of a buffer set on the Hub the manifests, the small metadata and the files of this buffer's sessions
-    are downloaded, nothing else; a second time none is. Frames are decoded when asked for.
+    From the Hub, only the manifests, the small metadata and the files of this buffer's sessions
+    are downloaded, and only once. Frames are decoded on demand.
 
     Args:
         episode_id: Id of the query episode, such as `VideoRepick/test/7`.
-        condition: Name of the condition, such as `k3`, one that the buffer set has planned.
-        buffer_set: A folder, a repository on the Hub (`namespace/name`), or what `load_buffer_set` returned
-            (then `revision`, `cache` and `threads` are its own).
+        condition: Name of a condition for which the buffer set has buffers, such as `k3`.
+        buffer_set: A folder, a repository on the Hub (`namespace/name`), or a buffer set returned
+            by `load_buffer_set` (then `revision`, `cache` and `threads` are ignored).
         revision: As for `load_buffer_set`.
         k: Short for the condition `k<k>`, instead of `condition`.
-        verify: Decode everything now and compare it with the recorded SHA-256; and later what
-            comes out of the cache.
-        cameras: Whose frames are downloaded now, such as `["front"]`; None for all. Others follow
-            when they are asked for.
+        verify: Decode everything now and compare it with the recorded SHA-256, and later also
+            compare what is read from the cache.
+        cameras: Cameras whose videos are downloaded now, such as `["front"]`; None for all. Other
+            videos are downloaded when they are used.
         cache: As for `load_buffer_set`.
         threads: As for `load_buffer_set`.
 
-    Returns:
-        The buffer.
-
     Raises:
-        InvalidIdError: `episode_id` or `condition` does not read as one.
-        InvalidOptionError: Neither or both of `condition` and `k` are given, or an argument is
-            not what it may be.
-        UnknownNameError: The buffer set does not have this episode or condition; offers the nearest.
-        MissingFileError: It is not a buffer set, or a file of it is missing.
+        InvalidIdError: `episode_id` or `condition` cannot be parsed.
+        InvalidOptionError: Neither or both of `condition` and `k` are given, or an argument has
+            an invalid value.
+        UnknownNameError: The buffer set lacks this episode or condition; the hint has the nearest.
+        MissingFileError: It is not a buffer set, or one of its files is missing.
         HubError: The repository is unknown, needs permission, or cannot be reached.
         FormatError: A file is damaged or of another format version.
-        HashMismatchError: The datasets are not the ones that the manifests were made for, or,
-            with `verify`, data is not what the manifest names.
+        HashMismatchError: The manifests were made for other datasets, or, with `verify`, data
+            differs from what the manifest records.
     """
-    opened = (
-        buffer_set
-        if isinstance(buffer_set, BufferSet)
-        else load_buffer_set(buffer_set, revision=revision, cache=cache, threads=threads)
-    )
-    return opened.load(episode_id, condition, k=k, verify=verify, cameras=cameras)
+    if not isinstance(buffer_set, BufferSet):
+        buffer_set = load_buffer_set(buffer_set, revision=revision, cache=cache, threads=threads)
+    return buffer_set.load(episode_id, condition, k=k, verify=verify, cameras=cameras)
 
 
-def _cache(cache: bool | str | os.PathLike[str] | DecodedCache) -> DecodedCache | None:
-    if isinstance(cache, bool | DecodedCache | None):
-        return DecodedCache(default_cache_folder()) if cache is True else cache or None
-    return DecodedCache(Path(_place("cache", cache, "True, False, a folder or a DecodedCache")))
+def _cache(cache: "bool | str | os.PathLike[str] | DecodedCache") -> "DecodedCache | None":
+    if cache is False or cache is None:
+        return None
+    from robomme_interference_data.storage.cache import DecodedCache, default_cache_folder
+
+    if cache is True:
+        return DecodedCache(default_cache_folder())
+    if isinstance(cache, DecodedCache):
+        return cache
+    _check_location("cache", cache, "True, False, a folder or a DecodedCache")
+    return DecodedCache(Path(cache))
 
 
-def _place(option: str, given: object, expected: str) -> str:
+def _check_location(option: str, given: object, expected: str) -> None:
     if not isinstance(given, str | os.PathLike) or not str(given) or "\0" in str(given):
         raise InvalidOptionError.expected(option, given, expected)
-    return os.fspath(given)

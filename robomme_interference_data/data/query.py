@@ -1,4 +1,4 @@
-"""A query episode without its buffer: what is asked, and what the robot sees first."""
+"""A query episode without its buffer: its goal and the first live observation."""
 
 from dataclasses import dataclass
 
@@ -23,11 +23,11 @@ from .dataset import Dataset
 
 @dataclass(frozen=True)
 class Query:
-    """A query episode; made by `BufferSet.query`.
+    """A query episode, returned by `BufferSet.query`.
 
     Attributes:
         dataset: The demonstrations.
-        record: What is recorded of the episode.
+        record: The episode's record.
     """
 
     dataset: Dataset
@@ -63,12 +63,11 @@ class Query:
 
     @property
     def lesson_frames(self) -> int:
-        """Frames of its demonstration, the first live observation not among them."""
+        """Frames of its demonstration, without the first live observation."""
         start = self.record.exec_start_idx
         if start is None:
-            raise FormatError.damaged(
-                self.dataset.files.describe(), f"{self.episode_id}: no lesson"
-            )
+            where = self.dataset.files.describe()
+            raise FormatError.damaged(where, f"{self.episode_id}: no lesson")
         return start
 
     @property
@@ -80,12 +79,12 @@ class Query:
     def manifest(
         self, condition: Condition, sessions: tuple[SessionEntry, ...], *, exact: bool
     ) -> BufferManifest:
-        """Return the manifest of the query's buffer under a condition.
+        """Return the manifest of a buffer of the query.
 
         Args:
             condition: The condition.
-            sessions: What the buffer holds, in order.
-            exact: Whether all frames are the recorded ones, bit for bit.
+            sessions: The buffer's sessions in order.
+            exact: Whether all frames equal the recorded ones bit for bit.
         """
         record, lessons = self.record, layout_sessions(sessions, "lesson")
         frames = sum(one.num_frames for one in sessions)

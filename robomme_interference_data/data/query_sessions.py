@@ -1,6 +1,6 @@
-"""The sessions of history buffers, drawn from datasets: no manifest is needed.
+"""Choose the sessions of history buffers from datasets (rules 1 to 5 of the protocol).
 
-Rules 1 to 5 of the protocol; the draw itself is `schema/draw.py`.
+The draw of distractor units is in `schema/draw.py`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,43 +30,37 @@ _ROLES = {
     RAW_DISTRACTORS: "distractor",
     CONTRADICTIONS: "contradiction",
 }
-"""What a session is to a query, by the dataset that it is of."""
+"""Role of a session by its dataset."""
 
 
 @dataclass(frozen=True)
 class SessionSource:
-    """Datasets that sessions are drawn from.
-
-    Attributes:
-        datasets: The datasets of a buffer set by name: the query episodes, and what sessions are of.
-        seed: Seed of the draw.
-    """
+    """The datasets of a buffer set by name, and the seed of the draw."""
 
     datasets: Mapping[str, Dataset]
     seed: int = 0
 
     @cached_property
     def pool(self) -> UnitPool:
-        """The units, to be drawn."""
+        """The units to draw from."""
         return UnitPool((one.episode_id for one in self.datasets[DISTRACTORS].records()), self.seed)
 
-    def session(self, dataset: str, episode: EpisodeId) -> SessionEntry:
-        """Return the session that an episode of a dataset is; contradictions by their query."""
-        if dataset not in self._sessions:
-            one = self.datasets[dataset]
-            self._sessions[dataset] = {
-                record.episode_id.scene: one.session(_ROLES[dataset], record)
-                for record in one.records()
+    def session(self, name: str, episode: EpisodeId) -> SessionEntry:
+        """Return the session of an episode in a dataset; contradictions go by their query's id."""
+        dataset = self.datasets[name]
+        if name not in self._sessions:
+            self._sessions[name] = {
+                record.episode_id.scene: dataset.session(_ROLES[name], record)
+                for record in dataset.records()
             }
-        found = self._sessions[dataset].get(episode)
-        if found is None:
+        session = self._sessions[name].get(episode)
+        if session is None:
             raise SourceError(
-                f"{self.datasets[dataset].files.describe()} does not hold {episode}, of which a "
-                "session is needed",
-                "Build it of the same episodes.",
-                f"build {dataset}",
+                f"{dataset.files.describe()} lacks {episode}, which a buffer needs",
+                "Build it from the same episodes.",
+                f"build {name}",
             )
-        return found
+        return session
 
     @cached_property
     def _sessions(self) -> dict[str, dict[EpisodeId, SessionEntry]]:
@@ -74,12 +68,7 @@ class SessionSource:
 
 
 class QuerySessions:
-    """The sessions that conditions give one query; see `conditions.SessionProvider`.
-
-    Args:
-        source: What they are drawn from.
-        record: Record of the query episode.
-    """
+    """The sessions that conditions can use for one query; see `conditions.SessionProvider`."""
 
     def __init__(self, source: SessionSource, record: EpisodeRecord):
         self._source = source
@@ -87,7 +76,7 @@ class QuerySessions:
         self._drawn: dict[bool, list[EpisodeId]] = {False: [], True: []}
 
     def buffer(self, condition: Condition) -> BufferManifest:
-        """Return the buffer of the query under a condition."""
+        """Return the manifest of the query's buffer under a condition."""
         datasets, record = self._source.datasets, self._record
         sessions = condition.sessions(self)
         exact = record.exact and all(
@@ -106,23 +95,23 @@ class QuerySessions:
             raise FormatError.damaged(where, f"{record.episode_id}: no digests of its parts")
         start, stop = record.spans[part]
         sha256 = getattr(record.span_sha256, part)
-        found = replace(whole, start=start, stop=stop, sha256=sha256)
-        return replace(found, role="filler", repeat=UNIT_FRAMES) if part == "last" else found
+        session = replace(whole, start=start, stop=stop, sha256=sha256)
+        return replace(session, role="filler", repeat=UNIT_FRAMES) if part == "last" else session
 
     def units(self, k: int, dataset: str = DISTRACTORS) -> Sequence[SessionEntry]:
-        """Return the units that are drawn for the query, or the raw ones of the same episodes."""
-        return [self._source.session(dataset, unit) for unit in self._draw(k, own=False)]
+        """Return the units drawn for the query, or the raw units of the same episodes."""
+        return [self._source.session(dataset, unit) for unit in self._draw(k, same_family=False)]
 
     def own_units(self, k: int) -> Sequence[SessionEntry]:
-        """Return the units of the query's own family that are drawn for it."""
-        return [self._source.session(DISTRACTORS, unit) for unit in self._draw(k, own=True)]
+        """Return the units of the query's own family drawn for it."""
+        return [self._source.session(DISTRACTORS, unit) for unit in self._draw(k, same_family=True)]
 
     def contradiction(self) -> SessionEntry:
         """Return the lesson in the query's scene with another answer."""
         return self._source.session(CONTRADICTIONS, self._record.episode_id)
 
-    def _draw(self, k: int, *, own: bool) -> Sequence[EpisodeId]:
-        if k > len(self._drawn[own]):  # fewer begin those that are drawn
-            draw = self._source.pool.draw_own if own else self._source.pool.draw
-            self._drawn[own] = draw(self._record.episode_id, k)
-        return self._drawn[own][:k]
+    def _draw(self, k: int, *, same_family: bool) -> Sequence[EpisodeId]:
+        if k > len(self._drawn[same_family]):  # a shorter draw is the beginning of a longer one
+            draw = self._source.pool.draw_own if same_family else self._source.pool.draw
+            self._drawn[same_family] = draw(self._record.episode_id, k)
+        return self._drawn[same_family][:k]

@@ -1,4 +1,4 @@
-"""Questions about the past that a buffer set may have: one for each query, with a marked picture."""
+"""Questions about the past: at most one per query of a buffer set, with a marked picture."""
 
 import string
 from collections.abc import Iterable
@@ -10,7 +10,7 @@ from robomme_interference_data.constants import DEMONSTRATIONS, QUESTIONS_PATH
 from robomme_interference_data.errors import FormatError, MissingFileError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import from_table, to_dict
-from robomme_interference_data.storage.files import LocalFiles, canonical_json
+from robomme_interference_data.storage.files import LocalFiles, digest_json
 from robomme_interference_data.storage.parquet import open_parquet, read_table
 
 from .buffer_set import BufferSet
@@ -25,26 +25,21 @@ class Question:
 
     episode_id: Annotated[EpisodeId, "The query episode."]
     revision: Annotated[str, "Revision of the demonstrations that it was made for."]
-    text: Annotated[str, "What is asked, beside the goal."]
+    text: Annotated[str, "The question, in addition to the goal."]
     options: Annotated[
         tuple[str, ...],
-        "The options in words, in the order of `LETTERS`; empty words where only the picture "
-        "tells one.",
+        "The options in words, in the order of `LETTERS`; empty where only the picture shows one.",
     ]
     answers: Annotated[
-        tuple[int, ...],
-        "The number, among the scene's answers, of one that each option stands for.",
+        tuple[int, ...], "Number of each option's answer among the scene's possible answers."
     ]
-    right: Annotated[int, "Place of the right option, from 0."]
-    picture: Annotated[
-        bytes,
-        "The first live view with the options marked and lettered, a PNG file.",
-    ]
+    right: Annotated[int, "Index of the right option, from 0."]
+    picture: Annotated[bytes, "The first live view with marked and lettered options, a PNG file."]
 
     def __post_init__(self) -> None:
         count = len(self.options)
         if not 2 <= count <= len(LETTERS) or len(set(self.answers)) != count:
-            raise FormatError(f"{count} options of {len(set(self.answers))} answers")
+            raise FormatError(f"{count} options with {len(set(self.answers))} different answers")
         if not 0 <= self.right < count or min(self.answers) < 0:
             raise FormatError(f"right option {self.right} of {count}, answers {self.answers}")
 
@@ -55,7 +50,7 @@ class Question:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """The options as they are read, such as `A: the red cube`."""
+        """The options with their letters, such as `A: the red cube`."""
         return tuple(
             f"{letter}: {words or f'the one marked {letter}'}"
             for letter, words in zip(self.letters, self.options, strict=True)
@@ -63,17 +58,16 @@ class Question:
 
     @property
     def chance(self) -> float:
-        """Share of right answers that drawing at random has."""
+        """Expected share of right answers from random guesses."""
         return 1 / len(self.options)
 
 
 def digest_questions(questions: Iterable[Question]) -> str:
-    """Return the SHA-256 over all that is asked, and that is right: the pictures too."""
-    digest = sha256()
-    for one in sorted(questions, key=lambda one: one.episode_id):
-        told = to_dict(one) | {"picture": sha256(one.picture).hexdigest()}
-        digest.update(canonical_json(told).encode(errors="backslashreplace"))
-    return digest.hexdigest()
+    """Return the SHA-256 over all questions, answers and pictures."""
+    ordered = sorted(questions, key=lambda one: one.episode_id)
+    return digest_json(
+        to_dict(one) | {"picture": sha256(one.picture).hexdigest()} for one in ordered
+    )
 
 
 def read_questions(buffer_set: BufferSet) -> dict[EpisodeId, Question]:
@@ -87,12 +81,12 @@ def read_questions(buffer_set: BufferSet) -> dict[EpisodeId, Question]:
         what = f"{buffer_set.location} has no questions ({QUESTIONS_PATH})"
         raise MissingFileError(what, hint, command) from None
     table = read_table(open_parquet(path), path)
-    found = {one.episode_id: one for one in from_table(Question, table, path)}
+    questions = {one.episode_id: one for one in from_table(Question, table, path)}
     revision = buffer_set.datasets[DEMONSTRATIONS].identity.revision
-    if len(found) != len(table):
+    if len(questions) != len(table):
         raise FormatError.damaged(path, "a query has two questions")
-    if any(one.revision != revision for one in found.values()):
+    if any(one.revision != revision for one in questions.values()):
         raise FormatError(f"{path} has questions for other demonstrations", hint, command)
-    if lacking := sorted({*buffer_set.episode_ids} - found.keys()):
+    if lacking := sorted({*buffer_set.episode_ids} - questions.keys()):
         raise FormatError(f"{path} lacks the question of {lacking[0]}", hint, command)
-    return found
+    return questions

@@ -1,9 +1,9 @@
-"""Rows and headers as frozen dataclasses: their Arrow schema and JSON follow from the fields.
+"""Convert frozen dataclasses (rows and headers) to and from Arrow tables and JSON.
 
-A field is text, a whole number, a number, a truth value, bytes (in tables only), an `EpisodeId`,
-another such record, a tuple of one of these, a map from text to one of these, or one of these or
-None. A record with a field `episode_id` also has the columns `family`, `split` and `index`, to
-filter by. What a field means stands in its annotation: `Annotated[int, "Stored frames."]`.
+A field is a str, int, float, bool, bytes (in tables only), `EpisodeId`, another such dataclass, a
+tuple of one of these, a dict from str to one of these, or one of these or None. A dataclass with a
+field `episode_id` also has the columns `family`, `split` and `index`, for filters. The annotation
+describes the field: `Annotated[int, "Stored frames."]`.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -26,39 +26,34 @@ _SCALARS: dict[Any, tuple[pa.DataType, tuple[type, ...], str]] = {
     bytes: (pa.binary(), (bytes,), "bytes"),
 }
 _LARGEST = 1 << 63
-"""No whole number in a table is as large, and none in JSON may be."""
+"""Integers in tables and JSON are smaller."""
 
 _PARTS = {
     "family": (pa.string(), "Family of the episode: the first part of its id."),
     "split": (pa.string(), "Split of the episode: the second part of its id."),
     "index": (pa.int64(), "Number of the episode: the last part of its id."),
 }
-"""Columns that the field `episode_id` has beside its own: type and meaning."""
+"""Further columns of the field `episode_id`: type and description."""
 _PART_FIELDS = [pa.field(name, kind, nullable=False) for name, (kind, _) in _PARTS.items()]
 
 
 def arrow_schema(record: type, keys: Sequence[str] = ()) -> pa.Schema:
-    """Return the columns of a record.
-
-    Args:
-        record: The dataclass.
-        keys: Names that maps of text to text have; Arrow has them as structs.
-    """
+    """Return the columns of a dataclass; `keys` are those of its dicts, which become structs."""
     return pa.schema(list(_codec(record).arrow(keys)))
 
 
 def descriptions(record: type) -> dict[str, str]:
-    """Return what each column of a record means: the text of its field's `Annotated`."""
-    found = {}
+    """Return the description of each column: the text of its field's `Annotated`."""
+    texts = {}
     for name, hint in get_type_hints(record, include_extras=True).items():
-        found[name] = next(iter(getattr(hint, "__metadata__", ())), "")
+        texts[name] = next(iter(getattr(hint, "__metadata__", ())), "")
         if name == "episode_id":
-            found |= {part: text for part, (_, text) in _PARTS.items()}
-    return found
+            texts |= {part: text for part, (_, text) in _PARTS.items()}
+    return texts
 
 
 def to_dict(record: Any) -> dict[str, Any]:
-    """Return a record as plain values, for JSON and Arrow: columns in order."""
+    """Return a record as plain values, for JSON and Arrow, columns in order."""
     write = _codec(type(record)).write
     plain: dict[str, Any] = write(record, {}) if write else record
     return plain
@@ -66,17 +61,16 @@ def to_dict(record: Any) -> dict[str, Any]:
 
 def to_table(records: Iterable[Any], schema: pa.Schema) -> pa.Table:
     """Return records as a table; parts that records share are converted once."""
-    kept = list(records)  # alive, so that an id is one object's
+    rows = list(records)  # kept alive, because `shared` has the ids of their parts
     shared: dict[int, Any] = {}
-    return pa.table([_column(field, kept, shared) for field in schema], schema=schema)
+    return pa.table([_column(field, rows, shared) for field in schema], schema=schema)
 
 
 def _column(field: pa.Field, records: Sequence[Any], shared: dict[int, Any]) -> pa.Array:
-    """Return a column; of lists, each record that several lists share goes in once."""
+    """Return a column; records that several lists share are converted once."""
     if not records:
         return pa.array([], field.type)
-    known = _names(records[0])
-    if field.name not in known:  # a part of the id
+    if field.name not in _names(records[0]):  # a part of the id
         return pa.array([getattr(one.episode_id, field.name) for one in records], field.type)
     values = [getattr(one, field.name) for one in records]
     codec = _codec(get_type_hints(type(records[0]))[field.name])
@@ -86,16 +80,16 @@ def _column(field: pa.Field, records: Sequence[Any], shared: dict[int, Any]) -> 
         return pa.array([codec.write(one, shared) for one in values], field.type)
     listed = [one for value in values for one in value]
     distinct = {id(one): one for one in listed}
-    place = dict(zip(distinct, range(len(distinct)), strict=True))
-    items = pa.array(
-        [codec.item(one, shared) for one in distinct.values()], field.type.value_type
-    ).take(pa.array([place[id(one)] for one in listed], pa.int64()))
+    position = {key: number for number, key in enumerate(distinct)}
+    converted = [codec.item(one, shared) for one in distinct.values()]
+    order = pa.array([position[id(one)] for one in listed], pa.int64())
+    items = pa.array(converted, field.type.value_type).take(order)
     offsets = pa.array([0, *accumulate(map(len, values))], pa.int32())
     return pa.ListArray.from_arrays(offsets, items, type=field.type)
 
 
 def from_table[T](record: type[T], table: pa.Table, path: object) -> Iterator[T]:
-    """Yield the records of a table's rows; further columns are left aside."""
+    """Yield the records of a table's rows; other columns are ignored."""
     names = _names(record)
     if missing := [name for name in names if name not in table.column_names]:
         raise FormatError.damaged(path, f"column {', '.join(missing)} is missing")
@@ -103,13 +97,9 @@ def from_table[T](record: type[T], table: pa.Table, path: object) -> Iterator[T]
 
 
 def from_dict[T](record: type[T], value: Any, path: object, *, strict: bool = False) -> T:
-    """Return the record that plain values stand for; the inverse of `to_dict`.
+    """Return the record of plain values, the inverse of `to_dict`; `path` is for messages.
 
-    Args:
-        record: The dataclass.
-        value: What was read.
-        path: Where, for messages.
-        strict: Refuse names that the record does not have.
+    If `strict`, unknown names are an error.
     """
     try:
         if strict and isinstance(value, Mapping):
@@ -117,8 +107,7 @@ def from_dict[T](record: type[T], value: Any, path: object, *, strict: bool = Fa
             known = {*names, *_PARTS} if "episode_id" in names else {*names}
             if unknown := sorted(map(str, value.keys() - known)):
                 raise ValueError(f"unknown {', '.join(unknown)}")
-        found: T = _codec(record).read(value)
-        return found
+        return _codec(record).read(value)  # type: ignore[no-any-return]
     except ValueError as error:
         raise FormatError.damaged(path, first_line(error)) from None
 
@@ -127,17 +116,17 @@ def _names(record: Any) -> list[str]:
     return [field.name for field in fields(record)]
 
 
-# --- what follows from a type ------------------------------------------------------------------
+# --- conversion by type ------------------------------------------------------------------------
 
 _Writer = Callable[[Any, dict[int, Any]], Any]
-"""From a value to a plain one; what is shared by many rows is remembered by its id."""
+"""Converts a value to a plain one; the dict has the results for shared values by their id."""
 
 
 @dataclass(frozen=True)
 class _Codec:
-    """How values of a type are kept: its Arrow type, given the keys of maps, and both ways.
+    """Conversions of a type; `arrow` takes the keys of dicts.
 
-    There is no `write` where values are plain already. Of a list, `item` writes one of its values.
+    Without `write`, values are plain already. `item` converts one value of a list.
     """
 
     arrow: Callable[[Sequence[str]], pa.DataType]
@@ -215,45 +204,45 @@ def _record(record: Any) -> _Codec:
     identified = "episode_id" in codecs
 
     def arrow(keys: Sequence[str]) -> pa.DataType:
-        found = []
+        columns = []
         for name, codec in codecs.items():
-            found.append(pa.field(name, codec.arrow(keys), nullable=codec.optional))
+            columns.append(pa.field(name, codec.arrow(keys), nullable=codec.optional))
             if name == "episode_id":
-                found += _PART_FIELDS
-        return pa.struct(found)
+                columns += _PART_FIELDS
+        return pa.struct(columns)
 
     def read(value: Any) -> Any:
         given = _of((dict,), value, "a map")
-        found = {}
+        values = {}
         for name, codec in codecs.items():
             if name not in given and not codec.optional:
                 raise ValueError(f"{name} is missing")
             try:
-                found[name] = codec.read(given.get(name))
+                values[name] = codec.read(given.get(name))
             except ValueError as error:
                 raise ValueError(f"{name}: {first_line(error)}") from None
-        return record(**found)
+        return record(**values)
 
     def write(value: Any, shared: dict[int, Any]) -> Any:
-        found = {}
+        plain = {}
         for name, codec in codecs.items():
             one = getattr(value, name)
-            found[name] = one if codec.write is None else codec.write(one, shared)
+            plain[name] = one if codec.write is None else codec.write(one, shared)
         if identified:
-            found |= {part: getattr(value.episode_id, part) for part in _PARTS}
-        return found
+            plain |= {part: getattr(value.episode_id, part) for part in _PARTS}
+        return plain
 
     return _Codec(arrow, read, _remembered(write))
 
 
 def _remembered(write: _Writer) -> _Writer:
-    def found(value: Any, shared: dict[int, Any]) -> Any:
+    def write_once(value: Any, shared: dict[int, Any]) -> Any:
         plain = shared.get(id(value))
         if plain is None:
             plain = shared[id(value)] = write(value, shared)
         return plain
 
-    return found
+    return write_once
 
 
 def _of(types: tuple[type, ...], value: Any, expected: str) -> Any:

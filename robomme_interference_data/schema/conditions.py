@@ -1,15 +1,15 @@
-"""Conditions: what history a query episode gets, by name. The registry of all of them.
+"""Conditions: which history a query episode gets, by name. The registry of all of them.
 
-A condition is `<kind>-k<n>` or, for the paper's, `no-history` and `k<n>`. Its rule turns a query
-into sessions, in order; nothing outside this file may assume what they are. Kinds that hold units
-of other families hold the very units of `k<n>`, so that two conditions differ in one thing only.
-All are nested in n.
+A condition is `<kind>-k<n>` or, for the paper's, `no-history` and `k<n>`. Its rule returns the
+sessions of a query's buffer in order; no code outside this file may assume what they are. Kinds
+with units of other families use the units of `k<n>`, so that two conditions differ in one respect
+only. All kinds are nested in n.
 """
 
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
@@ -31,27 +31,27 @@ DEFAULT_CONDITIONS = (NO_HISTORY, "k0", "k1", "k3", "k7")
 
 
 class SessionProvider(Protocol):
-    """What a rule makes the history of one query of."""
+    """The sessions from which rules compose the history of one query."""
 
     def lesson(self, part: str = "lesson") -> SessionEntry:
-        """Return the query's own demonstration: all of it, or a part.
+        """Return the query's own demonstration, or a part of it.
 
         Args:
-            part: `lesson`, all of it; `first` or `second`, a half; `last`, its last frame, held
-                for as many frames as a distractor unit has.
+            part: `lesson` for all of it; `first` or `second` for a half; `last` for its last
+                frame, held for as many frames as a distractor unit has.
         """
         ...
 
     def units(self, k: int, dataset: str = DISTRACTORS) -> Sequence[SessionEntry]:
-        """Return `k` units of other families, in order; nested in `k`, alike in all datasets."""
+        """Return `k` units of other families, nested in `k`; the same episodes in any dataset."""
         ...
 
     def own_units(self, k: int) -> Sequence[SessionEntry]:
-        """Return `k` units of the query's own family, of other scenes; nested in `k`."""
+        """Return `k` units of the query's own family, from other scenes; nested in `k`."""
         ...
 
     def contradiction(self) -> SessionEntry:
-        """Return a demonstration in the very scene of the query, with another answer."""
+        """Return a demonstration in the query's scene with another answer."""
         ...
 
 
@@ -60,16 +60,16 @@ Sessions = tuple[SessionEntry, ...]
 
 @dataclass(frozen=True)
 class Kind:
-    """A family of conditions that differ in `k` only.
+    """A family of conditions that differ only in `k`.
 
     Attributes:
         name: `k` for the paper's conditions with history, `no-history`, and so on.
-        rule: From a query's provider and `k` to its sessions.
+        rule: Returns the sessions for a query's provider and `k`.
         holds: The sessions in order, in words; units are those of `k<n>`.
-        asks: What is asked by it.
-        needs: Datasets that a buffer set must hold for it, beside demonstrations and distractors.
-        own_family: Whether units are of the query's own family.
-        counted: Whether its conditions have a `k` in their name.
+        asks: The question that it answers.
+        needs: Datasets that it needs in addition to demonstrations and distractors.
+        own_family: Whether its units are of the query's own family.
+        counted: Whether the names of its conditions have a `k`.
     """
 
     name: str
@@ -86,89 +86,76 @@ class Kind:
         prefix = "" if self.name == "k" else f"{self.name}-"
         return f"{prefix}k<n>" if self.counted else self.name
 
-
-def _nothing(provider: SessionProvider, k: int) -> Sessions:
-    return ()
-
-
-def _lesson_first(provider: SessionProvider, k: int) -> Sessions:
-    return (provider.lesson(), *provider.units(k))
+    def __reduce__(self) -> tuple[Any, ...]:  # rules cannot be pickled
+        return _kind, (self.name,)
 
 
-def _before(provider: SessionProvider, k: int) -> Sessions:
-    return (*provider.units(k), provider.lesson())
-
-
-def _middle(provider: SessionProvider, k: int) -> Sessions:
-    units, half = provider.units(k), (k + 1) // 2
-    return (*units[:half], provider.lesson(), *units[half:])
-
-
-def _held(provider: SessionProvider, k: int) -> Sessions:
-    return (provider.lesson(), *[provider.lesson("last")] * k)
-
-
-def _same(provider: SessionProvider, k: int) -> Sessions:
-    return (provider.lesson(), *provider.own_units(k))
-
-
-def _parts(provider: SessionProvider, k: int) -> Sessions:
-    return (provider.lesson("first"), *provider.units(k), provider.lesson("second"))
-
-
-def _raw(provider: SessionProvider, k: int) -> Sessions:
-    return (provider.lesson(), *provider.units(k, RAW_DISTRACTORS))
-
-
-def _absent(provider: SessionProvider, k: int) -> Sessions:
-    return tuple(provider.units(k))
-
-
-def _stale(provider: SessionProvider, k: int) -> Sessions:
-    return (provider.contradiction(), *_lesson_first(provider, k))
-
-
-def _misled(provider: SessionProvider, k: int) -> Sessions:
-    return (provider.contradiction(), *provider.units(k))
+def _kind(name: str) -> Kind:
+    return KINDS[name]
 
 
 _KINDS = (
-    Kind(NO_HISTORY, _nothing, "none", "the floor: no memory (paper)", counted=False),
-    Kind("k", _lesson_first, "lesson, n units", "retroactive interference (paper)"),
-    Kind("before", _before, "n units, lesson", "proactive interference"),
-    Kind("middle", _middle, "⌈n/2⌉ units, lesson, the other units", "position"),
+    Kind(NO_HISTORY, lambda p, k: (), "none", "the floor: no memory (paper)", counted=False),
+    Kind(
+        "k",
+        lambda p, k: (p.lesson(), *p.units(k)),
+        "lesson, n units",
+        "retroactive interference (paper)",
+    ),
+    Kind(
+        "before",
+        lambda p, k: (*p.units(k), p.lesson()),
+        "n units, lesson",
+        "proactive interference",
+    ),
+    Kind(
+        "middle",
+        lambda p, k: (*p.units(k)[: (k + 1) // 2], p.lesson(), *p.units(k)[(k + 1) // 2 :]),
+        "⌈n/2⌉ units, lesson, the other units",
+        "position",
+    ),
     Kind(
         "held",
-        _held,
+        lambda p, k: (p.lesson(), *[p.lesson("last")] * k),
         "lesson, its last frame for n × 32 frames",
         "delay and dilution without content",
     ),
     Kind(
         "same",
-        _same,
+        lambda p, k: (p.lesson(), *p.own_units(k)),
         "lesson, n units of the query's own family, other scenes",
         "similarity",
         own_family=True,
     ),
-    Kind("parts", _parts, "first half of the lesson, n units, second half", "scattered evidence"),
+    Kind(
+        "parts",
+        lambda p, k: (p.lesson("first"), *p.units(k), p.lesson("second")),
+        "first half of the lesson, n units, second half",
+        "scattered evidence",
+    ),
     Kind(
         "raw",
-        _raw,
+        lambda p, k: (p.lesson(), *p.units(k, RAW_DISTRACTORS)),
         "lesson, the same n units at full rate: 256 frames, stride 1",
         "whether the stride gives the border away",
         (RAW_DISTRACTORS,),
     ),
-    Kind("absent", _absent, "n units", "false memory: must not differ from no-history"),
+    Kind(
+        "absent",
+        lambda p, k: tuple(p.units(k)),
+        "n units",
+        "false memory: must not differ from no-history",
+    ),
     Kind(
         "stale",
-        _stale,
+        lambda p, k: (p.contradiction(), p.lesson(), *p.units(k)),
         "contradicting lesson, lesson, n units",
         "updating: the newer lesson counts",
         (CONTRADICTIONS,),
     ),
     Kind(
         "misled",
-        _misled,
+        lambda p, k: (p.contradiction(), *p.units(k)),
         "contradicting lesson, n units",
         "how far a memory is believed",
         (CONTRADICTIONS,),
@@ -183,12 +170,12 @@ _COUNTED = re.compile(r"(?:(?P<kind>[a-z]+)-)?k(?P<k>0|[1-9][0-9]?)")
 
 @dataclass(frozen=True)
 class Condition:
-    """A condition: what history a query gets.
+    """A condition: which history a query gets.
 
     Attributes:
         name: `no-history`, `k0`, `k3`, `before-k3`, …
         kind: Its kind.
-        k: Number of sessions that its kind adds; 0 for one that does not count.
+        k: Number of sessions that its kind adds; 0 for `no-history`.
     """
 
     name: str
@@ -199,7 +186,7 @@ class Condition:
         """Return the sessions of a query's buffer, in order.
 
         Raises:
-            BuildError: The provider does not hold so many units.
+            BuildError: The provider has too few units.
             SourceError: It has no contradicting lesson.
         """
         return self.kind.rule(provider, self.k)
@@ -214,7 +201,7 @@ class Condition:
 
 
 def parse_condition(text: str | Condition) -> Condition:
-    """Read a condition's name; a condition is returned as it is."""
+    """Parse a condition's name; a condition is returned unchanged."""
     if isinstance(text, Condition):
         return text
     if isinstance(text, str):
@@ -233,17 +220,17 @@ def parse_condition(text: str | Condition) -> Condition:
 
 def in_order(conditions: Iterable[str | Condition]) -> tuple[Condition, ...]:
     """Return conditions in the order of tables."""
-    found = sorted(map(parse_condition, conditions), key=lambda one: one.sort_key)
-    names = [one.name for one in found]
-    if not found or len(set(names)) < len(names):
+    ordered = sorted(map(parse_condition, conditions), key=lambda one: one.sort_key)
+    names = [one.name for one in ordered]
+    if not ordered or len(set(names)) < len(names):
         raise InvalidOptionError(
-            f"conditions {' '.join(names) or '(none)'}; expected some, each once",
+            f"conditions {' '.join(names) or '(none)'}; expected at least one, each once",
             f"For example: {' '.join(DEFAULT_CONDITIONS)}",
         )
-    return tuple(found)
+    return tuple(ordered)
 
 
 def datasets_of(conditions: Iterable[Condition]) -> tuple[str, ...]:
-    """Return the datasets that a buffer set must hold for conditions."""
+    """Return the names of the datasets that conditions need."""
     further = {name for one in conditions for name in one.kind.needs}
     return tuple(n for n in DATASETS if n in further or n in (DEMONSTRATIONS, DISTRACTORS))

@@ -1,23 +1,23 @@
-"""Draw the distractor units of a history buffer: pure, and the same on every machine.
+"""Draw the distractor units of a history buffer; the result is the same on every machine.
 
-Rules 1 to 4 of the protocol. The draw for a query depends on its id, on the set of eligible unit
-ids (those of other families), on the seed and on the rule version; on nothing else, and on no
-other query. All choices come from SHA-256, none from a random generator.
+Rules 1 to 4 of the protocol. The draw for a query depends only on its id, the ids of the units of
+other families, the seed and the rule version. Choices come from SHA-256, not from a random
+generator.
 
 Rule version 1, for a query of family F and index i:
 
-1. *Units of a family* are put in an order by SHA-256. The query takes the unit at position q of
-   its family's order, cyclically, where q numbers all queries that may draw from this family:
-   i times the number of such benchmark families, plus the rank of F among them (and an offset
-   from SHA-256). So consecutive queries take consecutive units, and all come up equally often.
-2. *Families* are put in an order by SHA-256 for every block of m consecutive queries of F, m
-   being the number of eligible families, and the order is rotated by one from query to query.
-   So within a block every family comes once at each place.
-3. A family with fewer units than the largest one joins in proportionally fewer queries, evenly
-   spaced, so that its units are not used more often than others; in the queries that it sits
-   out it comes after all families that join.
-4. The first round takes one unit of each family in that order. Further rounds, needed only if k
-   exceeds m, count as the next queries: the families that join then give their next unit.
+1. *Units of a family* are ordered by SHA-256. The query takes the unit at position q, modulo their
+   number; q numbers all queries that may draw from this family: i times the number of such
+   benchmark families, plus the rank of F among them, plus an offset from SHA-256. So consecutive
+   queries take consecutive units, and all units are used equally often.
+2. *Families* are ordered by SHA-256 for every block of m consecutive queries of F, where m is the
+   number of eligible families; the order rotates by one from query to query. So within a block
+   every family comes once at each position.
+3. A family with fewer units than the largest one joins proportionally fewer queries, evenly
+   spaced, so that its units are not used more often than others. In other queries it comes after
+   all families that join.
+4. The first round takes one unit of each family in that order. Further rounds, needed only if
+   k > m, count as the next queries: the families that join then give their next unit.
 """
 
 import hashlib
@@ -32,12 +32,7 @@ from robomme_interference_data.ids import EpisodeId
 
 
 class UnitPool:
-    """The distractor units that buffers draw from.
-
-    Args:
-        units: Ids of the episodes that the units were made of; order does not matter.
-        seed: Seed of the draw.
-    """
+    """The distractor units that buffers draw from; the order of `units` does not matter."""
 
     def __init__(self, units: Iterable[EpisodeId], seed: int = 0):
         self._hash = cache(partial(_hash, seed))  # the same for many queries
@@ -52,14 +47,9 @@ class UnitPool:
         self._families = dict(sorted(families.items()))
 
     def draw(self, query: EpisodeId, k: int) -> list[EpisodeId]:
-        """Draw `k` distinct units of other families for a query; nested in `k`.
+        """Draw `k` distinct units of other families in buffer order.
 
-        Args:
-            query: Id of the query episode.
-            k: Number of units, 0 or more.
-
-        Returns:
-            The units in buffer order. `draw(query, j)` is the beginning of it for every j ≤ k.
+        `draw(query, j)` is the beginning of `draw(query, k)` for every j ≤ k.
         """
         others = {name: units for name, units in self._families.items() if name != query.family}
         count = sum(map(len, others.values()))
@@ -72,9 +62,9 @@ class UnitPool:
         return list(islice(self._units(query, others), k))
 
     def draw_own(self, query: EpisodeId, k: int) -> list[EpisodeId]:
-        """Draw `k` distinct units of the query's own family, none of the query; nested in `k`.
+        """Draw `k` distinct units of the query's family, without the query's; nested in `k`.
 
-        They follow one another in the family's order, and queries begin seven units apart.
+        They are consecutive in the family's order; queries start seven units apart.
         """
         units = [one for one in self._families.get(query.family, []) if one != query]
         if k > len(units):
@@ -83,7 +73,7 @@ class UnitPool:
                 f"Build distractors from more episodes of {query.family}, or plan a smaller k.",
             )
         first = 7 * query.index + self._offset("own", query.split, query.family)
-        return [units[(first + place) % len(units)] for place in range(k)]
+        return [units[(first + number) % len(units)] for number in range(k)]
 
     def _units(self, query: EpisodeId, others: dict[str, list[EpisodeId]]) -> Iterator[EpisodeId]:
         """Yield all units of other families for a query, in buffer order."""
@@ -93,7 +83,7 @@ class UnitPool:
         taken = dict.fromkeys(order, 0)
 
         def joined(name: str, turn: int) -> int:
-            """Return in how many of the queries before the turn the family has joined."""
+            """Return how many of the queries before the turn the family has joined."""
             return (numbers[name] + turn) * len(others[name]) // largest
 
         def next_unit(name: str) -> EpisodeId:
@@ -113,7 +103,7 @@ class UnitPool:
             yield from (next_unit(name) for _ in range(len(others[name]) - taken[name]))
 
     def _order(self, query: EpisodeId, names: list[str]) -> list[str]:
-        """Return the other families in the order of the query's block, rotated."""
+        """Return the other families in the rotated order of the query's block."""
         block, rotation = divmod(query.index, max(1, len(names)))
         parts = ("order", query.split, query.family, str(block))
         order = sorted(names, key=lambda name: self._hash(*parts, name))
@@ -126,7 +116,7 @@ class UnitPool:
             rank = drawing.index(query.family)
         else:
             rank = self._offset("rank", query.family) % len(drawing)
-        # Families start at different places, so that small ones join at different queries.
+        # Families start at different positions, so that small ones join different queries.
         offset = self._offset("offset", query.split, family) % largest
         return query.index * len(drawing) + rank + offset
 

@@ -1,7 +1,6 @@
-"""Evidence: which frames of a lesson show a part of the hidden answer, and where in a buffer: pure.
+"""Evidence: which frames of a lesson show parts of the hidden answer, and where in a buffer.
 
-A span is recorded with its episode; where no source says what a frame shows, evidence is unknown
-(None), never guessed.
+Spans are recorded with their episode. If the source does not label frames, evidence is None.
 """
 
 from bisect import bisect_left
@@ -14,18 +13,18 @@ from .manifest import Session, SessionEntry
 from .records import EvidenceSpan
 
 _TEACHING = ("lesson", "contradiction")
-"""Roles of sessions that are a lesson: of such a one evidence is known, or it is not."""
+"""Roles of sessions whose evidence must be known."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """An evidence span, or as much of it as a session holds, in its place in a buffer.
+    """An evidence span, or the part of it in a session, with its frame range in a buffer.
 
     Attributes:
-        start: First frame in the buffer.
-        stop: Frame after its last one.
-        session: The session that it is in: it may be a contradicting lesson.
-        span: The whole span as it is stored.
+        start: Index of its first frame in the buffer.
+        stop: Index after its last frame.
+        session: Its session, which may be a contradicting lesson.
+        span: The whole stored span.
     """
 
     start: int
@@ -34,23 +33,21 @@ class Evidence:
     span: EvidenceSpan
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values: part, text, session and frames in the buffer."""
-        told = {"part": self.span.part, "text": self.span.text, "role": self.session.role}
-        return told | {"start": self.start, "stop": self.stop}
+        """Return plain values: part, text, role and frames in the buffer."""
+        span = {"part": self.span.part, "text": self.span.text, "role": self.session.role}
+        return span | {"start": self.start, "stop": self.stop}
 
     def seen(self, frames: Iterable[int]) -> bool:
-        """Whether any of some frames of the buffer shows it."""
+        """Return whether one of these frames of the buffer shows it."""
         return any(self.start <= frame < self.stop for frame in frames)
 
 
 def spans_of_parts(
     shown: Iterable[Iterable[int]], parts: Sequence[str]
 ) -> tuple[EvidenceSpan, ...]:
-    """Return the spans of a lesson, by part and then by place.
+    """Return the spans of a lesson from the parts that each frame shows, by part and then frame.
 
-    Args:
-        shown: Of each frame, in order, the numbers of the parts that it shows.
-        parts: The parts in words.
+    `parts` has the texts of the parts.
     """
     frames = [frozenset(one) for one in shown]
     return tuple(
@@ -62,13 +59,10 @@ def spans_of_parts(
 
 
 def spans_of_texts(texts: Iterable[str]) -> tuple[EvidenceSpan, ...] | None:
-    """Return the spans of a lesson of which each frame has a text: a run of equal ones is a part.
+    """Return the spans of a lesson from a text per frame: each run of equal texts is a part.
 
-    Empty texts are none, and so is `static`, which RoboMME writes where the robot does nothing.
-
-    Returns:
-        The spans, parts numbered in their order; None where no text says anything: then what
-        the frames show is unknown.
+    Empty texts and `static`, which RoboMME writes while the robot rests, are ignored. Returns None
+    if no text is left.
     """
     runs = [run for run in _runs(one.strip() for one in texts) if run[0] not in ("", "static")]
     spans = (EvidenceSpan(part, *run) for part, run in enumerate(runs))
@@ -80,11 +74,9 @@ def map_evidence(
 ) -> tuple[Evidence, ...] | None:
     """Return the evidence of a buffer, session by session; None if that of a lesson is unknown.
 
-    Args:
-        sessions: The buffer's sessions; any may hold a part of a lesson, or repeat its frames.
-        recorded: From a session to the evidence of its stored episode, None where unknown.
+    `recorded` returns the evidence of the stored episode of a session.
     """
-    placed: list[Evidence] = []
+    mapped: list[Evidence] = []
     for session in sessions:
         entry, spans = session.entry, recorded(session.entry)
         if spans is None and session.role in _TEACHING:
@@ -95,40 +87,34 @@ def map_evidence(
                 first, last = (
                     session.start + (at - entry.start) * entry.repeat for at in (start, stop)
                 )
-                placed.append(Evidence(first, last, session, span))
-    return tuple(placed)
+                mapped.append(Evidence(first, last, session, span))
+    return tuple(mapped)
 
 
 def among(evidence: Iterable[Evidence], frames: Sequence[int]) -> tuple[Evidence, ...]:
-    """Return the evidence that some frames of a buffer show, in its places among these frames.
+    """Return the evidence in a selection of frames, with frame ranges in that selection.
 
-    Args:
-        evidence: The buffer's evidence, in order.
-        frames: Indices in the buffer, ascending.
+    `frames` are indices in the buffer, ascending.
     """
-    places = ((bisect_left(frames, one.start), bisect_left(frames, one.stop)) for one in evidence)
-    shown = zip(evidence, places, strict=True)
+    ranges = ((bisect_left(frames, one.start), bisect_left(frames, one.stop)) for one in evidence)
+    shown = zip(evidence, ranges, strict=True)
     return tuple(replace(one, start=a, stop=b) for one, (a, b) in shown if a < b)
 
 
 def known_parts(evidence: Sequence[Evidence], kept: Collection[int]) -> dict[int, str]:
-    """Return the parts of the answer that some frames show, in words, what is newer first.
+    """Return the texts of the parts of the answer that frames of the buffer show, newest first.
 
-    Of two sessions that show the same part the later one counts, whatever its role.
-
-    Args:
-        evidence: A buffer's evidence, in order.
-        kept: Frames of the buffer.
+    If two sessions show the same part, the later one counts, regardless of its role.
     """
-    found: dict[int, str] = {}
+    texts: dict[int, str] = {}
     for one in reversed(evidence):
         if one.seen(kept):
-            found.setdefault(one.span.part, one.span.text)
-    return found
+            texts.setdefault(one.span.part, one.span.text)
+    return texts
 
 
 def _runs[T](values: Iterable[T]) -> Iterator[tuple[T, int, int]]:
-    """Yield each run of equal values: the value, its first place, and the one after its last."""
+    """Yield each run of equal values: the value, its first index, and the index after its last."""
     stop = 0
     for value, run in groupby(values):
         start, stop = stop, stop + len(list(run))

@@ -1,7 +1,7 @@
-"""What manifests hold, each declared once: sessions, buffers, and the header.
+"""Records of manifests: sessions, buffers, and the header.
 
-The columns of `buffers.parquet` and the fields of `manifest.json` follow from these (see
-`rows.py`); `docs/format.md` describes them to readers of the files.
+The columns of `buffers.parquet` and the fields of `manifest.json` follow from these dataclasses
+(see `codec.py`); `docs/format.md` describes the files.
 """
 
 from collections.abc import Sequence
@@ -13,20 +13,16 @@ from robomme_interference_data.errors import FormatError
 from robomme_interference_data.ids import EpisodeId
 
 ROLES = ("lesson", "distractor", "filler", "contradiction")
-"""What a session is to its query: its own demonstration (or a part of it), a distractor unit,
-material without content, or a lesson that contradicts its own. The paper's conditions use the first
-two."""
+"""Roles of a session: the query's demonstration or a part of it, a distractor unit, frames without
+content, or a lesson with another answer. The paper's conditions use the first two."""
 
-_MOST_HISTORY = 1 << 18
-"""Frames of a buffer, at most: seven hours; the paper's longest have some thousand."""
-
-_MOST_SESSIONS = 1 << 12
-"""Sessions of a buffer, at most."""
+_MAX_HISTORY = 1 << 18  # frames of a buffer: seven hours; the paper's longest have some thousand
+_MAX_SESSIONS = 1 << 12  # of a buffer
 
 
 @dataclass(frozen=True)
 class SessionEntry:
-    """One session of a history buffer: where its frames lie and what they must hash to."""
+    """One session of a history buffer: where its frames are stored, and their digest."""
 
     role: Annotated[str, "One of `lesson`, `distractor`, `filler`, `contradiction`."]
     family: Annotated[str, "Family of the recorded episode."]
@@ -36,16 +32,16 @@ class SessionEntry:
     episode_index: Annotated[int, "Number of the episode in that dataset."]
     start: Annotated[int, "First stored frame of the span."]
     stop: Annotated[int, "Frame after the last one."]
-    repeat: Annotated[int, "How often each frame is shown in a row; 1 but for held frames."]
-    sha256: Annotated[str, "Digest over the span, each frame once."]
+    repeat: Annotated[int, "How often each frame repeats; 1 except for held frames."]
+    sha256: Annotated[str, "Digest over the span, without repetitions."]
 
     def __post_init__(self) -> None:
         if self.role not in ROLES:
             raise FormatError(f"session role {self.role!r} is none of {', '.join(ROLES)}")
-        if not 0 <= self.start < self.stop or self.repeat < 1 or self.num_frames > _MOST_HISTORY:
+        if not 0 <= self.start < self.stop or self.repeat < 1 or self.num_frames > _MAX_HISTORY:
             raise FormatError(
                 f"session span [{self.start}, {self.stop}) × {self.repeat} of {self.source} is "
-                f"empty, negative, or of over {_MOST_HISTORY} frames"
+                f"empty, negative, or of over {_MAX_HISTORY} frames"
             )
 
     @property
@@ -56,12 +52,12 @@ class SessionEntry:
 
 @dataclass(frozen=True)
 class Session:
-    """A session in its place in a buffer.
+    """A session with its frame range in a buffer.
 
     Attributes:
-        start: First frame of the session in the buffer.
-        stop: Frame after its last one.
-        entry: What it is, and where its frames are stored.
+        start: Index of its first frame in the buffer.
+        stop: Index after its last frame.
+        entry: Its role, and where its frames are stored.
     """
 
     start: int
@@ -90,10 +86,10 @@ class Session:
 def layout_sessions(
     entries: Sequence[SessionEntry], role: str | None = None
 ) -> tuple[Session, ...]:
-    """Return sessions in their places, one after the other: all, or those of a role."""
+    """Return sessions with their frame ranges in a buffer: all, or those of a role."""
     stops = [0, *accumulate(entry.num_frames for entry in entries)]
-    placed = zip(stops, stops[1:], entries, strict=False)
-    return tuple(Session(*one) for one in placed if role in (None, one[2].role))
+    sessions = zip(stops, stops[1:], entries, strict=False)
+    return tuple(Session(*one) for one in sessions if role in (None, one[2].role))
 
 
 @dataclass(frozen=True)
@@ -108,42 +104,34 @@ class QueryFrame:
 
 @dataclass(frozen=True)
 class BufferManifest:
-    """A history buffer by name: what it holds, without the frames."""
+    """Description of a history buffer, without the frames."""
 
     episode_id: Annotated[EpisodeId, "The query episode."]
-    condition: Annotated[str, "Name of the condition: with `episode_id`, the buffer's key."]
+    condition: Annotated[str, "Name of the condition; with `episode_id`, the buffer's key."]
     k: Annotated[int, "Number of sessions that the condition adds."]
     goals: Annotated[tuple[str, ...], "Wordings of the query's goal; at least one."]
     seed: Annotated[int | None, "Seed of the query episode in its simulator, or None."]
     difficulty: Annotated[str | None, "`easy`, `medium`, `hard`, or None."]
-    simulator: Annotated[str | None, "Simulator that the query episode belongs to, or None."]
-    exact: Annotated[bool, "Whether all frames are the recorded ones, bit for bit."]
+    simulator: Annotated[str | None, "Simulator of the query episode, or None."]
+    exact: Annotated[bool, "Whether all frames equal the recorded ones bit for bit."]
     lesson_frames: Annotated[int, "Frames of the lesson in the buffer."]
-    history_frames: Annotated[
-        int,
-        "Frames of the whole buffer: the `exec_start_idx` of the policy servers.",
-    ]
+    history_frames: Annotated[int, "Frames of the buffer: `exec_start_idx` of the policy servers."]
     lesson_share: Annotated[
-        float,
-        "Share of lesson frames in an even 32-frame sample of history and first live "
-        "observation at the first step.",
+        float, "Share of lesson frames in an even 32-frame sample at the first step."
     ]
-    query: Annotated[
-        QueryFrame,
-        "Where the first live observation is stored; never part of the buffer.",
-    ]
+    query: Annotated[QueryFrame, "Where the first live observation is stored."]
     sessions: Annotated[tuple[SessionEntry, ...], "The sessions in order."]
 
     def __post_init__(self) -> None:
         frames = sum(session.num_frames for session in self.sessions)
-        if frames > _MOST_HISTORY or len(self.sessions) > _MOST_SESSIONS:
+        if frames > _MAX_HISTORY or len(self.sessions) > _MAX_SESSIONS:
             raise FormatError(
                 f"{self}: {frames} frames in {len(self.sessions)} sessions; expected at most "
-                f"{_MOST_HISTORY} in {_MOST_SESSIONS}"
+                f"{_MAX_HISTORY} in {_MAX_SESSIONS}"
             )
         if frames != self.history_frames:
             raise FormatError(
-                f"{self}: the sessions hold {frames} frames, history_frames says "
+                f"{self}: the sessions hold {frames} frames; expected history_frames, "
                 f"{self.history_frames}"
             )
 
@@ -158,31 +146,28 @@ class BufferManifest:
 
 @dataclass(frozen=True)
 class ManifestDataset:
-    """A dataset that manifests name."""
+    """A dataset that manifests refer to."""
 
     kind: Annotated[str, "Name of the dataset in a buffer set, such as `demonstrations`."]
     version: Annotated[str, "Its version."]
-    revision: Annotated[str, "Its revision: sessions name it."]
+    revision: Annotated[str, "Its revision, to which sessions refer."]
     identity: Annotated[str, "SHA-256 of its `meta/interference.json`."]
     location: Annotated[
         str | None,
-        "Where it lies: None for the folder of its name in the buffer set, `.` for the buffer set's own"
-        " root, `namespace/name@commit` for a repository on the Hub.",
+        "Folder or repository: None for the buffer set's folder of its name, `.` for the buffer "
+        "set's root, `namespace/name@commit` for a repository on the Hub.",
     ] = None
 
 
 @dataclass(frozen=True)
 class ManifestHeader:
-    """`manifests/manifest.json`: how the buffers of a buffer set were planned."""
+    """Content of `manifests/manifest.json`: how the buffers of a buffer set were planned."""
 
-    format_version: Annotated[int, "Of the files."]
-    rule_version: Annotated[int, "Of the draw."]
-    seed: Annotated[int, "Of the draw."]
+    format_version: Annotated[int, "Version of the file format."]
+    rule_version: Annotated[int, "Version of the rule of the draw."]
+    seed: Annotated[int, "Seed of the draw."]
     conditions: Annotated[tuple[str, ...], "Names of the planned conditions, in order."]
-    position_limit: Annotated[int | None, "Longest history and rollout together, or None."]
-    datasets: Annotated[
-        dict[str, ManifestDataset],
-        "The datasets by name, which are folders of the buffer set.",
-    ]
+    position_limit: Annotated[int | None, "Most frames of history and rollout together, or None."]
+    datasets: Annotated[dict[str, ManifestDataset], "The datasets by name."]
     counts: Annotated[dict[str, int], "Numbers of `queries`, `buffers` and `sessions`."]
     rows: Annotated[str, "SHA-256 of `buffers.parquet`."]

@@ -1,4 +1,4 @@
-"""How an episode stands, and what is written down of one that was rolled out."""
+"""The row that describes one rollout, and the status of an episode."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -12,10 +12,7 @@ from .shifts import parse_shift
 
 
 class Status(StrEnum):
-    """How an episode stands after a step.
-
-    `error` means that something broke: such a rollout is no failure of the policy.
-    """
+    """Status of an episode after a step; `error` does not count as a failure of the policy."""
 
     ONGOING = "ongoing"
     SUCCESS = "success"
@@ -39,125 +36,85 @@ KEY_COLUMNS = (
     "model_seed",
     "protocol_version",
 )
-"""What makes a rollout the one that it is: no two rows of a run agree in all of them."""
+"""Columns that identify a rollout: no two rows of a run agree in all of them."""
 
 TIMING_COLUMNS = (
     *("reset_s", "history_s", "policy_s", "simulator_s", "model_s", "wall_s"),
     "finished_at",
 )
-"""Columns that differ from one run to the next; all others do not."""
+"""The only columns that differ between repetitions of a run."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rollout:
-    """One rollout."""
+    """One rollout, or one answered question about the past."""
 
-    system: Annotated[str, "Name of the system: a policy together with its memory mechanism."]
-    simulator: Annotated[
-        str,
-        "`tabletop` or `robomme`; `questions` where one was answered instead.",
-    ]
+    system: Annotated[str, "Label of the system: a policy with its memory mechanism."]
+    simulator: Annotated[str, "`tabletop`, `robomme`, …; `questions` for an answered question."]
     buffer_set: Annotated[str, "Name of the buffer set."]
-    revision: Annotated[str, "Identity of that buffer set, `BufferSet.revision`."]
-    family: Annotated[str, "Task family."]
+    revision: Annotated[str, "Identity of the buffer set, `BufferSet.revision`."]
+    family: Annotated[str, "Task family of the query episode."]
     condition: Annotated[str, "`no-history`, `k0`, `k1`, …"]
     split: Annotated[str, "`train`, `val` or `test`."]
     episode: Annotated[int, "Index of the query episode."]
-    shift: Annotated[
-        str,
-        "How the live scene differed from the lesson's, such as `light:2`; `none` if not.",
-    ]
-    model_seed: Annotated[int, "Seed that the policy was given."]
+    shift: Annotated[str, "Difference of the live scene to the lesson's, `light:2`; or `none`."]
+    model_seed: Annotated[int, "Seed of the policy."]
     protocol_version: Annotated[int, "`PROTOCOL_VERSION` of the run."]
-    seed: Annotated[int | None, "Seed of the scene."]
-    difficulty: Annotated[str | None, "`easy`, `medium` or `hard`; None if not known."]
-    goal: Annotated[str | None, "The goal in words, as the policy got it."]
+    seed: Annotated[int | None, "Seed of the scene, or None."]
+    difficulty: Annotated[str | None, "`easy`, `medium`, `hard`, or None."]
+    goal: Annotated[str | None, "The goal that the policy received."]
     status: Annotated[str, "`success`, `fail`, `timeout` (after 1300 steps) or `error`."]
-    success: Annotated[
-        bool | None,
-        "Whether the status is `success`; None for an error, which is neither.",
-    ]
+    success: Annotated[bool | None, "Whether the status is `success`; None for an error."]
     steps: Annotated[int, "Executed steps."]
-    history_frames: Annotated[
-        int,
-        "Frames that the policy was given before the first live observation.",
-    ]
-    lesson_frames: Annotated[int, "Those of them that are of the lesson."]
+    history_frames: Annotated[int, "History frames that the policy received."]
+    lesson_frames: Annotated[int, "Lesson frames among them."]
     lesson_share: Annotated[
         float | None,
-        "Share of lesson frames in an even 32-frame sample of what was given and the first "
+        "Share of lesson frames in an even 32-frame sample of the received history and the first "
         "live observation; None without history.",
     ]
     evidence_kept: Annotated[
         float | None,
-        "Share of the lesson's evidence spans of which the system's memory holds a frame at "
-        "the first step; None where the evidence or the memory's rule is unknown, and without"
-        " a lesson.",
+        "Share of the lesson's evidence spans with a frame in the system's memory at the first "
+        "step; None if unknown or without a lesson.",
     ] = None
-    retrieval_model: Annotated[
-        str | None,
-        "Encoder and rule of the retrieval step, or None.",
-    ] = None
-    retrieval_start: Annotated[
-        int | None,
-        "First frame in the buffer that was retrieved, or None.",
-    ] = None
+    retrieval_model: Annotated[str | None, "Encoder and rule of the retrieval step."] = None
+    retrieval_start: Annotated[int | None, "First retrieved frame of the buffer."] = None
     retrieval_stop: Annotated[
-        int | None,
-        "Frame after the last one that was, or None; not all between need be.",
+        int | None, "Frame after the last retrieved one; frames between may be left out."
     ] = None
     retrieval_selected_lesson_fraction: Annotated[
         float | None,
-        "Share of lesson frames in an even 32-frame sample of what was retrieved and the "
-        "first live observation, as the released CSV has it.",
+        "Share of lesson frames in an even 32-frame sample of the retrieved frames and the first "
+        "live observation, as in the released CSV.",
     ] = None
     retrieval_selected_filler_fraction: Annotated[
-        float | None,
-        "The same for frames of other sessions.",
+        float | None, "Share of frames of other sessions in that sample."
     ] = None
     retrieval_selected_query_fraction: Annotated[
-        float | None,
-        "The same for the first live observation.",
+        float | None, "Share of the first live observation in that sample."
     ] = None
     answer: Annotated[
-        str | None,
-        "Letter of the option that was chosen, of a question about the past; None for a "
-        "rollout, and where no option was named.",
+        str | None, "Letter of the chosen option; None for a rollout or without a choice."
     ] = None
     chance: Annotated[
-        float | None,
-        "Share of right answers that drawing at random would have, of a question; None for a "
-        "rollout.",
+        float | None, "Expected share of right answers from random guesses; None for a rollout."
     ] = None
     model_calls: Annotated[
-        int | None,
-        "How often a vision-language model was asked, repetitions after faults among them; "
-        "None without one.",
+        int | None, "Calls of the vision-language model, with retries; None without a model."
     ] = None
-    model_tokens: Annotated[
-        int | None,
-        "Tokens of all questions and answers; None if it does not say.",
-    ] = None
-    model_faults: Annotated[int | None, "Its answers that could not be used."] = None
-    error: Annotated[
-        str | None,
-        "What broke, in one line; None unless the status is `error`.",
-    ] = None
-    attempt: Annotated[int, "How often the rollout was started, this time included."] = 1
-    video: Annotated[str | None, "Path of its video inside the run's folder, or None."] = None
+    model_tokens: Annotated[int | None, "Tokens of all prompts and answers, if reported."] = None
+    model_faults: Annotated[int | None, "Unusable answers of the model."] = None
+    error: Annotated[str | None, "What failed, in one line; only if the status is `error`."] = None
+    attempt: Annotated[int, "Number of attempts, this one included."] = 1
+    video: Annotated[str | None, "Path of its video inside the run's folder."] = None
     reset_s: Annotated[float | None, "Seconds to reset the simulator."] = None
-    history_s: Annotated[
-        float | None,
-        "Seconds to hand the history over, and to wait for what is not decoded yet.",
-    ] = None
-    policy_s: Annotated[
-        float | None,
-        "Seconds that the policy took for actions and observations.",
-    ] = None
-    simulator_s: Annotated[float | None, "Seconds of stepping."] = None
-    model_s: Annotated[float | None, "Seconds that the vision-language model took."] = None
-    wall_s: Annotated[float | None, "Seconds in all."] = None
-    finished_at: Annotated[str | None, "When it ended, UTC, `2026-01-31T12:00:00Z`."] = None
+    history_s: Annotated[float | None, "Seconds to decode and deliver the history."] = None
+    policy_s: Annotated[float | None, "Seconds in the policy."] = None
+    simulator_s: Annotated[float | None, "Seconds of stepping the simulator."] = None
+    model_s: Annotated[float | None, "Seconds in the vision-language model."] = None
+    wall_s: Annotated[float | None, "Seconds in total."] = None
+    finished_at: Annotated[str | None, "End, in UTC, `2026-01-31T12:00:00Z`."] = None
 
     def __post_init__(self) -> None:
         parse_shift(self.shift)

@@ -1,29 +1,25 @@
-"""What a sample of a history holds, whatever sessions the history is made of: pure."""
+"""Samples of a history's frames, and what they contain of lesson and evidence."""
 
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterable, Sequence
 from itertools import groupby
+from typing import TYPE_CHECKING
 
 from robomme_interference_data.constants import SAMPLE_FRAMES
 from robomme_interference_data.errors import UnknownNameError
 
-from .evidence import Evidence
 from .manifest import Session
+
+if TYPE_CHECKING:
+    from .evidence import Evidence
 
 
 def even_sample(history_frames: int, frames: int = SAMPLE_FRAMES) -> list[int]:
-    """Return the frames that an even sample takes at the first step: FrameSamp's rule.
+    """Return the ascending frame indices of an even sample at the first step: FrameSamp's rule.
 
-    The sample is of the history and the first live observation together: all frames while there
-    are fewer than 32, else those at the integer `linspace(0, t, 32)`, t being the index of the
-    live observation.
-
-    Args:
-        history_frames: Frames of the history buffer; also the index of the live observation.
-        frames: Frames of the sample, the live one among them, 2 or more; FrameSamp has 32.
-
-    Returns:
-        Indices, ascending; the last one is the live observation's.
+    The sample is of the history and the first live observation, whose index `history_frames` is
+    the last one: all frames if they are fewer than `frames`, else the integer
+    `linspace(0, history_frames, frames)`.
     """
     if history_frames + 1 < frames:
         return list(range(history_frames + 1))
@@ -36,29 +32,23 @@ MEMORIES: dict[str, Callable[..., Sequence[int]]] = {
     "framesamp": lambda live, frames=SAMPLE_FRAMES: even_sample(live, frames)[:-1],
     "window": lambda live, frames=SAMPLE_FRAMES: range(max(0, live - frames + 1), live),
 }
-"""Memory rule: which frames it keeps when the live observation has index `live`, itself apart.
+"""By name, functions from the index of the live observation to the earlier frames in memory.
 
-Also given how many it may keep, the live one among them, 32 unless told. `full` keeps all;
-`framesamp` all while they are fewer than that with the live one, else those of the integer
-`linspace(0, live, 32)` (the released FrameSamp's rule); `window` the last ones.
+The second argument is the size of the memory, with the live observation. `full` keeps all frames,
+`framesamp` those of `even_sample`, `window` the last ones.
 """
 
 
 def check_memory(name: str, of: str) -> None:
-    """Check that there is a memory rule.
-
-    Args:
-        name: Its name.
-        of: Who is asked for it, for the message.
-    """
+    """Check the name of a memory rule; `of` is the option's owner, for the message."""
     if name not in MEMORIES:
         raise UnknownNameError.among("memory", name, of, MEMORIES)
 
 
 def spread(start: int, stop: int, count: int) -> list[int]:
-    """Return at most `count` evenly spread indices from `start` to `stop` (excluded).
+    """Return up to `count` evenly spread indices from `start` to `stop` (excluded), ends included.
 
-    The first and the last frame are among them, unless `count` is 1.
+    If `count` is 1, that is `start`.
     """
     last = stop - start - 1
     count = min(count, last + 1)
@@ -66,58 +56,39 @@ def spread(start: int, stop: int, count: int) -> list[int]:
 
 
 def runs(frames: Iterable[int]) -> tuple[tuple[int, int], ...]:
-    """Return each run of consecutive indices: the first, and the one after the last.
-
-    Args:
-        frames: Indices, ascending.
-    """
-    found = []
+    """Return start and stop (excluded) of each run of consecutive numbers in ascending indices."""
+    spans = []
     for _, run in groupby(enumerate(frames), lambda pair: pair[1] - pair[0]):
         indices = [index for _, index in run]
-        found.append((indices[0], indices[-1] + 1))
-    return tuple(found)
+        spans.append((indices[0], indices[-1] + 1))
+    return tuple(spans)
 
 
 def lesson_frames(sessions: Iterable[Session], frames: Sequence[int]) -> int:
-    """Count those of some frames of a buffer that are of the lesson.
-
-    Args:
-        sessions: The buffer's sessions.
-        frames: Indices in the buffer, ascending.
-    """
+    """Count the lesson frames among ascending indices of a buffer's frames."""
     lessons = (session for session in sessions if session.role == "lesson")
     return sum(bisect_left(frames, one.stop) - bisect_left(frames, one.start) for one in lessons)
 
 
 def lesson_share(sessions: Iterable[Session], frames: Sequence[int]) -> float:
-    """Return the share of lesson frames, 0 to 1, in an even sample of what is given of a buffer.
+    """Return the share of lesson frames, 0 to 1, in an even sample of frames of a buffer.
 
-    The live observation that follows is the sample's last frame, and is no lesson.
-
-    Args:
-        sessions: The buffer's sessions.
-        frames: What is given: indices in the buffer, ascending.
+    The sample ends with the live observation, which is not a lesson frame. `frames` are ascending
+    indices in the buffer.
     """
     *sample, _ = even_sample(len(frames))
-    return lesson_frames(sessions, [frames[place] for place in sample]) / (len(sample) + 1)
+    return lesson_frames(sessions, [frames[index] for index in sample]) / (len(sample) + 1)
 
 
-def evidence_kept(evidence: Iterable[Evidence], kept: Collection[int]) -> float | None:
-    """Return the share of a lesson's evidence spans of which at least one frame is kept, 0 to 1.
+def evidence_kept(evidence: "Iterable[Evidence]", kept: Collection[int]) -> float | None:
+    """Return the share of a lesson's evidence spans with a kept frame, 0 to 1; None without any.
 
-    A span that several sessions show, such as two halves of the lesson, counts once; what a
-    contradicting lesson shows does not count.
-
-    Args:
-        evidence: The buffer's evidence.
-        kept: Frames of the buffer that a sample holds.
-
-    Returns:
-        The share; None where there is no evidence to keep.
+    A span in several sessions, such as the halves of a lesson, counts once; spans of contradicting
+    lessons do not count. `kept` are indices of frames in the buffer.
     """
-    found: dict[object, bool] = {}
+    seen: dict[object, bool] = {}
     for one in evidence:
         if one.session.role != "contradiction":
             key = one.session.source, one.span
-            found[key] = found.get(key, False) or one.seen(kept)
-    return sum(found.values()) / len(found) if found else None
+            seen[key] = seen.get(key, False) or one.seen(kept)
+    return sum(seen.values()) / len(seen) if seen else None

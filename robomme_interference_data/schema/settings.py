@@ -1,4 +1,4 @@
-"""Settings declared once: the fields of a frozen dataclass are the Python API and the options.
+"""Settings declared once: the fields of a frozen dataclass are also command-line options.
 
 ```python
 @dataclass(frozen=True)
@@ -7,14 +7,14 @@ class Config:
     workers: int = setting(1, help="Worker processes.")
 ```
 
-`cli.options.with_settings` gives a command the options `--out` and `--workers` of it.
+`cli.options.with_settings` gives a command the options `--out` and `--workers`.
 """
 
 import dataclasses
 from typing import Any
 
 SETTING = "setting"
-"""Key of a declaration in the metadata of its field."""
+"""Key of the declaration in a field's metadata."""
 
 
 def setting(
@@ -28,25 +28,19 @@ def setting(
     whole: bool = False,
     group: str | None = None,
 ) -> Any:
-    """Declare a field that is also an option.
+    """Declare a field that is also a command-line option.
 
     Args:
-        default: Its value if it is not given; without one, the option is required.
-        help: Its help, in a line.
-        name: Its option, where that is not the field's name; `-` stands for an argument.
-        metavar: Placeholder for its value in the help.
-        env: Environment variable that can give it.
-        shown: What the help shows as its default, where that says more than the value.
-        whole: Values of a list may contain commas, which do not separate them.
-        group: Title under which the help lists it; by default among the plain options.
+        default: Its default value; without one, the option is required.
+        help: One line of help.
+        name: The option, if it is not derived from the field's name; `-` for an argument.
+        metavar: Placeholder for the value in the help.
+        env: Environment variable that can set it.
+        shown: Default to show in the help instead of the value.
+        whole: Whether values of a list may contain commas, which do not separate them then.
+        group: Title of the help section that lists it.
     """
-    declared = {
-        "help": help,
-        "name": name,
-        "metavar": metavar,
-        "env": env,
-        "shown": shown,
-        "whole": whole,
-        "group": group,
-    }
+    declared = dict(
+        help=help, name=name, metavar=metavar, env=env, shown=shown, whole=whole, group=group
+    )
     return dataclasses.field(default=default, metadata={SETTING: declared})

@@ -1,4 +1,4 @@
-"""How the world may have changed since the lesson: what a shift is, and how it is written."""
+"""Shifts: how the live scene may differ from the lesson's."""
 
 import re
 from dataclasses import dataclass
@@ -6,20 +6,19 @@ from dataclasses import dataclass
 from robomme_interference_data.errors import InvalidOptionError
 
 KINDS = ("light", "camera", "clutter")
-"""What changes: colour and brightness of the lamps; where cameras stand and look; things that take
-no part, put beside."""
+"""Changes of: color and brightness of the lamps; camera poses; unused objects nearby."""
 
 STRENGTHS = (1, 2, 3)
-"""How much, from a little to clearly."""
+"""From weak to strong."""
 
 NO_SHIFT = "none"
-"""Stands for no shift: the live scene is that of the lesson."""
+"""No shift: the live scene looks like the lesson's."""
 
 SHIFT_HELP = (
     "none, or how the live scene differs from the lesson's (tabletop): light, camera or clutter "
     "and a strength from 1 to 3, such as light:2."
 )
-"""What the option of every command says."""
+"""Help of the option of every command."""
 
 _SHIFT = re.compile(f"({'|'.join(KINDS)}):([{''.join(map(str, STRENGTHS))}])")
 

@@ -1,4 +1,4 @@
-"""Subgoals: what a policy is to do next, in words, and where in the front image: pure."""
+"""Subgoals: what a policy should do next, in words, and where in the front image."""
 
 import re
 from collections.abc import Sequence
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from robomme_interference_data.errors import InvalidOptionError
 
 POINT = "<point>"
-"""What stands for each of its points in a subgoal's text."""
+"""Placeholder for a point in a subgoal's text."""
 
 Pixel = tuple[int, int]
 """A point of an image: row and column, (y, x), from 0."""
@@ -17,12 +17,11 @@ _NAMED_AT = re.compile(rf"\s*(?:\bat\s+)?{POINT}")
 
 @dataclass(frozen=True)
 class Subgoal:
-    """What to do next.
+    """What a policy should do next.
 
     Attributes:
-        text: In words; each thing's place is written `<point>`, as in `pick up the cube at
-            <point>`.
-        points: Where these places are in the front image, (y, x) in pixels, in order.
+        text: In words, with a `<point>` for each point, as in `pick up the cube at <point>`.
+        points: The points in the front image, (y, x) in pixels, in order.
     """
 
     text: str
@@ -33,37 +32,33 @@ class Subgoal:
             raise InvalidOptionError.expected(
                 f"subgoal {self.text!r}: its points",
                 list(self.points),
-                f"words, and as many points as the text has {POINT}",
+                f"some words, and a point for each {POINT}",
             )
 
     @property
     def simple(self) -> str:
-        """The text without places: what released servers take as `simple_subgoal`."""
+        """The text without points: `simple_subgoal` of released servers."""
         return without_points(self.text)
 
     @property
     def grounded(self) -> str:
-        """The text with places as `<y, x>`: what released servers take as `grounded_subgoal`."""
+        """The text with points as `<y, x>`: `grounded_subgoal` of released servers."""
         return write_points(self.text, [f"<{y}, {x}>" for y, x in self.points])
 
 
 def without_points(text: str) -> str:
-    """Return a subgoal's text without places."""
+    """Return a subgoal's text without points."""
     return _NAMED_AT.sub("", text).strip()
 
 
 def write_points(text: str, written: Sequence[str]) -> str:
-    """Return a subgoal's text with each `<point>` as it is to be written, in order."""
+    """Return a subgoal's text with each `<point>` replaced, in order."""
     first, *rest = text.split(POINT)
     return first + "".join(point + words for point, words in zip(written, rest, strict=True))
 
 
 def read_points(text: str, pattern: "re.Pattern[str]") -> tuple[str, list[dict[str, int]]]:
-    """Take numbers out of a text: each match of a pattern becomes `<point>`.
-
-    Returns:
-        The text, and of each match the numbers of its named groups, in order.
-    """
+    """Replace each match by `<point>`; return the text and the numbers of each match's groups."""
     text = text.replace(POINT, "")
     numbers = [
         {name: int(value) for name, value in match.groupdict().items() if value is not None}
@@ -76,6 +71,6 @@ _PIXELS = re.compile(r"<\s*(?P<y>\d{1,4})\s*,\s*(?P<x>\d{1,4})\s*>")
 
 
 def read_grounded(text: str) -> Subgoal:
-    """Read a subgoal that has its places as `<y, x>` in pixels, as RoboMME writes them."""
+    """Parse a subgoal with points as `<y, x>` in pixels, as RoboMME writes them."""
     words, numbers = read_points(text, _PIXELS)
     return Subgoal(words.strip(), tuple((one["y"], one["x"]) for one in numbers))

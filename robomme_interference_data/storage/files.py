@@ -141,6 +141,14 @@ def canonical_json(value: Any) -> str:
     )
 
 
+def digest_json(values: Iterable[Any], end: str = "") -> str:
+    """Return the SHA-256 over the canonical JSON of values in turn, `end` after each."""
+    digest = hashlib.sha256()
+    for value in values:
+        digest.update((canonical_json(value) + end).encode(errors="backslashreplace"))
+    return digest.hexdigest()
+
+
 def indented_json(value: Any) -> str:
     """Return the JSON text of a value for files: indented, with sorted keys, no NaN."""
     text = json.dumps(value, sort_keys=True, indent=2, ensure_ascii=False, allow_nan=False)

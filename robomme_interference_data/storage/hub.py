@@ -75,6 +75,11 @@ def locate(
     repository; a `Path` is always a folder.
     """
     folder = Path(location).expanduser()
+    if not isinstance(location, str) and not folder.is_dir():
+        raise MissingFileError(
+            f"there is no folder {folder}",
+            "Give an existing folder, or a repository on the Hub as text: 'namespace/name'.",
+        )
     if folder.is_dir():
         if revision is not None:
             raise InvalidOptionError(

@@ -21,7 +21,6 @@ from robomme_interference_data.data.query_sessions import QuerySessions, Session
 from robomme_interference_data.errors import (
     BuildError,
     FormatError,
-    HistoryTooLongError,
     InvalidOptionError,
     MissingFileError,
     SourceError,
@@ -149,7 +148,7 @@ def test_datasets_that_conditions_need(tmp_path: Path) -> None:
     write_metadata(root / "contradictions", "contradictions", records)
     plan = plan_manifests(in_folder(root), ("stale-k1",))
     assert list(plan.datasets) == ["demonstrations", "distractors", "contradictions"]
-    with pytest.raises(SourceError, match=r"contradictions does not hold \w+/test/0"):
+    with pytest.raises(SourceError, match=r"contradictions lacks \w+/test/0"):
         list(planned_buffers(plan))
     queries = [record("demonstrations", "PatternLock/test/1")]
     one = made_up(tmp_path / "one", queries=queries)
@@ -201,7 +200,7 @@ def test_the_position_limit(tmp_path: Path, limit: int, fits: bool) -> None:
     if fits:
         assert len(list(planned_buffers(plan))) == 8
         return
-    with pytest.raises(HistoryTooLongError, match="under k1 needs 1365 positions") as caught:
+    with pytest.raises(InvalidOptionError, match="under k1 needs 1365 positions") as caught:
         list(planned_buffers(plan))
     assert 'position_limit="none"' in str(caught.value.hint)
 

@@ -105,11 +105,11 @@ def test_a_buffer_by_its_key() -> None:
 @pytest.mark.parametrize(
     ("arguments", "error", "told"),
     [
-        ((), InvalidOptionError, "expected one of the two"),
-        (("k3", 3), InvalidOptionError, "expected one of the two"),
-        ((None, True), InvalidOptionError, "k True; expected a whole number"),
-        ((None, "3"), InvalidOptionError, "k '3'; expected a whole number"),
-        ((None, 3.0), InvalidOptionError, "k 3.0; expected a whole number"),
+        ((), InvalidOptionError, "expected exactly one"),
+        (("k3", 3), InvalidOptionError, "expected exactly one"),
+        ((None, True), InvalidOptionError, "k True; expected an integer"),
+        ((None, "3"), InvalidOptionError, "k '3'; expected an integer"),
+        ((None, 3.0), InvalidOptionError, "k 3.0; expected an integer"),
         ((None, -1), InvalidIdError, "'k-1' is not a condition"),
         ((3,), InvalidIdError, "3 is not a condition"),
         (("K3",), InvalidIdError, "'K3' is not a condition"),
@@ -149,7 +149,7 @@ def test_episodes_that_cannot_be_loaded(
     ("option", "values", "told"),
     [
         ("cache", (3, ["x"], b"x", "", "a\0b"), "expected True, False, a folder"),
-        ("threads", (0, -3, True, "2", 1.5), "expected a number from 1"),
+        ("threads", (0, -3, True, "2", 1.5), "expected an integer from 1"),
         ("buffer_set", (None, 3, b"g", "", "a\0b"), "expected a folder"),
     ],
 )
@@ -235,8 +235,10 @@ def test_what_is_no_buffer_set(tmp_path: Path) -> None:
         with pytest.raises(MissingFileError, match="is not a buffer set") as caught:
             load_buffer_set(folder)
         assert "build all" in str(caught.value.command)
-    with pytest.raises(InvalidOptionError, match="neither a folder nor"):
+    with pytest.raises(MissingFileError, match="no folder .*nowhere"):
         load_buffer_set(tmp_path / "nowhere")
+    with pytest.raises(InvalidOptionError, match="neither a folder nor"):
+        load_buffer_set(str(tmp_path / "nowhere"))
     with pytest.raises(InvalidOptionError, match="only a repository has revisions"):
         load_buffer_set(GOLDEN, revision="data-1.0.0")
 
@@ -360,8 +362,8 @@ def other_first_view(root: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (other_goals, "does not have the SHA-256 of manifest.json"),
-        (other_goals_with_their_sum, "goals of MoveCube/test/0 under k3 is not that of its query"),
+        (other_goals, "does not have the SHA-256 in manifest.json"),
+        (other_goals_with_their_sum, "goals of MoveCube/test/0 under k3 does not fit its query"),
         (shorter_lesson, "episode records of .* are not those of its revision"),
         (other_first_view, "first live view .*frames 48 to 48.* recorded SHA-256"),
     ],
@@ -386,7 +388,7 @@ def test_a_session_of_no_dataset(own_buffers: Path) -> None:
     del told["datasets"]["distractors"]
     header.write_text(json.dumps(told))
     assert load_buffer_set(own_buffers).load("MoveCube/test/0", "k0").frames().any()
-    with pytest.raises(FormatError, match=r"buffers\.parquet: .* 'distractors', no dataset"):
+    with pytest.raises(FormatError, match=r"buffers\.parquet: .* unknown dataset 'distractors'"):
         load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
 
 

@@ -113,7 +113,7 @@ def test_order() -> None:
     names = [one.name for one in in_order(given)]
     assert names == ["no-history", "k0", "k7", "k10", "before-k1", "stale-k0"]
     for names in ([], ["k1", "k1"]):
-        with pytest.raises(InvalidOptionError, match="expected some, each once"):
+        with pytest.raises(InvalidOptionError, match="expected at least one, each once"):
             in_order(names)
 
 

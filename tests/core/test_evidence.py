@@ -73,7 +73,7 @@ def test_a_run_of_equal_texts_is_a_part() -> None:
     [(-1, "a", 0, 1), (1 << 20, "a", 0, 1), (0, "", 0, 1), (0, "a" * 2000, 0, 1), (0, "a", 3, 3)],
 )
 def test_what_is_no_span(span: tuple[int, str, int, int]) -> None:
-    with pytest.raises(FormatError, match="evidence of part"):
+    with pytest.raises(FormatError, match="evidence"):
         EvidenceSpan(*span)
 
 
@@ -82,7 +82,7 @@ def test_a_record_keeps_its_evidence_inside_the_lesson() -> None:
     assert from_dict(type(known), to_dict(known), "here") == known
     unknown = record("demonstrations", "MoveCube/test/0")
     assert from_dict(type(known), to_dict(unknown), "here").evidence is None
-    with pytest.raises(FormatError, match=r"evidence in frames \[20, 21\) of a lesson of 20"):
+    with pytest.raises(FormatError, match=r"evidence in frames \[20, 21\).* lesson has 20 frames"):
         record("demonstrations", "MoveCube/test/0", evidence=(EvidenceSpan(0, "a", 20, 21),))
     with pytest.raises(FormatError, match="none in a unit"):
         record("distractors", "MoveCube/train/0", evidence=())

@@ -146,7 +146,7 @@ def test_frames_that_take_too_much_at_once_are_refused(tmp_path: Path) -> None:
     assert short.frames().shape == (0, 4096, 4096, 3)
     many = with_sessions(buffer.manifest, *buffer.manifest.sessions * 8)
     held = Buffer(many, buffer.query, load_buffer_set(root).datasets)
-    with pytest.raises(FormatError, match="are held at once") as caught:
+    with pytest.raises(FormatError, match="are allocated at once") as caught:
         held.frames()
     assert "stream" in str(caught.value.hint)
 

@@ -29,6 +29,7 @@ from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.evaluation import run_evaluation
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.runtime.executor import Serial
+from robomme_interference_data.storage.hub import locate
 
 QUERY = "MoveCube/test/0"
 VERSION = "data-1.0.0"
@@ -187,6 +188,22 @@ def test_fetch_a_part_twice(hub: HubServer, fetch: Fetched) -> None:
     assert code == 0 and len(hub.downloads()) == count and "to fetch: 0 files" in told
 
 
+def test_a_part_does_not_need_datasets_that_its_buffers_do_not_use(
+    hub: HubServer, fetch: Fetched, tmp_path: Path
+) -> None:
+    work = tmp_path / "work"
+    shutil.copytree(GOLDEN / "demonstrations", work / "shifted")
+    header = json.loads((work / MANIFEST_PATH).read_text(encoding="utf-8"))
+    stale = header["datasets"]["demonstrations"] | {"revision": "0" * 64, "location": None}
+    header["datasets"] |= {"shifted": stale, "contradictions": stale}
+    (work / MANIFEST_PATH).write_text(json.dumps(header), encoding="utf-8")
+    hub.push(f"datasets/{BUFFER_SET}", work)
+    part = ("--families", "MoveCube", "--conditions", "k0", "--cameras", "front", "--dry-run")
+    assert fetch(BUFFER_SET, *part)[0] == 0
+    code, output = fetch(BUFFER_SET, "--dry-run")
+    assert code == 1 and "contradictions" in output
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -212,6 +229,16 @@ def test_fetch_is_for_repositories_and_mixes_no_splits(
     (tmp_path / "other" / "manifests" / "manifest.json").write_text("{}", encoding="utf-8")
     code, told = fetch(BUFFER_SET, "--to", tmp_path / "other")
     assert code == 1 and "another buffer set" in told
+
+
+def test_only_text_can_name_a_repository(hub: HubServer, run: Any) -> None:
+    with pytest.raises(MissingFileError, match="there is no folder"):
+        load_buffer_set(Path(BUFFER_SET))
+    files = locate(BUFFER_SET, revision=VERSION)
+    assert locate(files.location).location == files.location
+    assert load_buffer_set(files.location).location == files.location
+    code, _, error = run("verify", BASE)
+    assert code == 1 and f"{BASE}@" in error  # the command takes it for a repository
 
 
 def test_a_repository_that_is_no_buffer_set(hub: HubServer) -> None:
@@ -276,7 +303,7 @@ def test_a_run_on_a_repository_keeps_its_commit(
     rows = []
     for number, buffer_set in enumerate((BUFFER_SET, str(GOLDEN))):
         out = tmp_path / f"run-{number}"
-        settings = RunConfig("replay", Path(buffer_set), out, conditions=("k1",), **config)
+        settings = RunConfig("replay", buffer_set, out, conditions=("k1",), **config)
         rows.append(run_evaluation(settings, executor=Serial()).rows[0])
     assert rows[0].revision == rows[1].revision and rows[0].status == rows[1].status
     header = json.loads((tmp_path / "run-0" / "run.json").read_text(encoding="utf-8"))

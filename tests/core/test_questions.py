@@ -111,7 +111,7 @@ DAMAGED: dict[str, tuple[Callable[[pa.Table], pa.Table], str]] = {
     "no picture": (put("picture", None), "picture"),
     "no such episode": (put("episode_id", "MoveCube"), "MoveCube"),
     "one option": (put("options", [""]), "1 options"),
-    "an answer twice": (put("answers", [1, 1, 2]), "of 2 answers"),
+    "an answer twice": (put("answers", [1, 1, 2]), "with 2 different answers"),
 }
 
 

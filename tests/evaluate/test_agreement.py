@@ -8,7 +8,7 @@ import pytest
 from support.runs import EPISODE, roll
 from support.worlds import Cheat, World, query_of
 
-from robomme_interference_data.errors import RolloutError
+from robomme_interference_data.errors import RunError
 from robomme_interference_data.evaluate.rollout.recording_check import check_lesson
 from robomme_interference_data.simulators.base import Observation
 
@@ -50,7 +50,7 @@ def test_check_lesson_names_what_differs(spoil: str, message: str | None) -> Non
     elif message is None:
         check_lesson(query, played, Observation({"front": front}, first.state))
     else:
-        with pytest.raises(RolloutError, match=message):
+        with pytest.raises(RunError, match=message):
             check_lesson(query, played, first)
 
 
@@ -81,7 +81,7 @@ class Other(World):
 )
 def test_another_version_of_the_simulator_is_noticed(changes: dict[str, Any], message: str) -> None:
     for condition in ("no-history", "k3"):
-        with pytest.raises(RolloutError) as raised:
+        with pytest.raises(RunError) as raised:
             roll(condition, Cheat(), simulator=Other(**changes))
         assert message in raised.value.message
         assert "another version of the simulator" in (raised.value.hint or "")

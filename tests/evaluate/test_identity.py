@@ -8,7 +8,7 @@ import pytest
 from support.policy_server import PolicyServer
 from support.runs import header, run, run_one
 
-from robomme_interference_data.errors import RunFolderError
+from robomme_interference_data.errors import RunError
 from robomme_interference_data.evaluate import RunConfig, merge_runs
 from robomme_interference_data.evaluate.policies.identity import policy_identity
 from robomme_interference_data.evaluate.policies.registry import pin_policy
@@ -51,7 +51,7 @@ def test_another_run_is_refused_and_the_difference_named(
     usual: dict[str, Any] = {"policy": STILL, "policy_options": ("gripper=-1",)}
     run_one(tmp_path / "run", **usual)
     before = (tmp_path / "run" / "run.json").read_bytes()
-    with pytest.raises(RunFolderError, match="holds another run") as raised:
+    with pytest.raises(RunError, match="holds another run") as raised:
         run_one(tmp_path / "run", **usual | changes)
     assert message in raised.value.message
     assert (tmp_path / "run" / "run.json").read_bytes() == before
@@ -73,9 +73,9 @@ def test_another_checkpoint_behind_the_same_words_is_refused(
         monkeypatch.setenv("CHECKPOINT", name)
         run_one(tmp_path / name, policy=policy)
     difference = r"policy_metadata\.checkpoint is '{}' there, '{}' here"
-    with pytest.raises(RunFolderError, match=difference.format("b", "a")):
+    with pytest.raises(RunError, match=difference.format("b", "a")):
         merge_runs([tmp_path / "a", tmp_path / "b"], tmp_path / "merged")
-    with pytest.raises(RunFolderError, match=difference.format("a", "b")):
+    with pytest.raises(RunError, match=difference.format("a", "b")):
         run_one(tmp_path / "a", policy=policy)
 
 
@@ -95,7 +95,7 @@ def test_where_a_server_listens_makes_no_other_run(tmp_path: Path) -> None:
         assert addresses == {f"127.0.0.1:{first.port}", f"127.0.0.1:{second.port}"}
         first.metadata = {"checkpoint": "b"}
         difference = r"server_metadata\.checkpoint is 'a' there, 'b' here"
-        with pytest.raises(RunFolderError, match=difference):
+        with pytest.raises(RunError, match=difference):
             serve("one", first, shard="1/2")
 
 

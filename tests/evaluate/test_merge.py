@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from support.runs import header, run, run_one, untimed
 
-from robomme_interference_data.errors import FormatError, RunFolderError
+from robomme_interference_data.errors import FormatError, RunError
 from robomme_interference_data.evaluate import merge_runs
 from robomme_interference_data.evaluate.run.log import read_record
 from robomme_interference_data.evaluate.run.plan import WorkItem
@@ -99,12 +99,12 @@ def test_videos_come_along(tmp_path: Path) -> None:
 def test_other_runs_and_taken_folders_are_refused(tmp_path: Path) -> None:
     run_one(tmp_path / "a")
     run_one(tmp_path / "b", model_seed=1)
-    with pytest.raises(RunFolderError, match=r"b holds another run: model_seed is 1 there, 0 here"):
+    with pytest.raises(RunError, match=r"b holds another run: model_seed is 1 there, 0 here"):
         merge_runs([tmp_path / "a", tmp_path / "b"], tmp_path / "merged")
-    with pytest.raises(RunFolderError, match="b is there already"):
+    with pytest.raises(RunError, match="b is there already"):
         merge_runs([tmp_path / "a"], tmp_path / "b")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(RunFolderError, match=r"empty holds no run: run\.json is missing"):
+    with pytest.raises(RunError, match=r"empty holds no run: run\.json is missing"):
         merge_runs([tmp_path / "a", tmp_path / "empty"], tmp_path / "merged")
     (tmp_path / "a" / "rollouts.jsonl").write_text("{}\n")
     with pytest.raises(FormatError, match="line 1 is no row"):

@@ -44,7 +44,7 @@ from robomme_interference_data.errors import (
     FormatError,
     InterferenceError,
     InvalidOptionError,
-    RunFolderError,
+    RunError,
 )
 from robomme_interference_data.evaluate.models import openai as endpoint
 from robomme_interference_data.evaluate.models.model import Reply
@@ -362,7 +362,7 @@ def test_another_run_is_refused_and_the_difference_named(
         usual = behind(server, frames=3, families=("MoveCube",), episodes="0")
         ask(tmp_path / "run", **usual)
         before = (tmp_path / "run" / "run.json").read_bytes()
-        with pytest.raises(RunFolderError, match="holds another run") as raised:
+        with pytest.raises(RunError, match="holds another run") as raised:
             ask(tmp_path / "run", **usual | changes)
     assert message in raised.value.message
     assert (tmp_path / "run" / "run.json").read_bytes() == before
@@ -395,7 +395,7 @@ def test_other_questions_make_another_run(tmp_path: Path) -> None:
         for one in questions().values()
     ]
     write_questions(turned, root)
-    with pytest.raises(RunFolderError, match="questions is"):
+    with pytest.raises(RunError, match="questions is"):
         ask(tmp_path / "run", buffer_set=root)
     told = header(tmp_path / "run")["identity"]["questions"]
     assert told == digest_questions(questions().values())

@@ -18,7 +18,7 @@ from support.worlds import Cheat, World
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.errors import (
-    HistoryTooLongError,
+    InvalidOptionError,
     PolicyError,
 )
 from robomme_interference_data.evaluate.policies.builtin import Privileged
@@ -148,7 +148,7 @@ def test_retrieval_hands_over_the_frames_that_it_chose_and_clips_show_them() -> 
 
 def test_what_retrieval_chose_keeps_the_position_limit() -> None:
     system = "retrieval-framesamp-modul"  # 4096 positions less 1300 steps
-    with pytest.raises(HistoryTooLongError, match="2797 frames under k7"):
+    with pytest.raises(InvalidOptionError, match="2797 frames under k7"):
         roll("k7", Cheat(), selector=Chooses(*range(2797)), system=system)
 
 

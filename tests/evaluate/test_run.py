@@ -13,7 +13,7 @@ import pytest
 from support.runs import header, run, run_one, untimed
 from support.worlds import World
 
-from robomme_interference_data.errors import RunFolderError, SimulatorCrashError
+from robomme_interference_data.errors import RunError, SimulatorCrashError
 from robomme_interference_data.evaluate.rollout import worker
 from robomme_interference_data.evaluate.run.log import read_record
 from robomme_interference_data.runtime.executor import Outcome, Serial
@@ -133,7 +133,7 @@ def test_the_header_says_how_the_folder_stands_from_the_start_and_after_ctrl_c(
     [
         # A simulator that broke may do better in the next attempt; what it says itself stands.
         ("raise", "SimulatorCrashError: the world fell apart (Pick it up.)", 2),
-        ("error", "RolloutError: the support.worlds:World simulator reported an error at step", 1),
+        ("error", "RunError: the support.worlds:World simulator reported an error at step", 1),
     ],
 )
 def test_a_rollout_that_breaks_is_an_error_and_run_again(
@@ -234,18 +234,18 @@ def test_without_any_worker_the_run_stops_with_why(tmp_path: Path) -> None:
 def test_folders_that_are_refused(tmp_path: Path) -> None:
     out, other = tmp_path / "run", tmp_path / "other"
     run_one(out)
-    with pytest.raises(RunFolderError, match="holds a run already"):
+    with pytest.raises(RunError, match="holds a run already"):
         run_one(out, no_resume=True)
     with (out / ".lock").open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        with pytest.raises(RunFolderError, match="another process is writing"):
+        with pytest.raises(RunError, match="another process is writing"):
             run_one(out)
     (out / "rollouts.jsonl").unlink()
-    with pytest.raises(RunFolderError, match=r"rollouts\.jsonl is missing"):
+    with pytest.raises(RunError, match=r"rollouts\.jsonl is missing"):
         run_one(out)
     other.mkdir()
     (other / "thesis.tex").write_text("…")
-    with pytest.raises(RunFolderError, match=r"holds other files \(thesis\.tex\)"):
+    with pytest.raises(RunError, match=r"holds other files \(thesis\.tex\)"):
         run_one(other)
     assert [path.name for path in other.iterdir()] == ["thesis.tex"]
 
@@ -258,7 +258,7 @@ def test_a_run_that_stopped_before_its_header_begins_again(tmp_path: Path) -> No
     (out / "run.json").unlink()
     for name in ("rollouts.csv", "rollouts.parquet"):
         (out / name).unlink()
-    with pytest.raises(RunFolderError, match="holds other files"):  # rows are never begun again
+    with pytest.raises(RunError, match="holds other files"):  # rows are never begun again
         run(out)
 
 

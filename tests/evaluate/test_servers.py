@@ -15,7 +15,7 @@ from support.runs import header, run, run_one
 from robomme_interference_data.errors import (
     InvalidOptionError,
     PolicyServerError,
-    RunFolderError,
+    RunError,
     ServerKeepaliveError,
 )
 from robomme_interference_data.evaluate.policies.identity import check_kind, hold_servers
@@ -40,7 +40,7 @@ def test_a_server_that_says_nothing_needs_a_checkpoint(
     assert header(tmp_path / "run")["identity"]["policy_options"]["checkpoint"] == "a"
     # What was said is text, whatever it looks like.
     difference = r"policy_options\.checkpoint is 'a' there, '79999' here"
-    with pytest.raises(RunFolderError, match=difference):
+    with pytest.raises(RunError, match=difference):
         run_one(tmp_path / "run", policy=server.url, policy_options=("checkpoint=79999",))
 
 

@@ -27,7 +27,7 @@ from robomme_interference_data.errors import (
     InterferenceError,
     InvalidOptionError,
     ModelError,
-    RunFolderError,
+    RunError,
 )
 from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.rollout.checks import check_settings, default_system
@@ -132,11 +132,11 @@ def test_the_prompt_and_the_model_make_the_run(tmp_path: Path) -> None:
         run_one(tmp_path / "run", **asking(server))
         moved = asking(other, subgoal_options=("frames=4", "repeats=1"))
         assert run_one(tmp_path / "run", **moved).counts["fail"] == 1  # where it is served is free
-        with pytest.raises(RunFolderError, match="prompt_sha256"):
+        with pytest.raises(RunError, match="prompt_sha256"):
             run_one(tmp_path / "run", **asking(server, subgoal_prompt="simple"))
-        with pytest.raises(RunFolderError, match=r"frames is 4 there, 5 here"):
+        with pytest.raises(RunError, match=r"frames is 4 there, 5 here"):
             run_one(tmp_path / "run", **asking(server, subgoal_options=("frames=5",)))
-        with pytest.raises(RunFolderError, match="subgoals"):
+        with pytest.raises(RunError, match="subgoals"):
             run_one(tmp_path / "run", policy=TOLD)
     start = header(tmp_path / "run")["starts"][0]
     assert start["policy"]["subgoals"]["model"] == {"model": "tiny"}

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from robomme_interference_data.errors import WireError
+from robomme_interference_data.errors import FormatError
 from robomme_interference_data.evaluate.policies.wire import pack, unpack
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "wire_messages.txt"
@@ -99,16 +99,16 @@ CLAIMED = st.builds(
 
 @given(st.binary(max_size=60) | CLAIMED)
 def test_any_bytes_are_a_message_or_a_clear_error(data: bytes) -> None:
-    with suppress(WireError):
+    with suppress(FormatError):
         unpack(data)
 
 
 @given(ANYTHING.map(pack), st.data())
 def test_a_cut_message_is_an_error(data: bytes, draw: st.DataObject) -> None:
     cut = draw.draw(st.integers(0, len(data) - 1))
-    with pytest.raises(WireError, match="are not a message"):
+    with pytest.raises(FormatError, match="are not a message"):
         unpack(data[:cut])
-    with pytest.raises(WireError, match="are not a message"):
+    with pytest.raises(FormatError, match="are not a message"):
         unpack(data + b"\x00")
 
 
@@ -120,7 +120,7 @@ def test_a_cut_message_is_an_error(data: bytes, draw: st.DataObject) -> None:
     ],
 )
 def test_what_cannot_be_sent(value: Any) -> None:
-    with pytest.raises(WireError, match="cannot"):
+    with pytest.raises(FormatError, match="cannot"):
         pack({"a": [value]})
 
 
@@ -145,5 +145,5 @@ def claimed(kind: str, **fields: Any) -> bytes:
     ],
 )
 def test_what_is_not_read(data: bytes, text: str) -> None:
-    with pytest.raises(WireError, match=text):
+    with pytest.raises(FormatError, match=text):
         unpack(data)

@@ -14,9 +14,8 @@ from support.buffer_sets import QUERIES, UNITS
 from support.retrieval import FRAMES, QUIET, Interrupted, TwoSums, files_of, make_index, remade
 
 from robomme_interference_data import load_buffer, load_buffer_set
-from robomme_interference_data.data.buffer_set_index import normalised
-from robomme_interference_data.data.embeddings import EmbeddingIndex
-from robomme_interference_data.errors import BuildError, MissingIndexError
+from robomme_interference_data.data.embeddings import EmbeddingIndex, normalized
+from robomme_interference_data.errors import BuildError, MissingFileError
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.segment import typical_cosine
@@ -38,9 +37,9 @@ def test_a_buffers_embeddings_are_those_of_its_frames(indexed: Path) -> None:
     found = buffer.embeddings("thumbnail")
     assert found.dtype == np.float32 and found.shape == (48 + 3 * 32, 528)
     assert np.linalg.norm(found, axis=1) == pytest.approx(1, abs=1e-6)
-    encoder, centre = Thumbnail(), units_index(indexed).centre
-    assert np.array_equal(found, normalised(encoder.prepare(buffer.frames()), centre))
-    query = normalised(encoder.prepare(buffer.query.frame()[None]), centre)[0]
+    encoder, centre = Thumbnail(), units_index(indexed).center
+    assert np.array_equal(found, normalized(encoder.prepare(buffer.frames()), centre))
+    query = normalized(encoder.prepare(buffer.query.frame()[None]), centre)[0]
     assert np.array_equal(buffer.query_embedding("thumbnail"), query)
     lesson, unit, *_ = buffer.manifest.sessions
     turned = remade(indexed, [unit, lesson]).embeddings("thumbnail")
@@ -67,12 +66,12 @@ def test_centre_and_typical_cosine_are_of_the_units_alone(indexed: Path) -> None
         units.read_frames(episode, "front", 0, images[episode])
     features = Thumbnail().prepare(images.reshape(-1, 32, 32, 3)).astype(np.float16)
     index = units.index("thumbnail")
-    assert index.centre == pytest.approx(features.mean(axis=0, dtype=np.float64), abs=1e-7)
-    pool = normalised(features, index.centre).reshape(UNITS, 32, -1)
+    assert index.center == pytest.approx(features.mean(axis=0, dtype=np.float64), abs=1e-7)
+    pool = normalized(features, index.center).reshape(UNITS, 32, -1)
     assert index.typical_cosine == typical_cosine(UNITS, pool.__getitem__)
     assert np.array_equal(index.span(3, 0, 32), features.reshape(UNITS, 32, -1)[3])
     other = datasets["demonstrations"].index("thumbnail")
-    assert (other.centre, other.header.typical_cosine) == (None, None)
+    assert (other.center, other.header.typical_cosine) == (None, None)
 
 
 @pytest.mark.parametrize("name", ["demonstrations", "distractors"])
@@ -94,9 +93,9 @@ def test_a_live_frame_has_the_embedding_of_the_stored_one(indexed: Path) -> None
 @given(arrays(np.float32, (3, 4), elements=st.floats(-999, 999, width=32)), st.booleans())
 def test_normalising(features: np.ndarray, centred: bool) -> None:
     centre = np.array([3, 0, -1, 0.5], np.float32) if centred else None
-    found = normalised(features, centre)
+    found = normalized(features, centre)
     assert found.dtype == np.float32
-    assert np.array_equal(found, normalised(features.astype(np.float16), centre))
+    assert np.array_equal(found, normalized(features.astype(np.float16), centre))
     exact = features.astype(np.float16).astype(np.float64) - (0 if centre is None else centre)
     lengths = np.linalg.norm(exact, axis=1, keepdims=True)
     assert found * lengths == pytest.approx(exact, rel=1e-5, abs=1e-5)
@@ -119,11 +118,11 @@ def test_each_camera_has_an_index_of_its_own(indexed: Path, own_buffers: Path) -
     both = files_of(own_buffers)
     assert {name: both[name] for name in once} == once and len(both) == 2 * len(once)
     buffer = load_buffer(QUERIES[0], "k1", buffer_set=own_buffers)
-    centre = units_index(own_buffers, "wrist").centre
-    expected = normalised(Thumbnail().prepare(buffer.frames("wrist")), centre)
+    centre = units_index(own_buffers, "wrist").center
+    expected = normalized(Thumbnail().prepare(buffer.frames("wrist")), centre)
     found = buffer.embeddings("thumbnail", "observation.images.wrist")
     assert np.array_equal(found, expected)
-    live = normalised(Thumbnail().prepare(buffer.query.frame("wrist")[None]), centre)[0]
+    live = normalized(Thumbnail().prepare(buffer.query.frame("wrist")[None]), centre)[0]
     measured = measure(buffer, "thumbnail", "wrist")
     assert np.array_equal(measured.alike, measure(buffer, "thumbnail", "wrist", live).alike)
 
@@ -143,7 +142,7 @@ def test_an_interrupted_run_goes_on(indexed: Path, own_buffers: Path) -> None:
     # Three lessons of four batches each, then units of two: one is done, and half of the next.
     with pytest.raises(KeyboardInterrupt):
         make_index(own_buffers, Interrupted(after=15))
-    with pytest.raises(MissingIndexError):
+    with pytest.raises(MissingFileError):
         load_buffer(QUERIES[0], "k0", buffer_set=own_buffers).embeddings("thumbnail")
     assert make_index(own_buffers) == [0, FRAMES[1] - 32]
     assert files_of(own_buffers) == files_of(indexed)

@@ -13,7 +13,7 @@ from support.retrieval import change_header, make_index
 
 from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.data.embeddings import episode_file
-from robomme_interference_data.errors import FormatError, InterferenceError, MissingIndexError
+from robomme_interference_data.errors import FormatError, InterferenceError, MissingFileError
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.select import measure
 from robomme_interference_data.retrieval.selector import Selector
@@ -40,11 +40,11 @@ def check(buffer_set: Path) -> None:
 
 
 def test_without_an_index(tiny_buffers: Path) -> None:
-    with pytest.raises(MissingIndexError, match="no embeddings of encoder 'thumbnail'") as caught:
+    with pytest.raises(MissingFileError, match="no embeddings of encoder 'thumbnail'") as caught:
         look_up(tiny_buffers)
     expected = f"index {tiny_buffers} --encoder thumbnail"
     assert caught.value.command == expected
-    with pytest.raises(MissingIndexError, match="camera 'wrist'") as caught:
+    with pytest.raises(MissingFileError, match="camera 'wrist'") as caught:
         load_buffer(QUERIES[0], "k0", buffer_set=tiny_buffers).embeddings("thumbnail", "wrist")
     assert caught.value.command == f"{expected} --camera wrist"
 
@@ -52,10 +52,10 @@ def test_without_an_index(tiny_buffers: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "error", "said"),
     [
-        ({"revision": "0" * 64}, MissingIndexError, "revision 0000"),
+        ({"revision": "0" * 64}, MissingFileError, "revision 0000"),
         ({"format_version": 2}, FormatError, "format version 2"),
-        ({"size": 7}, MissingIndexError, "made differently"),
-        ({"camera": "wrist"}, MissingIndexError, "camera 'wrist'"),
+        ({"size": 7}, MissingFileError, "made differently"),
+        ({"camera": "wrist"}, MissingFileError, "camera 'wrist'"),
         ({"encoder": None}, FormatError, "encoder: None"),
         ({"sums": "0" * 64}, FormatError, "SHA256SUMS"),
         ({"frames": "many"}, FormatError, "frames: 'many'"),
@@ -115,7 +115,7 @@ def test_two_models_of_one_name_are_told_apart(own_buffers: Path) -> None:
     encoder.name = "siglip:one/tiny"
     make_index(own_buffers, encoder)
     look_up(own_buffers, "siglip:one/tiny@v2")
-    with pytest.raises(MissingIndexError, match="of encoder 'siglip:one/tiny'") as caught:
+    with pytest.raises(MissingFileError, match="of encoder 'siglip:one/tiny'") as caught:
         look_up(own_buffers, "siglip:two/tiny")
     assert str(caught.value.command).startswith("index ")
 
@@ -130,7 +130,7 @@ def test_an_index_of_another_version_of_the_encoder(whole: Path) -> None:
         header["encoder"]["sha256"] = "0" * 64
         path.write_text(json.dumps(header))
         buffer = load_buffer(QUERIES[0], "k0", buffer_set=whole)
-        with pytest.raises(MissingIndexError, match=said) as caught:
+        with pytest.raises(MissingFileError, match=said) as caught:
             Selector("thumbnail").select(buffer, buffer.query.frame())
         assert caught.value.command == f"index {whole} --encoder thumbnail"
 
@@ -168,5 +168,5 @@ def test_a_buffer_set_without_units(whole: Path) -> None:
     told = json.loads(header.read_text())
     del told["datasets"]["distractors"]
     header.write_text(json.dumps(told))
-    with pytest.raises(MissingIndexError, match="distractors"):
+    with pytest.raises(MissingFileError, match="distractors"):
         load_buffer(QUERIES[0], "k0", buffer_set=whole).embeddings("thumbnail")

@@ -7,7 +7,7 @@ import pytest
 from support.buffer_sets import QUERIES
 
 from robomme_interference_data import load_buffer, load_buffer_set
-from robomme_interference_data.errors import InvalidOptionError, MissingIndexError
+from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.retrieval.select import choose, measure
 from robomme_interference_data.retrieval.selector import Selector
 
@@ -27,11 +27,11 @@ def test_what_identifies_a_selector(indexed: Path) -> None:
         index = buffer.index("thumbnail")
         assert Selector("thumbnail").identity(buffer) == {
             "encoder": "thumbnail",
-            "fingerprint": index.encoder.sha256,
+            "fingerprint": index.units.header.encoder.sha256,
             "camera": "front",
             "method": "max",
             "boundary": "adaptive",
-            "threshold": (1 + index.typical_cosine) / 2,
+            "threshold": (1 + index.units.typical_cosine) / 2,
         }
     fixed = Selector("thumbnail", rule="mean/0.5").identity(buffer)
     assert (fixed["method"], fixed["boundary"], fixed["threshold"]) == ("mean", 0.5, 0.5)
@@ -47,5 +47,5 @@ def test_what_it_cannot_choose_from(indexed: Path, tiny_buffers: Path) -> None:
     with pytest.raises(InvalidOptionError, match="the history is empty"):
         selector.select(empty, empty.query.frame())
     bare = load_buffer(QUERIES[0], "k0", buffer_set=tiny_buffers)
-    with pytest.raises(MissingIndexError):
+    with pytest.raises(MissingFileError):
         selector.select(bare, bare.query.frame())

@@ -15,7 +15,7 @@ from support.families import families
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import (
     InvalidOptionError,
-    RolloutError,
+    RunError,
     SimulatorCrashError,
     UnknownNameError,
 )
@@ -238,10 +238,10 @@ def test_the_cube_is_in_sight_all_through_a_lesson_in_pushing(tabletop: Tabletop
 
 def test_motion_out_of_reach_is_an_error(scene: TabletopEnv) -> None:
     reset(scene, "VideoUnmask", 0)
-    with pytest.raises(RolloutError, match="no solution"):
+    with pytest.raises(RunError, match="no solution"):
         list(scene.arm.move((0.6, 0.0, 0.1)))
     scene.arm.reset()
-    with pytest.raises(RolloutError, match=r"joint \d at its limit"):
+    with pytest.raises(RunError, match=r"joint \d at its limit"):
         list(scene.arm.move((-0.3, 0.28, 0.02), -math.pi / 2))
 
 

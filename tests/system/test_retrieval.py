@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from support.retrieval import QUIET, embedded, files_of
 
-from robomme_interference_data.data.buffer_set_index import normalised
+from robomme_interference_data.data.embeddings import normalized
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.segment import typical_cosine
@@ -51,9 +51,9 @@ def test_the_lesson_is_chosen_among_eight_sessions(episodes: Features) -> None:
         pool = [other[:-1][:256:8] for name, other in episodes.items() if name != family]
         means = [one.mean(axis=0, dtype=np.float64) for one in pool]
         centre = np.mean(means, axis=0).astype(np.float32)
-        units = [normalised(one, centre) for one in pool]
+        units = [normalized(one, centre) for one in pool]
         typical = typical_cosine(len(units), units.__getitem__)
-        rows = normalised(own, centre)
+        rows = normalized(own, centre)
         lesson, units = rows[:-1], units[:7]
         history = np.concatenate([lesson, *units])
         rule = Rule("max", Rule("max").threshold(typical))

@@ -12,7 +12,7 @@ from support.buffer_sets import QUERIES
 from support.retrieval import make_index
 
 from robomme_interference_data import load_buffer, load_buffer_set
-from robomme_interference_data.data.buffer_set_index import normalised
+from robomme_interference_data.data.embeddings import normalized
 from robomme_interference_data.errors import FormatError, HubError, InvalidOptionError
 from robomme_interference_data.retrieval.encoders import make_encoder
 from robomme_interference_data.retrieval.select import measure
@@ -60,7 +60,7 @@ def test_siglip_is_transformers_own_pipeline(model: str) -> None:
     assert found == pytest.approx(expected, abs=1e-5)
     # Alone or together, within a unit of float16 (2⁻¹¹ of a value).
     alone = np.concatenate([encoder.features(encoder.prepare(image[None])) for image in images])
-    apart = normalised(found) - normalised(alone)
+    apart = normalized(found) - normalized(alone)
     assert np.abs(apart).max() <= 2**-11
     assert encoder.computed_in == "cpu, float32"
     assert encoder.fingerprint == make_encoder(model, device="cpu").fingerprint
@@ -78,12 +78,12 @@ def test_siglip_makes_an_index(own_buffers: Path, model: str) -> None:
     demonstrations.read_frames(0, "front", 0, images)
     found, expected = demonstrations.index(model).span(0, 0, length), encoder.prepare(images)
     assert found == pytest.approx(encoder.features(expected), rel=2e-3, abs=2e-3)
-    assert datasets["distractors"].index(model).centre is None
+    assert datasets["distractors"].index(model).center is None
     buffer = load_buffer(QUERIES[0], "k1", buffer_set=own_buffers)
     selector = Selector(model, device="cpu")
     assert selector.name == "siglip-tiny/max/adaptive"
     live = encoder.features(encoder.prepare(buffer.query.frame()[None]))
-    given = measure(buffer, model, query=normalised(live)[0])
+    given = measure(buffer, model, query=normalized(live)[0])
     assert given.alike == pytest.approx(measure(buffer, model).alike, abs=2e-3)
     chosen = selector.select(buffer, buffer.query.frame())
     assert 0 <= chosen[0] <= chosen[-1] < len(buffer)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import FPS
-from robomme_interference_data.errors import RolloutError
+from robomme_interference_data.errors import RunError
 
 Script = Iterator[None]
 
@@ -195,7 +195,7 @@ class Arm:
         if not found or not inside.all():
             joint = int(np.argmin(inside)) + 1
             reason = f"joint {joint} at its limit" if found else "no solution"
-            raise RolloutError(
+            raise RunError(
                 f"the arm cannot reach {np.round(tcp, 3).tolist()} m, rotated by "
                 f"{math.degrees(yaw):.0f}°: {reason}",
                 "Keep targets within 0.3 to 0.72 m of the arm's base and clear of its limits.",
