@@ -102,15 +102,7 @@ def what_is_left(buffer: Buffer, memory: str, frames: Sequence[int]) -> Left:
 
 
 def chance(query: Query, known: dict[int, str]) -> float | None:
-    """Return the chance of a draw among the answers that agree with what is known to be right.
-
-    Args:
-        query: The query episode.
-        known: Parts of the answer in words, see `evidence.known_parts`.
-
-    Returns:
-        The chance; None where the answers of the query's simulator cannot be told.
-    """
+    """Return the chance of a draw among the answers that agree with what is known to be right."""
     spans, scene = query.record.evidence, recorded_scene(query)
     if spans is None or scene is None:
         return None

@@ -21,9 +21,6 @@ class BoundedClient(httpx.Client):
 
     The read timeout of `httpx` starts anew with each byte: a server that sends one now and then,
     or never ends its answer, would keep a client forever.
-
-    Args:
-        answer_s: Most seconds from a request to the last byte of its answer.
     """
 
     def __init__(self, answer_s: float):

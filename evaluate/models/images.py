@@ -17,10 +17,6 @@ def within(messages: Iterable[Message], images: int | None) -> list[Message]:
     """Return messages with at most so many images.
 
     Videos become images, evenly spread ones, and give way first, the longer ones before others.
-
-    Args:
-        messages: The messages.
-        images: Images at most in all; single ones are never left out. None: videos stay videos.
     """
     asked = list(messages)
     if images is None:

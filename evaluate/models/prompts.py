@@ -19,14 +19,7 @@ _MOST_BYTES = 1 << 16
 def fill(
     text: str, words: Mapping[str, str], views: Mapping[str, Sequence[Part]]
 ) -> tuple[Part, ...]:
-    """Return a prompt's text with what stands for its places, words and images in order.
-
-    Args:
-        text: The text.
-        words: Places such as `{goal}`, and the words for them.
-        views: Places such as `<history>`, and the images for them; `none` is written where there
-            are none.
-    """
+    """Return a prompt's text with what stands for its places, words and images in order."""
     parts: list[Part] = []
     rest = 0
     for match in re.finditer("|".join(map(re.escape, (*words, *views))), text):
@@ -72,19 +65,7 @@ def told(parts: Sequence[Part]) -> str:
 def read_prompt[T](
     record: type[T], package: str, names: Sequence[str], name: str, page: str
 ) -> tuple[T, str]:
-    """Read a prompt: one that comes with the package, or a TOML file by its path.
-
-    Args:
-        record: Its dataclass, of texts and whole numbers; raises `ValueError` for what it may not
-            be.
-        package: The package with `prompts/<name>.toml`.
-        names: Those that come with it.
-        name: Which is wanted.
-        page: Of the documentation, for messages.
-
-    Returns:
-        The prompt, and the SHA-256 of its file.
-    """
+    """Read a prompt: one that comes with the package, or a TOML file by its path."""
     path: Any = Path(name)
     if name in names:
         path = resources.files(package) / "prompts" / f"{name}.toml"

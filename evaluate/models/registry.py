@@ -60,13 +60,7 @@ def pin_model(text: str) -> str:
 
 
 def make_model(text: str, options: Sequence[str] = (), also: Sequence[str] = ()) -> ChatModel:
-    """Make a model in this process. No endpoint is reached before the first question.
-
-    Args:
-        text: The model as it is written, see `parse_model`.
-        options: Its options, each `NAME=VALUE`: see `OpenAIModel` and `TransformersModel`.
-        also: Names of options that something else takes from the same list, for messages.
-    """
+    """Make a model in this process. No endpoint is reached before the first question."""
     spec = parse_model(text)
     factory = MODELS.factory(spec)
     bound = bind_options(f"model {text!r}", factory, spec.given, options, also)

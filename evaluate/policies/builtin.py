@@ -89,11 +89,7 @@ class ReplayPolicy(Policy):
 
 
 def thumbnails(frames: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return the mean colours of 16×16 tiles, `(T, 16, 16, 3) float32`.
-
-    Args:
-        frames: `(T, H, W, 3) uint8`, H and W at least 16; what does not fill a tile is left out.
-    """
+    """Return the mean colours of 16×16 tiles, `(T, 16, 16, 3) float32`."""
     count, height, width, _ = frames.shape
     tall, wide = height // THUMBNAIL, width // THUMBNAIL
     cut = frames[:, : tall * THUMBNAIL, : wide * THUMBNAIL]
@@ -104,13 +100,7 @@ def thumbnails(frames: NDArray[np.uint8]) -> NDArray[np.float32]:
 def extrapolate(
     kept: NDArray[np.int64], states: NDArray[np.float32], last: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Add a last frame to kept ones, where its joints would be had they moved on as before.
-
-    Args:
-        kept: Indices of the frames, `(n,) int64`, ascending.
-        states: Their states, `(n, 8) float32`.
-        last: Index of the last frame; nothing is added if it is kept, or only one is.
-    """
+    """Add a last frame to kept ones, where its joints would be had they moved on as before."""
     if len(kept) < 2 or kept[-1] >= last:
         return kept, states
     speed = (states[-1] - states[-2]) / np.float32(kept[-1] - kept[-2])
@@ -127,14 +117,6 @@ def follow(
     Between two kept frames the targets are interpolated, one step for each frame that lies
     between; more where a joint would move over 0.08 rad in a step. The gripper closes when the
     way of its finger shrinks, opens when it grows, and else stays.
-
-    Args:
-        now: Present state, `(8,) float32`.
-        kept: Indices of the frames, `(n,) int64`, ascending.
-        states: Their states, `(n, 8) float32`.
-
-    Returns:
-        `(m, 8) float32`, m at least 1: 7 joint targets in rad, gripper −1 closed or 1 open.
     """
     grip = 1.0 if now[7] > 0.02 else -1.0
     targets = [np.append(now[:7], np.float32(grip))]

@@ -13,11 +13,7 @@ from typing import Any
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidMessage, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from robomme_interference_data.errors import (
-    PolicyServerError,
-    ServerKeepaliveError,
-    WireError,
-)
+from robomme_interference_data.errors import PolicyServerError, ServerKeepaliveError, WireError
 
 from .wire import pack, unpack
 
@@ -63,20 +59,7 @@ def _is_keepalive(error: Exception) -> bool:
 
 
 class ServerConnection:
-    """A connection that is opened, used, and, after any error, gone.
-
-    Args:
-        host: Name or address of the server.
-        port: Its port.
-        connect_s: Most seconds to wait until it can be used.
-        response_s: Most seconds from a message to its answer.
-        check: Called where no answer came; raises where it is known why none will, and else
-            returns what to do about it, or None.
-
-    Attributes:
-        name: `host:port`.
-        metadata: What the server said of itself when it was last connected; None before.
-    """
+    """A connection that is opened, used, and, after any error, gone."""
 
     def __init__(
         self,

@@ -12,23 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from robomme_interference_data.errors import (
-    InvalidOptionError,
-    PolicyError,
-    PolicyServerError,
-)
+from robomme_interference_data.errors import InvalidOptionError, PolicyError, PolicyServerError
 from robomme_interference_data.evaluate.systems import System
 from robomme_interference_data.schema.conditions import NO_HISTORY
 
 from .policy import Policy
-from .registry import (
-    BUILTINS,
-    POLICIES,
-    check_workers,
-    make_policy,
-    parse_policy,
-    policy_options,
-)
+from .registry import BUILTINS, POLICIES, check_workers, make_policy, parse_policy, policy_options
 from .server_lock import lock_server
 
 logger = logging.getLogger(__name__)
@@ -36,12 +25,7 @@ logger = logging.getLogger(__name__)
 
 @contextmanager
 def hold_servers(text: str, out: Path) -> Iterator[None]:
-    """Keep other runs from a policy's servers until the block ends; see `lock_server`.
-
-    Args:
-        text: The policy as it is written; one without servers needs no lock.
-        out: The run's folder, for whoever is refused.
-    """
+    """Keep other runs from a policy's servers until the block ends; see `lock_server`."""
     with ExitStack() as stack:
         for host, port in parse_policy(text).servers:
             stack.enter_context(lock_server(host, port, f"the run in {out.resolve()}"))
@@ -51,12 +35,7 @@ def hold_servers(text: str, out: Path) -> Iterator[None]:
 def describe_policy(
     text: str, options: Sequence[str] = (), *, workers: int = 1
 ) -> tuple[Policy, dict[str, Any]]:
-    """Make a policy once, ask what it is, and release it; of several servers ask each.
-
-    Returns:
-        The policy, closed, for its attributes; and its metadata, as plain values: empty for a
-        server that workers start, see `check_served`.
-    """
+    """Make a policy once, ask what it is, and release it; of several servers ask each."""
     spec = parse_policy(text)
     check_workers(spec, workers)
     if spec.serves:

@@ -109,15 +109,7 @@ def check_workers(spec: PolicySpec, workers: int) -> None:
 
 
 def make_policy(text: str, options: Sequence[str] = (), *, worker: int = 0) -> Policy:
-    """Make a policy in this process. No server is reached before the first rollout.
-
-    Args:
-        text: The policy as it is written, see `parse_policy`.
-        options: Its options, each `NAME=VALUE`: see `WebsocketPolicy` and `LeRobotPolicy`; a
-            factory takes what it takes.
-        worker: Number of this worker, from 0: with several servers, the one that it uses. A
-            `python:` factory that takes `worker` is given it.
-    """
+    """Make a policy in this process. No server is reached before the first rollout."""
     factory, given = _factory(text, worker)
     policy = factory(**given, **bind_options(f"policy {text!r}", factory, given, options))
     _check_members(text, policy)
@@ -131,12 +123,7 @@ def policy_options(text: str, options: Sequence[str] = ()) -> dict[str, Any]:
 
 
 def served_policy(text: str, serve: str | None) -> str:
-    """Return a policy as it is written, and with it the command that serves it, if there is one.
-
-    Args:
-        text: The policy as it is written.
-        serve: The command with which each worker starts its server, `{port}` in it.
-    """
+    """Return a policy as it is written, and with it the command that serves it, if there is one."""
     if serve is None:
         if parse_policy(text).serves:
             raise InvalidOptionError.expected("policy", text, POLICIES.kinds["websocket"].form)

@@ -24,11 +24,6 @@ def lock_server(host: str, port: int, holder: str) -> Iterator[None]:
 
     The lock is a file in this user's cache, and goes with the process, however it ends. Where it
     cannot be written, a warning says so, and the run goes on without.
-
-    Args:
-        host: Name or address of the server.
-        port: Its port.
-        holder: Who drives it, for the `PolicyServerError` of whoever comes next.
     """
     machine = socket.gethostname() if host in _THIS_MACHINE else host
     folder = default_cache_folder().parent / "servers"

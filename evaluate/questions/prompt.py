@@ -67,10 +67,6 @@ def read_letter(text: str, letters: str) -> str | None:
     after the words option or letter; else the one that stands alone, in capitals. Where one of
     these finds several letters, or one of no option, none was named. What a model wrote while it
     thought, before `</think>`, is left aside.
-
-    Args:
-        text: What the model wrote.
-        letters: Letters of the options, such as `ABCD`.
     """
     said = text.rpartition("</think>")[2]
     bare = re.sub(r"[^A-Za-z]", "", said)

@@ -27,16 +27,7 @@ CONTROLS = ("none", "blank", "text")
 
 @dataclass(frozen=True)
 class Prompted:
-    """A question, with what may be known of the past.
-
-    Attributes:
-        question: The question.
-        query: Its query episode.
-        seed: Seed for what is drawn.
-        known: Parts of the answer that the kept frames show, by number, in words; None where it is
-            unknown what they show.
-        frames: Decodes the kept frames of the history, `(n, H, W, 3) uint8`, n may be 0.
-    """
+    """A question, with what may be known of the past."""
 
     question: Question
     query: Query
@@ -52,14 +43,7 @@ class Prompted:
 
 @dataclass(frozen=True)
 class Answer:
-    """An answer, for row and record.
-
-    Attributes:
-        letter: The option that was chosen; None if none was named.
-        prompt: What a model was asked, in words; None without a model.
-        text: What it wrote.
-        tokens, calls, seconds: As `Reply` has them.
-    """
+    """An answer, for row and record."""
 
     letter: str | None
     prompt: str | None = None
@@ -96,12 +80,7 @@ OWN = {"recall": recall, "guess": guess}
 
 
 class ModelResponder:
-    """A vision-language model that answers, one question at a time.
-
-    Attributes:
-        images: Images that it can be shown with a question, the picture among them; None if there
-            is no bound.
-    """
+    """A vision-language model that answers, one question at a time."""
 
     def __init__(self, config: AskConfig):
         self._model = make_model(config.model, config.model_options)

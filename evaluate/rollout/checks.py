@@ -5,10 +5,7 @@ from collections.abc import Sequence
 
 from robomme_interference_data.constants import DEMONSTRATIONS
 from robomme_interference_data.data.buffer_set import BufferSet
-from robomme_interference_data.errors import (
-    InterferenceError,
-    InvalidOptionError,
-)
+from robomme_interference_data.errors import InterferenceError, InvalidOptionError
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import (
     BUILTINS,

@@ -80,10 +80,6 @@ class Clip:
 
     What goes wrong with the clip never reaches the rollout: its traceback is kept as `problem`,
     and there is no clip.
-
-    Attributes:
-        data: The clip, an MP4 file, once it is closed; None if there is none.
-        problem: What went wrong, or None.
     """
 
     def __init__(self, item: WorkItem, system: str, folder: str | None = None):

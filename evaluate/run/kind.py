@@ -19,12 +19,7 @@ from .plan import Plan, WorkItem
 
 @dataclass(frozen=True)
 class Job:
-    """What a worker does next.
-
-    Attributes:
-        item: What to roll out, or to ask.
-        metadata: What the policy, or the model, reports of itself in this run.
-    """
+    """What a worker does next."""
 
     item: WorkItem
     metadata: Mapping[str, Any] = field(default_factory=dict)
@@ -32,14 +27,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Run[C: RunConfig | AskConfig]:
-    """A run whose settings were checked: what its workers need, and what all its rows share.
-
-    Attributes:
-        config: Its settings; the system is named, and a model on the Hub has its commit.
-        system: The label under which its results are reported.
-        buffer_set: Label of the buffer set in its rows.
-        revision: `BufferSet.revision`.
-    """
+    """A run whose settings were checked: what its workers need, and what all its rows share."""
 
     config: C
     system: str
@@ -70,15 +58,7 @@ def stored_count(count: int | None) -> int | None:
 
 
 class RunKind[C: RunConfig | AskConfig](ABC):
-    """One kind of work: `evaluation.run_evaluation` calls its methods in their order here.
-
-    Attributes:
-        config: The settings; `prepare` names the commits of models in them.
-        buffer_set: The buffer set.
-        system: The label under which the rows are reported; set by `prepare`.
-        metadata: What the policy, or the model, reports of itself; set by `prepare`.
-        versions: Versions of the simulator; set by `prepare`.
-    """
+    """One kind of work: `evaluation.run_evaluation` calls its methods in their order here."""
 
     system: str
     metadata: dict[str, Any]

@@ -130,12 +130,7 @@ class RunHeader:
 
 
 class RunLog:
-    """A run's folder that is written, see `open_log`.
-
-    Attributes:
-        rows: The row that counts of each rollout, as of the opening, and of the end once that is
-            written: rows between are on the disk, and not in memory.
-    """
+    """A run's folder that is written, see `open_log`."""
 
     def __init__(self, folder: Path, header: RunHeader, rows: dict[WorkItem, Rollout]):
         self.folder, self.header, self.rows = folder, header, rows

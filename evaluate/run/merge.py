@@ -10,13 +10,7 @@ from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.rollouts import TIMING_COLUMNS, Rollout
 from robomme_interference_data.storage.files import LocalFiles
 
-from .log import (
-    ERRORS_LOG,
-    check_same_run,
-    is_done,
-    open_log,
-    read_run,
-)
+from .log import ERRORS_LOG, check_same_run, is_done, open_log, read_run
 from .plan import WorkItem
 
 _OWN = frozenset({*TIMING_COLUMNS, "attempt", "video"})

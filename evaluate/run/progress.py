@@ -22,10 +22,6 @@ class RunProgress:
     """A table of successes so far above a progress bar, on stderr; use as a context manager.
 
     Where stderr is no terminal, a line is written whenever a family's condition is done.
-
-    Args:
-        quiet: Show nothing.
-        unit: What is counted.
     """
 
     def __init__(self, *, quiet: bool = False, unit: str = "rollouts"):

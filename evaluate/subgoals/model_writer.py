@@ -16,12 +16,7 @@ from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Observation, Simulator
 
 from .prompt import Answer, load_prompt, merge_near
-from .writer import (
-    CAMERA,
-    History,
-    SubgoalWriter,
-    Turn,
-)
+from .writer import CAMERA, History, SubgoalWriter, Turn
 
 
 class ModelWriter(SubgoalWriter):

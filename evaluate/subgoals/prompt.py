@@ -27,12 +27,7 @@ _SPECIAL = re.compile(r"<\|\w+\|>")
 
 @dataclass(frozen=True)
 class Answer:
-    """What an answer says.
-
-    Attributes:
-        subgoal: What to do next.
-        keyframes: Numbers of the recent frames that are to be kept, from 0.
-    """
+    """What an answer says."""
 
     subgoal: Subgoal
     keyframes: tuple[int, ...] = ()
@@ -214,9 +209,5 @@ def merge_near(frames: Sequence[int], distance: int) -> list[int]:
 
 
 def load_prompt(name: str) -> tuple[Prompt, str]:
-    """Read a prompt: one of `PROMPTS`, or a TOML file by its path.
-
-    Returns:
-        The prompt, and the SHA-256 of its file.
-    """
+    """Read a prompt: one of `PROMPTS`, or a TOML file by its path."""
     return read_prompt(Prompt, __package__, PROMPTS, name, "docs/subgoals.md")

@@ -5,11 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from robomme_interference_data.evaluate.models.registry import (
-    make_model,
-    model_identity,
-    pin_model,
-)
+from robomme_interference_data.evaluate.models.registry import make_model, model_identity, pin_model
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.systems import System
 from robomme_interference_data.runtime.specs import bind_options
@@ -33,11 +29,7 @@ def make_writer(config: RunConfig) -> SubgoalWriter | None:
 
 
 def describe_subgoals(config: RunConfig, system: System) -> tuple[RunConfig, dict[str, Any]]:
-    """Make what writes subgoals once, ask what it is, and release it.
-
-    Returns:
-        The settings, the prompt among them; and its metadata, empty if nothing writes.
-    """
+    """Make what writes subgoals once, ask what it is, and release it."""
     if config.subgoals not in (None, ORACLE):
         config = replace(config, subgoal_prompt=config.subgoal_prompt or system.prompt)
     writer = make_writer(config)
@@ -50,12 +42,7 @@ def describe_subgoals(config: RunConfig, system: System) -> tuple[RunConfig, dic
 
 
 def subgoals_identity(config: RunConfig, metadata: Mapping[str, Any]) -> Any:
-    """Return what of the subgoals can change a result, as plain values; None without any.
-
-    Args:
-        config: The settings.
-        metadata: Of their writer: see `describe_subgoals`.
-    """
+    """Return what of the subgoals can change a result, as plain values; None without any."""
     if config.subgoals in (None, ORACLE):
         return config.subgoals
     own, others = _parted(config.subgoal_options)

@@ -22,12 +22,7 @@ ORACLE = "oracle"
 
 
 class History:
-    """The history that a policy is given, in the front camera's images; decoded when asked for.
-
-    Args:
-        buffer: The buffer.
-        given: Its frames that are given, ascending.
-    """
+    """The history that a policy is given, in the front camera's images; decoded when asked for."""
 
     def __init__(self, buffer: Buffer, given: Sequence[int]):
         self._buffer, self._given = buffer, given

@@ -29,18 +29,7 @@ _TYPES = {
 
 @dataclass(frozen=True)
 class Kind:
-    """One kind of a registry.
-
-    Attributes:
-        form: How it is written, for messages.
-        factory: What makes it, `package.module:name`.
-        target: Regular expression of what follows the colon; its named groups are arguments of the
-            factory.
-        default: The target where none is written.
-        given: Further arguments of the factory.
-        extra: The extra that has its libraries.
-        no_effect: Options, and keys of metadata, that change no result.
-    """
+    """One kind of a registry."""
 
     form: str
     factory: str

@@ -28,11 +28,7 @@ from support.chat_server import (
     ChatServer,
 )
 
-from robomme_interference_data.errors import (
-    InvalidOptionError,
-    ModelError,
-    UnknownNameError,
-)
+from robomme_interference_data.errors import InvalidOptionError, ModelError, UnknownNameError
 from robomme_interference_data.evaluate.models import bounded_http
 from robomme_interference_data.evaluate.models import openai as endpoint
 from robomme_interference_data.evaluate.models.images import within

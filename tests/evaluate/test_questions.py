@@ -26,15 +26,7 @@ from support.chat_server import (
 )
 from support.retrieval import make_index
 from support.runs import header
-from support.tabletop import (
-    LESSON,
-    NOBODY,
-    QUERIES,
-    TABLETOP,
-    copy_tabletop,
-    scene_of,
-    shown,
-)
+from support.tabletop import LESSON, NOBODY, QUERIES, TABLETOP, copy_tabletop, scene_of, shown
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.questions import write_questions

@@ -17,10 +17,7 @@ from support.worlds import Cheat, World
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.data.buffer import Buffer
-from robomme_interference_data.errors import (
-    HistoryTooLongError,
-    PolicyError,
-)
+from robomme_interference_data.errors import HistoryTooLongError, PolicyError
 from robomme_interference_data.evaluate.policies.builtin import Privileged
 from robomme_interference_data.evaluate.rollout.rollout import read_ahead
 
