@@ -1,7 +1,7 @@
 """Specifications: `kind:target` texts, `NAME=VALUE` options, and the factories behind them.
 
-Policies, models and simulators are named by such texts. What makes them is imported when one is
-made, as it may bring large libraries.
+Policies, models, encoders and simulators are named by such texts. A factory is imported on first
+use, because it may import large libraries.
 """
 
 import inspect
@@ -29,7 +29,20 @@ _TYPES = {
 
 @dataclass(frozen=True)
 class Kind:
-    """One kind of a registry."""
+    """One kind of a registry.
+
+    Attributes:
+        form: How it is written, for messages.
+        factory: What makes it, `package.module:name`.
+        target: Regular expression of what follows the colon; its named groups are arguments of the
+            factory.
+        default: The target where none is written.
+        given: Further arguments of the factory.
+        extra: The extra that has its libraries.
+        no_effect: Options, and keys of metadata, that change no result.
+        valid: Further check of the target.
+        on_hub: Whether the target is a folder, or a model on the Hub that `pin` pins.
+    """
 
     form: str
     factory: str
@@ -38,11 +51,13 @@ class Kind:
     given: Mapping[str, Any] = field(default_factory=dict)
     extra: str = ""
     no_effect: tuple[str, ...] = ()
+    valid: Callable[[str], bool] = lambda target: True
+    on_hub: bool = False
 
 
 @dataclass(frozen=True)
 class Spec:
-    """A text that was read: its kind, what follows the colon, and the arguments in that."""
+    """A parsed text: its kind, what follows the colon, and the arguments in that."""
 
     kind: str
     target: str = ""
@@ -59,7 +74,7 @@ class Registry:
         self._what, self.kinds = what, kinds
 
     def parse(self, text: str) -> Spec:
-        """Read a text: `UnknownNameError` for an unknown kind, else `InvalidOptionError`."""
+        """Parse a text: `UnknownNameError` for an unknown kind, else `InvalidOptionError`."""
         name, colon, target = text.partition(":")
         if name not in self.kinds:
             forms = ", ".join(kind.form for kind in self.kinds.values())
@@ -70,18 +85,42 @@ class Registry:
         kind = self.kinds[name]
         target = target if colon else kind.default
         match = re.fullmatch(kind.target, target, re.DOTALL)
-        if match is None or bool(colon) > bool(target):
+        if match is None or bool(colon) > bool(target) or not kind.valid(target):
             raise InvalidOptionError.expected(self._what, text, kind.form)
         return Spec(name, target, {**kind.given, **match.groupdict()})
 
+    def pin(self, text: str) -> str:
+        """Return the full text, with the commit of a model on the Hub: a branch may move."""
+        spec = self.parse(text)
+        if self.kinds[spec.kind].on_hub:
+            from robomme_interference_data.storage.hub import HubFiles, locate
+
+            files = locate(spec.target, "model")
+            if isinstance(files, HubFiles):
+                return f"{spec.kind}:{files.repo_id}@{files.commit}"
+        return str(spec)
+
     def factory(self, spec: Spec, name: str | None = None) -> Factory:
-        """Import what makes such a spec, or another name of the same module."""
+        """Import the factory of a spec, or another name of the same module."""
         kind = self.kinds[spec.kind]
         module, _, usual = kind.factory.partition(":")
         return load_extra(module, name or usual, f"the {self._what} {spec}", kind.extra)
 
+    def options(
+        self, text: str, options: Iterable[str], also: Iterable[str] = ()
+    ) -> dict[str, Any]:
+        """Return all options, defaults included; see `bind_options`."""
+        spec = self.parse(text)
+        what = f"{self._what} {text!r}"
+        return bind_options(what, self.factory(spec), spec.given, options, also)
+
+    def make(self, text: str, options: Iterable[str] = (), also: Iterable[str] = ()) -> Any:
+        """Make what a text and its `NAME=VALUE` options describe; see `bind_options`."""
+        spec = self.parse(text)
+        return self.factory(spec)(**spec.given, **self.options(text, options, also))
+
     def identity(self, spec: Spec, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return those options, or entries of metadata, that can change a result."""
+        """Return the options, or entries of metadata, that can change a result."""
         without = self.kinds[spec.kind].no_effect
         return {name: value for name, value in sorted(values.items()) if name not in without}
 
@@ -91,8 +130,7 @@ def import_factory(what: str, target: str) -> Factory:
     module, _, name = target.partition(":")
     if module == "__main__":
         raise InvalidOptionError(
-            f"{what} {target!r}: worker processes run another program, and find no such function "
-            "in it",
+            f"{what} {target!r}: worker processes run another program, which has no such function",
             "Put the function into a module, a .py file beside the script or on PYTHONPATH, and "
             "write MODULE:FUNCTION.",
         )
@@ -103,11 +141,11 @@ def import_factory(what: str, target: str) -> Factory:
             f"{what} {target!r}: importing {module} failed: {type(error).__name__}: {error}",
             "Install it, or run with PYTHONPATH set to the folder that it is in.",
         ) from error
-    found: Any = getattr(loaded, name, None)
-    if not callable(found):
+    factory: Any = getattr(loaded, name, None)
+    if not callable(factory):
         known = [key for key, value in vars(loaded).items() if callable(value)]
         raise UnknownNameError.among("function", name, f"module {module!r}", known)
-    return found  # type: ignore[no-any-return]
+    return factory  # type: ignore[no-any-return]
 
 
 def bind_options(
@@ -119,13 +157,13 @@ def bind_options(
 ) -> dict[str, Any]:
     """Return all options that a factory is called with, defaults included.
 
-    Text stays text where the factory declares it. Elsewhere it is read as JSON (`3`, `0.5`,
-    `true`, `null`) if it is that. Anything wrong is an `InvalidOptionError`. For messages are
-    `what` is made, such as `policy 'replay:full'`, and which options something else takes `also`.
+    A value is text where the factory declares text, else JSON (`3`, `0.5`, `true`, `null`) where it
+    parses as JSON. Invalid options raise `InvalidOptionError`; its message names `what` is made,
+    such as `policy 'replay:full'`, and lists options that something else takes, `also`.
     """
     signature, declared = signature_of(factory), _declared_types(factory)
     values: dict[str, Any] = {}
-    for name, text in _buffer_set(what, options).items():
+    for name, text in _split_options(what, options).items():
         kinds = declared.get(name)
         value = text if kinds and str in kinds else _read(text)
         if kinds and float in kinds and type(value) is int:
@@ -159,7 +197,7 @@ def signature_of(factory: Factory) -> inspect.Signature:
         return inspect.signature(lambda **options: None)
 
 
-def _buffer_set(what: str, options: Iterable[str]) -> dict[str, str]:
+def _split_options(what: str, options: Iterable[str]) -> dict[str, str]:
     values: dict[str, str] = {}
     for option in options:
         name, equals, value = option.partition("=")

@@ -6,12 +6,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.evaluate.score.outcomes import (
-    Flags,
-    Outcomes,
-    rate_of,
-    success,
-)
+from robomme_interference_data.evaluate.score.outcomes import Flags, Outcomes, rate_of, success
 from robomme_interference_data.evaluate.systems import is_bound
 from robomme_interference_data.stats.bootstrap import DRAWS, Floats, drawn_means
 from robomme_interference_data.stats.significance import ALPHA, holm

@@ -5,10 +5,7 @@ from collections.abc import Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
-from robomme_interference_data.schema.conditions import (
-    NO_HISTORY,
-    parse_condition,
-)
+from robomme_interference_data.schema.conditions import NO_HISTORY, parse_condition
 from robomme_interference_data.viz.figure import INK, connect_right, right_of, tidy
 
 from .data import CHANCE, FEW, PUBLISHED, Data

@@ -9,12 +9,7 @@ from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.cells import Cell
 from robomme_interference_data.evaluate.score.tables.paper import by_family
 from robomme_interference_data.evaluate.systems import base_of
-from robomme_interference_data.schema.conditions import (
-    Condition,
-    Kind,
-    in_order,
-    parse_condition,
-)
+from robomme_interference_data.schema.conditions import Condition, Kind, in_order, parse_condition
 from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.viz.figure import INK
 

@@ -13,13 +13,7 @@ from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
 from robomme_interference_data.stats.significance import ALPHA
-from robomme_interference_data.viz.figure import (
-    INK,
-    ink_on,
-    mapped,
-    open_figure,
-    save_figure,
-)
+from robomme_interference_data.viz.figure import INK, ink_on, mapped, open_figure, save_figure
 
 from . import curves, forests
 from .curves import curve, explained, legend

@@ -6,11 +6,7 @@ from collections.abc import Sequence
 from robomme_interference_data.evaluate.score.comparisons.contrast import START, Contrast
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.cells import Cell
-from robomme_interference_data.evaluate.score.tables.equivalence import (
-    BEYOND,
-    EQUIVALENT,
-    OPEN,
-)
+from robomme_interference_data.evaluate.score.tables.equivalence import BEYOND, EQUIVALENT, OPEN
 from robomme_interference_data.evaluate.systems import base_of, display_name, is_bound
 from robomme_interference_data.schema.conditions import NO_HISTORY, parse_condition
 from robomme_interference_data.stats.significance import holm
