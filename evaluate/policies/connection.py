@@ -6,6 +6,7 @@ import os
 import socket
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from typing import Any
 
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidMessage, InvalidStatus
@@ -71,6 +72,7 @@ class ServerConnection:
         self.metadata: dict[str, Any] | None = None
         self._connect_s, self._response_s, self._check = connect_s, response_s, check
         self._connection: ClientConnection | None = None
+        self._stack = ExitStack()
         self._sent = b""
 
     @property
@@ -134,13 +136,12 @@ class ServerConnection:
 
     def close(self) -> None:
         """Close the connection, if one is open."""
-        connection, self._connection = self._connection, None
-        if connection is not None:
-            connection.close()
+        self._connection = None
+        self._stack.close()
 
     def _handshake(self, seconds: float) -> ClientConnection:
         key = os.environ.get(API_KEY_VARIABLE)
-        return connect(
+        connecting = connect(
             f"ws://{self.name}",
             additional_headers={"Authorization": f"Api-Key {key}"} if key else {},
             open_timeout=seconds,
@@ -151,6 +152,7 @@ class ServerConnection:
             # A server that computes does not answer pings; `response_s` finds the dead ones.
             ping_interval=None,
         )
+        return self._stack.enter_context(connecting)
 
     def _unreachable(self, reason: str, hint: str | None = None) -> PolicyServerError:
         return PolicyServerError(
