@@ -35,7 +35,7 @@ from robomme_interference_data.constants import CAMERA_PREFIX, DEMONSTRATIONS, F
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.runtime.executor import Executor, Processes, Serial, Worker
 from robomme_interference_data.runtime.progress import WorkProgress
-from robomme_interference_data.storage.digest import FeatureDigests
+from robomme_interference_data.storage.arrays import FeatureDigests
 from robomme_interference_data.storage.encode import Codec, VideoEncoder, get_codec
 
 RECORDINGS = Path(__file__).resolve().parent.parent.parent / "shared" / "data"

@@ -5,13 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.cli.console import (
-    Group,
-    echo,
-    graceful_interrupt,
-    print_json,
-    print_status,
-)
+from robomme_interference_data.cli.console import echo, graceful_interrupt, print_json, print_status
+from robomme_interference_data.cli.help import App
 from robomme_interference_data.cli.options import AsJson, BufferSetFolder, with_settings
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
@@ -40,10 +35,7 @@ from .config import (
 if TYPE_CHECKING:
     from robomme_interference_data.storage.files import Files
 
-app = typer.Typer(
-    cls=Group,
-    no_args_is_help=True,
-    rich_markup_mode=None,
+app = App(
     help="Build a buffer set's datasets, demonstrations and distractor units first, and manifests.",
     epilog="""Flow: record or download episodes, build the datasets and the manifests, verify.
 
@@ -342,6 +334,7 @@ def audit(
     ```
     """
     from robomme_interference_data.data.loading import load_buffer_set
+    from robomme_interference_data.viz.tables import tables_text
 
     from .audit import audit_buffer_set
 
@@ -349,8 +342,7 @@ def audit(
     if as_json:
         print_json(report.as_dict())
     else:
-        for table in report.tables():
-            echo(table.text() + "\n")
+        echo(tables_text(report.tables()) + "\n")
         for leak in report.leaks:
             echo(f"LEAK, {leak.kind}: {leak.where}")
         print_status(

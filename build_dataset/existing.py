@@ -8,8 +8,7 @@ from robomme_interference_data.constants import IDENTITY_PATH, REPORT_PATH
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import BuildError
 from robomme_interference_data.schema.records import EpisodeRecord
-from robomme_interference_data.storage.files import LocalFiles
-from robomme_interference_data.storage.headers import read_header
+from robomme_interference_data.storage.files import LocalFiles, read_header
 
 from .config import BuildPlan
 from .identity import BuildReport

@@ -22,11 +22,14 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.records import EpisodeRecord, SpanDigests, lesson_spans
-from robomme_interference_data.storage.arrays import write_array
-from robomme_interference_data.storage.digest import FeatureDigests, SpanDigester, combine
+from robomme_interference_data.storage.arrays import (
+    FeatureDigests,
+    SpanDigester,
+    combine,
+    write_array,
+)
 from robomme_interference_data.storage.encode import Codec, VideoEncoder, get_codec
-from robomme_interference_data.storage.files import canonical_json, write_json
-from robomme_interference_data.storage.headers import read_header
+from robomme_interference_data.storage.files import canonical_json, read_header, write_json
 from robomme_interference_data.storage.video import iter_frames
 
 from .config import BuildPlan

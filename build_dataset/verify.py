@@ -45,16 +45,16 @@ from robomme_interference_data.schema.conditions import datasets_of
 from robomme_interference_data.schema.manifest import BufferManifest, ManifestHeader
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.schema.shifts import SHIFTS
-from robomme_interference_data.storage.digest import combine
+from robomme_interference_data.storage.arrays import combine
 from robomme_interference_data.storage.encode import CODECS, decode_image
 from robomme_interference_data.storage.files import (
     LocalFiles,
     all_files,
     indented_json,
+    read_header,
     read_json,
     sha256_file,
 )
-from robomme_interference_data.storage.headers import read_header
 from robomme_interference_data.storage.parquet import open_parquet
 
 from .identity import BuildReport, identity_of, listed_files, report_of

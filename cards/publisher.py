@@ -4,7 +4,6 @@ The tag comes last. What has no tag is no version, whatever an upload that faile
 """
 
 import logging
-import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
@@ -132,19 +131,11 @@ class Publisher:
     Args:
         config: As what something is published.
         private: Whether repositories that have to be created are private.
-        wait: Waits for so many seconds, while the Hub is busy.
     """
 
-    def __init__(
-        self,
-        config: VersionConfig,
-        *,
-        private: bool = False,
-        wait: Callable[[float], object] = time.sleep,
-    ):
+    def __init__(self, config: VersionConfig, *, private: bool = False):
         self._wanted = config.wanted
         self._private = private
-        self._wait = wait
 
     def plan(self, content: RepoContent, *, follows: bool = False) -> RepoPlan:
         """Look at what is there; return what is to become of a repository.
@@ -157,7 +148,7 @@ class Publisher:
             follows: Its versions count on their own: if it has changed it takes the next one that
                 fits, whatever version is asked for.
         """
-        repository = HubRepository(content.repo_id, self._wait)
+        repository = HubRepository(content.repo_id)
         state = repository.state()
         files_at = cache(repository.files)  # what a commit holds never changes
         existing = files_at(state.head) if state else {}

@@ -1,9 +1,7 @@
 """The files of a repository: in a folder, or on the Hub in one commit and a tag."""
 
 import hashlib
-import logging
 import shutil
-import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,20 +17,14 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.errors import HubError, PublishError
 from robomme_interference_data.storage.files import all_files, sha256_file
-from robomme_interference_data.storage.hub_errors import HubCall, busy_for
+from robomme_interference_data.storage.hub import HubCall
 from robomme_interference_data.storage.staging import replace_folder, staging_dir
 
 if TYPE_CHECKING:
     from huggingface_hub.hf_api import RepoFile as RemoteFile
 
-logger = logging.getLogger(__name__)
-
 _ROOTS = ("data", "videos", INDEX_DIR, DEMONSTRATIONS, QUESTIONS_PATH, *OPTIONAL_DATASETS)
 """What one version has at its root and another may not have, beside the files that all have."""
-
-_TRIES = 5
-_LONGEST_WAIT = 330
-"""Seconds; the Hub counts requests in windows of five minutes."""
 
 
 @dataclass(frozen=True)
@@ -176,15 +168,13 @@ class HubRepository:
 
     Args:
         repo_id: `namespace/name`.
-        wait: Waits for so many seconds, while the Hub is busy.
     """
 
-    def __init__(self, repo_id: str, wait: Callable[[float], object] = time.sleep):
+    def __init__(self, repo_id: str):
         from huggingface_hub import HfApi
 
         self.repo_id = repo_id
         self._api = HfApi()
-        self._wait = wait
         self._of: dict[str, Any] = {"repo_id": repo_id, "repo_type": "dataset"}
 
     @property
@@ -255,7 +245,7 @@ class HubRepository:
         operations: list[Any] = [CommitOperationDelete(path) for path in difference.removed]
         operations += [CommitOperationAdd(path, files[path].source) for path in difference.sent]
         options = {"commit_message": message, "parent_commit": head, **self._of}
-        made = self._call(self._api.create_commit, sends=True, operations=operations, **options)
+        made = self._call(self._api.create_commit, operations=operations, **options)
         if left := compare(files, self.files(made.oid)):
             raise HubError(
                 f"{self.repo_id} does not hold what was sent: {left}",
@@ -278,16 +268,5 @@ class HubRepository:
         if existing != commit:
             self._call(self._api.create_tag, **self._of, tag=name, revision=commit)
 
-    def _call(self, call: Callable[..., Any], *, sends: bool = False, **options: Any) -> Any:
-        """Call the client; wait and call again while the Hub is busy."""
-        about = HubCall(self.repo_id, sends=sends)
-        for _ in range(_TRIES - 1):
-            try:
-                return about.run(call, **options)
-            except HubError as error:
-                seconds = busy_for(error)
-                if seconds is None or seconds > _LONGEST_WAIT:
-                    raise
-            logger.warning("The Hub is busy: trying again in %.0f s", seconds)
-            self._wait(seconds)
-        return about.run(call, **options)
+    def _call(self, call: Callable[..., Any], **options: Any) -> Any:
+        return HubCall(self.repo_id).run(call, **options)

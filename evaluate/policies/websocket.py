@@ -25,9 +25,9 @@ from robomme_interference_data.errors import (
     ServerKeepaliveError,
     printed_last,
 )
+from robomme_interference_data.runtime import guard
 from robomme_interference_data.simulators.base import ACTION_SIZE, Observation
 
-from . import server_guard
 from .connection import ServerConnection
 from .policy import Frames, Policy, RolloutInfo
 from .server_lock import reserve_port
@@ -267,7 +267,7 @@ class ServedPolicy(WebsocketPolicy):
             )
         self.started = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
         self._process = subprocess.Popen(
-            [sys.executable, server_guard.__file__, *words],
+            [sys.executable, guard.__file__, *words],
             process_group=0,
             stdin=subprocess.PIPE,
             stdout=self._log,

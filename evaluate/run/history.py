@@ -9,7 +9,7 @@ from robomme_interference_data.data.buffer import Buffer, Chunk
 from robomme_interference_data.data.dataset import Dataset, camera_feature
 from robomme_interference_data.errors import HashMismatchError
 from robomme_interference_data.schema.manifest import SessionEntry
-from robomme_interference_data.storage.digest import FeatureDigests, combine
+from robomme_interference_data.storage.arrays import FeatureDigests, combine
 
 
 class HistoryReader:

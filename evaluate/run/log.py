@@ -25,9 +25,9 @@ from robomme_interference_data.storage.files import (
     canonical_json,
     parse_json,
     read_bytes,
+    read_header,
     write_json,
 )
-from robomme_interference_data.storage.headers import read_header
 from robomme_interference_data.storage.parquet import writing
 from robomme_interference_data.storage.staging import file_lock
 

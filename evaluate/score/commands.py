@@ -22,20 +22,35 @@ if TYPE_CHECKING:
     from .rows.reading import Rows
 
 
+_OUTPUT = "Output"
+
+
 @with_settings
 def score(
     settings: Settings,
-    out: Annotated[Path, typer.Option(help="Folder for tables, figures and the report.")],
+    out: Annotated[
+        Path,
+        typer.Option(help="Folder for tables, figures and the report.", rich_help_panel=_OUTPUT),
+    ],
     export_to: Annotated[
         Path | None,
-        typer.Option("--export", help="Also write the rows here as the released CSVs have them."),
+        typer.Option(
+            "--export",
+            help="Also write the rows to this folder, in the layout of the released CSVs.",
+            rich_help_panel=_OUTPUT,
+        ),
     ] = None,
-    png: Annotated[bool, typer.Option("--png", help="Figures as PNG, too, not SVG alone.")] = False,
+    png: Annotated[
+        bool, typer.Option("--png", help="Also write figures as PNG.", rich_help_panel=_OUTPUT)
+    ] = False,
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="Also write figures as PDF.", rich_help_panel=_OUTPUT)
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
-    r"""Score rollout rows: tables, statistics, figures and one report.
+    r"""Score rollouts: write tables, statistics, figures and a report.
 
-    Reads rows only, never a simulator, and can be run again at any time.
+    Reads rows only, without a simulator.
 
     Examples:
     ```
@@ -45,6 +60,7 @@ def score(
     ```
     """
     from robomme_interference_data.runtime.progress import WorkProgress
+    from robomme_interference_data.viz.tables import tables_text
 
     from .report.headline import headline
     from .scoring import score as compute
@@ -52,9 +68,10 @@ def score(
 
     check_output(out, export_to)
     found = compute(settings)
-    _tell([found.rows], found.notes)
+    _print_notes([found.rows], found.notes)
     with WorkProgress() as progress, progress.status("Drawing the figures"):
-        exported = write_score(found, out, export_to, command_line(), png=png)
+        formats = [".png"] * png + [".pdf"] * pdf
+        exported = write_score(found, out, export_to, command_line(), formats)
     for path in exported:
         print_status(f"{path} written")
     if as_json:
@@ -71,51 +88,49 @@ def score(
             }
         )
     else:
-        for grid in found.grids:
-            echo(f"{grid.text()}\n")
+        echo(f"{tables_text(found.grids)}\n")
     print_status(f"Report: {out / 'report.html'}")
 
 
 def compare(
     run_a: Annotated[Path, typer.Argument(help="Folder of a run, or file of rows.")],
     run_b: Annotated[
-        Path | None, typer.Argument(help="The other one; none compares conditions of one run.")
+        Path | None, typer.Argument(help="The other run; omit it to compare conditions of one run.")
     ] = None,
     conditions: Annotated[
         list[str] | None,
         typer.Option(
-            help="The condition of A and that of B, such as k0,k7, instead of each.",
+            help="A condition of A and one of B, such as k0,k7; by default each with itself.",
             metavar="NAME,…",
             callback=split_commas,
         ),
     ] = None,
     system_a: Annotated[
-        str | None, typer.Option(help="Name of the system of rows of A that name none.")
+        str | None, typer.Option(help="System of rows of A that name none.")
     ] = None,
     system_b: Annotated[
-        str | None, typer.Option(help="Name of the system of rows of B that name none.")
+        str | None, typer.Option(help="System of rows of B that name none.")
     ] = None,
     lenient: Annotated[
-        bool, typer.Option("--lenient", help="Leave bad rows out, and count them.")
+        bool, typer.Option("--lenient", help="Leave out bad rows and count them.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Compare two runs, or two conditions of one, paired over the episodes that both have.
+    """Compare two runs, or two conditions of one run, paired over shared episodes.
 
-    Of runs under different shifts the difference is what the shift costs.
+    Runs under different shifts can be compared: the difference is the effect of the shift.
 
     Examples:
     ```
     robomme-interference compare my-run my-run-with-retrieval
     robomme-interference compare my-run --conditions k0,k7
-    robomme-interference compare my-run my-run-under-light-2
     robomme-interference compare my-run rollouts.csv --system-b retrieval-framesamp-modul
     ```
     """
     from .comparisons.compare import compare as compute
 
     found = compute(run_a, run_b, (system_a, system_b), lenient, conditions or ())
-    _tell(found.runs, found.notes)
+    _print_notes(found.runs, found.notes)
     if as_json:
         bad = [rows.refused for rows in found.runs]
         print_json({"bad_rows": bad, "notes": list(found.notes), "rows": found.table.records()})
@@ -131,15 +146,14 @@ def power(
     ] = 0.06,
     as_json: AsJson = False,
 ) -> None:
-    """Tell what a number of episodes can show, before they are run.
+    """Compute which differences a number of episodes can detect.
 
-    The share that flips by itself is what the table noise of a score has, or compare of two runs
-    of one system.
+    The share that flips by chance is in the table noise of a score, and in the output of compare
+    for two runs of one system.
 
     Examples:
     ```
     robomme-interference power --margin 5 --episodes 450 --flips 0.06
-    robomme-interference power --margin 3 --episodes 450 --flips 0.12 --json
     ```
     """
     from .power import plan
@@ -149,20 +163,20 @@ def power(
         print_json(asdict(found))
         return
     least = "none" if found.smallest is None else f"{100 * found.smallest:.1f} points"
-    told = {
-        "noise floor: two equal systems differ by up to": f"±{100 * found.noise:.1f} points (95%)",
-        "smallest difference that is found with 80% power": least,
+    lines = {
+        "noise: 95% range between two equal systems": f"±{100 * found.noise:.1f} points",
+        "smallest difference found with 80% power": least,
         f"power to find {margin:g} points": f"{found.power:.0%}",
         f"episodes that find {margin:g} points with 80% power": f"{found.needed:,}",
-        "smallest margin of an equivalence, with 80% power": f"±{100 * found.equal:.1f} points",
+        "smallest margin of equivalence with 80% power": f"±{100 * found.equal:.1f} points",
     }
-    echo(f"{episodes:,} episodes, of which {100 * flips:g}% flip by themselves\n")
-    wide = max(map(len, told))
-    for name, value in told.items():
-        echo(f"{name:{wide}}  {value}")
+    echo(f"{episodes:,} episodes, of which {100 * flips:g}% flip by chance\n")
+    width = max(map(len, lines))
+    for name, value in lines.items():
+        echo(f"{name:{width}}  {value}")
 
 
-def _tell(found: "Sequence[Rows]", notes: Sequence[str]) -> None:
+def _print_notes(found: "Sequence[Rows]", notes: Sequence[str]) -> None:
     for rows in found:
         for refusal in rows.refusals:
             print_status(f"left out: {refusal}")

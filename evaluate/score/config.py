@@ -1,4 +1,4 @@
-"""What can be asked of a scoring."""
+"""Settings of a score."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -9,17 +9,16 @@ from robomme_interference_data.schema.settings import setting
 
 
 class Against(StrEnum):
-    """What rates can be compared with."""
+    """Published rates that a score can be compared with."""
 
     PAPER = "paper"
 
 
 class Expected(StrEnum):
-    """Which cells are expected, and which episodes a complete one has.
+    """The expected cells, and the episodes of a complete cell.
 
-    `benchmark`: the paper's five conditions, each with its nine families × test episodes 0 to 49;
-    `given`: the conditions and episodes that occur in any row of the simulator. A condition
-    that does not apply to a system is not expected of it.
+    `benchmark`: the paper's five conditions, each with nine families × test episodes 0 to 49;
+    `observed`: the conditions and episodes that occur in any row of the simulator.
     """
 
     BENCHMARK = "benchmark"
@@ -28,7 +27,16 @@ class Expected(StrEnum):
 
 @dataclass(frozen=True)
 class Settings:
-    """What is scored, and how."""
+    """What is scored, and how.
+
+    Attributes:
+        rows: Folders of runs, or files of rows.
+        system: System of rows that name none.
+        against: Published rates to compare with.
+        expected: Episodes of a complete cell.
+        margin: Margin of equivalence tests, in points; None for none.
+        lenient: Whether bad rows are left out.
+    """
 
     rows: tuple[Path, ...] = setting(
         name="-",
@@ -36,20 +44,24 @@ class Settings:
         metavar="ROWS",
         help="Folders of runs, or CSV, parquet or jsonl files.",
     )
-    system: str | None = setting(None, help="Name of the system of rows that name none.")
-    against: Against | None = setting(None, help="Put the published rates beside these.")
+    system: str | None = setting(None, help="System of rows that name none.", group="Rows")
+    against: Against | None = setting(
+        None, help="Compare with the published rates.", group="Statistics"
+    )
     expected: Expected = setting(
         Expected.BENCHMARK,
-        help="Episodes of a complete cell: the benchmark's (nine families, test episodes 0 to 49 "
-        "each), or those that any of the given rows is of.",
+        help="Episodes of a complete cell: the benchmark's (nine families, test episodes 0 to 49), "
+        "or those that occur in any row.",
+        group="Statistics",
     )
     margin: float | None = setting(
         None,
         metavar="POINTS",
         help="Test whether differences are within this many points: k against k0, and a system "
         "with retrieval against the one without.",
+        group="Statistics",
     )
-    lenient: bool = setting(False, help="Leave bad rows out, and count them.")
+    lenient: bool = setting(False, help="Leave out bad rows and count them.", group="Rows")
 
     def __post_init__(self) -> None:
         if self.margin is not None and not 0 < self.margin <= 100:

@@ -1,4 +1,4 @@
-"""What came of every rollout in one simulator, as one array."""
+"""The outcomes of all rollouts in one simulator, as one array."""
 
 import math
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ from .rows.reading import Rows
 from .rows.values import Row
 
 STATUSES = (Status.SUCCESS, Status.FAIL, Status.TIMEOUT, Status.ERROR)
-"""By their numbers in `Outcomes.status`."""
+"""In the order of their numbers in `Outcomes.status`."""
 
 TEST_EPISODES = 50
 _SUCCESS, _ERROR = 0, 3
@@ -33,37 +33,20 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Outcomes:
-    """What came of every rollout in one simulator: S systems, C conditions, E episodes, M seeds.
-
-    Attributes:
-        simulator: Name of the simulator.
-        systems: Those that have rows, in the order of tables.
-        conditions: Those that have rows or are expected, in the order of tables.
-        episodes: Those that have rows or are expected, in the canonical order.
-        model_seeds: Seeds that policies were given, ascending.
-        status: Place in `STATUSES` of each rollout, −1 where there is none, `(S, C, E, M) int8`.
-        evidence: Share of the lesson's evidence that the memory kept, NaN where that is not known,
-            `(S, C, E, M) float64`.
-        difficulty: Place of each episode's in `DIFFICULTIES`, −1 unknown, `(E,) int64`.
-        chance: Of each episode's question, the share of right answers that drawing at random has,
-            NaN where nothing was asked, `(E,) float64`.
-        expected: The episodes of a complete cell, `(E,) bool`.
-        due: The cells that are expected or have rows, `(S, C) bool`.
-        unpinned: Whether rows of a system name no revision of a buffer set, `(S,) bool`.
-    """
+    """The outcomes in one simulator: S systems, C conditions, E episodes, M model seeds."""
 
     simulator: str
-    systems: tuple[str, ...]
-    conditions: tuple[str, ...]
-    episodes: tuple[EpisodeId, ...]
-    model_seeds: tuple[int, ...]
-    status: Statuses
-    evidence: NDArray[np.float64]
-    difficulty: NDArray[np.int64]
-    chance: NDArray[np.float64]
-    expected: Flags
-    due: Flags
-    unpinned: Flags
+    systems: tuple[str, ...]  # with rows, in the order of tables
+    conditions: tuple[str, ...]  # with rows or expected, in the order of tables
+    episodes: tuple[EpisodeId, ...]  # with rows or expected, in canonical order
+    model_seeds: tuple[int, ...]  # ascending
+    status: Statuses  # index into STATUSES, −1 without a rollout, (S, C, E, M) int8
+    evidence: NDArray[np.float64]  # share of the evidence kept, NaN if unknown, (S, C, E, M)
+    difficulty: NDArray[np.int64]  # index into DIFFICULTIES, −1 if unknown, (E,)
+    chance: NDArray[np.float64]  # success of guessing, NaN unless a question, (E,)
+    expected: Flags  # the episodes of a complete cell, (E,)
+    due: Flags  # the cells that are expected or have rows, (S, C)
+    unpinned: Flags  # systems whose rows name no revision of a buffer set, (S,)
 
     def cell(self, system: str, condition: str) -> tuple[int, int]:
         """Return the place of a cell on the first two axes."""
@@ -71,12 +54,11 @@ class Outcomes:
 
     def ran(self, system: str) -> list[str]:
         """Return the conditions under which a system has rows."""
-        there = self.has_rows[self.systems.index(system)]
-        return [condition for condition, has in zip(self.conditions, there, strict=True) if has]
+        has_rows = self.has_rows[self.systems.index(system)]
+        return [condition for condition, has in zip(self.conditions, has_rows, strict=True) if has]
 
     def pairable(self, one: str, other: str) -> bool:
-        """Whether two systems had the same histories, as far as their rows tell."""
-        # Of a buffer set that one names and the other does not, nobody knows whether it is one.
+        """Whether two systems had the same histories: both or neither name a revision."""
         same = self.unpinned[[self.systems.index(name) for name in (one, other)]]
         return bool(same[0] == same[1])
 
@@ -99,13 +81,13 @@ class Outcomes:
         return np.stack([(self.status == place).sum(-1) for place in range(len(STATUSES))], -1)
 
     @cached_property
-    def there(self) -> Flags:
+    def has_episode(self) -> Flags:
         """Whether a system has any row of an episode, `(S, E) bool`."""
         return np.asarray((self.status >= 0).any(axis=(1, 3)))
 
     @cached_property
     def counted(self) -> Flags:
-        """Whether a rollout of the episode counts: any that is no error, `(S, C, E) bool`."""
+        """Whether any rollout of the episode is not an error, `(S, C, E) bool`."""
         return np.asarray(counting(self.status).any(-1))
 
     @cached_property
@@ -137,22 +119,15 @@ def success(status: Statuses) -> NDArray[np.float64]:
 
 
 class Rate(NamedTuple):
-    """A success rate.
+    """A success rate."""
 
-    Attributes:
-        n: Episodes that count: at least one rollout that is no error.
-        value: Mean of their `success`, NaN of none; means that are equal are equal numbers.
-        trials: How many independent ones it is worth: n, and with repeats more (see
-            `stats.intervals.effective_n`).
-    """
-
-    n: int
-    value: float
-    trials: float
+    n: int  # episodes that count
+    value: float  # mean of their success, NaN if there are none
+    trials: float  # effective number of independent trials: n, and more with repeats
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Its 95% Wilson interval; `(0, 1)` of no episode."""
+        """Its 95% Wilson interval; `(0, 1)` without episodes."""
         return wilson(self.value * self.trials if self.n else 0, self.trials)
 
 
@@ -172,10 +147,10 @@ def rate_of(status: Statuses) -> Rate:
 
 
 def outcomes_of(rows: Rows, expected: Expected) -> dict[str, Outcomes]:
-    """Return simulator to the outcomes in it, by name, with the cells that are expected."""
+    """Return the outcomes of each simulator, by its name."""
     return {
-        name: _outcomes(part, name, expected, rows.unpinned)
-        for name, part in rows.by("simulator").items()
+        name: _outcomes([r for r in rows if r.simulator == name], name, expected, rows.unpinned)
+        for name in rows.names("simulator")
     }
 
 
@@ -183,9 +158,9 @@ def _outcomes(
     rows: Sequence[Row], simulator: str, which: Expected, unpinned: frozenset[tuple[str, str]]
 ) -> Outcomes:
     systems = tuple(sorted({row.system for row in rows}, key=_table_order))
-    given = {row.condition for row in rows}
-    due = given if which is Expected.OBSERVED else {*DEFAULT_CONDITIONS}
-    conditions = tuple(one.name for one in in_order(given | due))
+    observed = {row.condition for row in rows}
+    due = observed if which is Expected.OBSERVED else {*DEFAULT_CONDITIONS}
+    conditions = tuple(one.name for one in in_order(observed | due))
     model_seeds = tuple(sorted({row.model_seed for row in rows}))
     ids = {(row.family, row.split, row.episode) for row in rows}
     expected = ids
@@ -195,27 +170,12 @@ def _outcomes(
         }
     episodes = sorted((EpisodeId(*one) for one in ids | expected), key=lambda one: one.sort_key)
 
-    axes = [
-        {name: place for place, name in enumerate(axis)}
-        for axis in (
-            systems,
-            conditions,
-            [(one.family, one.split, one.index) for one in episodes],
-            model_seeds,
-        )
-    ]
+    axes = (systems, conditions, [(e.family, e.split, e.index) for e in episodes], model_seeds)
+    places = [{name: place for place, name in enumerate(axis)} for axis in axes]
+    keys = [(r.system, r.condition, (r.family, r.split, r.episode), r.model_seed) for r in rows]
     at = tuple(
-        np.array(
-            [
-                (
-                    axes[0][row.system],
-                    axes[1][row.condition],
-                    axes[2][row.family, row.split, row.episode],
-                    axes[3][row.model_seed],
-                )
-                for row in rows
-            ]
-        ).T
+        np.array([place[key] for key in column])
+        for place, column in zip(places, zip(*keys, strict=True), strict=True)
     )
     shape = tuple(map(len, axes))
     status, evidence = np.full(shape, -1, np.int8), np.full(shape, np.nan)

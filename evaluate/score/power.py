@@ -1,8 +1,8 @@
-"""What a number of episodes can show: power of paired comparisons, before they are run. Pure.
+"""Power of paired comparisons: the differences that a number of episodes can detect.
 
-The model: a share f of the episodes flips by itself between two equal systems, half of it each way,
-and a true difference δ adds as many flips one way. So the share f / 2 is gained and f / 2 + δ lost,
-or the other way round.
+The model: a share f of the episodes flips by chance between two equal systems, half of it each way,
+and a true difference δ adds flips one way. So the share f / 2 is gained and f / 2 + δ lost, or the
+other way round.
 """
 
 import math
@@ -23,23 +23,23 @@ POWER = 0.8
 """The power that is planned for."""
 
 MOST = 5_000
-"""Episodes that plans are made for: the sums over all ways that they come out grow with them."""
+"""The most episodes of a plan: the time to sum over all outcomes grows with them."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What paired rollouts can show.
+    """What paired rollouts can detect; all but `episodes` and `needed` are fractions.
 
     Attributes:
         episodes: Episodes that run on both sides.
-        flips: Share of them that flips by itself.
-        margin: A difference of interest, a fraction.
-        noise: How far apart two equal systems come out in 95% of comparisons: z √(f / n).
-        power: Probability that McNemar's exact test finds a difference of `margin` at 5%.
-        smallest: Smallest difference that it finds with 80% power; None if it finds none.
-        needed: How many episodes find a difference of `margin` with 80% power (see `needed`).
-        equal: Smallest margin within which two equal systems are shown to be so, by two one-sided
-            tests at 5%, with 80% power: (z(95%) + z(90%)) √(f / n), one-sided quantiles.
+        flips: Share of them that flips by chance.
+        margin: A difference of interest.
+        noise: 95% range of the difference between two equal systems: z √(f / n), at most 1.
+        power: Probability that McNemar's exact test at 5% finds a difference of `margin`.
+        smallest: Smallest difference found with 80% power; None if none is.
+        needed: Episodes that find a difference of `margin` with 80% power.
+        equal: Smallest margin of an equivalence test at 5% with 80% power for two equal systems:
+            (z(95%) + z(90%)) √(f / n) with one-sided quantiles, at most 1.
     """
 
     episodes: int
@@ -53,7 +53,7 @@ class Plan:
 
 
 def plan(margin: float, episodes: int, flips: float) -> Plan:
-    """Return what episodes can show; the margin is a fraction."""
+    """Return what episodes can detect; the margin is a fraction."""
     if not 0 < margin <= 1:
         expected = "points, more than 0 up to 100"
         raise InvalidOptionError.expected("margin", float(f"{100 * margin:g}"), expected)
@@ -64,14 +64,14 @@ def plan(margin: float, episodes: int, flips: float) -> Plan:
     if margin + flips > 1:
         raise InvalidOptionError(
             f"{100 * margin:g} points and flips {flips} are more than all episodes",
-            "A difference adds its own flips to those: their sum is 1 at most.",
+            "A difference adds flips: margin and flips must sum to at most 100%.",
         )
     noise = math.sqrt(flips / episodes)
     return Plan(
-        *(episodes, flips, margin, z_of(0.95) * noise, power(margin, episodes, flips)),
+        *(episodes, flips, margin, min(1.0, z_of(0.95) * noise), power(margin, episodes, flips)),
         smallest=smallest(episodes, flips),
         needed=needed(margin, flips),
-        equal=(z_of(1 - 2 * ALPHA) + z_of(POWER)) * noise,
+        equal=min(1.0, (z_of(1 - 2 * ALPHA) + z_of(POWER)) * noise),
     )
 
 
@@ -138,10 +138,10 @@ def smallest(episodes: int, flips: float) -> float | None:
 
 
 def note(counts: Iterable[tuple[int, int, int]]) -> str:
-    """Return in a sentence what comparisons like some could show; nothing where none is paired.
+    """Return a sentence on what comparisons with these pairs, gained and lost can detect.
 
-    `counts` are pairs, gained and lost of each. Their episodes are those of the most, and the flips
-    the median of what goes both ways: twice the fewer of gained and lost.
+    It uses the most episodes, and the median of the flips that go both ways: twice the smaller of
+    gained and lost. Empty without pairs.
     """
     found = [one for one in counts if one[0]]
     if not found:
@@ -151,6 +151,6 @@ def note(counts: Iterable[tuple[int, int, int]]) -> str:
     least = smallest(n, flips)
     shown = "no difference" if least is None else f"a difference of {100 * least:.1f} points"
     return (
-        f" {n:,} episode{'s' * (n > 1)} of which {percent(flips)} flip both ways, as here in the "
-        f"median, show {shown} with 80% power."
+        f" With {n:,} episode{'s' * (n > 1)}, of which {percent(flips)} flip both ways (the median "
+        f"here), {shown} can be detected with 80% power."
     )

@@ -1,4 +1,4 @@
-"""A scoring, from rows to tables."""
+"""Score rows of rollouts: from rows to tables."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,9 +9,9 @@ from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.stats.bootstrap import DRAWS
 from robomme_interference_data.viz.tables import Table
 
-from .comparisons import effects, families, interaction, ranks
+from .comparisons import effects, families, ranks
 from .comparisons.contrast import Contrast
-from .comparisons.tables import comparison_table
+from .comparisons.tables import SPECS, comparison_table
 from .config import Against, Expected, Settings
 from .outcomes import Outcomes, outcomes_of
 from .rows.reading import Rows, read_rows
@@ -19,22 +19,14 @@ from .tables import cells, chance, equivalence, evidence_kept, paper
 
 TABLES = (
     *("main", "chance", "systems", "ranks", "family", "difficulty", "lift", "effects"),
-    *(
-        "interaction",
-        "equivalence",
-        "interference",
-        "by_evidence_kept",
-        "ceiling",
-        "decay",
-        "noise",
-    ),
-    *("families", "family_effects", "matrix", "coverage", "paper", "paper_family"),
+    *("interaction", "equivalence", "interference", "by_evidence_kept", "ceiling", "decay"),
+    *("noise", "families", "family_effects", "matrix", "coverage", "paper", "paper_family"),
 )
 """Every table that a score may have, in order."""
 
 _ALWAYS = {"main", "family", "difficulty", "lift", "effects", "decay", "noise", "coverage"}
 _ALWAYS |= {"paper", "paper_family"}
-"""Tables that are written without rows, too."""
+"""Tables that are written even without rows."""
 
 
 @dataclass(frozen=True)
@@ -42,16 +34,16 @@ class Score:
     """Everything that is computed from rows.
 
     Attributes:
-        settings: What was asked for.
-        draws: Bootstrap samples.
+        settings: The settings.
+        draws: Number of bootstrap samples.
         rows: The rows.
-        notes: What a reader must know, such as that two systems are not paired.
-        outcomes: What came of the rollouts, by simulator.
-        contrasts: All comparisons of all systems, in the order of tables.
-        published: Rates of the paper, if the score is compared with them.
+        notes: Warnings for readers, such as that two systems are not paired.
+        outcomes: Outcomes of the rollouts, by simulator.
+        contrasts: All comparisons, in the order of tables.
+        published: The published rates, if the score is compared with them.
         cells: System × condition, over all episodes, by family and by difficulty.
-        tables: All tables by name, the paper's main table aside.
-        grids: The paper's main table of each simulator.
+        tables: All tables by name, except the paper's main table.
+        grids: The paper's main table for each simulator.
     """
 
     settings: Settings
@@ -67,7 +59,7 @@ class Score:
 
 
 def score(settings: Settings, draws: int = DRAWS) -> Score:
-    """Score rows, with so many bootstrap samples."""
+    """Score rows, with a number of bootstrap samples."""
     rows = read_rows(settings.rows, settings.system, settings.lenient)
     if not len(rows):
         where = f"in {', '.join(map(str, settings.rows))}"
@@ -75,24 +67,21 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
             f"all {rows.refused:,} rows {where} are bad; the first is {rows.refusals[0]}"
             if rows.refused
             else f"there are no rows {where}",
-            "Without any sound row there is nothing to score.",
+            "Give at least one valid row.",
         )
     outcomes = outcomes_of(rows, settings.expected)
     every = tuple(outcomes.values())
     compared, decays, notes = _compared(rows, every, draws)
-    by_family = [one for own in every for one in families.family_effects(own, compared)]
+    by_family = [one for outcome in every for one in families.family_effects(outcome, compared)]
     found = cells.cells_of(every)
     published = paper.published() if settings.against is Against.PAPER else ()
     tables = [
         *(cells.rate_table(found, name) for name in ("main", "family", "difficulty")),
         chance.chance_table(outcomes, found),
         ranks.rank_table(every, draws),
-        *(comparison_table(name, compared) for name in ("lift", "effects", "interference")),
-        *(comparison_table(name, compared) for name in ("ceiling", "systems", "matrix")),
-        comparison_table("interaction", compared),
-        comparison_table("family_effects", by_family),
+        *(comparison_table(name, [*compared, *by_family]) for name in SPECS),
         families.families_table(every, compared),
-        evidence_kept.access_table(every),
+        evidence_kept.evidence_table(every),
         effects.decay_table(decays),
         effects.noise_table(every),
         cells.coverage_table(found),
@@ -101,9 +90,9 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         margin = settings.margin
         tables.append(equivalence.equivalence_table(compared, found, published, margin))
     if published:
-        # The paper's rates are over the benchmark's grid, whatever the grid of this scoring.
+        # The paper's rates are over the benchmark's grid.
         whole = cells.cells_of(outcomes_of(rows, Expected.BENCHMARK).values())
-        tables += [paper.paper_table(whole), paper.paper_family_table(whole)]
+        tables += [paper.paper_table(whole), paper.paper_table(whole, by_part=True)]
         notes += paper.not_compared(whole)
     tables = [one for one in tables if one.rows or one.name in _ALWAYS]
     return Score(
@@ -123,7 +112,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
 def _compared(
     rows: Rows, every: Sequence[Outcomes], draws: int
 ) -> tuple[list[Contrast], list[tuple[Any, ...]], list[str]]:
-    """Return all comparisons, the rows of `decay`, and why systems are not paired."""
+    """Return all comparisons, the rows of `decay`, and notes on systems that are not paired."""
     compared, decays, notes = list[Contrast](), list[tuple[Any, ...]](), list[str]()
     for outcomes in every:
         for system in outcomes.systems:
@@ -138,16 +127,16 @@ def _compared(
             found, decay = effects.effects_of(outcomes, system, **beside, draws=draws)
             compared += found
             decays += decay
-        compared += ranks.systems_of(outcomes) + interaction.interactions_of(outcomes)
+        compared += ranks.systems_of(outcomes) + ranks.interactions_of(outcomes)
     return compared, decays, notes
 
 
 def _unpaired(rows: Rows, outcomes: Outcomes, system: str, other: str) -> str:
-    """Return why two systems differ in more than what is asked; nothing if they do not."""
+    """Return why two systems cannot be paired; empty if they can."""
     if not outcomes.pairable(system, other):
         (lone,) = (one for one in (system, other) if (outcomes.simulator, one) in rows.unpinned)
         return f"the rows of {lone} name no revision of a buffer set, so their histories may differ"
     steps = [rows.retrieval.get((outcomes.simulator, one)) for one in (system, other)]
     if None not in steps and steps[0] != steps[1]:
-        return f"they are behind other retrieval steps, {' and '.join(map(str, steps))}"
+        return f"their retrieval steps differ: {' and '.join(map(str, steps))}"
     return ""

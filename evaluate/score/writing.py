@@ -1,5 +1,6 @@
 """Write a score into a folder: tables, figures, the methods and the report."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from robomme_interference_data.storage.files import write_text
@@ -20,14 +21,13 @@ def write_score(
     out: Path,
     export_to: Path | None = None,
     command: str | None = None,
-    *,
-    png: bool = False,
+    formats: Sequence[str] = (),
 ) -> list[Path]:
     """Write tables, figures and the report, each atomically and the report last.
 
-    What can be refused is refused before anything is written. Tables and figures of an earlier
-    score that this one does not have are removed; files of other names stay. Returns the files of
-    rows that were written to `export_to` in the released layout.
+    Tables and figures of an earlier score that this one does not have are removed; other files
+    stay. Figures are SVG, and also in `formats` (`.png`, `.pdf`). Returns the files of rows that
+    were written to `export_to` in the released layout.
     """
     with open_figure():
         load_jinja2("the report")
@@ -41,15 +41,16 @@ def write_score(
         write_text(out / "tables" / name, text)
     for suffix, text in zip((".md", ".bib"), methods(score), strict=True):
         write_text(out / f"methods{suffix}", text)
-    drawn = figures.draw_figures(score, out / "figures", png=png)
+    drawn = figures.draw_figures(score, out / "figures", (".svg", *formats))
     for name in {f"{table}{suffix}" for table in TABLES for suffix in _SUFFIXES} - {*texts}:
         (out / "tables" / name).unlink(missing_ok=True)
     for kind in figures.FIGURES:
         for drawing in (out / "figures").glob(f"{kind}-*.svg"):
             if MAKER.encode() not in drawing.read_bytes():
-                continue  # somebody else's
-            if drawing.stem not in drawn or not png:
-                drawing.with_suffix(".png").unlink(missing_ok=True)
+                continue  # not written by this program
+            for suffix in (".png", ".pdf"):
+                if drawing.stem not in drawn or suffix not in formats:
+                    drawing.with_suffix(suffix).unlink(missing_ok=True)
             if drawing.stem not in drawn:
                 drawing.unlink()
     write_report(score, drawn, out / "report.html", command)

@@ -1,4 +1,4 @@
-"""Commands that fetch and look at buffer sets, and at this machine."""
+"""Commands that fetch and show buffer sets, and check this machine."""
 
 from dataclasses import asdict
 from operator import attrgetter
@@ -44,25 +44,27 @@ def list_buffers(
     from robomme_interference_data.viz.tables import Table
 
     opened = load_buffer_set(buffer_set)
-    found = opened.manifests(family=families, condition=conditions, difficulty=difficulty)
+    chosen = opened.manifests(family=families, condition=conditions, difficulty=difficulty)
+    manifests = list(chosen)
     if as_json:
-        print_json([to_dict(manifest) for manifest in found])
+        print_json([to_dict(manifest) for manifest in manifests])
         return
     values = attrgetter(
         "episode_id", "condition", "difficulty", "lesson_frames", "history_frames", "lesson_share"
     )
     table = Table.make(
         "buffers",
-        opened.location,
-        "episode condition difficulty lesson:count history:count share:ratio",
-        map(values, found),
-        "lesson, history: frames; share: of lesson in an even 32-frame sample",
+        f"Buffers of {opened.location}",
+        "episode condition difficulty lesson_frames:count history_frames:count lesson_share:rate",
+        map(values, manifests),
+        "lesson share: of an even 32-frame sample of the history",
     )
-    echo(table.text())
+    episodes = len({manifest.episode_id for manifest in manifests})
+    echo(f"{table.text()}\n\n{len(manifests):,} buffers of {episodes:,} episodes")
 
 
 def list_conditions(as_json: AsJson = False) -> None:
-    """List the kinds of conditions: what history each gives a query, and what it asks.
+    """List the kinds of conditions: the history that each prescribes, and its purpose.
 
     Examples:
     ```
@@ -79,8 +81,8 @@ def list_conditions(as_json: AsJson = False) -> None:
         "Conditions",
         "condition sessions asks needs",
         ((kind.pattern, kind.holds, kind.asks, " ".join(kind.needs)) for kind in KINDS.values()),
-        f"n: 0 to {MAX_K}. units: of other families, the same ones for every kind. needs: datasets "
-        "beside demonstrations and distractors.",
+        f"n: 0 to {MAX_K}. units: distractor units of other families, the same for every kind. "
+        "needs: datasets in addition to demonstrations and distractors.",
     )
     if as_json:
         print_json(table.records())
@@ -94,10 +96,10 @@ def show(
     condition: ConditionName,
     out: Picture = None,
     camera: Annotated[str, typer.Option(help="Camera to draw.")] = "front",
-    shift: Annotated[str, typer.Option(help=f"{SHIFT_HELP} Drawn with --out.")] = NO_SHIFT,
+    shift: Annotated[str, typer.Option(help=f"{SHIFT_HELP} Requires --out.")] = NO_SHIFT,
     as_json: AsJson = False,
 ) -> None:
-    """Show one buffer: its sessions as a table, or as a film strip with --out.
+    """Show the sessions of one buffer as a table, and as a film strip with --out.
 
     Examples:
     ```
@@ -112,25 +114,24 @@ def show(
     from robomme_interference_data.viz.tables import Table
 
     check_output(out)
-    under = parse_shift(shift)
-    if under is not None and out is None:
+    scene_shift = parse_shift(shift)
+    if scene_shift is not None and out is None:
         raise InvalidOptionError(
-            f"--shift {shift} says nothing where nothing is drawn",
-            "Add --out strip.png, or leave it out.",
+            f"--shift {shift} has no effect without --out", "Add --out strip.png, or omit --shift."
         )
     opened = load_buffer_set(buffer_set)
     buffer = opened.load(episode, condition)
-    buffer.query.dataset.shape(camera)  # refuses an unknown one
+    buffer.query.dataset.shape(camera)  # raises for an unknown one
     if out is not None:
         from robomme_interference_data.viz.filmstrip import draw_strip
 
-        live = live_frame(opened, buffer, under, camera)
+        live = live_frame(opened, buffer, scene_shift, camera)
         draw_strip(buffer, out, camera=camera, live=live)
         print_status(f"{out} written")
     manifest, evidence = buffer.manifest, buffer.evidence
     if as_json:
-        told = None if evidence is None else [one.told() for one in evidence]
-        print_json(to_dict(manifest) | {"evidence": told})
+        spans = None if evidence is None else [one.told() for one in evidence]
+        print_json(to_dict(manifest) | {"evidence": spans})
         return
     table = Table.make(
         "sessions",
@@ -140,31 +141,32 @@ def show(
             (number, one.role, one.family, str(one.source), f"{one.start} to {one.stop - 1}")
             for number, one in enumerate(buffer.sessions)
         ),
-        f"{len(buffer)} history frames; an even 32-frame sample at the first step holds "
-        f"{manifest.lesson_share:.0%} lesson",
     )
     echo(table.text())
     if evidence:
-        spans = Table.make(
+        answers = Table.make(
             "evidence",
-            "What shows the answer",
+            "Frames of the buffer that show the answer",
             "part:count text session frames",
             (
                 (one.span.part, one.span.text, one.session.role, f"{one.start} to {one.stop - 1}")
                 for one in evidence
             ),
-            "frames: in the buffer",
         )
-        echo(f"\n{spans.text()}")
+        echo(f"\n{answers.text()}")
+    echo(
+        f"\n{len(buffer)} history frames; {manifest.lesson_share:.0%} of an even 32-frame sample "
+        "are of the lesson"
+    )
 
 
 def show_question(
     buffer_set: BufferSetFolder,
     episode: QueryName,
-    out: Annotated[Path | None, typer.Option(help="Picture to write, .png.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Image to write, .png.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show the question about the past of one query: in words, and its picture with --out.
+    """Show the question about the past of one query, and its image with --out.
 
     Example:
     ```
@@ -185,16 +187,16 @@ def show_question(
         with atomic_path(out) as partial:
             partial.write_bytes(question.picture)
         print_status(f"{out} written")
-    told = {
+    fields = {
         "goal": query.goal,
         "question": question.text,
         "options": question.lines,
         "right": question.letters[question.right],
     }
     if as_json:
-        print_json(told)
+        print_json(fields)
         return
-    for name, text in told.items():
+    for name, text in fields.items():
         lines = text if isinstance(text, tuple) else (text,)
         echo("\n".join(f"{name if not n else '':8}  {line}" for n, line in enumerate(lines)))
 
@@ -204,14 +206,14 @@ def fetch(
     buffer_set: Annotated[str, typer.Argument(help="Repository, namespace/name or …@data-1.0.0.")],
     config: FetchConfig,
     to: Annotated[
-        Path | None, typer.Option(help="Folder to copy the files to; by default only the cache.")
+        Path | None, typer.Option(help="Folder to copy the files to; default: only the cache.")
     ] = None,
-    dry_run: Annotated[bool, typer.Option(help="Only tell what would be fetched.")] = False,
+    dry_run: Annotated[bool, typer.Option(help="Only print what would be fetched.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Fetch a buffer set from the Hub, or the part of it that some buffers need.
 
-    What is there already is not fetched again; every file is checked against its digest.
+    Existing files are not fetched again; every file is checked against its SHA-256.
 
     Examples:
     ```
@@ -228,7 +230,7 @@ def fetch(
     with graceful_interrupt("What was fetched is kept"):
         opened = load_buffer_set(buffer_set)
         parts = plan_fetch(opened, config)
-        told = [
+        repositories = [
             {
                 "repository": part.files.describe(),
                 "files": len(part.sizes),
@@ -238,21 +240,21 @@ def fetch(
             }
             for part in parts
         ]
-        for one in told:
+        for repository in repositories:
             print_status(
                 "{repository}: {files:,} files, {bytes:,} bytes; to fetch: {missing_files:,} "
-                "files, {missing_bytes:,} bytes".format(**one)
+                "files, {missing_bytes:,} bytes".format(**repository)
             )
         if not dry_run:
             fetch_parts(parts, to)
     if as_json:
-        print_json({"to": None if to is None else str(to), "repositories": told})
+        print_json({"to": None if to is None else str(to), "repositories": repositories})
     elif not dry_run:
         print_status(f"Next: robomme-interference list {to or opened.location}")
 
 
 def doctor(as_json: AsJson = False) -> None:
-    """Check what works on this machine, and print the command that mends what does not.
+    """Check which parts of the package work on this machine, and print how to fix the others.
 
     Example:
     ```

@@ -1,4 +1,4 @@
-"""What commands share: messages on stderr, JSON on stdout, and how they are stopped."""
+"""Output of commands (results on stdout, messages on stderr) and their interruption."""
 
 import json
 import logging
@@ -11,30 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import typer
-from typer.core import TyperGroup
 
 from robomme_interference_data.constants import IDENTITY_PATH, MANIFEST_HEADER, MANIFEST_ROWS
 from robomme_interference_data.errors import InvalidOptionError, visible
 
 
-class Group(TyperGroup):
-    """Commands whose help says each one's first sentence whole."""
-
-    @property
-    def sections(self) -> dict[str, list[str]]:
-        """The names of the commands, under titles."""
-        return {"Commands": list(self.commands)}
-
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the section of each title."""
-        for title, names in self.sections.items():
-            with formatter.section(title):
-                told = [(name, self.commands[name].get_short_help_str(200)) for name in names]
-                formatter.write_dl(told)
-
-
 def echo(text: str, *, nl: bool = True) -> None:
-    """Print output to stdout; what a terminal would obey instead of showing it is escaped."""
+    """Print a result to stdout; control sequences are escaped."""
     typer.echo(visible(text), nl=nl)
 
 
@@ -51,21 +34,21 @@ class _Messages(logging.Handler):
 
 
 def log_to_stderr() -> None:
-    """Print what the package logs, from INFO on, to stderr."""
+    """Print log messages of the package, from INFO on, to stderr."""
     logger = logging.getLogger("robomme_interference_data")
     logger.handlers = [_Messages()]
     logger.setLevel(logging.INFO)
 
 
 def check_output(*paths: Path | None) -> None:
-    """Refuse to write into a dataset or the manifests of a buffer set, every file of which is hashed."""
+    """Raise if a path is inside a dataset or manifests, whose files are hashed."""
     for path in filter(None, paths):
         for folder in (path.resolve(), *path.resolve().parents):
             manifests = (folder / name for name in (MANIFEST_HEADER, MANIFEST_ROWS))
             if (folder / IDENTITY_PATH).is_file() or all(path.is_file() for path in manifests):
                 raise InvalidOptionError(
-                    f"{path} lies inside {folder}, whose files are a buffer set's",
-                    "Give a place outside the buffer set.",
+                    f"{path} is inside {folder}, a part of a buffer set",
+                    "Write to a path outside the buffer set.",
                 )
 
 
@@ -76,39 +59,40 @@ def print_json(value: Any) -> None:
 
 
 def command_line() -> str:
-    """Return the command that runs, to be typed again."""
+    """Return the current command as text."""
     return shlex.join(["robomme-interference", *sys.argv[1:]])
 
 
 class _Terminated(KeyboardInterrupt):
-    """SIGTERM came."""
+    """SIGTERM arrived."""
 
 
 @contextmanager
 def graceful_interrupt(kept: str, place: Path | None = None) -> Iterator[None]:
-    """Let Ctrl-C, and SIGTERM as schedulers send it, end a command in peace; tell how to go on.
+    """End a command cleanly after Ctrl-C or SIGTERM, and print how to resume.
 
     Args:
-        kept: What an interrupted command leaves behind, such as `Finished episodes are kept`.
-        place: Where that is, if it may not have been made yet.
+        kept: What the command leaves when interrupted, such as `Finished episodes are kept`.
+        place: Its folder, if that may not exist yet.
     """
 
-    def told() -> str:
-        return kept if place is None or place.is_dir() else "Nothing was written yet"
-
     def stop(*_: object) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one must not cut the ending short
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # schedulers may send it again
         raise _Terminated
+
+    def print_kept(instruction: str) -> None:
+        state = kept if place is None or place.is_dir() else "Nothing was written yet"
+        print_status(f"\nStopped. {state}; {instruction}:\n{command_line()}")
 
     before = signal.signal(signal.SIGTERM, stop)
     try:
         yield
     except KeyboardInterrupt as interrupt:
-        print_status(f"\nStopped. {told()}; go on with:\n{command_line()}")
+        print_kept("resume with")
         raise typer.Exit(143 if isinstance(interrupt, _Terminated) else 130) from None
     except OSError as error:
-        if error.errno is not None:  # the system's word on a file, such as that the disk is full
-            print_status(f"Stopped. {told()}; once mended, go on with:\n{command_line()}")
+        if error.errno is not None:  # such as a full disk
+            print_kept("once this is fixed, resume with")
         raise
     finally:
         signal.signal(signal.SIGTERM, before)

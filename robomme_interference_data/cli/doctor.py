@@ -1,10 +1,9 @@
-"""Find out what works on this machine, and which command mends what does not.
+"""Check which parts of the package work on this machine, and how to fix the others.
 
-Nothing heavy is imported: installed versions are read from the packages' metadata, and other
-processes find out whether the simulators work.
+Nothing heavy is imported: versions come from the metadata of installed packages, and the simulators
+are tried in other processes.
 """
 
-import logging
 import os
 import platform
 import subprocess
@@ -18,27 +17,25 @@ from packaging.requirements import Requirement
 from robomme_interference_data.errors import InterferenceError, first_line
 from robomme_interference_data.viz.tables import Column, Table
 
-logger = logging.getLogger(__name__)
-
 DISTRIBUTION = "robomme-interference-data"
 
 RENDERER = "robomme_interference_data.simulators.tabletop.renderer"
-"""The program that draws a picture: a broken driver can crash its process or never return."""
+"""Draws an image in a process of its own, since a broken driver can crash or hang it."""
 
 RENDERER_S, ROBOMME_S, HUB_S = 30, 120, 10
-"""Seconds that the simulators and the Hub have to answer."""
+"""Time limits of the checks, in seconds."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """One row of the doctor's table.
+    """The result of a check.
 
     Attributes:
         name: What was checked.
-        ok: True if it works, False if something needed does not, None if something optional is
-            absent or cannot be used.
-        detail: Versions, names, or what is wrong.
-        fix: The command that mends it; None if there is nothing to mend.
+        ok: True if it works, False if something required does not, None if something optional is
+            missing or does not work.
+        detail: Versions, or the problem.
+        fix: The command that fixes the problem; None if there is none.
     """
 
     name: str
@@ -48,7 +45,7 @@ class Check:
 
 
 def checks() -> list[Check]:
-    """Check everything; takes a few seconds, and a minute more where RoboMME is."""
+    """Run all checks, which takes some seconds."""
     return [
         Check("Python", True, f"{platform.python_version()} ({sys.executable})"),
         check_packages(),
@@ -61,14 +58,14 @@ def checks() -> list[Check]:
 
 
 def report(rows: Sequence[Check]) -> Table:
-    """Return the rows as a table for a terminal; what mends one stands below it."""
-    words = {True: "ok", False: "FAILS", None: "absent"}
+    """Return the results as a table for a terminal, each fix below its problem."""
+    states = {True: "ok", False: "FAILS", None: "optional"}
     lines: list[tuple[str, str, str]] = []
     for row in rows:
-        lines.append((words[row.ok], row.name, row.detail))
+        lines.append((states[row.ok], row.name, row.detail))
         if row.fix is not None:
-            lines.append(("", "", f"to mend: {row.fix}"))
-    columns = (Column(""), Column("what"), Column("found"))
+            lines.append(("", "", f"fix: {row.fix}"))
+    columns = (Column("state"), Column("part"), Column("result"))
     return Table("doctor", "", columns, tuple(lines))
 
 
@@ -79,20 +76,20 @@ def extras() -> list[str]:
 
 
 def check_packages(extra: str = "") -> Check:
-    """Check the packages of an extra; without one, those that are always needed."""
+    """Check the packages of an extra, or those that are always required."""
     name = f"Extra [{extra}]" if extra else "Core libraries"
-    needed = _requirements(DISTRIBUTION, extra)
-    problems = [problem for requirement in needed for problem in _problems(requirement)]
+    required = _requirements(DISTRIBUTION, extra)
+    problems = [problem for requirement in required for problem in _problems(requirement)]
     if not problems:
-        found = ", ".join(f"{one.name} {metadata.version(one.name)}" for one in needed)
-        return Check(name, True, found)
+        versions = ", ".join(f"{one.name} {metadata.version(one.name)}" for one in required)
+        return Check(name, True, versions)
     if extra:
         return Check(name, None, ", ".join(problems), f'pip install "{DISTRIBUTION}[{extra}]"')
     return Check(name, False, ", ".join(problems), f"pip install --upgrade {DISTRIBUTION}")
 
 
 def _requirements(distribution: str, extra: str) -> list[Requirement]:
-    """Return what a distribution needs here for one of its extras, or without any (`""`)."""
+    """Return what a distribution requires here for an extra, or without any (`""`)."""
 
     def applies(requirement: Requirement, extra: str) -> bool:
         return requirement.marker is None or requirement.marker.evaluate({"extra": extra})
@@ -102,7 +99,7 @@ def _requirements(distribution: str, extra: str) -> list[Requirement]:
 
 
 def _problems(requirement: Requirement) -> Iterator[str]:
-    """Yield what is missing or of a wrong version, extras of the requirement included."""
+    """Yield missing packages and wrong versions, including the extras of the requirement."""
     try:
         version = metadata.version(requirement.name)
     except metadata.PackageNotFoundError:
@@ -116,83 +113,77 @@ def _problems(requirement: Requirement) -> Iterator[str]:
 
 
 def check_video() -> Check:
-    """Check that PyAV can decode videos of datasets, and encode them, which only builds need."""
-    name, decoder, encoder = "Video (PyAV)", "libdav1d", "libaom-av1"
-    fix = 'pip install --force-reinstall --only-binary av "av>=14"'
+    """Check that PyAV can decode datasets, and can encode them, which only builds need."""
+    # Wheels of later versions do not contain the encoder.
+    fix = 'pip install --force-reinstall --no-deps --only-binary av "av>=15,<16"'
     try:
         import av
     except ImportError as error:
-        return Check(name, False, str(error), fix)
-    found = f"PyAV {av.__version__}"
-    for ok, codec, what in ((False, decoder, "decoder"), (None, encoder, "encoder")):
+        return Check("Video (PyAV)", False, str(error), fix)
+    for codec, ok, effect in (
+        ("libdav1d", False, "videos cannot be decoded"),
+        ("libaom-av1", None, "datasets cannot be built, only loaded"),
+    ):
         if codec not in av.codecs_available:
-            return Check(name, ok, f"{found} has no {what} {codec}", fix)
-    return Check(name, True, f"{found} with {decoder} and {encoder}")
+            problem = f"PyAV {av.__version__} has no {codec}: {effect}"
+            return Check("Video (PyAV)", ok, problem, fix)
+    return Check("Video (PyAV)", True, f"PyAV {av.__version__} with libdav1d and libaom-av1")
 
 
 def check_renderer(module: str = RENDERER, seconds: float = RENDERER_S) -> Check:
-    """Let the simulator's renderer draw a picture."""
-    name, only = "Vulkan", "; only simulators need it"
+    """Check that the simulators' renderer can draw."""
     if util.find_spec("sapien") is None:
-        return Check(name, None, f"not tried without sapien{only}")
+        return Check("Vulkan", None, "not tried without sapien; only simulators need it")
     fix = "sudo make vulkan (in a checkout, on Debian), or install your GPU's Vulkan driver"
+    command = [sys.executable, "-m", module]
     try:
-        done = subprocess.run(
-            [sys.executable, "-m", module],
-            capture_output=True,
-            text=True,
-            timeout=seconds,
-            check=False,
-        )
+        done = subprocess.run(command, capture_output=True, text=True, timeout=seconds, check=False)
     except subprocess.TimeoutExpired:
-        return Check(name, None, f"a driver did not answer within {seconds:g} s{only}", fix)
-    if done.returncode == 0:
-        return Check(name, True, f"drawn with {done.stdout.strip()}")
-    words = done.stderr.strip().splitlines() or [f"a driver crashed (exit code {done.returncode})"]
-    return Check(name, None, words[-1] + only, fix)
+        problem = f"the driver did not answer within {seconds:g} s"
+    else:
+        if done.returncode == 0:
+            return Check("Vulkan", True, f"drawn with {done.stdout.strip()}")
+        crash = f"the driver crashed (exit code {done.returncode})"
+        problem = (done.stderr.strip().splitlines() or [crash])[-1]
+    return Check("Vulkan", None, f"{problem}; only simulators need it", fix)
 
 
 def check_robomme() -> Check:
-    """Have RoboMME play a demonstration with each of its arms, if its interpreter is named."""
+    """Check that RoboMME can reset an episode, if its interpreter is configured."""
     from robomme_interference_data.simulators.robomme.process import PYTHON_VARIABLE
     from robomme_interference_data.simulators.robomme.simulator import ARMS, RoboMMESimulator
 
-    name = "Official simulator"
+    name, python = "Official simulator", os.environ.get(PYTHON_VARIABLE)
     fix = f"export {PYTHON_VARIABLE}=PATH, the Python of an environment that has RoboMME"
-    python = os.environ.get(PYTHON_VARIABLE)
     if not python:
-        detail = f"{PYTHON_VARIABLE} is not set; only the simulator robomme needs it"
-        return Check(name, None, detail, fix)
-    logger.info("RoboMME plays an episode with each of its arms: a minute or so")
+        return Check(name, None, f"only --simulator robomme needs {PYTHON_VARIABLE}", fix)
     try:
         with RoboMMESimulator(python, answer_s=ROBOMME_S) as simulator:
             versions = [f"{key} {value}" for key, value in simulator.versions(python).items()]
-            versions += [f"patched: {one}" for one in simulator.patches]
-            for family in ARMS:
-                simulator.reset(f"{family}/test/0")
+            simulator.reset(f"{next(iter(ARMS))}/test/0")
     except InterferenceError as error:
         return Check(name, False, first_line(error), fix)
     return Check(name, True, f"{python}: {', '.join(versions)}")
 
 
 def check_hub() -> Check:
-    """Check that the Hub answers and knows the token, which is not shown."""
+    """Check that the Hub answers and accepts the token, which is never shown."""
     import httpx
     from huggingface_hub import HfApi, constants, get_token
+    from huggingface_hub.errors import HfHubHTTPError
     from huggingface_hub.utils import get_session
 
     name, hub, token = "Hugging Face Hub", constants.ENDPOINT, get_token()
     if constants.HF_HUB_OFFLINE:
         return Check(name, None, "HF_HUB_OFFLINE is set", "unset HF_HUB_OFFLINE")
     try:
+        get_session().head(hub, timeout=HUB_S)
         if token is None:
-            get_session().head(hub, timeout=HUB_S)
-            detail = f"{hub} answers; without a token, which private datasets need"
-            return Check(name, None, detail, "hf auth login")
+            problem = f"{hub} answers; private datasets need a token"
+            return Check(name, None, problem, "hf auth login")
         return Check(name, True, f"{hub} answers {HfApi().whoami(token)['name']}")
+    except HfHubHTTPError:
+        return Check(name, False, f"{hub} rejects the token", "hf auth login --force")
     except httpx.HTTPError as error:
-        response = getattr(error, "response", None)
-        if response is not None and response.status_code == httpx.codes.UNAUTHORIZED:
-            return Check(name, False, f"{hub} does not know the token", "hf auth login --force")
-        detail = f"{hub} does not answer: {first_line(error)}"
-        return Check(name, None, detail, "check the network, and HF_ENDPOINT if it is set")
+        fix = "check the network, and HF_ENDPOINT if it is set"
+        return Check(name, None, f"{hub} does not answer: {first_line(error)}", fix)

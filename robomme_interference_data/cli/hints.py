@@ -1,4 +1,4 @@
-"""How the command line prints an error: settings as its options, and the command to type next."""
+"""The text of an error: settings appear as options, with the command to run next."""
 
 import re
 import shlex
@@ -14,7 +14,7 @@ from robomme_interference_data.errors import (
 PROGRAM = "robomme-interference"
 
 NEXT_COMMANDS: dict[type[InterferenceError], str] = {NoRendererError: "doctor"}
-"""Commands that help against errors of a type, where the error itself names none."""
+"""Commands to run after errors of a type, unless the error names one."""
 
 _SETTING = re.compile(
     r"""(?P<tick>`?)\b(?P<name>[a-z]\w*)=(?P<quote>["'])(?P<value>.*?)(?P=quote)(?P=tick)|`(\w+)`"""
@@ -33,14 +33,9 @@ def option_names(root: Any, arguments: Sequence[str]) -> dict[str, str]:
 
 
 def error_lines(error: InterferenceError, options: Mapping[str, str]) -> list[str]:
-    """Return what is printed for an error: its message, its hint, and the command to type next.
+    """Return the message, the hint and the next command; `options` are those of `option_names`."""
 
-    Args:
-        error: The error.
-        options: Options by the names of their settings, as `option_names` returns them.
-    """
-
-    def typed(match: re.Match[str]) -> str:
+    def as_option(match: re.Match[str]) -> str:
         option = options.get(match["name"] or match[5])
         if option is None:
             return match[0]
@@ -50,6 +45,6 @@ def error_lines(error: InterferenceError, options: Mapping[str, str]) -> list[st
     name = isinstance(error, InvalidOptionError) and error.option
     if name and name in options:
         message = re.sub(rf"(?<![\w-]){re.escape(name)}\b", options[name], message, count=1)
-    lines = [_SETTING.sub(typed, text) for text in (message, error.hint) if text]
+    lines = [_SETTING.sub(as_option, text) for text in (message, error.hint) if text]
     command = error.command or NEXT_COMMANDS.get(type(error))
     return lines if command is None else [*lines, f"Run: {PROGRAM} {command}"]

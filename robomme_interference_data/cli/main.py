@@ -1,14 +1,11 @@
-"""The `robomme-interference` command: a thin root, and how errors are shown.
-
-Each area has its own commands file; only this one sees all of them.
-"""
+"""The root of the command line, and the display of errors. Each area declares its own commands."""
 
 import os
 import signal
 import sys
 import traceback
 from importlib import metadata
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -19,30 +16,28 @@ from robomme_interference_data.evaluate import commands as evaluating
 from robomme_interference_data.evaluate.score import commands as scoring
 from robomme_interference_data.retrieval import commands as retrieving
 from robomme_interference_data.simulators import commands as simulating
-from robomme_interference_data.storage.hub_errors import check_endpoint
+from robomme_interference_data.storage.hub import check_endpoint
 
 from . import commands
-from .console import Group, echo, log_to_stderr, print_status
+from .console import echo, log_to_stderr, print_status
+from .help import App, Group
 from .hints import PROGRAM, error_lines, option_names
 
 
 class _Root(Group):
-    """Lists the commands under the titles of `_GROUPS`."""
+    """Lists the commands below the titles of `_GROUPS`."""
 
-    @property
     def sections(self) -> dict[str, list[str]]:
         return {title: [name for name, _ in group] for title, group in _GROUPS.items()}
 
 
-app = typer.Typer(
+app = App(
     cls=_Root,
     name=PROGRAM,
-    no_args_is_help=True,
-    rich_markup_mode=None,  # rich would take longer to load than all else
     pretty_exceptions_enable=False,
     help="History buffers for RoboMME-Interference: build, load, stream and score.",
-    epilog="""A buffer set is a folder with demonstrations, distractor units and manifests of buffers.
-An option that takes several values is repeated, or has commas between them (NAME,…).
+    epilog="""A buffer set is a folder with demonstrations, distractor units and manifests.
+Options shown with NAME,… accept several values: separate them by commas or repeat the option.
 
 ```
 robomme-interference doctor
@@ -89,11 +84,11 @@ _GROUPS = {
         ("publish-results", publishing.publish_results),
     ),
 }
-"""Commands in the order in which one uses them."""
+"""Commands by title, in their order of use."""
 
 
-def _tell_version(asked: bool) -> None:
-    if asked:
+def _print_version(requested: bool) -> None:
+    if requested:
         echo(f"{PROGRAM} {metadata.version('robomme-interference-data')}")
         raise typer.Exit
 
@@ -102,10 +97,12 @@ def _tell_version(asked: bool) -> None:
 def _root(
     version: Annotated[
         bool,
-        typer.Option("--version", help="Tell the version.", callback=_tell_version, is_eager=True),
+        typer.Option(
+            "--version", help="Print the version.", callback=_print_version, is_eager=True
+        ),
     ] = False,
 ) -> None:
-    check_endpoint()  # before a library that works with the Hub is imported
+    check_endpoint()  # before libraries that use the Hub are imported
 
 
 for _commands in _GROUPS.values():
@@ -113,44 +110,31 @@ for _commands in _GROUPS.values():
         if isinstance(_command, typer.Typer):
             app.add_typer(_command, name=_name)
         else:
-            app.command(name=_name)(_command)
-
-
-def _keep_lines(command: Any) -> Any:
-    """Keep the lines of fenced blocks in the help of a command and of those under it."""
-    for name in ("help", "epilog"):
-        prose, *blocks = (getattr(command, name) or "").split("```\n")
-        for number, text in enumerate(blocks):
-            prose += text if number % 2 else "\n\b\n" + text.replace("\n\n", "\n\n\b\n") + "\n"
-        setattr(command, name, prose.replace("```", "").replace("`", ""))
-    for inner in getattr(command, "commands", {}).values():
-        _keep_lines(inner)
-    return command
+            app.command(_name)(_command)
 
 
 def main() -> None:
-    """Run the command line; known errors are printed without a traceback."""
+    """Run the command line; print known errors without a traceback."""
     log_to_stderr()
-    command = _keep_lines(typer.main.get_command(app))
+    command = typer.main.get_command(app)
     try:
         command(prog_name=PROGRAM)
     except InterferenceError as error:
         _fail(*error_lines(error, option_names(command, sys.argv[1:])))
-    except KeyboardInterrupt:  # before the command itself has begun, see `graceful_interrupt`
+    except KeyboardInterrupt:  # outside `graceful_interrupt`
         sys.exit(128 + signal.SIGINT)
-    except BrokenPipeError:  # the reader of stdout (head, less) has gone
+    except BrokenPipeError:  # head or less closed stdout
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except Exception as error:
-        if not isinstance(error, OSError) or error.errno is None:  # a fault of ours
+        if not isinstance(error, OSError) or error.errno is None:  # a bug
             print_status(traceback.format_exc())
             sys.exit(1)
-        names = [name for name in (error.filename, error.filename2) if name is not None]
-        where = f"{' -> '.join(map(str, names))}: " if names else ""
-        hint = "Check the path, its permissions and the space left on the disk."
+        names = [str(name) for name in (error.filename, error.filename2) if name is not None]
+        hint = "Check the path, its permissions and the free disk space."
         if isinstance(error, FileExistsError | NotADirectoryError):
-            hint = "A file lies where a folder is to be: give another path, or move the file away."
-        _fail(f"{where}{error.strerror}", hint)
+            hint = "The path must be a folder, but a file has this name. Use another path."
+        _fail(": ".join(filter(None, (" -> ".join(names), error.strerror))), hint)
 
 
 def _fail(message: str, *further: str) -> None:

@@ -1,6 +1,6 @@
-"""Options and arguments of commands: those that several have, and those that settings declare.
+"""Options and arguments that commands share, and options from dataclasses of settings.
 
-A list is an option that is repeated, or whose values are separated by commas.
+A list is an option that is repeated, or has values separated by commas.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from robomme_interference_data.schema.settings import SETTING
 
 
 def split_commas(values: Sequence[str] | None) -> list[str] | None:
-    """Return the values of a list, which were repeated or separated by commas."""
+    """Return the values of a list option."""
     if values is None:
         return None
     return [part for text in values for part in text.split(",") if part]
@@ -35,19 +35,13 @@ Families = Annotated[list[str], typer.Option(help="Families.", show_default="all
 Conditions = Annotated[
     list[str], typer.Option(help="Conditions, such as k3.", show_default="all", **_LIST)
 ]
-Picture = Annotated[Path | None, typer.Option(help="Picture to write, .png or .svg.")]
+Picture = Annotated[Path | None, typer.Option(help="Image to write, .png or .svg.")]
 
 
 def with_settings[**P, R](function: Callable[P, R]) -> Callable[..., R]:
-    """Give a command the options of the dataclasses that its parameters are.
+    """Replace a command's parameters that are dataclasses of settings by their options.
 
-    ```python
-    @app.command()
-    @with_settings
-    def evaluate(config: Config, as_json: AsJson = False) -> None: ...
-    ```
-
-    A tuple is an option that takes several values; a truth value is a flag.
+    A tuple becomes a list option, a bool a flag.
     """
     signature = inspect.signature(function, eval_str=True)
     parameters: list[inspect.Parameter] = []
@@ -60,18 +54,18 @@ def with_settings[**P, R](function: Callable[P, R]) -> Callable[..., R]:
             parameters += options
         else:
             parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
-    parameters.sort(key=lambda one: one.default is not inspect.Parameter.empty)
+    parameters.sort(key=lambda parameter: parameter.default is not inspect.Parameter.empty)
 
     @wraps(function)
-    def command(**given: Any) -> R:
-        built = {
-            name: config(**{field: _as_tuple(given.pop(field)) for field in fields})
+    def command(**values: Any) -> R:
+        settings = {
+            name: config(**{field: _as_tuple(values.pop(field)) for field in fields})
             for name, (config, fields) in configs.items()
         }
-        return function(**built, **given)  # type: ignore[call-arg]
+        return function(**settings, **values)  # type: ignore[call-arg]
 
     command.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
-    command.__annotations__ = {one.name: one.annotation for one in parameters}
+    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return command
 
 
@@ -80,7 +74,7 @@ def _as_tuple(value: Any) -> Any:
 
 
 def _options(config: Any) -> list[inspect.Parameter]:
-    """Return a parameter for each setting of a dataclass, those of its keyword-only fields last."""
+    """Return a parameter for each setting of a dataclass, keyword-only fields last."""
     hints = get_type_hints(config)
     fields = [field for field in dataclasses.fields(config) if SETTING in field.metadata]
     fields.sort(key=lambda field: field.kw_only is True)
@@ -89,7 +83,7 @@ def _options(config: Any) -> list[inspect.Parameter]:
 
 def _option(field: dataclasses.Field[Any], kind: Any) -> inspect.Parameter:
     declared, default = field.metadata[SETTING], field.default
-    about = {
+    attributes = {
         "help": declared["help"],
         "metavar": declared["metavar"],
         "envvar": declared["env"],
@@ -100,13 +94,13 @@ def _option(field: dataclasses.Field[Any], kind: Any) -> inspect.Parameter:
         listed: Any = list.__class_getitem__(get_args(plain)[0])
         kind = listed if plain is kind else listed | None
         if not declared["whole"]:
-            about |= _LIST | ({"metavar": about["metavar"]} if about["metavar"] else {})
+            attributes |= _LIST | {"metavar": attributes["metavar"] or _LIST["metavar"]}
     if declared["shown"] is not None:
-        about["show_default"] = declared["shown"]
+        attributes["show_default"] = declared["shown"]
     elif default in (None, ()):
-        about["show_default"] = False
+        attributes["show_default"] = False
     name = declared["name"] or "--" + field.name.replace("_", "-")
-    option: Any = typer.Argument(**about) if name == "-" else typer.Option(name, **about)
+    option: Any = typer.Argument(**attributes) if name == "-" else typer.Option(name, **attributes)
     parameter = inspect.Parameter(
         field.name, inspect.Parameter.KEYWORD_ONLY, annotation=Annotated[kind, option]
     )

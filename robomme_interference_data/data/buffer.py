@@ -24,8 +24,8 @@ from robomme_interference_data.schema.manifest import (
     Session,
     layout_sessions,
 )
+from robomme_interference_data.storage.arrays import combine
 from robomme_interference_data.storage.cache import DecodedCache
-from robomme_interference_data.storage.digest import combine
 
 from .buffer_set_index import BufferSetIndex
 from .dataset import Dataset

@@ -27,8 +27,7 @@ from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import Condition, parse_condition
 from robomme_interference_data.schema.manifest import BufferManifest, ManifestHeader
 from robomme_interference_data.storage.cache import DecodedCache
-from robomme_interference_data.storage.files import LocalFiles, canonical_json
-from robomme_interference_data.storage.headers import read_header
+from robomme_interference_data.storage.files import LocalFiles, canonical_json, read_header
 from robomme_interference_data.storage.hub import HubFiles
 from robomme_interference_data.viz.tables import Table
 

@@ -34,9 +34,14 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import from_dict, to_dict
 from robomme_interference_data.schema.manifest import SessionEntry
 from robomme_interference_data.schema.records import DatasetIdentity, EpisodeRecord
-from robomme_interference_data.storage.digest import SpanDigester, combine
-from robomme_interference_data.storage.files import Files, canonical_json, read_sums, sha256_file
-from robomme_interference_data.storage.headers import read_header
+from robomme_interference_data.storage.arrays import SpanDigester, combine
+from robomme_interference_data.storage.files import (
+    Files,
+    canonical_json,
+    read_header,
+    read_sums,
+    sha256_file,
+)
 from robomme_interference_data.storage.lerobot import LeRobotFiles
 
 from .embeddings import EmbeddingIndex

@@ -36,10 +36,10 @@ from robomme_interference_data.storage.files import (
     Files,
     LocalFiles,
     canonical_json,
+    read_header,
     read_sums,
     sha256_file,
 )
-from robomme_interference_data.storage.headers import read_header
 
 CENTRE_FILE = "centre.npy"
 INDEX_SUMS = "SHA256SUMS"

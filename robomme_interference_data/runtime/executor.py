@@ -1,24 +1,24 @@
-"""Who runs tasks: this process (`Serial`), processes (`Processes`), or a cluster (`RayWorkers`).
+"""Executors: run tasks in this process (`Serial`), in processes, or on a cluster (`RayWorkers`).
 
-Whatever has tasks takes an executor, and gets outcomes as values. `concurrent.futures` gives up
-on all work when one process dies and cannot stop a hung task; pebble stops one, but neither tries
-it again, nor ends what the task had started, nor reports where it hung.
+Outcomes are values. `concurrent.futures` stops all work when one process dies and cannot stop a
+task that hangs. Pebble can, but neither retries it, nor ends the processes that it started, nor
+reports where it hung.
 """
 
 import platform
 from abc import ABC, abstractmethod
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from importlib import metadata
-from typing import Any, Protocol, Unpack
+from typing import Any, Protocol
 
 from robomme_interference_data.errors import InvalidOptionError, WorkerRetiredError
 from robomme_interference_data.lazy import load_extra
 from robomme_interference_data.schema.settings import setting
 
 from .process import ProcessScheduler, end_if_starting
-from .scheduler import ATTEMPTS, Limits
+from .scheduler import ATTEMPTS
 from .worker import Outcome, Task, Worker, attempt
 
 __all__ = [
@@ -36,25 +36,34 @@ __all__ = [
 
 @dataclass(frozen=True, kw_only=True)
 class WorkersConfig:
-    """Who does the work."""
+    """Settings of the workers."""
 
-    workers: int = setting(1, help="Worker processes.", metavar="N")
-    executor: str = setting("processes", help="processes, on this machine, or ray, on a cluster.")
-    ray_address: str = setting(
-        "auto", metavar="ADDRESS", help="ray: auto, local or HOST:PORT; see docs/cluster.md."
+    workers: int = setting(1, help="Worker processes.", metavar="N", group="Execution")
+    executor: str = setting(
+        "processes", help="processes (on this machine) or ray (on a cluster).", group="Execution"
     )
-    cpus_per_worker: float = setting(1.0, help="ray: processors that each worker takes.")
-    gpus_per_worker: float = setting(0.0, help="ray: share of a GPU that each worker takes.")
+    ray_address: str = setting(
+        "auto",
+        metavar="ADDRESS",
+        help="Address of the Ray cluster: auto, local or HOST:PORT.",
+        group="Execution",
+    )
+    cpus_per_worker: float = setting(
+        1.0, help="CPUs that Ray reserves for each worker.", group="Execution"
+    )
+    gpus_per_worker: float = setting(
+        0.0, help="Share of a GPU that Ray reserves for each worker.", group="Execution"
+    )
 
 
 def make_executor(config: WorkersConfig) -> "Executor":
-    """Make the executor of some settings."""
+    """Return the executor that the settings describe."""
     if config.executor == "processes":
-        for one in fields(WorkersConfig)[2:]:
-            if getattr(config, one.name) != one.default:
+        for field in fields(WorkersConfig)[2:]:
+            if getattr(config, field.name) != field.default:
                 raise InvalidOptionError(
-                    f'{one.name} has no effect with executor="processes"',
-                    'Set executor="ray", or leave it out.',
+                    f'{field.name} has no effect with executor="processes"',
+                    'Set executor="ray", or omit it.',
                 )
         return Processes(config.workers)
     if config.executor != "ray":
@@ -67,21 +76,18 @@ def make_executor(config: WorkersConfig) -> "Executor":
 
 
 def describe(function: Task) -> dict[str, str]:
-    """Return what must be the same on all machines that run a function, as text by name.
-
-    Versions of Python and this package, and what its method `describe` returns, if it has one.
-    """
+    """Return what must be equal on all machines: versions, and the result of `Task.describe`."""
     package = "robomme-interference-data"
     versions = {"python": platform.python_version(), package: metadata.version(package)}
     return versions | getattr(function, "describe", dict)()
 
 
 class Session(Protocol):
-    """Workers that are kept, with what their copies of the function hold, from run to run."""
+    """Workers that keep their copies of a function, and its resources, between runs."""
 
-    def run(self, tasks: Iterable[Any], **limits: Unpack[Limits]) -> Generator[Outcome]:
+    @property
+    def run(self) -> Callable[..., Generator[Outcome]]:
         """Call the session's function on every task; see `Executor.run`."""
-        ...
 
 
 class Executor(ABC):
@@ -89,28 +95,26 @@ class Executor(ABC):
 
     @abstractmethod
     def session(self, function: Task) -> AbstractContextManager[Session]:
-        """Keep workers for a function in the block, through several runs.
-
-        At its end all workers end: those without work may close what they hold.
+        """Keep workers for a function in the block, through several runs; then end all workers.
 
         Args:
             function: What to do with each task.
         """
 
-    def run(
-        self, function: Task, tasks: Iterable[Any], **limits: Unpack[Limits]
-    ) -> Generator[Outcome]:
-        """Call a function on every task; yield outcomes as they come.
+    def run(self, function: Task, tasks: Iterable[Any], **limits: Any) -> Generator[Outcome]:
+        """Call a function on every task; yield outcomes as they arrive.
 
-        A worker that dies or exceeds a limit is replaced, and its task is started again, up to
-        `attempts` times; so is a task that raises one of `again`. Any other exception is final. A
-        worker whose function raises `WorkerRetiredError` gives its task back to the others and
-        ends. If the generator is closed early, workers that have a task are stopped.
+        A worker that dies or exceeds a limit is replaced, and its task is retried. A worker whose
+        function raises `WorkerRetiredError` returns its task to the others and ends; any other
+        exception, except those in `again`, is final. If the generator is closed early, workers that
+        have a task are stopped.
 
         Args:
             function: What to do with each task.
             tasks: Picklable tasks.
-            limits: See `Limits`.
+            limits: `time_limit`: seconds that one task may take; None, the default, for no limit.
+                `attempts`: how often a task is started before its error is reported; 2 by default.
+                `again`: errors of this package after which a task is retried; none by default.
         """
         end_if_starting()
         todo = list(tasks)
@@ -121,11 +125,11 @@ class Executor(ABC):
 
 @dataclass(frozen=True)
 class Serial(Executor):
-    """Runs tasks in this process, one after the other; there are no time limits."""
+    """Runs tasks in this process, one after the other, without time limits."""
 
     @contextmanager
     def session(self, function: Task) -> Iterator[Session]:
-        """Close the function when the block ends; see `Executor.session`."""
+        """Release the function's resources when the block ends; see `Executor.session`."""
         try:
             yield _SerialSession(function)
         finally:
@@ -136,28 +140,34 @@ class Serial(Executor):
 class _SerialSession:
     function: Task
 
-    def run(self, tasks: Iterable[Any], **limits: Unpack[Limits]) -> Generator[Outcome]:
-        attempts = limits.get("attempts", ATTEMPTS)
+    def run(
+        self,
+        tasks: Iterable[Any],
+        *,
+        time_limit: float | None = None,
+        attempts: int = ATTEMPTS,
+        again: tuple[type[Exception], ...] = (),
+    ) -> Generator[Outcome]:
         worker = Worker()
         for task in tasks:
             for number in range(1, attempts + 1):
-                result = attempt(self.function, task, worker)
-                outcome = Outcome(task, *result, number, worker.take_files())
+                outcome = attempt(self.function, task, worker)
+                outcome = replace(outcome, attempts=number, files=worker.take_files())
                 if isinstance(outcome.error, WorkerRetiredError):
                     raise outcome.error
-                if not isinstance(outcome.error, limits.get("again", ())):
+                if not isinstance(outcome.error, again):
                     break
             yield outcome
 
 
 @dataclass(frozen=True)
 class Processes(Executor):
-    """Runs tasks in worker processes that may hang or die without taking the work with them.
+    """Runs tasks in worker processes, whose crashes and hangs do not stop the others.
 
-    What workers print goes to stderr. They may start processes of their own, which end with them.
+    Workers print to stderr. Processes that they start end with them.
 
     Attributes:
-        workers: How many.
+        workers: Number of worker processes.
     """
 
     workers: int

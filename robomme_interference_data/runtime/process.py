@@ -1,4 +1,4 @@
-"""Workers that are processes of this machine; see `executor.py`."""
+"""Worker processes on this machine; see `executor.py`."""
 
 import multiprocessing
 import os
@@ -9,33 +9,41 @@ import tempfile
 import time
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.errors import WorkerError
 
-from .scheduler import Reply, Scheduler
-from .worker import ProcessWorker, Task, has_begun, left_behind, unpickled
+from .scheduler import Scheduler
+from .worker import (
+    Outcome,
+    ProcessWorker,
+    Task,
+    has_begun,
+    read_remains,
+    take_files,
+    unpickle_outcome,
+)
 
 CLOSE_S = 10.0
-"""Seconds that workers without work have to close what they hold."""
+"""Seconds that idle workers have to release their resources."""
 
 START_S = 300.0
-"""Seconds that a worker has to start, which imports what its function needs."""
+"""Seconds that a worker has to start, which includes importing what its function needs."""
 
 _LOOK_S = 5.0
-"""Seconds after which workers that have not started yet are looked at."""
+"""Seconds between checks of workers that have not started yet."""
 
 _STARTED_AGAIN = 97
-"""Exit code of a worker that came upon the call that started it."""
+"""Exit code of a worker whose imports reach the call that starts workers."""
 
 
 def end_if_starting() -> None:
-    """End this process silently if it is a worker that is only importing the caller's script.
+    """End this process silently if it is a worker that is still importing the caller's script.
 
-    So a script that starts work at its top, which each worker would start again, gets one error
-    from its own process.
+    Then a script that starts work at module level gets one error, from its own process.
     """
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         sys.exit(_STARTED_AGAIN)
@@ -59,18 +67,17 @@ class WorkerProcess:
         theirs.close()
 
     def send(self, task: Any, time_limit: float | None) -> None:
-        """Let it work on a task."""
-        with suppress(OSError):  # it died while idle: `receive` finds out
+        """Start a task."""
+        with suppress(OSError):  # it died while idle: `receive` reports that
             self.pipe.send((task, time_limit))
 
-    def receive(self) -> Reply:
-        """Return its answer, which has arrived, or why there is none."""
-        data = None
-        with suppress(EOFError, OSError):
+    def receive(self) -> Outcome:
+        """Return the outcome, which has arrived."""
+        try:
             data = self.pipe.recv_bytes()
-        if data is None:
+        except (EOFError, OSError):
             return self._death()
-        return Reply(*unpickled(data), left_behind(self._home)[2])
+        return unpickle_outcome(data, take_files(self._home))
 
     def check_start(self) -> None:
         """Raise if it takes too long to start."""
@@ -81,32 +88,32 @@ class WorkerProcess:
             )
 
     def stop(self) -> None:
-        """End it now; its guard ends what it started."""
+        """Kill it; its guard kills the processes that it started."""
         self._process.kill()
         self.end(0.0)
 
     def end(self, seconds: float) -> None:
-        """Let it end within a time; then end it."""
+        """Kill it if it does not end within a time."""
         self.pipe.close()
         self._process.join(seconds)
         self._process.kill()
         self._process.join()
         shutil.rmtree(self._home, ignore_errors=True)
 
-    def _death(self) -> Reply:
+    def _death(self) -> Outcome:
         self._process.join()
         code = self._process.exitcode or 0
         if has_begun(self._home) or code < 0:  # a signal can come at any time
-            late, trace, files = left_behind(self._home)
-            error = late or RuntimeError(f"the worker process died (exit code {code})")
-            return Reply(None, error, trace, files, worker="dead")
-        what = f"ended before its first task (exit code {code}); its output is above"
+            outcome = read_remains(self._home)
+            died = RuntimeError(f"the worker process died (exit code {code})")
+            return replace(outcome, error=outcome.error or died)
+        problem = f"ended before its first task (exit code {code}); its output is above"
         if code == _STARTED_AGAIN:
-            what = "came upon the call that started it"
+            problem = "would start worker processes while it imports the script"
         raise WorkerError(
-            f"a worker process {what}",
-            "Worker processes import the script that starts them: it has to be a file, with the "
-            'call under  if __name__ == "__main__":',
+            f"a worker process {problem}",
+            "Worker processes import the script that starts them: it must be a file that makes "
+            'the call under  if __name__ == "__main__":',
         )
 
 
@@ -122,7 +129,7 @@ class ProcessScheduler(Scheduler[WorkerProcess]):
         return WorkerProcess(self._function, number)
 
     def wait(self, workers: Sequence[WorkerProcess]) -> Iterable[WorkerProcess]:
-        """Wait for answers; a worker that died has one, too."""
+        """Wait for outcomes; a worker that died has one, too."""
         answered = wait([one.pipe for one in workers], timeout=_LOOK_S)
         for one in workers:
             one.check_start()
@@ -139,11 +146,11 @@ class ProcessScheduler(Scheduler[WorkerProcess]):
 
 def _serve(function: Task, pipe: Connection, number: int, home: Path) -> None:
     """Work on tasks until the parent closes the pipe."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     multiprocessing.current_process().daemon = False  # a daemon may not start processes
     parent = multiprocessing.parent_process()
     worker = ProcessWorker(number, home, parent.sentinel if parent else -1)
-    os.dup2(2, 1)  # stdout is for what the command writes
+    os.dup2(2, 1)  # stdout is reserved for the output of the command
     sys.stdout = sys.stderr
     with suppress(OSError, EOFError):
         while True:

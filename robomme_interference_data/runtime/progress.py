@@ -1,4 +1,4 @@
-"""A progress bar for long work, on stderr."""
+"""A progress bar on stderr, with the rate and the time left."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -18,17 +18,17 @@ from rich.progress import (
 from rich.text import Text
 
 
-class _Speed(ProgressColumn):
+class _Rate(ProgressColumn):
     def __init__(self, unit: str):
         super().__init__()
         self._unit = unit
 
     def render(self, task: Task) -> Text:
-        speed = task.finished_speed or task.speed
-        rate = f"{speed:,.0f} {self._unit}/s" if speed and speed >= 1 else ""
-        if speed and speed < 1:
-            rate = f"{60 * speed:.2g} {self._unit}/min"
-        return Text(rate, style="progress.data.speed")
+        rate = task.finished_speed or task.speed
+        if not rate:
+            return Text()
+        shown = f"{rate:,.0f} {self._unit}/s" if rate >= 1 else f"{60 * rate:.2g} {self._unit}/min"
+        return Text(shown, style="progress.data.speed")
 
 
 class _Bars(Progress):
@@ -43,13 +43,7 @@ class _Bars(Progress):
 class WorkProgress:
     """A progress bar on stderr; use as a context manager.
 
-    Args:
-        unit: What is counted.
-        quiet: Show nothing.
-        above: Returns text to show above the bars, whenever they are drawn.
-
-    Attributes:
-        console: Where to print lines while the bars are shown.
+    `above` returns text to show above the bar; `console` prints lines while the bar is shown.
     """
 
     def __init__(
@@ -60,59 +54,52 @@ class WorkProgress:
         above: Callable[[], str] | None = None,
     ):
         self.console = Console(stderr=True, quiet=quiet)
-        self._progress = _Bars(
+        self._bars = _Bars(
             TextColumn("{task.description}"),
             BarColumn(),
             MofNCompleteColumn(),
             TextColumn(unit),
-            _Speed(unit),
+            _Rate(unit),
             TimeRemainingColumn(),
             console=self.console,
-            speed_estimate_period=3600,  # s; one piece of work may take half of it
+            speed_estimate_period=3600,  # s; a single task may take half of it
         )
-        self._progress.above = above
+        self._bars.above = above
         self._task: TaskID | None = None
         self._nodes: dict[str, TaskID] = {}
 
     def __enter__(self) -> Self:
-        self._progress.start()
+        self._bars.start()
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._progress.stop()
+        self._bars.stop()
 
-    def start(self, description: str, frames: int) -> None:
-        """Begin a new bar of so many frames."""
-        self._task, self._nodes = self._progress.add_task(description, total=frames), {}
-        self._progress.advance(self._task, 0)  # the speed is since then
+    def start(self, description: str, total: int) -> None:
+        """Begin a new bar."""
+        self._task, self._nodes = self._bars.add_task(description, total=total), {}
+        self._bars.advance(self._task, 0)  # the rate counts from now
 
-    def advance(self, frames: int, *, before: bool = False, node: str | None = None) -> None:
-        """Count frames as done.
-
-        Args:
-            frames: How many.
-            before: They were done by an earlier run, and do not count for the speed.
-            node: The node of a cluster that did them; each has a bar of its own.
-        """
+    def advance(self, count: int, *, before: bool = False, node: str | None = None) -> None:
+        """Count work as done: by an earlier run (`before`), or by a node, which has its own bar."""
         if self._task is None:
             return
         if node is not None:
             if node not in self._nodes:
-                total = self._progress.tasks[-1].total
-                self._nodes[node] = self._progress.add_task(f"  {node}", total=total)
-            self._progress.advance(self._nodes[node], frames)
+                total = self._bars.tasks[-1].total
+                self._nodes[node] = self._bars.add_task(f"  {node}", total=total)
+            self._bars.advance(self._nodes[node], count)
         if before:
-            task = next(task for task in self._progress.tasks if task.id == self._task)
-            self._progress.reset(self._task, completed=int(task.completed) + frames)
-            self._progress.advance(self._task, 0)
-        else:
-            self._progress.advance(self._task, frames)
+            task = next(task for task in self._bars.tasks if task.id == self._task)
+            self._bars.reset(self._task, completed=int(task.completed) + count)
+            count = 0  # restarts the rate
+        self._bars.advance(self._task, count)
 
     @contextmanager
     def status(self, description: str) -> Iterator[None]:
-        """Show a line while work of unknown length goes on."""
-        task = self._progress.add_task(description, total=None)
+        """Show a line during work of unknown length."""
+        task = self._bars.add_task(description, total=None)
         try:
             yield
         finally:
-            self._progress.remove_task(task)
+            self._bars.remove_task(task)

@@ -1,12 +1,13 @@
-"""Workers on a Ray cluster: the one place that imports Ray, which needs the extra `cluster`.
+"""Workers on a Ray cluster. This is the only module that imports Ray (extra `cluster`).
 
-A worker is an actor: Ray finds a node with room for it, and ends it with the job. One that died,
-or was lost with its node, is replaced by another. Only the caller writes.
+A worker is an actor: Ray places it on a node with enough resources and ends it with the job. A
+worker that dies, or is lost with its node, is replaced. Only the caller writes files.
 """
 
 import logging
 import os
 import pickle
+import re
 import shutil
 import signal
 import socket
@@ -14,7 +15,7 @@ import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, redirect_stdout, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,45 +30,40 @@ from robomme_interference_data.errors import InvalidOptionError, WorkerError, fi
 
 from .executor import Executor, Session, describe
 from .process import CLOSE_S, START_S, end_if_starting
-from .scheduler import Reply, Scheduler
-from .worker import ProcessWorker, Task, left_behind, unpickled
+from .scheduler import Scheduler
+from .worker import Outcome, ProcessWorker, Task, read_remains, unpickle_outcome
 
 logger = logging.getLogger(__name__)
 
 _PASSED = ("PYTHONPATH", "HF_ENDPOINT", "HF_HUB_OFFLINE")
-"""What the environment of this process says to workers: where modules are, and where the Hub."""
-
-_TOKEN = (
-    "If its nodes want a token: set RAY_AUTH_MODE=token, and put theirs into ~/.ray/auth_token."
-)
+"""Environment variables that workers inherit."""
 
 _CONNECT_S = 10.0
-"""Seconds to wait for a cluster's head."""
+"""Seconds to wait for the cluster's head."""
 
 _COLLECT_S = 30.0
-"""Seconds that a node has to say what a worker that died left there."""
+"""Seconds to wait for what a dead worker left on its node."""
 
 _FAILURES = 5
-"""How often a worker may fail to begin."""
+"""How often a worker may fail to start."""
 
 _WAIT_S = 30.0
-"""Seconds after which a message says that no worker could begin yet."""
+"""Seconds after which a warning reports that no worker could start yet."""
 
 
 @dataclass(frozen=True)
 class RayWorkers(Executor):
     """Runs tasks in worker processes on the nodes of a Ray cluster; see `Executor`.
 
-    A worker says, as it begins, what its node has installed, and what the tasks say of themselves
-    there (`Task.describe`): a difference to this process is an error. Workers are in the folder
-    that this process is in, where a node has it.
+    When a worker starts, the result of `describe` on its node must equal that of this process.
+    Workers run in the current folder of this process if their node has it.
 
     Attributes:
-        workers: How many, at most; those for which there is no room start when a node comes.
-        address: `auto` for the cluster that this machine is a node of, `HOST:PORT` of its head, or
-            `local` for one that lasts as long as the work.
-        cpus: Processors that each takes, of those that Ray counts.
-        gpus: Share of a GPU that each takes.
+        workers: Maximum number of workers; those that do not fit start when a node joins.
+        address: `auto` for the cluster of this machine, `HOST:PORT` of its head, or `local` for a
+            cluster that ends with the work.
+        cpus: CPUs that Ray reserves for each worker.
+        gpus: Share of a GPU that Ray reserves for each worker.
     """
 
     workers: int
@@ -76,65 +72,41 @@ class RayWorkers(Executor):
     gpus: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.workers < 1:
-            raise InvalidOptionError.expected("workers", self.workers, "1 or more")
-        for name in ("cpus", "gpus"):
-            if not 0 <= getattr(self, name) < float("inf"):
-                raise InvalidOptionError.expected(
-                    f"{name}_per_worker", getattr(self, name), "0 or more"
-                )
-        if self.gpus > 1 and self.gpus % 1:  # so Ray has it
-            raise InvalidOptionError.expected("gpus_per_worker", self.gpus, "1 or less, or whole")
-        port = self.address.rpartition(":")[2]
-        if self.address not in ("auto", "local") and not (
-            port != self.address and port.isdecimal() and int(port) < 1 << 16
+        whole = self.gpus <= 1 or self.gpus % 1 == 0
+        is_address = re.fullmatch(r"auto|local|[^/]+:\d{1,5}", self.address)
+        for name, value, valid, expected in (
+            ("workers", self.workers, self.workers >= 1, "1 or more"),
+            ("cpus_per_worker", self.cpus, 0 <= self.cpus < float("inf"), "0 or more"),
+            ("gpus_per_worker", self.gpus, self.gpus >= 0 and whole, "0 to 1, or a whole number"),
+            ("ray_address", self.address, is_address, "auto, local or HOST:PORT"),
         ):
-            raise InvalidOptionError.expected(
-                "ray_address", self.address, "auto, local or HOST:PORT"
-            )
+            if not valid:
+                raise InvalidOptionError.expected(name, value, expected)
 
     @contextmanager
     def session(self, function: Task) -> Iterator[Session]:
-        """Keep workers on nodes of a cluster in the block; see `Executor.session`.
-
-        A worker that is lost with its node costs only the task that it works on.
-        """
+        """Keep workers on nodes of a cluster in the block; see `Executor.session`."""
         end_if_starting()
-        with _connected(self.address):
-            resources: Any = ray.cluster_resources
-            has = resources()
-            if self.address == "local" and not (
-                has.get("CPU", 0) >= self.cpus and has.get("GPU", 0) >= self.gpus
-            ):
-                raise WorkerError(
-                    f"this machine does not have {self.wanted} for a worker",
-                    "Set smaller cpus_per_worker and gpus_per_worker.",
-                )
-            with closing(_RayScheduler(function, self)) as scheduler:
-                yield scheduler
-
-    @property
-    def wanted(self) -> str:
-        """What a worker takes, for messages."""
-        return f"{self.cpus:g} CPUs" + (f" and {self.gpus:g} GPUs" if self.gpus else "")
+        with _connected(self.address), closing(_RayScheduler(function, self)) as scheduler:
+            yield scheduler
 
 
 @ray.remote
-def _left_behind(home: Path) -> tuple[TimeoutError | None, str | None, dict[str, bytes]]:
-    """Return what a worker that died left on its node."""
-    return left_behind(home)
+def _read_remains(home: Path) -> Outcome:
+    """Return, on the node of a dead worker, the outcome of its last task."""
+    return read_remains(home)
 
 
 @ray.remote
 class WorkerActor:
-    """A worker, on whatever node Ray starts it."""
+    """A worker on the node where Ray starts it."""
 
     def begin(
         self, number: int, function: bytes, folder: str
     ) -> tuple[str, Path, dict[str, str] | str]:
-        """Return the node's id, the worker's folder, and what `describe` says, or why it fails."""
+        """Return the node's id, the worker's folder, and the result of `describe` or its error."""
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        with suppress(OSError):  # relative paths mean what they mean in the caller's folder
+        with suppress(OSError):  # so that relative paths keep their meaning
             os.chdir(folder)
         self._home = Path(tempfile.mkdtemp(prefix="robomme-interference-"))
         self._worker = ProcessWorker(number, self._home)
@@ -147,150 +119,141 @@ class WorkerActor:
                 return node, self._home, first_line(error)
 
     def work(self, task: Any, time_limit: float | None) -> tuple[bytes, dict[str, bytes]]:
-        """Return what came of a task, pickled, and the files that it sent."""
+        """Return the pickled outcome of a task and the files that it sent."""
         try:
-            done = self._worker.work(self._function, task, time_limit)
-        except SystemExit:  # which Ray would take for a wish of the actor
+            outcome = self._worker.work(self._function, task, time_limit)
+        except SystemExit:  # Ray would end the actor without an error
             os._exit(1)
-        return done, self._worker.take_files()
+        return outcome, self._worker.take_files()
 
     def end(self) -> None:
-        """Release what the function holds."""
+        """Release the function's resources."""
         getattr(self._function, "close", lambda: None)()
         shutil.rmtree(self._home, ignore_errors=True)
 
 
 class _RayWorker:
-    """The driver's side of a worker; it begins as soon as there is room for it."""
+    """The driver's side of a worker, which starts when Ray has the resources for it."""
 
     def __init__(self, scheduler: "_RayScheduler", number: int):
-        self._all, self.number, self.ready = scheduler, number, False
+        self._scheduler, self.number, self.ready = scheduler, number, False
         self._failures = 0
         self._node, self._home = "", Path()
         self._begin()
 
     def _begin(self) -> None:
-        self.actor = self._all.make()
-        self.call = self.actor.begin.remote(self.number, *self._all.given)
+        self.actor = self._scheduler.make_actor()
+        self.call = self.actor.begin.remote(self.number, *self._scheduler.arguments)
 
-    def settle(self) -> None:
-        """Take note that it has begun; where its process was lost, begin again."""
+    def finish_start(self) -> None:
+        """Check the worker's node; if the worker died while it started, start it again."""
         try:
-            self._node, self._home, found = ray.get(self.call)
+            self._node, self._home, versions = ray.get(self.call)
         except RayError as error:
             self._failures += 1
             if self._failures == _FAILURES:
-                raise WorkerError(f"a worker cannot begin: {_cause(error)}") from None
+                raise WorkerError(f"a worker cannot start: {_cause(error)}") from None
             self._begin()
             return
-        if found != (own := self._all.own):
-            wrong = found
-            if isinstance(found, dict):
-                wrong = "; ".join(
-                    f"{key} is {found.get(key, 'missing')} there, {own.get(key, 'missing')} here"
-                    for key in sorted({*found, *own})
-                    if found.get(key) != own.get(key)
+        expected = self._scheduler.versions
+        if versions != expected:
+            differences = versions
+            if isinstance(versions, dict):
+                differences = "; ".join(
+                    f"{key} is {versions.get(key, 'missing')} there, "
+                    f"{expected.get(key, 'missing')} here"
+                    for key in sorted({*versions, *expected})
+                    if versions.get(key) != expected.get(key)
                 )
             raise WorkerError(
-                f"node {_name(self._node)} of the cluster is not as this process is: {wrong}",
-                "Install the same on all nodes, and give a buffer set that all of them see.",
+                f"node {_name(self._node)} of the cluster differs from this process: {differences}",
+                "Install the same packages on all nodes, and use a buffer set that all can read.",
             )
         self.ready = True
 
     def send(self, task: Any, time_limit: float | None) -> None:
-        """Let it work on a task."""
+        """Start a task."""
         self.call = self.actor.work.remote(task, time_limit)
 
-    def receive(self) -> Reply:
-        """Return its answer, or what became of it."""
+    def receive(self) -> Outcome:
+        """Return the outcome, which has arrived."""
         try:
             data, files = ray.get(self.call)
         except RayTaskError as error:
             raise error.cause from None
         except RayError as error:
             return self._death(error)
-        return Reply(*unpickled(data), files, _name(self._node))
+        return unpickle_outcome(data, files, _name(self._node))
 
-    def _death(self, error: RayError) -> Reply:
-        """Tell a worker that broke, whose node can be asked why, from one that was lost."""
+    def _death(self, error: RayError) -> Outcome:
+        """Return the outcome of a worker that died, which its node knows, or was lost with it."""
         try:
             if isinstance(error, OutOfMemoryError):
                 raise error
-            there = NodeAffinitySchedulingStrategy(self._node, soft=False)
-            ask = _left_behind.options(num_cpus=0, scheduling_strategy=there)
-            late, trace, files = ray.get(ask.remote(self._home), timeout=_COLLECT_S)
+            strategy = NodeAffinitySchedulingStrategy(self._node, soft=False)
+            read = _read_remains.options(num_cpus=0, scheduling_strategy=strategy)
+            outcome = ray.get(read.remote(self._home), timeout=_COLLECT_S)
         except RayError:
             lost = RuntimeError(f"the worker was lost with its node: {_cause(error)}")
-            return Reply(error=lost, worker="lost")
-        broke = late or RuntimeError("the worker process died")
-        return Reply(None, broke, trace, files, _name(self._node), "dead")
+            return Outcome(error=lost, worker="lost")
+        died = outcome.error or RuntimeError("the worker process died")
+        return replace(outcome, error=died, node=_name(self._node))
 
     def stop(self) -> None:
-        """End it now; its guard ends what it started."""
+        """Kill it; its guard kills the processes that it started."""
         ray.kill(self.actor)
 
 
 class _RayScheduler(Scheduler[_RayWorker]):
-    """Runs tasks on the cluster.
-
-    Args:
-        function: What to do with each task.
-        config: How many workers there are, and what each takes.
-    """
+    """Runs tasks on the cluster."""
 
     def __init__(self, function: Task, config: RayWorkers):
         super().__init__(config.workers)
         actor: Any = WorkerActor
         dumps: Any = cloudpickle.dumps
         options = {"num_cpus": config.cpus, "num_gpus": config.gpus, "max_restarts": 0}
-        self.make = actor.options(**options).remote
-        self.given, self.own = (dumps(function), str(Path.cwd())), describe(function)
-        self._wanted = config.wanted
+        self.make_actor = actor.options(**options).remote
+        self.arguments, self.versions = (dumps(function), str(Path.cwd())), describe(function)
+        self._needs = f"{config.cpus:g} CPUs and {config.gpus:g} GPUs"
 
     def start(self, number: int) -> _RayWorker:
-        """Start a worker, now or when there is room for it."""
+        """Request a worker."""
         return _RayWorker(self, number)
 
     def wait(self, workers: Sequence[_RayWorker]) -> Iterable[_RayWorker]:
-        """Wait until some have an answer, or are ready; return those with an answer."""
-        calls = {one.call: one for one in workers}
+        """Wait until some have an outcome, or are ready; return those with an outcome."""
+        calls = {worker.call: worker for worker in workers}
         done, _ = ray.wait([*calls], timeout=_WAIT_S)
-        if not done and not any(one.ready for one in workers):
-            logger.warning("No node of the cluster has %s for a worker; waiting", self._wanted)
-        answered = [calls[call] for call in done if calls[call].ready]
-        for call in done:
-            if not calls[call].ready:
-                calls[call].settle()
+        if not done and not any(worker.ready for worker in workers):
+            logger.warning("Waiting for a node of the cluster with %s free", self._needs)
+        arrived = [calls[call] for call in done]
+        answered = [worker for worker in arrived if worker.ready]
+        for worker in arrived:
+            if not worker.ready:
+                worker.finish_start()
         return answered
 
     def close(self) -> None:
         """End all actors."""
-        ends = [one.actor.end.remote() for one in self.workers if one.ready]
+        ends = [worker.actor.end.remote() for worker in self.workers if worker.ready]
         if ends:
             ray.wait(ends, num_returns=len(ends), timeout=CLOSE_S)
-        for one in self.workers:
-            one.stop()
+        for worker in self.workers:
+            worker.stop()
 
 
 @contextmanager
 def _connected(address: str) -> Iterator[None]:
-    """Be a driver of a cluster in the block, unless this process is one already."""
+    """Connect to a cluster in the block, unless this process is connected already."""
     if ray.is_initialized():
         yield
         return
-    unreached = WorkerError(
-        f"no Ray cluster can be reached at {address!r}",
-        'Start one with  ray start --head  and give its address, or "local".',
-    )
-    host, colon, port = address.rpartition(":")
-    if colon:  # Ray itself would wait for minutes
-        try:
-            socket.create_connection((host, int(port)), timeout=_CONNECT_S).close()
-        except (OSError, ValueError):
-            raise unreached from None
-    # What Ray says of nodes that are lost goes to stdout, which is for the rows.
+    # Ray prints messages about lost nodes to stdout, which is reserved for the rows.
     with redirect_stdout(sys.stderr):
         try:
+            host, colon, port = address.rpartition(":")
+            if colon:  # Ray itself would wait for minutes
+                socket.create_connection((host, int(port)), timeout=_CONNECT_S).close()
             ray.init(
                 address=address,
                 include_dashboard=False if address == "local" else None,
@@ -298,13 +261,12 @@ def _connected(address: str) -> Iterator[None]:
                 logging_level=logging.ERROR,
                 runtime_env={"env_vars": {k: v for k, v in os.environ.items() if k in _PASSED}},
             )
-        except ConnectionError as error:
-            unreached.hint = f"{unreached.hint}\n{_TOKEN}"
-            raise unreached from error
-        except (ValueError, RuntimeError, RayError) as error:  # such as another version of Ray
+        except (OSError, OverflowError, ValueError, RuntimeError, RayError) as error:
             raise WorkerError(
-                f"the Ray cluster at {address!r} refuses: {first_line(error)}",
-                f"Install the same Ray and Python here and on its nodes.\n{_TOKEN}",
+                f"cannot connect to the Ray cluster at {address!r}: {first_line(error)}",
+                'Start one with  ray start --head  and set its address, or set "local". Its nodes '
+                "need the same Ray and Python as this machine. If it requires a token, set "
+                "RAY_AUTH_MODE=token and copy the token to ~/.ray/auth_token.",
             ) from error
         try:
             yield
@@ -313,10 +275,10 @@ def _connected(address: str) -> Iterator[None]:
 
 
 def _name(node_id: str) -> str:
-    """Return what a node is called in messages: its address, and the beginning of its id."""
+    """Return a node's name in messages: its address and the beginning of its id."""
     nodes: Any = ray.nodes
-    known = {node["NodeID"]: node["NodeManagerAddress"] for node in nodes()}
-    return f"{known[node_id]}-{node_id[:6]}"
+    addresses = {node["NodeID"]: node["NodeManagerAddress"] for node in nodes()}
+    return f"{addresses[node_id]}-{node_id[:6]}"
 
 
 def _cause(error: RayError) -> str:

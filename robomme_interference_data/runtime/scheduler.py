@@ -1,10 +1,10 @@
-"""Hands tasks to workers, whatever these are, and starts again what broke."""
+"""Assigns tasks to workers, and retries tasks whose worker died."""
 
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Generator, Iterable, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, TypedDict, Unpack
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 from robomme_interference_data.errors import WorkerRetiredError
 
@@ -13,76 +13,53 @@ from .worker import Outcome
 ATTEMPTS = 2
 
 _LOSSES = 5
-"""How often the worker of a task may be lost through no fault of the task."""
-
-
-class Limits(TypedDict, total=False):
-    """Limits of tasks.
-
-    Attributes:
-        time_limit: Seconds that one task may take; None, the default, for no limit.
-        attempts: How often a task is started before its error is reported; 2 by default.
-        again: Errors of this package after which a task is started again; none by default.
-    """
-
-    time_limit: float | None
-    attempts: int
-    again: tuple[type[Exception], ...]
-
-
-@dataclass(frozen=True)
-class Reply:
-    """What a worker answered, and whether it can go on.
-
-    Attributes:
-        worker: `fine`; `dead`, because of its task; or `lost`, with its node.
-    """
-
-    value: Any = None
-    error: BaseException | None = None
-    trace: str | None = None
-    files: dict[str, bytes] = field(default_factory=dict)
-    node: str | None = None
-    worker: Literal["fine", "dead", "lost"] = "fine"
+"""How often the worker of a task may be lost with its node."""
 
 
 class Handle(Protocol):
-    """What the caller holds of a worker.
+    """The caller's side of a worker.
 
     Attributes:
         number: The worker's number.
-        ready: Whether it takes tasks already.
+        ready: Whether it accepts tasks already.
     """
 
     number: int
     ready: bool
 
     def send(self, task: Any, time_limit: float | None) -> None:
-        """Let it work on a task."""
+        """Start a task."""
 
-    def receive(self) -> Reply:
-        """Return its answer, which has arrived."""
+    def receive(self) -> Outcome:
+        """Return the outcome, which has arrived."""
         ...
 
     def stop(self) -> None:
-        """End it now."""
+        """Kill the worker."""
 
 
 @dataclass
 class QueuedTask:
-    """A task, how often it broke its worker or failed, and how often its worker was lost."""
+    """A task, how often it failed or killed its worker, and how often its worker was lost."""
 
     task: Any
-    broke: int = 0
-    lost: int = 0
+    failures: int = 0
+    losses: int = 0
+
+    def needs_retry(
+        self, outcome: Outcome, attempts: int, again: tuple[type[Exception], ...]
+    ) -> bool:
+        """Count an outcome; return whether the task is to be started again."""
+        if outcome.worker == "lost":
+            self.losses += 1
+            return self.losses < _LOSSES
+        self.failures += 1
+        repeatable = outcome.worker == "dead" or isinstance(outcome.error, again)
+        return repeatable and self.failures < attempts
 
 
 class Scheduler[H: Handle](ABC):
-    """Runs tasks on workers that it starts when there is work for them, until it is closed.
-
-    Args:
-        workers: How many, at most.
-    """
+    """Runs tasks on at most so many workers, which it starts when there is work for them."""
 
     def __init__(self, workers: int):
         self._numbers = deque(range(workers))  # of workers that do not run
@@ -94,70 +71,54 @@ class Scheduler[H: Handle](ABC):
 
     @abstractmethod
     def wait(self, workers: Sequence[H]) -> Iterable[H]:
-        """Wait until some have an answer, or are ready; return those with an answer."""
+        """Wait until some have an outcome, or are ready; return those with an outcome."""
 
     @abstractmethod
     def close(self) -> None:
-        """End all workers, which may release what they hold, within a time."""
+        """End all workers, which may release their resources, within a time."""
 
-    def run(self, tasks: Iterable[Any], **limits: Unpack[Limits]) -> Generator[Outcome]:
-        """Yield the outcomes of tasks as they come; see `Executor.run`."""
+    def run(
+        self,
+        tasks: Iterable[Any],
+        *,
+        time_limit: float | None = None,
+        attempts: int = ATTEMPTS,
+        again: tuple[type[Exception], ...] = (),
+    ) -> Generator[Outcome]:
+        """Yield the outcomes of tasks as they arrive; see `Executor.run`."""
         waiting = deque(map(QueuedTask, tasks))
         busy: dict[H, QueuedTask] = {}
         try:
             while waiting or busy:
-                free = [one for one in self.workers if one not in busy]
+                free = [worker for worker in self.workers if worker not in busy]
                 while self._numbers and len(free) < len(waiting):
                     free.append(self.start(self._numbers.popleft()))
                     self.workers.append(free[-1])
-                for worker in [one for one in free if one.ready][: len(waiting)]:
+                for worker in [worker for worker in free if worker.ready][: len(waiting)]:
                     busy[worker] = waiting.popleft()
-                    worker.send(busy[worker].task, limits.get("time_limit"))
+                    worker.send(busy[worker].task, time_limit)
                 starting = [one for one in self.workers if not one.ready] if waiting else []
                 for worker in self.wait([*busy, *starting]):
-                    reply = worker.receive()
-                    outcome = self._settle(worker, busy.pop(worker), reply, waiting, limits)
-                    if outcome is not None:
-                        yield outcome
+                    outcome, queued = worker.receive(), busy.pop(worker)
+                    if isinstance(outcome.error, WorkerRetiredError):
+                        waiting.appendleft(queued)
+                        self._drop(worker, replaced=False)
+                        if not self.workers and not self._numbers:
+                            raise outcome.error
+                        continue
+                    if outcome.worker != "alive":
+                        self._drop(worker)
+                    if queued.needs_retry(outcome, attempts, again):
+                        waiting.append(queued)
+                    else:
+                        count = queued.failures + queued.losses
+                        yield replace(outcome, task=queued.task, attempts=count)
         finally:
             for worker in busy:
                 self._drop(worker)
 
-    def _drop(self, worker: H, *, replace: bool = True) -> None:
+    def _drop(self, worker: H, *, replaced: bool = True) -> None:
         worker.stop()
         self.workers.remove(worker)
-        if replace:
+        if replaced:
             self._numbers.append(worker.number)
-
-    def _settle(
-        self,
-        worker: H,
-        queued: QueuedTask,
-        reply: Reply,
-        waiting: deque[QueuedTask],
-        limits: Limits,
-    ) -> Outcome | None:
-        """Return the outcome of a task, or queue it again."""
-        if isinstance(reply.error, WorkerRetiredError):
-            waiting.appendleft(queued)
-            self._drop(worker, replace=False)
-            if not self.workers and not self._numbers:
-                raise reply.error
-            return None
-        if reply.worker != "fine":
-            self._drop(worker)
-        if reply.worker == "lost":
-            queued.lost += 1
-            again = queued.lost < _LOSSES
-        else:
-            queued.broke += 1
-            again = queued.broke < limits.get("attempts", ATTEMPTS) and (
-                reply.worker == "dead" or isinstance(reply.error, limits.get("again", ()))
-            )
-        if again:
-            waiting.append(queued)
-            return None
-        attempts = queued.broke + queued.lost
-        return Outcome(
-            queued.task, reply.value, reply.error, reply.trace, attempts, reply.files, reply.node
-        )

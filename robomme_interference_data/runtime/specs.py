@@ -1,4 +1,4 @@
-"""Specifications: `kind:target` texts, `NAME=VALUE` options, and the factories behind them.
+"""Specs, such as `kind:target`, with `NAME=VALUE` options, and the factories that they select.
 
 Policies, models, encoders and simulators are named by such texts. A factory is imported on first
 use, because it may import large libraries.
@@ -32,11 +32,10 @@ class Kind:
     """One kind of a registry.
 
     Attributes:
-        form: How it is written, for messages.
-        factory: What makes it, `package.module:name`.
-        target: Regular expression of what follows the colon; its named groups are arguments of the
-            factory.
-        default: The target where none is written.
+        form: Its syntax, for messages.
+        factory: Its factory, `package.module:name`.
+        target: Regular expression of the target; its named groups are arguments of the factory.
+        default: The target of a spec without one.
         given: Further arguments of the factory.
         extra: The extra that has its libraries.
         no_effect: Options, and keys of metadata, that change no result.
@@ -68,7 +67,7 @@ class Spec:
 
 
 class Registry:
-    """Kinds by name; `what` they are, such as `policy`, is for messages."""
+    """Kinds by name; messages call them `what`, such as `policy`."""
 
     def __init__(self, what: str, kinds: Mapping[str, Kind]):
         self._what, self.kinds = what, kinds
@@ -103,8 +102,8 @@ class Registry:
     def factory(self, spec: Spec, name: str | None = None) -> Factory:
         """Import the factory of a spec, or another name of the same module."""
         kind = self.kinds[spec.kind]
-        module, _, usual = kind.factory.partition(":")
-        return load_extra(module, name or usual, f"the {self._what} {spec}", kind.extra)
+        module, _, default = kind.factory.partition(":")
+        return load_extra(module, name or default, f"the {self._what} {spec}", kind.extra)
 
     def options(
         self, text: str, options: Iterable[str], also: Iterable[str] = ()
@@ -126,7 +125,7 @@ class Registry:
 
 
 def import_factory(what: str, target: str) -> Factory:
-    """Import a function or class by `module:name`; `what` it makes is for messages."""
+    """Import a function or class by `module:name`; messages call its result `what`."""
     module, _, name = target.partition(":")
     if module == "__main__":
         raise InvalidOptionError(
@@ -139,7 +138,7 @@ def import_factory(what: str, target: str) -> Factory:
     except Exception as error:
         raise InvalidOptionError(
             f"{what} {target!r}: importing {module} failed: {type(error).__name__}: {error}",
-            "Install it, or run with PYTHONPATH set to the folder that it is in.",
+            "Install it, or set PYTHONPATH to the folder that contains it.",
         ) from error
     factory: Any = getattr(loaded, name, None)
     if not callable(factory):
@@ -155,7 +154,7 @@ def bind_options(
     options: Iterable[str],
     also: Iterable[str] = (),
 ) -> dict[str, Any]:
-    """Return all options that a factory is called with, defaults included.
+    """Return all options of a call of a factory, including defaults.
 
     A value is text where the factory declares text, else JSON (`3`, `0.5`, `true`, `null`) where it
     parses as JSON. Invalid options raise `InvalidOptionError`; its message names `what` is made,
@@ -165,12 +164,12 @@ def bind_options(
     values: dict[str, Any] = {}
     for name, text in _split_options(what, options).items():
         kinds = declared.get(name)
-        value = text if kinds and str in kinds else _read(text)
+        value = text if kinds and str in kinds else _parse_json(text)
         if kinds and float in kinds and type(value) is int:
             value = float(value)
-        if kinds and type(value) not in kinds:  # bool is none of the numbers here
+        if kinds and type(value) not in kinds:  # here, bool is not a number
             expected = " or ".join(_TYPES[kind] for kind in kinds)
-            raise InvalidOptionError.expected(f"{what}: its option {name} is", value, expected)
+            raise InvalidOptionError.expected(f"{what}: option {name} is", value, expected)
         values[name] = value
     try:
         bound = signature.bind(**given, **values)
@@ -180,20 +179,20 @@ def bind_options(
             f"{what}: {error}", f"Its options: {', '.join(names) or 'none'}."
         ) from error
     bound.apply_defaults()
-    taken: dict[str, Any] = {}
+    arguments: dict[str, Any] = {}
     for name, value in bound.arguments.items():
         if signature.parameters[name].kind is inspect.Parameter.VAR_KEYWORD:
-            taken |= value
+            arguments |= value
         elif signature.parameters[name].kind is not inspect.Parameter.VAR_POSITIONAL:
-            taken[name] = value
-    return {name: value for name, value in taken.items() if name not in given}
+            arguments[name] = value
+    return {name: value for name, value in arguments.items() if name not in given}
 
 
 def signature_of(factory: Factory) -> inspect.Signature:
-    """Return a factory's parameters; of one that declares none, that it takes any by name."""
+    """Return a factory's signature, or one that accepts any options if it has none."""
     try:
         return inspect.signature(factory)
-    except ValueError:  # something built in
+    except ValueError:  # a builtin
         return inspect.signature(lambda **options: None)
 
 
@@ -206,12 +205,12 @@ def _split_options(what: str, options: Iterable[str]) -> dict[str, str]:
                 f"{what}: option", option, "NAME=VALUE, such as device=cpu"
             )
         if name in values:
-            raise InvalidOptionError(f"{what}: option {name} is given twice", "Give it once.")
+            raise InvalidOptionError(f"{what}: option {name} is set twice", "Set it once.")
         values[name] = value
     return values
 
 
-def _read(text: str) -> Any:
+def _parse_json(text: str) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError):
@@ -219,10 +218,10 @@ def _read(text: str) -> Any:
 
 
 def _declared_types(factory: Factory) -> dict[str, tuple[type, ...]]:
-    """Return the types of the parameters that are declared as plain values."""
+    """Return the types of the parameters that are declared with plain types."""
     try:
         hints = get_type_hints(factory.__init__ if inspect.isclass(factory) else factory)
-    except (AttributeError, NameError, TypeError):  # nothing can be known of it
+    except (AttributeError, NameError, TypeError):  # no readable annotations
         return {}
     declared = {}
     for name, hint in hints.items():

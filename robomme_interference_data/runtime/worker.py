@@ -1,4 +1,4 @@
-"""What a task can use of the worker that runs it, and what is left of a worker that died."""
+"""What a task can use of its worker, its outcome, and what a worker that died leaves on disk."""
 
 import faulthandler
 import os
@@ -9,22 +9,24 @@ import time
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 from urllib.parse import quote, unquote
 
 from robomme_interference_data.errors import InterferenceError
+
+from . import guard
 
 _SCRATCH, _FILES, _LIMIT = "scratch", "files", "limit"
 
 
 class Worker:
-    """The worker that runs a task. This class serves in the caller's own process.
+    """The worker that runs a task. This class is the worker in the caller's own process.
 
     Attributes:
         number: From 0; a worker that replaces one that died has its number.
-        folder: Where tasks may keep files while they run, removed when the worker ends. None for
+        folder: Where tasks may keep files while they run; removed when the worker ends. None for
             the system's temporary folder.
     """
 
@@ -33,9 +35,9 @@ class Worker:
         self._sent: dict[str, bytes] = {}
 
     def send_file(self, path: str, data: bytes) -> None:
-        """Send a file to the caller, who alone writes: a worker may be on another machine.
+        """Send a file to the caller; a worker may run on another machine, so only callers write.
 
-        Files arrive however the task ends. Of files with the same path the last one counts.
+        Files arrive even if the task fails. A file replaces an earlier one with the same path.
         """
         self._sent[path] = data
 
@@ -46,17 +48,17 @@ class Worker:
 
     @contextmanager
     def limit(self, seconds: float | None, what: str) -> Iterator[None]:
-        """End the worker if the block takes longer; `what` names it in the error.
+        """End the worker if the block takes longer; `what` names the block in the error.
 
-        In the caller's own process there is no limit.
+        There is no limit in the caller's own process.
         """
         yield
 
 
 class ProcessWorker(Worker):
-    """A worker in a process of its own, which ends together with all that it starts.
+    """A worker process, which ends together with all processes that it starts.
 
-    `home` is its folder, empty; `parent` a file descriptor that closes when the parent ends, or -1.
+    `home` is its empty folder; `parent` a file descriptor that closes when the parent ends, or -1.
     """
 
     def __init__(self, number: int, home: Path, parent: int = -1):
@@ -67,9 +69,9 @@ class ProcessWorker(Worker):
         self._late = (home / _LIMIT).open("wb", buffering=0)
         if os.getpgrp() != os.getpid():
             os.setpgid(0, 0)
-        guard = [sys.executable, "-I", "-S", str(Path(__file__).with_name("guard.py"))]
+        arguments = ["--worker", str(os.getpid()), str(parent), str(home)]
         subprocess.Popen(
-            [*guard, str(os.getpid()), str(parent), str(home)],
+            [sys.executable, "-I", "-S", guard.__file__, *arguments],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -77,18 +79,18 @@ class ProcessWorker(Worker):
         )
 
     def send_file(self, path: str, data: bytes) -> None:
-        """Keep a file where it outlives this process; see `Worker.send_file`."""
+        """Keep a file where it outlives this process."""
         partial = self._home / "partial"
         partial.write_bytes(data)
         partial.replace(self._home / _FILES / quote(path, safe=""))
 
     def take_files(self) -> dict[str, bytes]:
         """Return the files that were sent since the last call."""
-        return _take_files(self._home)
+        return take_files(self._home)
 
     @contextmanager
     def limit(self, seconds: float | None, what: str) -> Iterator[None]:
-        """End this process if the block takes longer, also while C code holds Python's lock."""
+        """End this process if the block takes longer, even while C code holds the GIL."""
         if seconds is None:
             yield
             return
@@ -112,18 +114,17 @@ class ProcessWorker(Worker):
             faulthandler.dump_traceback_later(left, exit=True, file=self._late)
 
     def work(self, function: "Task", task: Any, time_limit: float | None) -> bytes:
-        """Run a task; return its value, error and traceback, pickled."""
+        """Run a task; return its outcome, without the task and its files, pickled."""
         with self.limit(time_limit, "the task"):
-            value, error, trace = attempt(function, task, self)
+            outcome = replace(attempt(function, task, self), task=None)
             try:
-                return pickle.dumps((value, error, trace))
+                return pickle.dumps(outcome)
             except Exception as problem:
-                cause = error_text(problem if error is None else error)
-                return pickle.dumps((None, RuntimeError(f"the task's outcome: {cause}"), trace))
+                return pickle.dumps(_unreadable(outcome.error or problem, outcome.trace))
 
 
 class Task(Protocol):
-    """What is done with each task: a picklable function, of which each worker gets a copy.
+    """What to do with each task: a picklable function, of which each worker gets a copy.
 
     If it has a method `close`, a worker that is no longer needed calls it. If it has a method
     `describe`, the names and texts that it returns must be the same on all machines.
@@ -141,44 +142,50 @@ class Outcome:
     Attributes:
         task: The task.
         value: What the function returned, or None.
-        error: Why there is no value, or None. An error of this package that the function raised
-            is unchanged; another one, or the worker's death, is a `RuntimeError`; an exceeded
-            limit is a `TimeoutError`.
-        trace: Where it was raised, or where the worker hung; None if not known.
+        error: Why there is no value, or None. Errors of this package are unchanged; any other
+            error, or the worker's death, is a `RuntimeError`; an exceeded limit is a
+            `TimeoutError`.
+        trace: Traceback of the error, or of the worker that exceeded a limit; None if unknown.
         attempts: How often the task was started.
-        files: What it sent, see `Worker.send_file`: path to bytes.
+        files: Files that the task sent (see `Worker.send_file`), by path.
         node: The node of a cluster that ran it; None on this machine.
+        worker: `alive` after the task; `dead` because of it; or `lost` with its node.
     """
 
-    task: Any
+    task: Any = None
     value: Any = None
     error: BaseException | None = None
     trace: str | None = None
     attempts: int = 1
     files: dict[str, bytes] = field(default_factory=dict)
     node: str | None = None
+    worker: Literal["alive", "dead", "lost"] = "alive"
 
 
-def attempt(
-    function: Task, task: Any, worker: Worker
-) -> tuple[Any, BaseException | None, str | None]:
-    """Return a task's value, or its error and traceback."""
+def attempt(function: Task, task: Any, worker: Worker) -> Outcome:
+    """Call the function on a task once."""
     try:
-        return function(task, worker), None, None
+        return Outcome(task, function(task, worker))
     except InterferenceError as error:
-        return None, error, traceback.format_exc()
+        return Outcome(task, error=error, trace=traceback.format_exc())
     except Exception as error:
         # Foreign exceptions may not survive pickling; their text does.
-        return None, RuntimeError(error_text(error)), traceback.format_exc()
+        described = RuntimeError(f"{type(error).__name__}: {error}")
+        return Outcome(task, error=described, trace=traceback.format_exc())
 
 
-def unpickled(data: bytes) -> tuple[Any, BaseException | None, str | None]:
-    """Return what `ProcessWorker.work` pickled; what cannot be read is an error."""
+def unpickle_outcome(data: bytes, files: dict[str, bytes], node: str | None = None) -> Outcome:
+    """Return the outcome that `ProcessWorker.work` pickled; an unreadable one is an error."""
     try:
-        value, error, trace = pickle.loads(data)
+        outcome = pickle.loads(data)
     except Exception as problem:
-        return None, RuntimeError(f"the task's outcome: {error_text(problem)}"), None
-    return value, error, trace
+        outcome = _unreadable(problem)
+    return replace(outcome, files=files, node=node)
+
+
+def _unreadable(error: BaseException, trace: str | None = None) -> Outcome:
+    text = f"the task's outcome cannot be sent: {type(error).__name__}: {error}"
+    return Outcome(error=RuntimeError(text), trace=trace)
 
 
 def has_begun(home: Path) -> bool:
@@ -186,23 +193,19 @@ def has_begun(home: Path) -> bool:
     return (home / _LIMIT).exists()
 
 
-def left_behind(home: Path) -> tuple[TimeoutError | None, str | None, dict[str, bytes]]:
-    """Return what a worker left in its folder: the limit it exceeded, where, and its files."""
+def read_remains(home: Path) -> Outcome:
+    """Return the outcome of the task that killed a worker, from what is left in its folder."""
     if not has_begun(home):
-        return None, None, {}
+        return Outcome(worker="dead")
     message, _, trace = (home / _LIMIT).read_bytes().decode(errors="replace").partition("\n")
     error = TimeoutError(message) if trace else None
-    return error, trace or None, _take_files(home)
+    return Outcome(error=error, trace=trace or None, files=take_files(home), worker="dead")
 
 
-def _take_files(home: Path) -> dict[str, bytes]:
+def take_files(home: Path) -> dict[str, bytes]:
+    """Return and delete the files that a worker with this folder sent."""
     files = {}
     for path in sorted((home / _FILES).iterdir()):
         files[unquote(path.name)] = path.read_bytes()
         path.unlink()
     return files
-
-
-def error_text(error: BaseException) -> str:
-    """Return type and text of an error."""
-    return f"{type(error).__name__}: {error}"

@@ -1,4 +1,4 @@
-"""The bootstrap: intervals of means over episodes, and of what is linear in them."""
+"""Bootstrap confidence intervals of means over episodes."""
 
 import hashlib
 import math
@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 DRAWS = 10_000
-"""Bootstrap samples."""
+"""Number of bootstrap samples."""
 
 MIN_EPISODES = 10
-"""So many episodes must stand out for a slope, or a mean over families, to have an interval."""
+"""Episodes that must differ from the most common value for an interval."""
 
-_CHUNK = 2**15  # numbers at a time: they stay in the cache, and BLAS starts no threads for them
+_CHUNK = 2**15  # values at a time: they fit the CPU cache, and BLAS starts no threads
 _NORMAL = NormalDist()
 
 
 class Interval(NamedTuple):
-    """An estimate with its interval; bounds are NaN where they cannot be had."""
+    """An estimate and its interval; bounds are NaN if there is none."""
 
     value: float
     low: float = math.nan
@@ -31,19 +31,15 @@ class Interval(NamedTuple):
 
 
 def slope_weights(ks: Sequence[int]) -> Floats:
-    """Return the weights of rates under conditions with these k in their log-linear slope.
+    """Return the weight of the rate at each k in the log-linear slope.
 
-    The slope b is that of the least-squares line rate = a + b · log₂(k + 1): k + 1 is the number
-    of sessions in the buffer, the lesson included, so b is the change of the success rate with
-    each doubling of the history's sessions. With x = log₂(k + 1): b = Σ (x − x̄) rate / Σ (x − x̄)².
-    Every condition weighs the same, as all run the same episodes. Of single episodes in the place
-    of rates it is what each adds to the slope: b is their mean.
+    The slope b is that of the least-squares line rate = a + b · log₂(k + 1): the change of the
+    success rate per doubling of the sessions. With x = log₂(k + 1): b = Σ (x − x̄) rate / Σ (x −
+    x̄)². All conditions have equal weight, since all run the same episodes, so b is also the mean
+    of the episodes' slopes.
 
-    Source: ordinary least squares; the logarithm is our choice, after the paper's k 0, 1, 3, 7,
-    which doubles the sessions from one condition to the next.
-
-    Args:
-        ks: At least two different k.
+    Source: ordinary least squares; the logarithm is our choice, since the paper's k 0, 1, 3, 7
+    double the sessions.
     """
     x = np.log2(np.asarray(ks, float) + 1)
     centred = x - x.mean()
@@ -51,11 +47,10 @@ def slope_weights(ks: Sequence[int]) -> Floats:
 
 
 def varies_enough(values: Floats) -> bool:
-    """Whether what each episode adds to a comparison, `(E,)`, varies enough for a bootstrap.
+    """Whether the episodes' values, `(E,)`, vary enough for a bootstrap.
 
-    At least `MIN_EPISODES` episodes must have another value than the commonest one, which for a
-    paired difference is most often 0. With fewer, the resampled means fall on a coarse lattice, and
-    intervals cover less than they promise, down to width zero where all episodes agree.
+    At least `MIN_EPISODES` episodes must differ from the most common value. With fewer, the
+    resampled means take few distinct values and the intervals are too narrow.
     """
     _, counts = np.unique(values.round(12), return_counts=True)
     return len(values) - int(counts.max(initial=0)) >= MIN_EPISODES
@@ -64,46 +59,35 @@ def varies_enough(values: Floats) -> bool:
 def bootstrap(values: Floats, key: str, draws: int = DRAWS) -> list[Interval]:
     """Return the mean of each column with its 95% BCa interval, all from the same draws.
 
-    The episode is the cluster: its outcomes under all conditions, repeats among them as a mean,
-    are drawn together, so what episodes have in common never counts as evidence twice.
+    `values` has a row per episode, with NaN if missing, `(E, K) float64`. Episodes are the
+    clusters: all values of an episode are drawn together, with the mean of its repeats. The text
+    `key` seeds the draws.
 
-    The bounds are the quantiles α₁ and α₂ of the draws, with
-    α = Φ(z₀ + (z₀ + z) / (1 − a (z₀ + z))) for z = ∓1.96: z₀ = Φ⁻¹ of the share of draws below
-    the estimate, ties counting half; a = Σ dᵢ³ / 6 (Σ dᵢ²)^1.5 with dᵢ the i-th episode's value
-    minus the mean. Draws without any episode that has a value are left out. Where the correction
-    itself has no value, as when all draws lie on one side of the estimate, the bounds are the plain
-    percentiles. One episode alone has no interval: its bounds are NaN.
+    The bounds are the quantiles α of the draws with α = Φ(z₀ + (z₀ + z) / (1 − a (z₀ + z))) for z =
+    ∓1.96; z₀ = Φ⁻¹ of the share of draws below the estimate, with half of the ties; a = Σ dᵢ³ / 6
+    (Σ dᵢ²)^1.5 with the deviations dᵢ from the mean. Draws without any value are omitted. If the
+    correction is undefined, as when all draws are on one side of the estimate, the bounds are the
+    plain percentiles. A single episode has no interval.
 
-    Source: Efron (1987), Better bootstrap confidence intervals, JASA 82, 171–185; Efron and
-    Tibshirani (1993), An Introduction to the Bootstrap, chapter 14.
-
-    Args:
-        values: A row per episode, NaN for what is missing, `(E, K) float64`.
-        key: Text that seeds the draws. The same key, values and order of episodes give the same
-            intervals, whatever else is computed.
-        draws: Number of bootstrap samples.
+    Source: Efron (1987), JASA 82, 171–185; Efron and Tibshirani (1993), An Introduction to the
+    Bootstrap, chapter 14.
     """
     if not values.size:
         return [Interval(math.nan)] * values.shape[1]
     drawn = drawn_means(values, key, draws)
     return [
-        _interval(own[~np.isnan(own)], means[np.isfinite(means)])
-        for own, means in zip(values.T, drawn.T, strict=True)
+        _interval(column[~np.isnan(column)], means[np.isfinite(means)])
+        for column, means in zip(values.T, drawn.T, strict=True)
     ]
 
 
 def drawn_means(values: Floats, key: str, draws: int = DRAWS) -> Floats:
-    """Return the means of each column in the draws that `bootstrap` takes, `(draws, K)`.
+    """Return the column means in the draws of `bootstrap`, `(draws, K)`; NaN without values.
 
-    They are rounded: what is exactly equal is so on any machine. NaN where a draw has no value.
-
-    Args:
-        values: As of `bootstrap`, of at least one episode.
-        key: As of `bootstrap`.
-        draws: As of `bootstrap`.
+    They are rounded, so that equal means are equal on any machine.
     """
     known = ~np.isnan(values)
-    # Most columns lack the same episodes, mostly none: each mask is summed once.
+    # Most columns lack the same episodes: each mask is summed once.
     masks, place = np.unique(known, axis=1, return_inverse=True)
     columns = np.concatenate([np.where(known, values, 0.0), masks], axis=1)
     drawn = drawn_counts(key, len(values), draws)
@@ -137,16 +121,16 @@ def _interval(values: Floats, drawn: Floats) -> Interval:
 
 
 def generator_of(key: str) -> np.random.Generator:
-    """Return random numbers that a text seeds: the same on every machine."""
+    """Return a random generator seeded with a text; it is the same on every machine."""
     seed = int.from_bytes(hashlib.sha256(key.encode()).digest()[:16])
     return np.random.Generator(np.random.PCG64(seed))
 
 
 @lru_cache(maxsize=2)
 def drawn_counts(key: str, episodes: int, draws: int) -> NDArray[np.uint8]:
-    """Return how often each draw takes each episode, `(draws, episodes)`; no one 256 times.
+    """Return how often each draw contains each episode, `(draws, episodes)`, always below 256.
 
-    All systems over the same episodes share the draws.
+    All systems with the same episodes share the draws.
     """
     generator = generator_of(key)
     counts = np.zeros((draws, episodes), np.uint8)

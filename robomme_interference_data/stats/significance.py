@@ -1,7 +1,7 @@
-"""Tests of success rates, and their correction for being many. Pure functions, of numbers alone.
+"""Tests of success rates, and their correction for multiple comparisons.
 
-The exact tests are our own because whole numbers of Python give them to the last digit without
-SciPy, which takes seconds to import; the tests hold them against SciPy's.
+Own implementations, because Python's integers give exact tests without importing SciPy, which takes
+seconds. The tests compare them with SciPy's.
 """
 
 import math
@@ -12,25 +12,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 ALPHA = 0.05
-"""Below this p something is taken as found."""
+"""Significance level."""
 
-_LATTICE = 27720  # divided by every number up to 12: means of so many repeats lie on it exactly
-_STEPS = 20  # of five repeats and of four of them, where one broke
+_LATTICE = 27720  # divisible by every number up to 12: exact for means of so many repeats
+_STEPS = 20  # exact for means of 4 or 5 repeats
 
 
 def mcnemar(gained: int, lost: int) -> tuple[float, float]:
     """Return the two-sided p-value of the exact McNemar test, and its mid-p.
 
-    With n = gained + lost discordant pairs and m the smaller count, under the null hypothesis
-    either way is equally likely: p = min(1, 2 · P(X ≤ m)), X ~ Binomial(n, ½). Pairs that agree
-    do not enter. Without discordant pairs p is 1. The exact test rejects less often than its level
-    says; the mid-p, p − P(X = m), or 1 where as many are gained as lost, about as often.
+    With n = gained + lost discordant pairs and m the smaller count: p = min(1, 2 · P(X ≤ m)) for X
+    ~ Binomial(n, ½), or 1 without such pairs. The exact test is conservative; the less conservative
+    mid-p is p − P(X = m), or 1 if gained = lost.
 
-    Source: McNemar (1947), Psychometrika 12, 153–157, in its exact binomial form; mid-p: Fagerland,
-    Lydersen and Laake (2013), BMC Medical Research Methodology 13, 91.
+    Source: McNemar (1947), Psychometrika 12, 153–157; mid-p: Fagerland, Lydersen and Laake (2013),
+    BMC Medical Research Methodology 13, 91.
     """
     pairs = gained + lost
-    ways = total = 1  # of choosing i of the pairs, and of choosing up to i
+    ways = total = 1  # to choose i of the pairs, and up to i
     for i in range(min(gained, lost)):
         ways = ways * (pairs - i) // (i + 1)
         total += ways
@@ -42,20 +41,15 @@ def mcnemar(gained: int, lost: int) -> tuple[float, float]:
 def sign_flip(differences: NDArray[np.float64]) -> tuple[float, float]:
     """Return the two-sided p-value of the exact sign-flip test of paired means, and its mid-p.
 
-    Under the null hypothesis each difference d is as likely its opposite. Of the 2ⁿ ways to give
-    the n differences their signs, p is the share of those whose sum is as far from 0 as the
-    observed one, or farther; the mid-p counts those that are as far by half, and is 1 where the
-    observed sum is 0. Of differences of single rollouts, −1, 0 and 1, it is McNemar's exact test.
+    Of the 2ⁿ ways to assign signs to the n differences, `(E,) float64`, p is the share whose sum is
+    at least as far from 0 as the observed one. The mid-p counts sums that are equally far by half,
+    and is 1 if the observed sum is 0. For single rollouts this is McNemar's exact test.
 
-    The differences are whole numbers of some common step. Where the largest is more than twenty
-    such steps, as of many repeats, they are rounded to twentieths: as exact a test, of
-    slightly other numbers.
+    The differences are multiples of a common step. If the largest exceeds twenty steps, they are
+    rounded to twentieths; the test stays exact for these.
 
     Source: Fisher (1935), The Design of Experiments, section 21; Edgington and Onghena (2007),
     Randomization Tests, chapter 6.
-
-    Args:
-        differences: Of the episodes' means, `(E,) float64`.
     """
     steps = np.rint(_LATTICE * differences).astype(np.int64)
     steps //= max(1, int(np.gcd.reduce(steps)))
@@ -68,13 +62,13 @@ def sign_flip(differences: NDArray[np.float64]) -> tuple[float, float]:
     if len(counts) == 2:
         ones = int(counts[1])
         return mcnemar((ones + observed) // 2, (ones - observed) // 2)
-    # Of each sum, from the least to the most, in twice the step.
+    # The probability of each sum, from the smallest, in units of two steps.
     chances: NDArray[np.float64] = np.ones(1)
     for size in np.flatnonzero(counts[1:]) + 1:
-        own = np.zeros(int(size * counts[size]) + 1)
-        own[:: int(size)] = _heads(int(counts[size]))
-        chances = np.convolve(chances, own).astype(np.float64)
-    # A sum that is `observed` or more: so many of the last.
+        factor = np.zeros(int(size * counts[size]) + 1)
+        factor[:: int(size)] = _heads(int(counts[size]))
+        chances = np.convolve(chances, factor).astype(np.float64)
+    # The number of sums that are `observed` or more.
     last = (len(chances) - 1 - observed) // 2 + 1
     tail = chances[len(chances) - last :]
     return min(1.0, 2 * float(tail.sum())), min(1.0, float(2 * tail.sum() - tail[0]))
@@ -82,25 +76,19 @@ def sign_flip(differences: NDArray[np.float64]) -> tuple[float, float]:
 
 @lru_cache(maxsize=1024)
 def _heads(coins: int) -> NDArray[np.float64]:
-    """Return the chances of 0 to all heads of some coins."""
+    """Return the probabilities of 0 to all heads for a number of coins."""
     return np.array([math.comb(coins, heads) / 2**coins for heads in range(coins + 1)])
 
 
 def poisson_binomial(successes: int, chances: Sequence[float]) -> float:
-    """Return the one-sided p-value of so many successes or more, if each came by its own chance.
+    """Return the one-sided p-value of so many successes or more, given each trial's chance.
 
-    The number of successes of independent trials with chances c is Poisson-binomial: the chance of
-    i of them is the coefficient of xⁱ in Π (1 − c + c x), which is multiplied out. All terms are
-    positive, so small p-values have all their digits.
+    P(i successes) is the coefficient of xⁱ in Π (1 − c + c x) over the chances c. All terms are
+    positive, so small p-values are accurate.
 
-    Source: Hong (2013), On computing the distribution function for the Poisson binomial
-    distribution, Computational Statistics and Data Analysis 59, 41–51.
-
-    Args:
-        successes: Observed successes.
-        chances: Of each trial, from 0 to 1.
+    Source: Hong (2013), Computational Statistics and Data Analysis 59, 41–51.
     """
-    counts: NDArray[np.float64] = np.ones(1)  # of each number of successes, from none
+    counts: NDArray[np.float64] = np.ones(1)  # by number of successes
     for chance in chances:
         counts = np.convolve(counts, (1 - chance, chance)).astype(np.float64)
     return min(1.0, float(counts[successes:].sum()))
@@ -111,10 +99,10 @@ def two_proportions(
 ) -> float:
     """Return the two-sided p-value of the test of two unpaired rates; NaN without trials.
 
-    With the rate p of both together: z = (p₁ − p₂) / √(p (1 − p)(1/n₁ + 1/n₂)), normal. Where all
-    trials came out alike p is 1.
+    With the pooled rate p: z = (p₁ − p₂) / √(p (1 − p)(1/n₁ + 1/n₂)), standard normal. p is 1 if
+    all trials have the same outcome.
 
-    Source: Pearson's χ² test of a fourfold table, without correction.
+    Source: Pearson's χ² test of a 2 × 2 table, without correction.
     """
     if trials == 0 or other_trials == 0:
         return math.nan
@@ -126,13 +114,12 @@ def two_proportions(
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Return p-values adjusted for their number by Holm's step-down method, in the same order.
+    """Return p-values adjusted by Holm's step-down method, in the same order.
 
-    Sorted upwards, p(i) becomes max over j ≤ i of min(1, (m − j + 1) · p(j)), with m p-values.
-    NaN, where there was nothing to test, stays and is no test.
+    Sorted in ascending order, p(i) becomes max over j ≤ i of min(1, (m − j + 1) · p(j)) for m
+    p-values. NaN means not tested; it stays and does not count.
 
-    Source: Holm (1979), A simple sequentially rejective multiple test procedure, Scandinavian
-    Journal of Statistics 6, 65–70.
+    Source: Holm (1979), Scandinavian Journal of Statistics 6, 65–70.
     """
     known = [index for index, p in enumerate(p_values) if not math.isnan(p)]
     adjusted, largest = [math.nan] * len(p_values), 0.0

@@ -1,32 +1,38 @@
-"""Arrays in `.npy` files, as `np.save` writes them: never pickled, and exactly as expected."""
+"""Arrays in `.npy` files, and SHA-256 over decoded data, which defines bit-exact here.
 
+The digest of a *feature* over a span of frames is the SHA-256 of its values in order, without any
+header: images as `(T, H, W, 3) uint8` RGB, vectors as `(T, D) float32` little-endian, C order. The
+digest of a *span* is the SHA-256 of the canonical JSON of its feature digests by name, without that
+of the actions. Both can be recomputed from decoded arrays with hashlib alone.
+"""
+
+import hashlib
 import math
 import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.constants import ACTION
 from robomme_interference_data.errors import FormatError
+
+from .files import canonical_json
 
 _FILE = re.compile(
     rb"\x93NUMPY\x01\x00..\{'descr': '([<|][a-z]\d)', 'fortran_order': False, "
     rb"'shape': \((\d{1,12}(?:, \d{1,12})*),?\), \} *\n",
     re.DOTALL,
 )
-"""What a file begins with. numpy reads a header as Python, and of damaged ones ends in all kinds of
-errors and warnings."""
+"""The header. numpy parses it as Python, which raises any error or warning if it is damaged."""
 
-_HEADER_BYTES = 1024
-"""Bytes in which the header ends, at most: `np.save` writes 128 for what this package stores."""
+_MAX_HEADER_BYTES = 1024  # `np.save` writes 128 for the arrays of this package
 
 
 def write_array(path: Path, array: NDArray[Any]) -> None:
-    """Write an array as `np.save` does, in C order.
-
-    From `np.save` itself, a full disk is an error without a number.
-    """
+    """Write an array as `np.save` does, in C order; unlike it, keep the system's error number."""
     with path.open("wb") as file:
         array = np.asarray(array, order="C")
         np.lib.format.write_array_header_1_0(  # type: ignore[no-untyped-call]
@@ -39,31 +45,72 @@ def write_array(path: Path, array: NDArray[Any]) -> None:
 def map_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:
     """Return an array that `write_array` wrote as a read-only memory map.
 
-    Nothing is allocated before type, shape and the file's size agree. Not by `np.load`, which also
-    opens archives.
-
-    Args:
-        path: The file.
-        dtype: Type that it must have.
-        shape: Shape that it must have; -1 for a side of any length.
+    Type and shape must be the given ones (-1 for any length), and fit the file's size, before
+    anything is allocated. `np.load` would also open archives.
     """
     expected = f"{np.dtype(dtype)} of shape {shape}"
     with path.open("rb") as file:
-        header = _FILE.match(start := file.read(_HEADER_BYTES))
+        header = _FILE.match(start := file.read(_MAX_HEADER_BYTES))
     if header is None or int.from_bytes(start[8:10], "little") != header.end() - 10:
-        raise FormatError.damaged(path, f"no array: {start[:99]!r}; expected {expected}")
+        raise FormatError.damaged(path, f"not an array: {start[:99]!r}; expected {expected}")
     kind, sides = header[1].decode(), tuple(map(int, header[2].split(b", ")))
     fits = len(sides) == len(shape) and all(
-        wanted in (-1, side) for wanted, side in zip(shape, sides, strict=True)
+        length in (-1, side) for length, side in zip(shape, sides, strict=True)
     )
     if not fits or kind != np.dtype(dtype).str:
         raise FormatError.damaged(path, f"holds {kind} of shape {sides}; expected {expected}")
-    size, whole = math.prod(sides) * np.dtype(dtype).itemsize, path.stat().st_size
-    if header.end() + size != whole:
-        raise FormatError.damaged(path, f"{whole} bytes, of an array of shape {sides}")
+    size = path.stat().st_size
+    if header.end() + math.prod(sides) * np.dtype(dtype).itemsize != size:
+        raise FormatError.damaged(path, f"{size} bytes do not fit an array of shape {sides}")
     return np.memmap(path, dtype, "r", header.end(), sides)
 
 
 def read_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:
     """Read an array into memory; see `map_array`."""
     return np.array(map_array(path, dtype, shape))
+
+
+def combine(digests: Mapping[str, str]) -> str:
+    """Return the digest of a span from the digests of its features, by feature name.
+
+    Actions are excluded: a buffer does not hold them, and a dataset may lose them as it grows.
+    """
+    included = {name: digest for name, digest in digests.items() if name != ACTION}
+    return hashlib.sha256(canonical_json(included).encode()).hexdigest()
+
+
+class FeatureDigests:
+    """Running digests of several features."""
+
+    def __init__(self) -> None:
+        self._running: dict[str, Any] = {}
+
+    def update(self, feature: str, values: NDArray[Any]) -> None:
+        """Add the next value, or several stacked along a first axis, of a feature."""
+        if values.dtype == np.float32:
+            values = values.astype("<f4", copy=False)
+        elif values.dtype != np.uint8:
+            raise TypeError(f"expected uint8 or float32 values to digest, not {values.dtype}")
+        running = self._running.setdefault(feature, hashlib.sha256())
+        running.update(np.ascontiguousarray(values).data)
+
+    def current(self) -> dict[str, str]:
+        """Return the digests of the values so far, by feature name."""
+        return {name: running.copy().hexdigest() for name, running in self._running.items()}
+
+
+class SpanDigester:
+    """Running digests of spans `(start, stop)` of an episode, which may overlap."""
+
+    def __init__(self, spans: Iterable[tuple[int, int]]):
+        self._spans = [(start, stop, FeatureDigests()) for start, stop in spans]
+
+    def update(self, feature: str, index: int, value: NDArray[Any]) -> None:
+        """Add a feature's value at a frame, in order."""
+        for start, stop, running in self._spans:
+            if start <= index < stop:
+                running.update(feature, value)
+
+    def digests(self) -> list[dict[str, str]]:
+        """Return the digests of each span, by feature."""
+        return [running.current() for _, _, running in self._spans]

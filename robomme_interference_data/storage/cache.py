@@ -1,4 +1,4 @@
-"""A cache of decoded frames: memory-mappable arrays by content hash, bounded in size."""
+"""A cache of decoded frames: memory-mapped arrays by content hash, bounded in size."""
 
 import os
 import re
@@ -12,18 +12,17 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError, InvalidOptionError
 
-from .arrays import map_array, write_array
-from .digest import FeatureDigests
+from .arrays import FeatureDigests, map_array, write_array
 from .files import atomic_path
 
-_OWN = re.compile(r"[0-9a-f]{64}\.npy")
+_NAME = re.compile(r"[0-9a-f]{64}\.npy")
 _HEADER = 128  # bytes that numpy writes before the data of an array of four dimensions
 
 _warned: set[Path] = set()
-"""Folders that could not be written to; one warning each."""
+"""Folders that could not be written to, and were warned about."""
 
 _room: dict["DecodedCache", int] = {}
-"""Bytes that this process may still add to a cache before it looks at the folder again."""
+"""Bytes that this process may still add to a cache before it measures the folder again."""
 
 
 def default_cache_folder() -> Path:
@@ -36,19 +35,19 @@ def default_cache_folder() -> Path:
 class DecodedCache:
     """Decoded frames of sessions, one `.npy` file each, named by the SHA-256 of the frames.
 
-    When they outgrow the bound, the files that were not used for longest are removed; files of
-    other names stay. Several processes may share a folder: files appear whole, and one that
-    vanishes is decoded again. Each counts what it adds and looks at the folder again after a
-    sixteenth of the bound at the latest, so that several may exceed it by as much each, for a
-    while. A crash of the machine may lose files, as they are not flushed to the disk. Where
-    nothing can be written, as on a full disk, there is one warning, and nothing is kept.
+    Beyond the bound, the least recently used files are deleted; files with other names stay.
+    Several processes may share a folder: files appear whole, and a missing one is decoded again.
+    Each process measures the folder again after adding a sixteenth of the bound, and so may exceed
+    it by that much for a while. Files are not flushed to disk, so a crash of the machine may lose
+    some. If the folder cannot be written to, as on a full disk, the cache warns once and stores
+    nothing.
 
     Args:
-        folder: Where the arrays lie; made when first written to.
-        max_bytes: Bound on the size of all arrays, in bytes.
+        folder: Folder of the arrays, created when first needed.
+        max_bytes: Bound on the total size, in bytes.
 
     Raises:
-        InvalidOptionError: The bound is not positive.
+        InvalidOptionError: If the bound is not positive.
     """
 
     folder: Path
@@ -56,7 +55,7 @@ class DecodedCache:
 
     def __post_init__(self) -> None:
         if self.max_bytes <= 0:
-            raise InvalidOptionError(f"cache bound of {self.max_bytes} bytes is not positive")
+            raise InvalidOptionError(f"max_bytes is {self.max_bytes}; expected a positive number")
 
     def get(
         self, sha256: str, shape: tuple[int, ...], *, verify: bool = False
@@ -65,23 +64,23 @@ class DecodedCache:
 
         Args:
             sha256: Digest of the frames.
-            shape: Expected shape, `(T, H, W, 3)`; a file of another one counts as absent.
-            verify: Compare the frames with the digest; others count as absent. Not the default:
-                it takes longer than reading them.
+            shape: Expected shape, `(T, H, W, 3)`; a file with another shape counts as absent.
+            verify: Compare the frames with the digest; a mismatch counts as absent. This takes
+                longer than reading the frames.
         """
-        if not _OWN.fullmatch(f"{sha256}.npy"):
-            return None  # a dataset may call its frames what it likes
+        if not _NAME.fullmatch(f"{sha256}.npy"):
+            return None  # an untrusted dataset may have any text here
         path = self._path(sha256)
         try:
             frames = map_array(path, np.uint8, shape)
         except (OSError, FormatError):
             return None
-        with suppress(OSError):  # a folder that only others may write
+        with suppress(OSError):  # a read-only folder
             os.utime(path)
         return None if verify and frames_sha256(frames) != sha256 else frames
 
     def put(self, sha256: str, frames: NDArray[np.uint8]) -> None:
-        """Store frames, unless they alone exceed the bound, and remove the least used ones."""
+        """Store frames, unless they alone exceed the bound; delete the least recently used ones."""
         size = frames.nbytes + _HEADER
         if size > self.max_bytes:
             return
@@ -95,7 +94,7 @@ class DecodedCache:
             if self.folder not in _warned:
                 _warned.add(self.folder)
                 warnings.warn(
-                    f"decoded frames are not kept in {self.folder}: {error.strerror or error}",
+                    f"decoded frames cannot be cached in {self.folder}: {error.strerror or error}",
                     RuntimeWarning,
                     stacklevel=2,
                 )
@@ -104,11 +103,11 @@ class DecodedCache:
         return self.folder / f"{sha256}.npy"
 
     def _shrink(self) -> int:
-        """Remove what exceeds the bound; return how many bytes are left until it is reached."""
+        """Delete files beyond the bound; return the bytes left until it is reached."""
         files = []
         for path in self.folder.iterdir():
-            if _OWN.fullmatch(path.name):
-                with suppress(FileNotFoundError):  # removed by another process
+            if _NAME.fullmatch(path.name):
+                with suppress(FileNotFoundError):  # deleted by another process
                     files.append((path, path.stat()))
         size = sum(stat.st_size for _, stat in files)
         for path, stat in sorted(files, key=lambda item: item[1].st_mtime_ns):
@@ -120,7 +119,7 @@ class DecodedCache:
 
 
 def frames_sha256(frames: NDArray[np.uint8]) -> str:
-    """Return the digest of frames, by which they are kept."""
+    """Return the digest that names frames in the cache."""
     digests = FeatureDigests()
     digests.update("frames", frames)
     return digests.current()["frames"]

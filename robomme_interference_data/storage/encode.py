@@ -1,4 +1,4 @@
-"""Encode frames with PyAV: as video, for datasets and clips, and as PNG; decode single images."""
+"""Encode frames with PyAV, as video or PNG; decode single images."""
 
 import os
 from collections.abc import Iterator, Mapping
@@ -23,16 +23,11 @@ _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 
 @dataclass(frozen=True)
 class Codec:
-    """Video settings, in LeRobot's terms (`RGBEncoderConfig`).
+    """Video settings, in the terms of LeRobot's `RGBEncoderConfig`.
 
-    Attributes:
-        name: Name on the command line.
-        vcodec: FFmpeg encoder.
-        pix_fmt: Pixel format.
-        settings: Further arguments of `RGBEncoderConfig`.
-        options: What they become for FFmpeg; a test holds the two against each other.
-        exact: Whether decoding gives back the very pixels.
-        min_side: Smallest height and width in pixels that the encoder takes.
+    `settings` are further arguments of `RGBEncoderConfig`, and `options` the same for FFmpeg; a
+    test compares them. `exact` codecs are lossless. `min_side` is the smallest height and width in
+    pixels.
     """
 
     name: str
@@ -49,8 +44,8 @@ _AOM_LOSSLESS = {"usage": 1, "cpu-used": 8, "row-mt": 1, "aom-params": "lossless
 CODECS = {
     codec.name: codec
     for codec in (
-        # Exact in PyAV, torchcodec and browsers; key frames are near and nothing is reordered, so
-        # that seeking is safe.
+        # Lossless in PyAV, torchcodec and browsers. Key frames are close and nothing is reordered,
+        # so seeking is safe.
         Codec(
             name="av1-lossless",
             vcodec="libaom-av1",
@@ -79,12 +74,12 @@ CLIP = Codec(
     vcodec="libx264",
     pix_fmt="yuv420p",
     settings={},
-    # With its macroblock tree, x264 gives other bytes each time unless both sides are multiples of
-    # 16: it reads memory that nobody has written.
+    # With its macroblock tree, x264 reads uninitialized memory unless both sides are multiples of
+    # 16, so that its output varies.
     options={"crf": "22", "preset": "veryfast", "x264-params": "mbtree=0"},
     exact=False,
 )
-"""Clips of rollouts, to look at in any player: H.264 in MP4; even heights and widths."""
+"""Clips of rollouts for any player: H.264 in MP4, for even heights and widths."""
 
 
 def get_codec(name: str) -> Codec:
@@ -95,15 +90,9 @@ def get_codec(name: str) -> Codec:
 
 
 class VideoEncoder:
-    """Writes frames to one video file, in the calling thread: none can be dropped.
+    """Writes frames to one video file in the calling thread, so that none is dropped.
 
-    Args:
-        path: File to write.
-        codec: Settings.
-        fps: Frame rate in Hz.
-        height: Rows of pixels.
-        width: Columns of pixels.
-        container: FFmpeg's name of the container; None if the path's suffix says it.
+    The container follows from the path's suffix, unless given by FFmpeg's name.
     """
 
     def __init__(
@@ -118,14 +107,14 @@ class VideoEncoder:
         if min(height, width) < codec.min_side:
             raise BuildError(
                 f"{path.stem}: frames of {width}×{height} pixels are too small for {codec.name}, "
-                f"which takes {codec.min_side}×{codec.min_side} and more",
+                f"which needs at least {codec.min_side}×{codec.min_side}",
                 "Use the codec 'av1-lossless'.",
             )
         self._path = path
         self._container: Any = None
         os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 prints its settings otherwise
         with self._errors():
-            # No version of FFmpeg is written then.
+            # Omits FFmpeg's version.
             self._container = av.open(
                 str(path), "w", format=container, container_options={"fflags": "+bitexact"}
             )
@@ -135,7 +124,7 @@ class VideoEncoder:
         self._stream.pix_fmt = codec.pix_fmt
         self._stream.height = height
         self._stream.width = width
-        self._stream.codec_context.thread_count = 1  # episodes are encoded side by side instead
+        self._stream.codec_context.thread_count = 1  # episodes are encoded in parallel
         self._time_base = Fraction(1, fps)
         self._stream.time_base = self._time_base
         self._count = 0
@@ -150,7 +139,7 @@ class VideoEncoder:
         self._count += 1
 
     def close(self) -> None:
-        """Write what is pending and close the file."""
+        """Flush the encoder and close the file."""
         with self._errors():
             self._container.mux(self._stream.encode(None))
             self._container.close()
@@ -161,14 +150,14 @@ class VideoEncoder:
             yield
         except (av.error.FFmpegError, UnknownCodecError) as error:
             if self._container is not None:
-                # PyAV would close it when it is collected, and print what fails once more by then.
+                # Otherwise PyAV closes it during garbage collection, and prints the error again.
                 with suppress(av.error.FFmpegError):
                     self._container.close()
             raise BuildError(f"{self._path}: the video cannot be written: {error}") from error
 
 
 def png(image: NDArray[np.uint8]) -> bytes:
-    """Return an image, `(H, W, 3) uint8` RGB, as PNG: nothing of it is lost."""
+    """Encode an image, `(H, W, 3) uint8` RGB, as PNG."""
     height, width, _ = image.shape
     encoder = av.CodecContext.create("png", "w")
     encoder.width, encoder.height, encoder.pix_fmt = width, height, "rgb24"
@@ -177,22 +166,22 @@ def png(image: NDArray[np.uint8]) -> bytes:
 
 
 def is_png(data: bytes) -> bool:
-    """Tell whether an encoded image is a PNG."""
+    """Return whether an encoded image is PNG, and not JPEG."""
     if data.startswith(_PNG):
         return True
     if data.startswith(_JPEG):
         return False
     raise FormatError(
         f"an image starts with the bytes {data[:8].hex(' ') or '(none)'}; expected PNG or JPEG",
-        "Store images as PNG: it is exact.",
+        "Store images as PNG, which is lossless.",
     )
 
 
 def decode_image(data: bytes) -> NDArray[np.uint8]:
-    """Decode a PNG or JPEG image to `(H, W, 3) uint8` RGB; transparency is left out."""
+    """Decode a PNG or JPEG image to `(H, W, 3) uint8` RGB, without transparency."""
     codec = av.CodecContext.create("png" if is_png(data) else "mjpeg", "r")
     codec.thread_count = 1
-    # Without these, a PNG with a broken checksum is decoded as if nothing were wrong.
+    # By default, FFmpeg accepts a PNG with a wrong checksum.
     codec.options = {"err_detect": "crccheck+explode", "max_pixels": str(MOST_PIXELS)}
     try:
         frames = codec.decode(av.Packet(data)) + codec.decode(None)

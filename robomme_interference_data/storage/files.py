@@ -1,4 +1,4 @@
-"""Reach the files of a dataset, and write files so that none is ever seen half-written."""
+"""Access the files of a dataset, read JSON within bounds, and write files atomically."""
 
 import errno
 import hashlib
@@ -12,32 +12,28 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, NoReturn, Protocol
 
-from robomme_interference_data.errors import (
-    FormatError,
-    MissingFileError,
-)
+from robomme_interference_data.constants import FORMAT_VERSION
+from robomme_interference_data.errors import FormatError, MissingFileError
 
-_MOST_JSON = 16 << 20
-"""Bytes of a file of JSON, at most: ours have some thousand, and Python takes forty times as many
-for some values."""
+_MAX_JSON_BYTES = 16 << 20
+"""Our files have some thousand bytes, and Python takes forty times as many for some values."""
 
-_MOST_SUMS = 64 << 20
-"""Bytes of a list of SHA-256, at most: those of half a million files."""
+_MAX_SUMS_BYTES = 64 << 20
+"""A list of the SHA-256 of half a million files."""
 
-_DEEPEST = 64
-"""Lists and maps of JSON inside each other, at most: what Python reads, it cannot always show,
-compare or write again."""
+_MAX_DEPTH = 64
+"""Nesting of JSON: Python can read more than it can always print, compare or write."""
 
 
 class Files(Protocol):
-    """The one way in which this package reaches the files of a dataset or buffer set.
+    """The only way in which this package accesses the files of a dataset or buffer set.
 
-    A path is always relative, with `/`, such as `meta/info.json`. Paths come out of data files
-    that a stranger may have written: none leads out of the dataset, not by a link either.
+    A path is always relative, with `/`, such as `meta/info.json`. Paths come from data files that
+    are not trusted: no path leaves the dataset, and no link does.
     """
 
     def path(self, relative: str) -> Path:
-        """Return where the file lies on this machine, fetching it first if need be."""
+        """Return where the file is on this machine, fetching it first if necessary."""
         ...
 
     def list(self, folder: str, suffix: str = "") -> list[str]:
@@ -45,20 +41,20 @@ class Files(Protocol):
         ...
 
     def fetch(self, paths: Iterable[str]) -> None:
-        """Bring files to this machine that are about to be read, several at a time."""
+        """Bring files that are about to be read to this machine, several at a time."""
         ...
 
     def snapshot(self, *patterns: str) -> Path:
-        """Return the folder that holds all files, bringing those here that match a pattern."""
+        """Fetch the files that match a pattern; return the folder of all files."""
         ...
 
     @property
     def location(self) -> str:
-        """What `locate` finds the same files by: a folder, or `namespace/name@commit`."""
+        """The argument of `locate` for the same files: a folder, or `namespace/name@commit`."""
         ...
 
     def describe(self) -> str:
-        """Return the location in words, for messages only."""
+        """Return the location for messages."""
         ...
 
 
@@ -71,41 +67,40 @@ class LocalFiles:
     def path(self, relative: str) -> Path:
         """Return the file's path; see `Files.path`."""
         path = self.root / check_relative(relative, self.describe())
-        # Links are followed only inside the folder, and into the store that the Hub's client
-        # keeps the files of a snapshot, or of a folder in one, in.
+        # A link may lead inside the folder. In a snapshot of the Hub's cache, or a folder of one,
+        # it may also lead to the cache's `blobs`.
         root = self.root.resolve()
-        stores = (one.parent.parent / "blobs" for one in (root, root.parent) if _is_snapshot(one))
-        store = next(stores, root)
-        real = Path(os.path.realpath(path))  # which a link that goes round does not stop
-        if not (real.is_relative_to(root) or real.is_relative_to(store)):
+        snapshots = (one for one in (root, root.parent) if one.parent.name == "snapshots")
+        blobs = next((one.parent.parent / "blobs" for one in snapshots), root)
+        target = Path(os.path.realpath(path))  # unlike `Path.resolve`, it accepts circular links
+        if not (target.is_relative_to(root) or target.is_relative_to(blobs)):
             raise FormatError(
                 f"{relative} in {self.root} is a link that leads out of the folder",
-                "Put the file itself there.",
+                "Replace the link by the file.",
             )
         try:
-            there = real.is_file()
+            exists = target.is_file()
         except OSError as error:
             if error.errno != errno.ENAMETOOLONG:
                 raise
             raise FormatError.damaged(self.root, f"{relative[:80]!r}… is too long") from None
-        if not there:
+        if not exists:
             raise MissingFileError(
                 f"{relative} is missing in {self.root}",
-                "The folder is not a complete dataset: build it again, or point to the folder "
-                "that holds it.",
+                "The folder is not a complete dataset: build it again, or give the right folder.",
             )
         return path
 
     def list(self, folder: str, suffix: str = "") -> list[str]:
         """Return the files under a folder; see `Files.list`."""
-        found = (self.root / folder).rglob(f"*{suffix}")
-        return sorted(p.relative_to(self.root).as_posix() for p in found if p.is_file())
+        matches = (self.root / folder).rglob(f"*{suffix}")
+        return sorted(p.relative_to(self.root).as_posix() for p in matches if p.is_file())
 
     def fetch(self, paths: Iterable[str]) -> None:
-        """Do nothing: the files are here; see `Files.fetch`."""
+        """Do nothing: the files are local."""
 
     def snapshot(self, *patterns: str) -> Path:
-        """Return the folder; see `Files.snapshot`."""
+        """Return the folder."""
         return self.root
 
     @property
@@ -119,25 +114,24 @@ class LocalFiles:
 
 
 def all_files(root: Path) -> list[str]:
-    """Return the sorted relative paths of all that is no folder, links that lead nowhere too."""
-    found = (path for path in root.rglob("*") if path.is_symlink() or not path.is_dir())
-    return sorted(path.relative_to(root).as_posix() for path in found)
-
-
-def _is_snapshot(folder: Path) -> bool:
-    return folder.parent.name == "snapshots"
+    """Return the sorted relative paths of everything but folders; broken links are included."""
+    paths = (path for path in root.rglob("*") if path.is_symlink() or not path.is_dir())
+    return sorted(path.relative_to(root).as_posix() for path in paths)
 
 
 def check_relative(relative: str, where: str) -> str:
-    """Return a relative path that stays in its folder."""
+    """Return a path if it is relative and stays in its folder."""
     path = PurePosixPath(relative)
     try:
         os.fsencode(relative)
     except UnicodeEncodeError:
-        raise FormatError.damaged(where, f"{relative!r} is no path") from None
+        raise FormatError.damaged(where, f"{relative!r} is not a valid path") from None
     if path.is_absolute() or ".." in path.parts or "\0" in relative:
         raise FormatError.damaged(where, f"the path {relative!r} leads out of it")
     return relative
+
+
+# --- JSON ----------------------------------------------------------------------------------------
 
 
 def canonical_json(value: Any) -> str:
@@ -148,76 +142,88 @@ def canonical_json(value: Any) -> str:
 
 
 def indented_json(value: Any) -> str:
-    """Return the JSON text of a value as files have it: indented, with sorted keys, no NaN."""
+    """Return the JSON text of a value for files: indented, with sorted keys, no NaN."""
     text = json.dumps(value, sort_keys=True, indent=2, ensure_ascii=False, allow_nan=False)
     return text + "\n"
 
 
 def read_bytes(path: Path, most: int) -> bytes:
-    """Return a file's bytes."""
+    """Return the bytes of a file that has at most `most`."""
     with path.open("rb") as file:
         size = os.fstat(file.fileno()).st_size
         if size > most:
-            raise FormatError.damaged(path, f"{size:,} bytes; at most {most:,} are read")
+            raise FormatError.damaged(path, f"{size:,} bytes; expected at most {most:,}")
         return file.read()
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON file that holds an object."""
-    return parse_json(read_bytes(path, _MOST_JSON), path)
+    return parse_json(read_bytes(path, _MAX_JSON_BYTES), path)
 
 
 def parse_json(data: bytes, where: object) -> dict[str, Any]:
-    """Read JSON: an object, in which no key occurs twice and all numbers are finite.
-
-    Args:
-        data: UTF-8.
-        where: What is read, for messages.
-    """
+    """Parse a JSON object in UTF-8, in which keys are unique and numbers are finite."""
     try:
         value = _JSON.decode(data.decode())
-        if data.count(b"[") + data.count(b"{") > _DEEPEST and _is_deep(value):
-            raise ValueError(f"over {_DEEPEST} lists and maps inside each other")
+        if data.count(b"[") + data.count(b"{") > _MAX_DEPTH and _is_deep(value):
+            raise ValueError(f"over {_MAX_DEPTH} nested arrays and objects")
     except (ValueError, RecursionError) as error:
-        raise FormatError.damaged(where, f"not JSON: {error}") from None
+        raise FormatError.damaged(where, f"not valid JSON: {error}") from None
     if not isinstance(value, dict):
-        raise FormatError.damaged(where, "no JSON object")
+        raise FormatError.damaged(where, "not a JSON object")
     return value
 
 
 def _finite(text: str) -> float:
     value = float(text)
-    if not math.isfinite(value):
-        raise ValueError(f"{text[:80]} is no finite number")
-    return value
+    return value if math.isfinite(value) else _not_finite(text)
 
 
-def _not_finite(name: str) -> NoReturn:
-    raise ValueError(f"{name} is no finite number")
+def _not_finite(text: str) -> NoReturn:
+    raise ValueError(f"{text[:80]} is not a finite number")
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    value = dict(pairs)
+    if len(value) < len(pairs):
         names = [name for name, _ in pairs]
-        twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"{twice[:80]!r} occurs twice")
-    return found
+        duplicate = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"the key {duplicate[:80]!r} occurs twice")
+    return value
 
 
 _JSON = json.JSONDecoder(object_pairs_hook=_unique, parse_float=_finite, parse_constant=_not_finite)
 
 
 def _is_deep(value: Any) -> bool:
-    inside = [value]
-    for _ in range(_DEEPEST):
-        inside = [
-            one
-            for outer in inside
-            for one in (outer.values() if isinstance(outer, dict) else outer)
-            if isinstance(one, dict | list)
+    level = [value]
+    for _ in range(_MAX_DEPTH):
+        level = [
+            inner
+            for outer in level
+            for inner in (outer.values() if isinstance(outer, dict) else outer)
+            if isinstance(inner, dict | list)
         ]
-    return bool(inside)
+    return bool(level)
+
+
+def read_header[T](path: Path, record: type[T]) -> T:
+    """Read the JSON header of a folder as a record with the current `format_version`, if any."""
+    from robomme_interference_data.schema.codec import descriptions, from_dict
+
+    value = read_json(path)
+    if "format_version" in descriptions(record):
+        version = value.get("format_version")
+        if version != FORMAT_VERSION:
+            raise FormatError(
+                f"{path} has format version {version!r}; this package reads {FORMAT_VERSION}",
+                "Install the version of robomme-interference-data that wrote it, or build it "
+                "again.",
+            )
+    return from_dict(record, value, path, strict=True)
+
+
+# --- writing -------------------------------------------------------------------------------------
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -226,34 +232,27 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    r"""Write UTF-8 text, lines ending alike on every system, atomically.
-
-    Of a file's name that is not UTF-8, its bytes are written as JSON would: `\udcff`.
-    """
+    r"""Write UTF-8 text with `\n` as line end, atomically; half a character becomes `\udcff`."""
     with atomic_path(path) as partial:
         partial.write_text(text, encoding="utf-8", errors="backslashreplace", newline="\n")
 
 
 @contextmanager
-def with_filename(place: object) -> Iterator[None]:
-    """Add a file name to the system's error where it has none: that of a full disk has not."""
+def with_filename(path: object) -> Iterator[None]:
+    """Add a file name to the system's errors without one, such as that of a full disk."""
     try:
         yield
     except OSError as error:
         if error.errno is not None and error.filename is None:
-            error.filename = str(place)
+            error.filename = str(path)
         raise
 
 
 @contextmanager
 def atomic_path(path: Path, *, flush: bool = True) -> Iterator[Path]:
-    """Give a temporary path beside `path` that becomes `path` if the block succeeds.
+    """Give a temporary path that replaces `path` if the block succeeds, and is deleted otherwise.
 
-    If the block fails, nothing is left behind.
-
-    Args:
-        path: The file to write.
-        flush: Let the data reach the disk before the name does.
+    With `flush`, the data reaches the disk before the file gets its name.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".partial")
@@ -271,6 +270,9 @@ def atomic_path(path: Path, *, flush: bool = True) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
+# --- SHA-256 of files ----------------------------------------------------------------------------
+
+
 def sha256_file(path: Path) -> str:
     """Return the SHA-256 of a file's bytes, in hexadecimal."""
     with path.open("rb") as file:
@@ -278,27 +280,27 @@ def sha256_file(path: Path) -> str:
 
 
 def format_sums(root: Path, paths: Iterable[str]) -> str:
-    """Return the SHA-256 of files as `sha256sum` writes them, a line each, sorted by path."""
+    """Return the SHA-256 of files in the format of `sha256sum`, sorted by path."""
     return "".join(f"{sha256_file(root / path)}  {path}\n" for path in sorted(paths))
 
 
 def digest_folder(folder: Path, patterns: Iterable[str]) -> str:
-    """Return the SHA-256 over names and bytes of a folder's files that fit one of the patterns."""
-    found = {path for pattern in patterns for path in folder.rglob(pattern) if path.is_file()}
-    names = (path.relative_to(folder).as_posix() for path in found)
+    """Return the SHA-256 over names and bytes of a folder's files that match a pattern."""
+    paths = {path for pattern in patterns for path in folder.rglob(pattern) if path.is_file()}
+    names = (path.relative_to(folder).as_posix() for path in paths)
     return hashlib.sha256(format_sums(folder, names).encode()).hexdigest()
 
 
 def read_sums(path: Path) -> dict[str, str]:
-    """Read a file of what `format_sums` returns: SHA-256 by path."""
+    """Read a file in the format of `format_sums`: SHA-256 by path."""
     sums = {}
     try:
-        lines = read_bytes(path, _MOST_SUMS).decode().splitlines()
+        lines = read_bytes(path, _MAX_SUMS_BYTES).decode().splitlines()
     except UnicodeDecodeError as error:
         raise FormatError.damaged(path, error) from None
     for line in lines:
         digest, gap, name = line.partition("  ")
         if not gap or len(digest) != 64 or not name:
-            raise FormatError.damaged(path, f"{line[:80]!r} is no line of SHA-256 and path")
+            raise FormatError.damaged(path, f"{line[:80]!r} is not a SHA-256 and a path")
         sums[check_relative(name, str(path))] = digest
     return sums

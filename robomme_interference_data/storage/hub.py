@@ -1,64 +1,104 @@
 """Reach repositories on the Hugging Face Hub, pinned to one commit: datasets, policies, encoders.
 
 The stock client does the work, so its own settings hold (`HF_ENDPOINT`, `HF_HUB_OFFLINE`,
-`HF_HOME`, `HF_HUB_CACHE`, `HF_TOKEN`), and its cache is the only one. `hub_errors` turns what it
-raises into this package's errors.
+`HF_HOME`, `HF_HUB_CACHE`, `HF_TOKEN`), and its cache is the only one. `HubCall` turns its errors
+into this package's errors.
 """
 
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import cached_property, partial
 from hashlib import sha1
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
-from robomme_interference_data.errors import HashMismatchError, InvalidOptionError
+from robomme_interference_data.errors import (
+    HashMismatchError,
+    HubError,
+    InvalidOptionError,
+    MissingFileError,
+)
 
-from .files import LocalFiles, all_files, check_relative, sha256_file
-from .hub_errors import HubCall, check_endpoint
+from .files import LocalFiles, all_files, check_relative, sha256_file, with_filename
 
 _LOCATION = re.compile(r"([A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*)(?:@(.+))?")
 _VERSION = re.compile(r"data-\d+\.\d+\.\d+")
-_AT_ONCE = 8
+_ENDPOINT = re.compile(r"https?://([\w.-]+|\[[\da-fA-F:.]+\])(:[1-9]\d{0,4})?(/\S*)?")
+_PUBLIC = "https://huggingface.co"
+_PARALLEL_DOWNLOADS = 8
+
+_LOGIN = (
+    "{endpoint} rejects your login",
+    "Create a token with the permission, and log in: hf auth login (HF_TOKEN takes precedence)",
+)
+_UNKNOWN = (
+    "{repo} does not exist, or your login has no access",
+    "Check the name; no local folder {repo_id} exists either. For a private repository, log in: "
+    "hf auth login",
+)
+_ERRORS = {
+    "GatedRepoError": (
+        "{repo} is gated, and your login has no access",
+        "Request access at {page}, then log in: hf auth login",
+    ),
+    "RevisionNotFoundError": (
+        "{repo} has no revision {revision!r}",
+        "Its branches and tags are listed at {page}/tree/main",
+    ),
+    "RepositoryNotFoundError": _UNKNOWN,
+    "HFValidationError": _UNKNOWN,
+    "RemoteEntryNotFoundError": (
+        "{path} is missing in {repo_id}@{revision}",
+        "The repository is incomplete; its files are listed at {page}/tree/{revision}",
+    ),
+    "LocalTokenNotFoundError": _LOGIN,
+    401: _LOGIN,
+    403: ("your login lacks the permission for {repo}", "Use another token: hf auth login --force"),
+    412: (
+        "somebody else wrote to {repo_id} at the same time",
+        "Check {page}/commits/main, then run the same command again.",
+    ),
+}
+"""Message and hint by the client's error class or the HTTP status; the first match counts."""
 
 
 def locate(
     location: str | os.PathLike[str], repo_type: str = "dataset", revision: str | None = None
 ) -> "LocalFiles | HubFiles":
-    """Return the files at a location.
+    """Return the files at a location: a folder, `namespace/name` or `namespace/name@revision`.
 
-    Args:
-        location: A folder, or a repository on the Hub: `namespace/name`, or with a branch, tag or
-            commit `namespace/name@revision`. An existing folder takes precedence over a repository;
-            a `Path` is always a folder.
-        repo_type: `dataset` or `model`.
-        revision: The branch, tag or commit, if not in `location`.
+    The revision may also be given separately. An existing folder takes precedence over a
+    repository; a `Path` is always a folder.
     """
     folder = Path(location).expanduser()
     if folder.is_dir():
         if revision is not None:
             raise InvalidOptionError(
                 f"revision {revision!r} of the folder {folder}; only a repository has revisions",
-                "Leave it out, or give namespace/name instead of the folder.",
+                "Omit the revision, or give namespace/name instead of the folder.",
             )
         return LocalFiles(folder)
     return HubFiles.parse(str(location), repo_type, revision)
 
 
+def check_endpoint() -> None:
+    """Check that `HF_ENDPOINT` is an address: some other values break the client's import."""
+    endpoint = os.environ.get("HF_ENDPOINT", _PUBLIC)
+    if not _ENDPOINT.fullmatch(endpoint):
+        expected, hint = f"an address such as {_PUBLIC}", "To use that one: unset HF_ENDPOINT"
+        raise InvalidOptionError.expected("HF_ENDPOINT", endpoint, expected, hint)
+
+
 class HubFiles:
-    """Files of a repository at one commit, downloaded into the Hub's cache when asked for.
+    """Files of a `dataset` or `model` repository at one commit, downloaded on use.
 
-    The revision is resolved once, at the first use; copies made after that (worker processes get
-    one each) keep the commit. Offline, it is what the revision last stood for; and so it always is
-    for a version's tag, `data-1.0.0`: a published version never changes.
-
-    Args:
-        repo_id: Repository, `namespace/name`.
-        revision: Branch, tag or commit hash; None for the main branch.
-        repo_type: `dataset` or `model`.
+    The revision (a branch, tag or commit hash) is resolved once, at the first use; pickled copies
+    keep the commit. Offline, it is the commit that the revision last resolved to. The same holds
+    for the tag of a version, such as `data-1.0.0`: a published version never changes.
     """
 
     folder = ""
@@ -87,22 +127,22 @@ class HubFiles:
 
     def inside(self, folder: str) -> "HubFiles":
         """Return the files of a folder of the repository, at the same commit."""
-        found = HubFiles(self.repo_id, self.commit, self.repo_type)
-        found.folder = f"{folder}/"
-        return found
+        inner = HubFiles(self.repo_id, self.commit, self.repo_type)
+        inner.folder = f"{folder}/"
+        return inner
 
     @cached_property
     def commit(self) -> str:
-        """Commit hash that the revision stands for."""
+        """Commit hash of the revision."""
         from huggingface_hub import HfApi
         from huggingface_hub.errors import RevisionResolutionError
 
-        resolve, wanted = HfApi().resolve_revision, {"revision": self.revision}
-        wanted["repo_type"] = self.repo_type
+        options = {"repo_type": self.repo_type, "revision": self.revision}
+        resolve = partial(HfApi().resolve_revision, self.repo_id, **options)
         if _VERSION.fullmatch(self.revision):
             with suppress(RevisionResolutionError):
-                return str(resolve(self.repo_id, local_files_only=True, **wanted).resolved)
-        return str(self._call().run(resolve, self.repo_id, **wanted).resolved)
+                return str(resolve(local_files_only=True).resolved)
+        return str(self._call().run(resolve).resolved)
 
     @property
     def location(self) -> str:
@@ -110,33 +150,26 @@ class HubFiles:
         return f"{self.repo_id}@{self.commit}"
 
     def path(self, relative: str) -> Path:
-        """Return the file's path in the cache, downloading it first if need be; see `Files.path`.
+        """Return the file's path in the cache, downloading it if necessary; see `Files.path`.
 
-        What arrives is compared with the digest that the Hub has of it.
+        A downloaded file is compared with the digest that the Hub has of it.
         """
         from huggingface_hub import hf_hub_download
         from huggingface_hub.utils import tqdm
 
         check_relative(relative, self.describe())
         new, name = self.missing([relative]), self.folder + relative
-        path = Path(
-            self._call(name).run(
-                hf_hub_download,
-                self.repo_id,
-                name,
-                repo_type=self.repo_type,
-                revision=self.commit,
-                tqdm_class=partial(tqdm, disable=True),  # files are small, and counted by `fetch`
-            )
-        )
-        self._check({one: path for one in new})
+        quiet = partial(tqdm, disable=True)  # files are small, and counted by `fetch`
+        download = partial(hf_hub_download, tqdm_class=quiet, **self._options)
+        path = Path(self._call(name).run(download, self.repo_id, name))
+        self._check(dict.fromkeys(new, path))
         return path
 
     def fetch(self, paths: Iterable[str]) -> None:
         """Download files that are not in the cache, with a progress bar; see `Files.fetch`.
 
-        Not by `snapshot_download`, which lists the whole repository first: for one buffer of a
-        large dataset that is more bytes, and more requests, than the buffer's metadata.
+        `snapshot_download` would first list the whole repository: for one buffer of a large
+        dataset, more bytes and requests than the buffer's metadata.
         """
         from huggingface_hub.utils import tqdm
 
@@ -145,33 +178,29 @@ class HubFiles:
             return
         with (
             tqdm(total=len(missing), desc=f"Fetching from {self.repo_id}", unit=" files") as bar,
-            ThreadPoolExecutor(_AT_ONCE) as pool,
+            ThreadPoolExecutor(_PARALLEL_DOWNLOADS) as pool,
         ):
-            for _ in pool.map(self.path, missing):  # an error cancels those that wait
+            for _ in pool.map(self.path, missing):  # an error cancels the downloads in the queue
                 bar.update()
 
     def missing(self, paths: Iterable[str]) -> list[str]:
         """Return the files that are not in the cache, each once."""
         from huggingface_hub import try_to_load_from_cache
 
-        def cached(path: str) -> object:
-            of = {"repo_type": self.repo_type, "revision": self.commit}
-            return try_to_load_from_cache(self.repo_id, self.folder + path, **of)
-
-        return [path for path in dict.fromkeys(paths) if not isinstance(cached(path), str)]
+        cached = partial(try_to_load_from_cache, self.repo_id, **self._options)
+        unique = dict.fromkeys(paths)
+        return [path for path in unique if not isinstance(cached(self.folder + path), str)]
 
     def sizes(self) -> dict[str, int]:
-        """Ask how large every file of the repository is; return bytes by path."""
+        """Return the size of every file of the repository, in bytes by path."""
         from huggingface_hub import HfApi
 
-        of = {"repo_type": self.repo_type, "revision": self.commit}
-        tree = self._call().run(
-            lambda: list(HfApi().list_repo_tree(self.repo_id, recursive=True, **of))  # in pages
-        )
+        list_tree = partial(HfApi().list_repo_tree, recursive=True, **self._options)
+        tree = self._call().run(lambda: list(list_tree(self.repo_id)))  # requests come in pages
         return {
-            one.path.removeprefix(self.folder): one.size
-            for one in tree
-            if hasattr(one, "size") and one.path.startswith(self.folder)
+            entry.path.removeprefix(self.folder): entry.size
+            for entry in tree
+            if hasattr(entry, "size") and entry.path.startswith(self.folder)
         }
 
     def snapshot(self, *patterns: str) -> Path:
@@ -182,13 +211,9 @@ class HubFiles:
         cache = repo_folder_name(repo_id=self.repo_id, repo_type=self.repo_type)
         root = Path(constants.HF_HUB_CACHE, cache, "snapshots", self.commit, self.folder)
         before = {*all_files(root)}
-        self._call().run(
-            snapshot_download,
-            self.repo_id,
-            repo_type=self.repo_type,
-            revision=self.commit,
-            allow_patterns=[self.folder + pattern for pattern in patterns],
-        )
+        allowed = [self.folder + pattern for pattern in patterns]
+        download = partial(snapshot_download, allow_patterns=allowed, **self._options)
+        self._call().run(download, self.repo_id)
         self._check({path: root / path for path in all_files(root) if path not in before})
         return root
 
@@ -198,17 +223,17 @@ class HubFiles:
 
     def describe(self) -> str:
         """Return `namespace/name@revision`, with the commit as revision once it is known."""
-        whole = f"{self.repo_id}@{self._at}"
-        return f"{whole}, {self.folder}" if self.folder else whole
+        repository = f"{self.repo_id}@{self._known_revision}"
+        return f"{repository}, {self.folder}" if self.folder else repository
 
-    def _check(self, came: dict[str, Path]) -> None:
-        """Check files that have just come, and remove those that are not what the Hub has.
+    def _check(self, downloaded: dict[str, Path]) -> None:
+        """Remove downloaded files whose digest differs from the Hub's, and raise.
 
-        The client checks their length only. It keeps files under their digests: Git's of small
-        ones, SHA-256 of large ones.
+        The client checks only their length. It names files in its cache by their digests: Git's of
+        small ones, SHA-256 of large ones.
         """
         damaged = []
-        for relative, path in came.items():
+        for relative, path in downloaded.items():
             blob = path.resolve()
             digest = {40: _git_sha1, 64: sha256_file}.get(len(blob.name))
             if digest is not None and digest(blob) != blob.name:
@@ -217,20 +242,91 @@ class HubFiles:
                 damaged.append(relative)
         if damaged:
             raise HashMismatchError(
-                f"{', '.join(damaged)} of {self.describe()} came damaged: the digest is another",
-                "What is damaged was thrown away. Run the same command again.",
+                f"{', '.join(damaged)} of {self.describe()} came damaged: the digest differs",
+                "The damaged files were deleted. Run the same command again.",
             )
 
-    def _call(self, path: str | None = None) -> HubCall:
-        return HubCall(self.repo_id, self.repo_type, self._at, path)
+    @property
+    def _options(self) -> dict[str, Any]:
+        return {"repo_type": self.repo_type, "revision": self.commit}
+
+    def _call(self, path: str | None = None) -> "HubCall":
+        return HubCall(self.repo_id, self.repo_type, self._known_revision, path)
 
     @property
-    def _at(self) -> str:
-        """The commit once it is known, and before that the revision."""
-        at: str = self.__dict__.get("commit", self.revision)
-        return at
+    def _known_revision(self) -> str:
+        revision: str = self.__dict__.get("commit", self.revision)
+        return revision
 
 
 def _git_sha1(path: Path) -> str:
     data = path.read_bytes()
     return sha1(b"blob %d\0" % len(data) + data).hexdigest()
+
+
+@dataclass(frozen=True)
+class HubCall:
+    """A call of the Hub's client about one repository, with this package's errors.
+
+    `revision` is set for downloads only, and `path` if they are of one file.
+    """
+
+    repo_id: str
+    repo_type: str = "dataset"
+    revision: str | None = None
+    path: str | None = None
+
+    @property
+    def page(self) -> str:
+        """Address of the repository's page."""
+        from huggingface_hub import constants
+
+        kind = "datasets/" if self.repo_type == "dataset" else ""
+        return f"{constants.ENDPOINT}/{kind}{self.repo_id}"
+
+    def run(self, call: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+        """Call a function of the client."""
+        import httpx
+        from huggingface_hub import constants, errors
+
+        try:
+            return call(*arguments, **options)
+        except (
+            OSError,
+            ValueError,
+            RuntimeError,
+            errors.EntryNotFoundError,
+            errors.RevisionResolutionError,
+            httpx.TransportError,
+            httpx.InvalidURL,
+        ) as error:
+            cause: BaseException = error
+            vague = (RuntimeError, errors.LocalEntryNotFoundError, errors.RevisionResolutionError)
+            while isinstance(cause, vague) and cause.__cause__ is not None:
+                cause = cause.__cause__
+            if isinstance(cause, OSError) and cause.errno is not None:
+                with with_filename(constants.HF_HUB_CACHE if self.revision else self.repo_id):
+                    raise cause from None
+            raise self._explained(cause) from cause
+
+    def _explained(self, error: BaseException) -> HubError | MissingFileError:
+        from huggingface_hub import constants
+
+        repo = f"the {self.repo_type} repository {self.repo_id!r} on {constants.ENDPOINT}"
+        status = getattr(getattr(error, "response", None), "status_code", None)
+        keys = [*(kind.__name__ for kind in type(error).__mro__), status]
+        key = next((key for key in _ERRORS if key in keys), None)
+        if key is not None:
+            values = vars(self) | {"repo": repo, "page": self.page, "endpoint": constants.ENDPOINT}
+            message, hint = (text.format(**values) for text in _ERRORS[key])
+            missing = key == "RemoteEntryNotFoundError"
+            return MissingFileError(message, hint) if missing else HubError(message, hint)
+        what = f"{self.path} of {repo}" if self.path else repo
+        reason, hint = " ".join(str(error).split()), "Run the same command again to resume."
+        if constants.HF_HUB_OFFLINE:
+            reason, hint = "HF_HUB_OFFLINE is set", "With a network: unset HF_HUB_OFFLINE"
+        elif status in (429, 503):
+            reason = f"the Hub is busy ({status})"
+            hint = "Wait some minutes, then run the same command again to resume."
+        missing_locally = "is not in the cache, and " if self.revision else ""
+        return HubError(f"{what} {missing_locally}cannot be reached: {reason}", hint)

@@ -1,10 +1,13 @@
 """Read LeRobot datasets with pyarrow and PyAV alone: v3.0, and v2.1 as its variant.
 
-The only reader of that layout: history datasets of this package and recordings of anybody else go
-through it. Tests hold it against lerobot's own.
+The only reader of that layout, for datasets of this package and for recordings. Tests compare it
+with lerobot's own reader.
 """
 
+import math
+import re
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -17,37 +20,43 @@ from robomme_interference_data.errors import FormatError, MissingFileError, Unkn
 
 from . import video
 from .files import Files, parse_json, read_bytes, read_json
-from .lerobot_layout import (
-    VERSIONS,
-    EpisodeLocation,
-    check_info,
-    place_episode,
-)
 from .parquet import RowSpan, is_plain, open_parquet, read_table, reading
+
+VERSIONS = ("v3.0", "v2.1")
 
 _V21_EPISODES = "meta/episodes.jsonl"
 _V21_TASKS = "meta/tasks.jsonl"
+_FIELD = re.compile(r"\{(\w+)(?::0(\d)d)?\}")
 
-_MOST_LINES = 64 << 20
-"""Bytes of v2.1's per-episode columns, at most: those of half a million episodes."""
+# Upper bounds, checked before anything is allocated.
+_MAX_LINES_BYTES = 64 << 20  # of v2.1's per-episode columns: those of half a million episodes
+_MAX_COLUMNS = 1000  # of v2.1's per-episode columns: each row may name others
+_MAX_TABLE_BYTES = 1 << 30  # of the per-episode columns in all: a million episodes have less
+_MAX_VECTOR = 4096  # numbers in a vector of a frame
+_MAX_VALUES = 1 << 26  # values in a frame of a feature: twice an image of 3840 × 2160 pixels
+_MAX_SIDES = 8  # numbers in a shape
+_MAX_EPISODES = 10_000_000
+_MAX_FEATURES = 10_000
+_MAX_TEMPLATE = 1000  # characters of a path template
+_MAX_NAME = 200  # characters of a feature's name, which a template may repeat
+_MAX_FRAME = 1 << 40  # number of a frame in its file: a container's timestamp has 64 bits
+_FPS = (1e-3, 1e6)
 
-_MOST_NUMBERS = 4096
-"""Numbers in a vector of a frame, at most: a held frame's are repeated in a buffer."""
 
-_MOST_BYTES = 1 << 30
-"""Bytes that the per-episode columns may take in all: a million episodes have less."""
+@dataclass(frozen=True)
+class EpisodeLocation:
+    """Frames of an episode, its rows' file, and each camera's `(file, number of first frame)`."""
 
-_MOST_COLUMNS = 1000
-"""Of v2.1's per-episode columns, at most: each row may name others."""
+    length: int
+    data: str
+    videos: dict[str, tuple[str, int]]
 
 
 class LeRobotFiles:
     """A LeRobot dataset: its metadata, and values and frames of its episodes.
 
-    Args:
-        files: How to reach the dataset.
-        tables: Paths of its episode tables, if they are known: on the Hub, to list files takes
-            longer than to fetch these.
+    `tables` are the paths of its episode tables, if known: on the Hub, listing the files takes
+    longer than fetching these.
     """
 
     def __init__(self, files: Files, tables: Sequence[str] = ()):
@@ -59,7 +68,7 @@ class LeRobotFiles:
         except MissingFileError as error:
             raise MissingFileError(
                 f"{files.describe()} is no LeRobot dataset: {INFO_PATH} is missing",
-                "Point to the folder that holds meta/, data/ and videos/.",
+                "Give the folder that holds meta/, data/ and videos/.",
             ) from error
         self.info = read_json(path)
         self.version = self.info.get("codebase_version")
@@ -70,7 +79,7 @@ class LeRobotFiles:
                 "Convert it with LeRobot's own scripts (lerobot.scripts."
                 "convert_dataset_v21_to_v30 and its predecessors).",
             )
-        check_info(self.info, path)
+        _check_info(self.info, path)
 
     @property
     def fps(self) -> float:
@@ -83,14 +92,14 @@ class LeRobotFiles:
         return dict(self.info["features"])
 
     def shape(self, column: str) -> tuple[int, ...]:
-        """Return the shape of a column's values; of a camera `(H, W, 3)`, however it is told."""
+        """Return the shape of a column's values; of a camera `(H, W, 3)`, even if stored first."""
         feature = self.info["features"][column]
         shape = tuple(feature["shape"])
         if feature["dtype"] in ("video", "image"):
             if len(shape) == 3 and shape[2] != 3:
                 shape = (*shape[1:], shape[0])
             if len(shape) != 3 or shape[2] != 3:
-                what = f"{INFO_PATH} says that {column} has shape {feature['shape']}"
+                what = f"{column} has shape {feature['shape']} in {INFO_PATH}"
                 raise FormatError.damaged(self.files.describe(), what)
         return shape
 
@@ -136,39 +145,39 @@ class LeRobotFiles:
 
     def locate(self, index: int) -> EpisodeLocation:
         """Return where an episode lies."""
-        return place_episode(self.info, index, self.row(index), self.files.describe())
+        return _locate_episode(self.info, index, self.row(index), self.files.describe())
 
     def rows(self, index: int) -> RowSpan:
         """Return the rows of an episode in its data file."""
-        place = self.locate(index)
-        path = self.files.path(place.data)
-        whole = RowSpan(path)
-        found = np.flatnonzero(whole.scalars("episode_index") == index)
+        location = self.locate(index)
+        path = self.files.path(location.data)
+        file = RowSpan(path)
+        found = np.flatnonzero(file.scalars("episode_index") == index)
         start = int(found[0]) if len(found) else 0
-        rows = whole.part(start, start + len(found))
-        numbers = np.arange(len(found))  # as many as there are, whatever length the metadata says
+        rows = file.part(start, start + len(found))
+        numbers = np.arange(len(found))  # not `location.length`, which may be huge
         if (
-            len(found) != place.length
+            len(found) != location.length
             or (found != start + numbers).any()
             or (rows.scalars("frame_index") != numbers).any()
         ):
-            raise FormatError(
-                f"{path} holds {len(found)} rows of episode {index}; {place.length}, one after the "
-                "other and counted from 0, are expected",
-                "The dataset is damaged: download or build it again.",
+            what = (
+                f"{len(found)} rows of episode {index}; expected {location.length}, one after the "
+                "other, with a frame_index from 0"
             )
+            raise FormatError.damaged(path, what)
         return rows
 
     def vectors(self, index: int, column: str) -> NDArray[np.float32]:
         """Read a column of vectors of an episode, `(T, D) float32`."""
         rows = self.rows(index)
         values = rows.vectors(column)
-        if values.shape[1:] != self.shape(column) or values.shape[1] > _MOST_NUMBERS:
-            raise FormatError.damaged(
-                rows.path,
-                f"{column} of episode {index} has {values.shape[1]} values a frame; info.json "
-                f"says {self.shape(column)}",
+        if values.shape[1:] != self.shape(column) or values.shape[1] > _MAX_VECTOR:
+            what = (
+                f"{column} of episode {index} has {values.shape[1]} values a frame; info.json has "
+                f"{self.shape(column)}"
             )
+            raise FormatError.damaged(rows.path, what)
         return values
 
     def iter_frames(
@@ -186,7 +195,7 @@ class LeRobotFiles:
         if not 0 <= start <= stop <= length:
             raise FormatError(
                 f"episode {index} of {self.files.describe()} has {length} stored frames; frames "
-                f"{start} to {stop - 1} were asked for"
+                f"{start} to {stop - 1} were requested"
             )
 
     def _v30_table(self) -> pa.Table:
@@ -195,29 +204,116 @@ class LeRobotFiles:
         if not paths:
             raise MissingFileError(
                 f"{EPISODES_DIR} holds no parquet file in {self.files.describe()}",
-                "The dataset is not complete: download or build it again.",
+                "The dataset is incomplete: download or build it again.",
             )
         tables = []
         for path in paths:
             file = open_parquet(path)
-            told = (field for field in file.schema_arrow if is_plain(field.type))
-            names = [field.name for field in told if not field.name.startswith("stats/")]
-            tables.append(read_table(file, path, names))
-            if sum(table.nbytes for table in tables) > _MOST_BYTES:
-                raise FormatError.damaged(path, f"with others over {_MOST_BYTES:,} bytes")
+            columns = [field.name for field in file.schema_arrow if is_plain(field.type)]
+            columns = [name for name in columns if not name.startswith("stats/")]
+            tables.append(read_table(file, path, columns))
+            if sum(table.nbytes for table in tables) > _MAX_TABLE_BYTES:
+                what = f"the episode tables have over {_MAX_TABLE_BYTES:,} bytes"
+                raise FormatError.damaged(path, what)
         with reading(paths[0]):  # files with columns of different types
             return pa.concat_tables(tables)
 
     def _v21_table(self) -> pa.Table:
         rows = list(self._json_lines(_V21_EPISODES))
         names = dict.fromkeys(name for row in rows for name in row)
-        if len(names) > _MOST_COLUMNS:
-            raise FormatError.damaged(self.files.path(_V21_EPISODES), f"{len(names)} columns")
-        with reading(self.files.path(_V21_EPISODES)):
+        path = self.files.path(_V21_EPISODES)
+        if len(names) > _MAX_COLUMNS:
+            raise FormatError.damaged(path, f"{len(names)} columns")
+        with reading(path):
             return pa.table({name: [row.get(name) for row in rows] for name in names})
 
     def _json_lines(self, relative: str) -> Iterator[dict[str, Any]]:
         path = self.files.path(relative)
-        for number, line in enumerate(read_bytes(path, _MOST_LINES).splitlines(), 1):
+        for number, line in enumerate(read_bytes(path, _MAX_LINES_BYTES).splitlines(), 1):
             if line.strip():
                 yield parse_json(line, f"{path}, line {number}")
+
+
+def _check_info(info: dict[str, Any], path: object) -> None:
+    """Check types and sizes of what is read from `info.json`."""
+
+    def check(valid: bool, name: str) -> None:
+        if not valid:
+            raise FormatError.damaged(path, f"{name} is {repr(info.get(name))[:200]}")
+
+    def is_count(value: Any, least: int, most: int) -> bool:
+        return isinstance(value, int) and least <= value <= most
+
+    def is_template(value: Any) -> bool:
+        return isinstance(value, str) and len(value) <= _MAX_TEMPLATE
+
+    fps, features = info.get("fps"), info.get("features")
+    check(isinstance(fps, int | float) and _FPS[0] <= fps <= _FPS[1], "fps")
+    check(is_count(info.get("total_episodes"), 0, _MAX_EPISODES), "total_episodes")
+    check(is_count(info.get("chunks_size", 1000), 1, _MAX_EPISODES), "chunks_size")
+    check(is_template(info.get("data_path")), "data_path")
+    check(isinstance(features, dict) and 0 < len(features) <= _MAX_FEATURES, "features")
+    for name, feature in features.items() if isinstance(features, dict) else ():
+        check(len(name) <= _MAX_NAME and isinstance(feature, dict), "features")
+        check(isinstance(feature.get("dtype"), str), "features")
+        shape = feature.get("shape")
+        check(isinstance(shape, list) and len(shape) <= _MAX_SIDES, "features")
+        check(all(is_count(side, 1, _MAX_VALUES) for side in shape), "features")
+        check(math.prod(shape) <= _MAX_VALUES, "features")
+        described = (feature.get("info", {}), feature.get("video_info", {}))
+        check(all(one is None or isinstance(one, dict) for one in described), "features")
+        check(feature["dtype"] != "video" or is_template(info.get("video_path")), "video_path")
+
+
+def fill_template(template: str, where: object, **values: str | int) -> str:
+    """Fill in a path template of `info.json`: `{name}` and `{name:03d}`, nothing else."""
+    invalid = FormatError.damaged(where, f"the path template {template!r} cannot be filled in")
+
+    def fill(match: re.Match[str]) -> str:
+        value = values.get(match[1])
+        if value is None or (match[2] and not isinstance(value, int)):
+            raise invalid
+        return f"{value:0{match[2]}d}" if match[2] else str(value)
+
+    filled = _FIELD.sub(fill, template)
+    if "{" in filled or "}" in filled:
+        raise invalid
+    return filled
+
+
+def _locate_episode(
+    info: dict[str, Any], index: int, row: dict[str, Any], where: str
+) -> EpisodeLocation:
+    """Return where an episode lies, given its per-episode columns."""
+    old = info["codebase_version"] == "v2.1"
+
+    def whole(name: str) -> int:
+        value = row.get(name)
+        if not isinstance(value, int) or not 0 <= value <= _MAX_FRAME:
+            raise FormatError.damaged(where, f"{name} of episode {index} is {value!r}")
+        return value
+
+    def path(template: str, key: str, **more: str) -> str:
+        if old:
+            chunk = index // info.get("chunks_size", 1000)
+            return fill_template(template, where, episode_chunk=chunk, episode_index=index, **more)
+        chunk, file = whole(f"{key}/chunk_index"), whole(f"{key}/file_index")
+        return fill_template(template, where, chunk_index=chunk, file_index=file, **more)
+
+    def first_frame(key: str) -> int:
+        name, fps = f"{key}/from_timestamp", info["fps"]
+        start: Any = 0.0 if old else row.get(name)
+        valid = isinstance(start, int | float) and 0 <= start < 1e9
+        if not valid or (frame := round(start * fps)) > _MAX_FRAME:
+            raise FormatError.damaged(where, f"{name} is {start!r}")
+        if abs(frame - start * fps) > 0.1:
+            raise FormatError.damaged(where, f"{name} {start!r} lies between two frames")
+        return frame
+
+    videos = {
+        name: (path(info["video_path"], key, video_key=name), first_frame(key))
+        for name, feature in info["features"].items()
+        if feature["dtype"] == "video"
+        for key in (f"videos/{name}",)
+    }
+    return EpisodeLocation(whole("length"), path(info["data_path"], "data"), videos)

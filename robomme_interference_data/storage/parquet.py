@@ -1,7 +1,7 @@
-"""Read parquet files: spans of rows, values out of columns, and one clear error for damage; write.
+"""Read spans of rows and values of columns from parquet files; write parquet files.
 
-`pyarrow.parquet.read_table` with filters is left aside: its scanner takes seconds to load, and
-can wait forever on a damaged file.
+`pyarrow.parquet.read_table` with filters is not used: its scanner takes seconds to load, and may
+hang on a damaged file.
 """
 
 import os
@@ -20,29 +20,24 @@ from numpy.typing import NDArray
 from robomme_interference_data.errors import FormatError, InterferenceError
 
 from .files import atomic_path
-from .untrusted.parquet_pages import (
-    MOST_FOOTER,
-    decoded_size,
-    read_chunks,
-)
+from .untrusted.parquet_pages import MAX_FOOTER_BYTES, decoded_size, read_chunks
 
 _IMAGES_AT_ONCE = 8
 
-_MOST_LISTED = 1 << 14
-"""Row groups, columns, and other lists in the metadata, at most: for so many, room is made before
-one is read, and columns that lie in each other so deep take so much of the stack."""
+_MAX_LIST = 1 << 14
+"""Length of a list in the metadata, such as row groups: pyarrow allocates memory for it first."""
 
-_MOST_ROWS = 1 << 26
-_MOST_VALUES = 1 << 26
-"""Rows of a file and values of a read, at most: a million rows of a run have a third of them."""
+_MAX_ROWS = 1 << 26
+_MAX_VALUES = 1 << 26
+"""Rows of a file and values of a read: a million rows of a run have a third of them."""
 
-_MOST_BYTES = 2 << 30
-"""Bytes that a read, or the images of a row group, may take once decoded."""
+_MAX_BYTES = 2 << 30
+"""Decoded bytes of a read, or of the images of a row group."""
 
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Turn what pyarrow raises while the block reads a file into one clear error."""
+    """Turn pyarrow's errors on a damaged file into `FormatError`."""
     try:
         yield
     except InterferenceError:
@@ -60,18 +55,18 @@ def open_parquet(path: Path) -> pq.ParquetFile:
             pa.OSFile(os.fsencode(path)),  # as pyarrow cannot encode names that are not UTF-8
             buffer_size=1 << 20,
             page_checksum_verification=True,  # of pages that have one
-            thrift_string_size_limit=MOST_FOOTER,
-            thrift_container_size_limit=_MOST_LISTED,
+            thrift_string_size_limit=MAX_FOOTER_BYTES,
+            thrift_container_size_limit=_MAX_LIST,
         )
-        told = file.metadata
-        if [len(group) for group in chunks] != [told.num_columns] * told.num_row_groups:
+        metadata = file.metadata
+        if [len(group) for group in chunks] != [metadata.num_columns] * metadata.num_row_groups:
             raise ValueError("its row groups do not have the columns of its schema")
-        rows = [told.row_group(group).num_rows for group in range(told.num_row_groups)]
-        if min(rows, default=0) < 0 or sum(rows) != told.num_rows:
-            raise ValueError(f"{told.num_rows} rows; its row groups have {sum(rows)}")
-        if told.num_rows > _MOST_ROWS:
-            raise ValueError(f"{told.num_rows:,} rows; at most {_MOST_ROWS:,} are read")
-        _ = file.schema_arrow.names  # which may be no text
+        rows = [metadata.row_group(group).num_rows for group in range(metadata.num_row_groups)]
+        if min(rows, default=0) < 0 or sum(rows) != metadata.num_rows:
+            raise ValueError(f"{metadata.num_rows} rows; its row groups have {sum(rows)}")
+        if metadata.num_rows > _MAX_ROWS:
+            raise ValueError(f"{metadata.num_rows:,} rows; expected at most {_MAX_ROWS:,}")
+        _ = file.schema_arrow.names  # raises if a name is not UTF-8
         return file
 
 
@@ -81,14 +76,7 @@ def read_table(
     columns: Sequence[str] | None = None,
     groups: Sequence[int] | None = None,
 ) -> pa.Table:
-    """Return columns of a file, checked value by value: texts are texts, lists lie where they say.
-
-    Args:
-        file: What `open_parquet` returned.
-        path: The file's path.
-        columns: Names of the columns; None for all.
-        groups: Numbers of row groups; None for all.
-    """
+    """Return columns and row groups of an open file (None for all), with every value validated."""
     chosen = range(file.num_row_groups) if groups is None else groups
     names = None if columns is None else list(columns)
     with reading(path):
@@ -106,27 +94,30 @@ def read_table(
 def _check_size(
     file: pq.ParquetFile, path: Path, columns: list[str] | None, groups: Sequence[int]
 ) -> None:
-    """Refuse what would take too much memory."""
+    """Raise if a read would take too much memory."""
     size = values = 0
-    told = [file.metadata.schema.column(number) for number in range(file.metadata.num_columns)]
-    wanted = None if columns is None else tuple(f"{name}." for name in columns)
-    numbers = [n for n, c in enumerate(told) if wanted is None or f"{c.path}.".startswith(wanted)]
+    every = [file.metadata.schema.column(number) for number in range(file.metadata.num_columns)]
+    prefixes = None if columns is None else tuple(f"{name}." for name in columns)
+    chosen = [
+        (number, column)
+        for number, column in enumerate(every)
+        if prefixes is None or f"{column.path}.".startswith(prefixes)
+    ]
     chunks = read_chunks(path)
-    with path.open("rb") as bare:
+    with path.open("rb") as raw:
         for group in groups:
-            for number in numbers:
-                chunk, column = chunks[group][number], told[number]
+            for number, column in chosen:
+                chunk = chunks[group][number]
                 values += chunk.values
-                kind, length = column.physical_type, column.length
-                size += decoded_size(bare, chunk, kind, length, _MOST_BYTES)
-                if size > _MOST_BYTES or values > _MOST_VALUES:
-                    what = f"over {_MOST_BYTES:,} bytes or {_MOST_VALUES:,} values once decoded"
+                size += decoded_size(raw, chunk, column.physical_type, column.length, _MAX_BYTES)
+                if size > _MAX_BYTES or values > _MAX_VALUES:
+                    what = f"over {_MAX_BYTES:,} bytes or {_MAX_VALUES:,} values once decoded"
                     raise ValueError(what)
 
 
 @contextmanager
 def writing(path: Path) -> Iterator[BinaryIO]:
-    """Open a file for pyarrow to write, whole or not at all: it cannot encode every name itself."""
+    """Open a file for pyarrow to write atomically; by name, it requires UTF-8."""
     with atomic_path(path) as partial, partial.open("wb") as file:
         yield file
 
@@ -138,32 +129,27 @@ _PLAIN = {pa.null(), pa.bool_(), *_NUMBERS, *_UNSIGNED, *_TEXTS}
 
 
 def is_listed(kind: pa.DataType) -> bool:
-    """Tell whether a type is one of Arrow's lists."""
+    """Return whether a type is one of Arrow's lists."""
     return bool(
         pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
     )
 
 
 def is_plain(kind: pa.DataType) -> bool:
-    """Tell whether values of a type are texts, numbers, truth values, or made of these."""
+    """Return whether a type is text, bytes, number, bool, or a list or struct of these."""
     if pa.types.is_dictionary(kind) or is_listed(kind):
         return is_plain(kind.value_type)
     if pa.types.is_struct(kind):
-        named = len({field.name for field in kind}) == kind.num_fields
-        return named and all(is_plain(field.type) for field in kind)
+        unique = len({field.name for field in kind}) == kind.num_fields
+        return unique and all(is_plain(field.type) for field in kind)
     return kind in _PLAIN
 
 
 class RowSpan:
-    """Rows of a parquet file that lie one after the other.
+    """The rows `start` to `stop` (excluded; None for all) of a parquet file.
 
-    Only the row groups that hold them are read. The statistics of row groups are never asked:
-    pyarrow ends the process where those are damaged.
-
-    Args:
-        path: The file.
-        start: First row.
-        stop: Row after the last one; None for all that there are.
+    Only the row groups that hold them are read. The statistics of row groups are never used:
+    damaged ones crash pyarrow.
     """
 
     def __init__(self, path: Path, start: int = 0, stop: int | None = None):
@@ -176,7 +162,7 @@ class RowSpan:
         return self.stop - self.start
 
     def part(self, start: int, stop: int) -> "RowSpan":
-        """Return rows of the same file, numbered as in the file; it is not opened again."""
+        """Return other rows of the same open file, numbered as in the file."""
         part = copy(self)
         part.start, part.stop = start, stop
         return part
@@ -193,35 +179,35 @@ class RowSpan:
         groups, first = self._row_groups()
         table = read_table(self._file, self.path, columns, groups)
         rows = table.slice(self.start - first, len(self))
-        if len(rows) < len(self):  # a damaged column may hold fewer than the file says
-            what = f"{len(rows)} rows of {', '.join(rows.column_names)}, not {len(self)}"
+        if len(rows) < len(self):  # a damaged column may be shorter
+            what = f"{len(rows)} rows of {', '.join(rows.column_names)}; expected {len(self)}"
             raise FormatError.damaged(self.path, what)
         return rows
 
     def scalars(self, name: str) -> NDArray[np.int64]:
         """Return a column of booleans or integers, or of lists of one such value, `(T,) int64`."""
-        column, what = self.table([name])[name], f"column {name!r}"
+        column = self.table([name])[name]
         kind = column.type
         if is_listed(kind):
             column, kind = pc.list_flatten(column), kind.value_type
             if len(column) != len(self):
-                raise FormatError.damaged(self.path, f"{what} has lists of several values")
+                raise FormatError.damaged(self.path, f"column {name!r} has lists of several values")
         if not (pa.types.is_boolean(kind) or pa.types.is_integer(kind)) or column.null_count:
             raise FormatError(
-                f"{self.path}: {what} is of type {kind} with {column.null_count} empty values; "
-                "expected booleans or integers, none empty"
+                f"{self.path}: column {name!r} is of type {kind} with {column.null_count} empty "
+                "values; expected booleans or integers, none empty"
             )
         with reading(self.path):  # a number too large
             return np.asarray(pc.cast(column, pa.int64()).to_numpy())
 
     def texts(self, name: str) -> list[str]:
-        """Return a column of texts; one that is missing is empty."""
+        """Return a column of texts, with empty ones for nulls."""
         column = self.table([name])[name]
         if not (pa.types.is_string(column.type) or pa.types.is_large_string(column.type)):
             raise FormatError(
                 f"{self.path}: column {name!r} is of type {column.type}; expected texts"
             )
-        with reading(self.path):  # what is no UTF-8
+        with reading(self.path):  # invalid UTF-8
             return [text or "" for text in column.to_pylist()]
 
     def vectors(self, name: str) -> NDArray[np.float32]:
@@ -236,16 +222,15 @@ class RowSpan:
             raise FormatError(
                 f"{what} has empty values or vectors of several lengths: "
                 f"{sorted(lengths.drop_null().to_pylist())}",
-                "Every row needs a vector, and all of them the same length.",
+                "Every row needs a vector of the same length.",
             )
         values = flat.to_numpy().reshape(len(column), lengths[0].as_py())
         return np.ascontiguousarray(values, dtype=np.float32)
 
     def images(self, name: str) -> Iterator[bytes]:
-        """Yield the encoded images of a column in order, a few of them in memory at a time.
+        """Yield the encoded images of a column of structs with the field `bytes`, in order.
 
-        The column is a struct with the field `bytes`, as Hugging Face `Image` columns are. At
-        most the encoded bytes of one row group are held, and less where the writer allows it.
+        At most one row group is held in memory, and less if the file's pages are smaller.
         """
         kind = self._type(name)
         stored = pa.types.is_struct(kind) and kind.get_field_index("bytes") >= 0

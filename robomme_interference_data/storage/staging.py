@@ -1,4 +1,4 @@
-"""Make a folder whole or not at all: beside its place, by one process at a time."""
+"""Create a folder atomically, by one process at a time."""
 
 import fcntl
 import shutil
@@ -11,17 +11,15 @@ from robomme_interference_data.errors import BuildError, InterferenceError
 from .files import with_filename
 
 _BEFORE = "before"
-"""Name in a staging folder of what is being replaced."""
+"""Name of the replaced folder in a staging folder."""
 
 
 @contextmanager
 def file_lock(lock: Path, busy: InterferenceError) -> Iterator[None]:
-    """Hold a lock file until the block ends; the lock goes with the process, however it ends.
+    """Hold a lock file until the block or the process ends; raise `busy` if another one holds it.
 
-    Args:
-        lock: The file, made if need be and left behind. Not the folder itself: network file
-            systems lock only what is open for writing.
-        busy: Raised if another process holds it.
+    The file remains. A folder cannot be locked: network file systems lock only files that are open
+    for writing.
     """
     with lock.open("a") as file:
         try:
@@ -32,23 +30,23 @@ def file_lock(lock: Path, busy: InterferenceError) -> Iterator[None]:
 
 
 def staging_path(out: Path) -> Path:
-    """Return the hidden folder beside `out` in which `out` is made."""
+    """Return the hidden folder next to `out` in which `out` is built."""
     return out.parent / f".{out.name}.building"
 
 
 @contextmanager
 def staging_dir(out: Path) -> Iterator[Path]:
-    """Make and lock the folder in which `out` is made, for one process at a time.
+    """Create and lock the staging folder of `out`; `replace_folder` moves the result to `out`.
 
-    What is made there becomes `out` by `replace_folder`. If the block succeeds, the staging folder
-    is removed; if it fails, it stays for the next attempt, unless nothing in it is finished.
+    If the block succeeds, the staging folder is removed; if it fails, it stays for the next
+    attempt, unless nothing in it is finished.
     """
     work = staging_path(out)
     work.mkdir(parents=True, exist_ok=True)
-    busy = BuildError(f"another process makes {out}", "Wait for it to end, or stop it.")
+    busy = BuildError(f"another process is building {out}", "Wait for it to end, or stop it.")
     with file_lock(work / "lock", busy):
         before, finished = work / _BEFORE, False
-        if before.exists() and not out.exists():  # killed while it was replaced
+        if before.exists() and not out.exists():  # killed during `replace_folder`
             before.rename(out)
         shutil.rmtree(before, ignore_errors=True)
         try:
@@ -61,9 +59,9 @@ def staging_dir(out: Path) -> Iterator[Path]:
 
 
 def replace_folder(made: Path, out: Path) -> None:
-    """Let a folder in the staging folder of `out` become `out`, instead of what is there.
+    """Move a folder from the staging folder of `out` to `out`, which it replaces.
 
-    If the process is killed in between, the next `staging_dir` puts the old folder back.
+    If the process is killed in between, the next `staging_dir` restores the old folder.
     """
     before = staging_path(out) / _BEFORE
     if out.exists():

@@ -1,7 +1,7 @@
-"""Decode spans of frames from a video file: the only place that reads video.
+"""Decode spans of frames from a video file: the only module that reads video.
 
-A LeRobot v3 video file holds many episodes one after the other at a constant frame rate, so a
-frame is named by its number in the file: its presentation time multiplied by the rate.
+A LeRobot v3 video file holds consecutive episodes at a constant frame rate, so a frame is
+identified by its number in the file: its presentation time multiplied by the rate.
 """
 
 from collections.abc import Generator, Iterator
@@ -17,39 +17,26 @@ from robomme_interference_data.errors import FormatError, MissingFileError
 from .untrusted.video_boxes import find_container, unreadable
 
 MOST_PIXELS = 1 << 24
-"""Pixels of a frame, at most: twice those of 3840 × 2160."""
+"""Upper bound on the pixels of a frame: twice 3840 × 2160."""
 
 _LATEST = 1 << 62
-"""What FFmpeg can seek to, in ticks of a container."""
+"""Upper bound on the ticks of a container to which FFmpeg can seek."""
 
 _DECODERS = (
     *("libdav1d", "libaom-av1", "av1", "h264", "hevc", "vp8", "vp9", "mpeg4", "mjpeg"),
     *("ffv1", "png", "rawvideo", "huffyuv", "ffvhuff", "utvideo", "qtrle"),
 )
-"""Decoders that are used, of FFmpeg's hundreds: those of LeRobot's codecs, and lossless ones."""
+"""FFmpeg's decoders that are used: those of LeRobot's codecs, and lossless ones."""
 
 
 def iter_frames(
-    path: Path,
-    start: int,
-    stop: int | None,
-    fps: float,
-    shape: tuple[int, ...] | None = None,
+    path: Path, start: int, stop: int | None, fps: float, shape: tuple[int, ...] | None = None
 ) -> Generator[NDArray[np.uint8]]:
-    """Decode the frames `start` (included) to `stop` (excluded) of a video file, in order.
+    """Decode the frames `start` to `stop` (excluded; None for all) of a video file, in order.
 
-    Decoding runs on the calling thread and holds one frame at a time. Every frame's presentation
-    time is checked, so that a frame can neither be missing nor come twice.
-
-    Args:
-        path: The video file.
-        start: Number of the first frame in the file.
-        stop: Number after the last frame; None for all that there are.
-        fps: Constant frame rate of the file, in Hz.
-        shape: Shape that every frame must have, `(H, W, 3)`; None for any.
-
-    Yields:
-        Frames, `(H, W, 3) uint8` RGB. The array is the caller's.
+    Frames are `(H, W, 3) uint8` RGB; `shape` is the shape that they must have. Decoding runs on the
+    calling thread and holds one frame at a time. Every frame's presentation time is checked, so
+    that no frame is missing or duplicated.
     """
     expected = start
     with closing(_indexed_frames(path, start, fps, shape)) as frames:
@@ -57,10 +44,8 @@ def iter_frames(
             return
         for number, frame in frames:
             if number != expected:
-                raise FormatError(
-                    f"{path}: frame {expected} is missing (the next one found is {number})",
-                    "The file is damaged: download or build it again.",
-                )
+                what = f"frame {expected} is missing; the next frame is {number}"
+                raise FormatError.damaged(path, what)
             if shape is not None:
                 _check_shape(path, (frame.height, frame.width), shape)
             yield _to_rgb(path, frame)
@@ -68,20 +53,18 @@ def iter_frames(
             if expected == stop:
                 return
     if stop is not None or expected == start:
-        wanted = "at least one frame" if stop is None else f"frames {start} to {stop - 1}"
-        raise FormatError(
-            f"{path}: the video ends before frame {expected}; expected {wanted}",
-            "The file is damaged or incomplete: download or build it again.",
-        )
+        frames_expected = "a frame" if stop is None else f"frames {start} to {stop - 1}"
+        what = f"the video ends before frame {expected}; expected {frames_expected}"
+        raise FormatError.damaged(path, what)
 
 
 def _to_rgb(path: Path, frame: av.VideoFrame) -> NDArray[np.uint8]:
     try:
-        # Planar RGB (the lossless codec) is only re-arranged, without the colour converter.
+        # Planar RGB (the lossless codec) needs no color conversion.
         planar = frame.format.name == "gbrp"
         return frame.to_ndarray() if planar else frame.to_ndarray(format="rgb24")
     except (av.error.FFmpegError, ValueError) as error:
-        raise FormatError.damaged(path, f"a frame has no colours: {error}") from None
+        raise FormatError.damaged(path, f"a frame cannot be converted to RGB: {error}") from None
 
 
 @contextmanager
@@ -104,14 +87,14 @@ def open_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.Vid
         stream = container.streams.video[0]
         context = stream.codec_context
         if context is None:  # a header cut short; PyAV would crash the process
-            raise unreadable(path, "its codec is not known")
+            raise unreadable(path, "its codec is unknown")
         if context.name not in _DECODERS or not stream.time_base:
             what = f"codec {context.name}, time base {stream.time_base}"
             raise unreadable(path, what)
         if context.width * context.height > MOST_PIXELS:
             raise unreadable(path, f"frames of {context.width}×{context.height} pixels")
         context.options = limits
-        stream.thread_count = 1  # sessions are decoded side by side instead
+        stream.thread_count = 1  # sessions are decoded in parallel
         yield container, stream
 
 
@@ -124,7 +107,7 @@ def _indexed_frames(
             _check_shape(path, (stream.height, stream.width), shape)
         tick = float(stream.time_base) * fps
         if start / tick >= _LATEST:
-            raise FormatError.damaged(path, f"no video has a frame {start} at {fps:g} Hz")
+            raise FormatError.damaged(path, f"there is no frame {start} at {fps:g} Hz")
         try:
             if start > 0:
                 container.seek(round(start / tick), stream=stream, backward=True)
@@ -132,8 +115,8 @@ def _indexed_frames(
             for frame in container.decode(stream):
                 number = _number(path, frame, tick, fps)
                 if first and number > start:
-                    # The seek index was off (some muxers mark no earlier key frame): read from
-                    # the beginning instead, slower and always right.
+                    # The seek went too far (some muxers mark no earlier key frame): read from the
+                    # beginning, which is slower and always right.
                     container.seek(0, stream=stream, backward=True)
                     yield from (
                         (n, f)
@@ -145,17 +128,14 @@ def _indexed_frames(
                 if number >= start:
                     yield number, frame
         except av.error.FFmpegError as error:
-            raise FormatError(
-                f"{path}: decoding stopped: {error}",
-                "The file is damaged or incomplete: download or build it again.",
-            ) from error
+            raise FormatError.damaged(path, f"decoding stopped: {error}") from error
 
 
 def _check_shape(path: Path, found: tuple[int, ...], shape: tuple[int, ...]) -> None:
     if found != shape[:2]:
         raise FormatError(
-            f"{path}: frames are {found[1]}×{found[0]} pixels; the dataset's info.json says "
-            f"{shape[1]}×{shape[0]}"
+            f"{path}: frames have {found[1]}×{found[0]} pixels; expected {shape[1]}×{shape[0]}, as "
+            "in the dataset's info.json"
         )
 
 
@@ -166,7 +146,7 @@ def _number(path: Path, frame: av.VideoFrame, tick: float, fps: float) -> int:
     number = round(position)
     if abs(position - number) > 0.1:
         raise FormatError(
-            f"{path}: a frame lies at {position / fps:.4f} s, between frames {int(position)} and "
+            f"{path}: a frame at {position / fps:.4f} s lies between frames {int(position)} and "
             f"{int(position) + 1} at {fps:g} frames per second"
         )
     return number

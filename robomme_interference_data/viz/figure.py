@@ -1,10 +1,9 @@
-"""Figures saved as PNG or SVG with the same bytes each time, and a page to draw on by inches.
+"""Reproducible PNG and SVG figures, and a page whose coordinates are inches.
 
-`open_figure` is the one place where matplotlib is set up. On a page, lengths are inches from the
-upper left corner, y going down; font sizes and line widths are points.
+Only `open_figure` sets up matplotlib. On a page, the origin is the upper left corner and y points
+down; font sizes and line widths are points.
 """
 
-import gc
 import warnings
 from bisect import bisect_right
 from collections.abc import Iterator
@@ -21,7 +20,7 @@ INK, GREY = "#222222", "#767676"
 
 
 class Hue:
-    """Okabe and Ito's colours, which people with a colour vision deficiency can tell apart, too."""
+    """The color-blind-safe colors of Okabe and Ito."""
 
     BLUE, SKY, GREEN, YELLOW = "#0072B2", "#56B4E9", "#009E73", "#F0E442"
     ORANGE, VERMILION, PINK = "#E69F00", "#D55E00", "#CC79A7"
@@ -29,25 +28,21 @@ class Hue:
 
 _DPI = 180
 MAKER = "robomme-interference"
-"""What a picture says that it was made by."""
+"""Recorded in each file as the program that wrote it."""
 
 _METADATA: dict[str, dict[str, str | None]] = {
     ".png": {"Software": MAKER},
     ".svg": {"Creator": MAKER, "Date": None, "Format": None, "Type": None},
+    ".pdf": {"Creator": MAKER, "Producer": None, "CreationDate": None},
 }
-"""For each suffix that can be written, what it says; without matplotlib's version and the date."""
+"""Metadata written for each supported suffix, without matplotlib's version and the date."""
 
 
 @contextmanager
 def open_page(out: Path, width: float) -> Iterator["Page"]:
-    """Give a page that is written to `out`, atomically, when the block ends without an error.
+    """Yield a page of this width, in inches, and write it atomically if the block succeeds.
 
-    The reader's own matplotlib settings have no effect. The same drawing gives the same bytes
-    with the same version of matplotlib.
-
-    Args:
-        out: File to write, `.png` or `.svg`.
-        width: Width of the page in inches; its height is set in the block.
+    The block sets the page's height. The user's matplotlib settings have no effect.
     """
     _suffix(out)  # before anything is drawn
     with open_figure() as figure:
@@ -60,9 +55,9 @@ def open_page(out: Path, width: float) -> Iterator["Page"]:
 
 @contextmanager
 def open_figure() -> Iterator[Any]:
-    """Give an empty white matplotlib `Figure`; the reader's own settings have no effect.
+    """Yield an empty white matplotlib `Figure`; the user's settings have no effect.
 
-    It is drawn, and saved with `save_figure`, inside the block.
+    Draw it, and save it with `save_figure`, inside the block.
     """
     try:
         import matplotlib.style
@@ -72,26 +67,21 @@ def open_figure() -> Iterator[Any]:
     settings: dict[str, Any] = {"svg.hashsalt": MAKER, "image.composite_image": False}
     names = ("text.color", "axes.labelcolor", "xtick.color", "ytick.color")
     settings |= dict.fromkeys(names, INK)
-    settings |= {"svg.fonttype": "none"}  # text stays text: small, quick, to be found and read out
-    settings |= {"font.sans-serif": ["DejaVu Sans", "Verdana"]}  # it is named with each text
+    settings |= {
+        "svg.fonttype": "none"
+    }  # small files, and text that can be searched and read aloud
+    settings |= {"font.sans-serif": ["DejaVu Sans", "Verdana"]}  # recorded with each text
     with (
         matplotlib.style.context("default"),
         matplotlib.rc_context(settings),
         warnings.catch_warnings(),
     ):
         warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)
-        # Of so many objects the search for garbage takes a fifth of the time.
-        searched = gc.isenabled()
-        gc.disable()
-        try:
-            yield Figure(facecolor="white")
-        finally:
-            if searched:
-                gc.enable()
+        yield Figure(facecolor="white")
 
 
 def save_figure(figure: Any, out: Path) -> None:
-    """Write a figure to `.png` or `.svg`, atomically, without the date and the version."""
+    """Write a figure to `.png` or `.svg`, atomically, without date and version."""
     suffix = _suffix(out)
     try:
         with atomic_path(out) as partial:
@@ -115,11 +105,7 @@ def _suffix(out: Path) -> str:
 
 
 class Page:
-    """A page to draw on; made by `open_page`. What is drawn later lies on top, text uppermost.
-
-    Attributes:
-        height: Height in inches; to be set before the page is saved.
-    """
+    """A page made by `open_page`; set its `height`, in inches, before the block ends."""
 
     def __init__(self, figure: Any, width: float):
         self.figure = figure
@@ -136,7 +122,7 @@ class Page:
         return text_to_path.get_text_width_height_descent(text, font, ismath=False)[0] / 72
 
     def wrap(self, text: str, size: float, width: float, *, most: int) -> list[str]:
-        """Break a text into at most `most` lines; what is too much stays in the last."""
+        """Break a text into at most `most` lines; the last may be too long."""
         lines: list[str] = []
         for word in _printable(text).split():
             longer = f"{lines[-1]} {word}" if lines else word
@@ -157,13 +143,8 @@ class Page:
         align: str = "center",
         bold: bool = False,
         color: str = "black",
-        turned: bool = False,
     ) -> None:
-        """Write a line under `y`, in black or a colour.
-
-        Text that is wider than `width` gets smaller, by a quarter at most, and then loses its
-        middle. `turned` text reads upwards.
-        """
+        """Write a line below `y`; text wider than `width` shrinks by a quarter, or is cut."""
         text = _printable(text)
         if width is not None and (measured := self.text_width(text, size, bold=bold)) > width:
             size *= max(0.75, width / measured)
@@ -178,8 +159,7 @@ class Page:
             color=color,
             horizontalalignment=align,
             verticalalignment="top",
-            rotation=90 if turned else 0,
-            parse_math=False,  # a goal may hold dollar signs
+            parse_math=False,  # a goal may contain dollar signs
         )
 
     def _shortened(self, text: str, size: float, width: float, bold: bool) -> str:
@@ -212,7 +192,7 @@ class Page:
         )
 
     def tick(self, x: float, top: float, bottom: float) -> None:
-        """Draw a short upright line."""
+        """Draw a short vertical line."""
         self.axes.vlines(x, top, bottom, color="black", linewidth=0.7)
 
     def arrow(self, left: float, right: float, y: float) -> None:
@@ -228,7 +208,7 @@ def _printable(text: str) -> str:
 
 
 def tidy(axes: Any) -> None:
-    """Take away from axes what carries nothing."""
+    """Remove the decoration of axes, and add horizontal grid lines."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(GREY)
     axes.tick_params(colors=INK, labelsize=8, length=3)
@@ -237,34 +217,34 @@ def tidy(axes: Any) -> None:
 
 
 def tint(color: str, share: float) -> str:
-    """Return a colour (`#rrggbb`) mixed with white, of which it makes up `share`."""
+    """Return a mixture of white and a share of a color, as `#rrggbb`."""
     return "#" + "".join(f"{round(255 * (1 - share * (1 - v))):02x}" for v in _rgb(color))
 
 
 def ink_on(color: str) -> str:
-    """Return the ink, black or white, that has the higher contrast (WCAG 2) on a colour."""
+    """Return black or white, whichever has the higher contrast (WCAG 2) with a color."""
     linear = [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in _rgb(color)]
     luminance = sum(w * v for w, v in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
     return "black" if (luminance + 0.05) ** 2 > 1.05 * 0.05 else "white"
 
 
-def mapped(colours: str, share: float) -> str:
-    """Return the colour, `#rrggbb`, that one of matplotlib's colour maps has at a share."""
+def mapped(color_map: str, share: float) -> str:
+    """Return the color of a matplotlib color map at a value from 0 to 1, as `#rrggbb`."""
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
 
-    return str(to_hex(colormaps[colours](share)))
+    return str(to_hex(colormaps[color_map](share)))
 
 
 def right_of(axes: Any, inches: float) -> Any:
-    """Return the transform of what lies so far right of axes; its y is in data."""
+    """Return the transform for artists some inches right of axes; y is in data units."""
     from matplotlib.transforms import ScaledTranslation
 
     return axes.get_yaxis_transform() + ScaledTranslation(inches, 0, axes.figure.dpi_scale_trans)
 
 
 def connect_right(axes: Any, value: float, label: float, inches: float, **line: Any) -> Any:
-    """Draw a line from a value on the right edge of axes to the height of its label beside it."""
+    """Draw a line from a value at the right edge of axes to the height of its label."""
     from matplotlib.patches import ConnectionPatch
 
     ends = {"coordsA": right_of(axes, 0), "coordsB": right_of(axes, inches)}

@@ -1,12 +1,14 @@
-"""Tables as data, for terminals, and as CSV and Markdown: the one renderer of all of them."""
+"""Tables as data, and as text for terminals, CSV, Markdown, LaTeX and HTML."""
 
 import csv
 import io
 import math
+import shutil
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
-from textwrap import wrap
+from itertools import zip_longest
+from textwrap import fill, wrap
 from typing import Any, Literal, Self, cast
 
 import pyarrow as pa
@@ -18,7 +20,7 @@ Kind = Literal["text", "count", "rate", "points", "ratio", "p", "flag"]
 
 
 class Provisional(float):
-    """A p-value of what is not complete yet: readers see it marked †."""
+    """A p-value of incomplete data, shown with †."""
 
 
 @dataclass(frozen=True)
@@ -27,8 +29,8 @@ class Column:
 
     Attributes:
         name: Its name.
-        kind: How values are shown. `rate` and `points` are fractions: Markdown shows percent and
-            percentage points, CSV the fraction with six digits after the point.
+        kind: How values are shown. `rate` and `points` are fractions: CSV has six decimals of
+            them, everything else percent and percentage points.
     """
 
     name: str
@@ -41,9 +43,9 @@ class Table:
 
     Attributes:
         name: Name of its files.
-        title: What it shows, in a line.
+        title: Its subject, in a line.
         columns: The columns.
-        rows: A tuple of values a row.
+        rows: Tuples of values.
         note: How to read it, in a sentence or two.
     """
 
@@ -57,14 +59,14 @@ class Table:
     def make(
         cls, name: str, title: str, columns: str, rows: Iterable[tuple[Any, ...]], note: str = ""
     ) -> Self:
-        """Return a table whose columns are given as text, such as `system n:count rate:rate`."""
+        """Return a table with columns such as `system n:count rate:rate`."""
         named = (column.partition(":") for column in columns.split())
-        found = tuple(Column(name, cast(Kind, kind or "text")) for name, _, kind in named)
-        return cls(name, title, found, tuple(rows), note)
+        parsed = tuple(Column(name, cast(Kind, kind or "text")) for name, _, kind in named)
+        return cls(name, title, parsed, tuple(rows), note)
 
     @classmethod
     def of(cls, record: type, rows: Iterable[Any], name: str, title: str) -> Self:
-        """Return records of one type as a table: the columns are those of its Arrow schema."""
+        """Return records of one type as a table with the columns of their Arrow schema."""
         kinds: dict[Any, Kind] = {pa.int64(): "count", pa.float64(): "ratio", pa.bool_(): "flag"}
         schema = arrow_schema(record)
         columns = tuple(Column(field.name, kinds.get(field.type, "text")) for field in schema)
@@ -86,20 +88,18 @@ class Table:
         return out.getvalue()
 
     def _layout(self, left: str, right: str) -> tuple[list[str], list[str], list[list[str]]]:
-        """Return the side of each column, one of two marks, its head, and the rows as read."""
+        """Return the mark of each column's side, the heads, and the rows as text."""
         sides = [left if one.kind in ("text", "flag") else right for one in self.columns]
         heads = [one.name.replace("_", " ") for one in self.columns]
         return sides, heads, [self.cells(row) for row in self.rows]
 
     def cells(self, row: Sequence[Any]) -> list[str]:
-        """Return a row as a reader sees it."""
+        """Return a row as text."""
         return [_shown(v, c.kind) for v, c in zip(row, self.columns, strict=True)]
 
     def markdown(self) -> str:
         """Return the table as Markdown, under its title."""
-        return (
-            "\n\n".join(part for part in (f"# {self.title}", self.grid(), self.note) if part) + "\n"
-        )
+        return "\n\n".join(filter(None, (f"# {self.title}", self.grid(), self.note))) + "\n"
 
     def grid(self) -> str:
         """Return the table as Markdown, without title and note."""
@@ -108,7 +108,7 @@ class Table:
         return "\n".join(f"| {' | '.join(line)} |" for line in [heads, rule, *cells])
 
     def latex(self) -> str:
-        """Return the table as LaTeX, for the package booktabs; title and note are comments."""
+        """Return the table as LaTeX for booktabs; title and note are comments."""
         sides, heads, rows = self._layout("l", "r")
         head, *lines = (" & ".join(map(_tex, line)) for line in [heads, *rows])
         body = "".join(f"{line} \\\\\n" for line in lines)
@@ -123,27 +123,75 @@ class Table:
         sides, heads, rows = self._layout("left", "right")
 
         def line(tag: str, cells: Sequence[str]) -> str:
-            found = (
+            parts = (
                 f'<{tag} style="text-align: {side}">{escape(cell)}</{tag}>'
                 for side, cell in zip(sides, cells, strict=True)
             )
-            return f"<tr>{''.join(found)}</tr>"
+            return f"<tr>{''.join(parts)}</tr>"
 
         body = "".join(line("td", row) for row in rows)
         table = f"<table><thead>{line('th', heads)}</thead><tbody>{body}</tbody></table>"
         return f"<p>{escape(self.title)}</p>{table}<p>{escape(self.note)}</p>"
 
-    def text(self) -> str:
-        """Return the table for a terminal: aligned, under its title, the note below."""
+    def text(self, width: int | None = None) -> str:
+        """Return the table for a terminal: title, aligned columns, note.
+
+        Cells wrap, and columns continue below, to fit the width: by default the terminal's, at
+        least 80.
+        """
+        width = width or max(80, shutil.get_terminal_size().columns)
         sides, heads, rows = self._layout("<", ">")
-        lines = [heads, *rows]
-        widths = [max(map(len, cells)) for cells in zip(*lines, strict=True)]
-        laid = [
-            "  ".join(f"{c:{s}{w}}" for c, s, w in zip(line, sides, widths, strict=True)).rstrip()
-            for line in lines
+        columns = list(zip(heads, *rows, strict=True))
+        widths = [max(map(len, cells)) for cells in columns]
+        least = [
+            min(_MAX_WORD, _longest_word(cells))
+            if column.kind == "text"
+            else max(_longest_word(cells[:1]), *map(len, cells[1:]), 0)
+            for cells, column in zip(columns, self.columns, strict=True)
         ]
-        text = "\n".join([laid[0], "  ".join("-" * width for width in widths), *laid[1:]])
-        return visible("\n\n".join(part for part in (self.title, text, self.note) if part))
+        while sum(widths) + 2 * (len(widths) - 1) > width and widths != least:
+            wrappable = (i for i, size in enumerate(widths) if size > least[i])
+            widths[max(wrappable, key=widths.__getitem__)] -= 1
+        blocks: list[list[int]] = [[]]
+        for column, size in enumerate(widths):
+            if column > 1 and sum(widths[one] + 2 for one in blocks[-1]) + size > width:
+                blocks.append([0])
+            blocks[-1].append(column)
+        parts = [fill(self.title, width)]
+        for block in blocks:
+            formats = [(sides[column], widths[column]) for column in block]
+            rule = "  ".join("-" * size for _, size in formats)
+            lines = [_aligned([row[column] for column in block], formats) for row in [heads, *rows]]
+            parts.append("\n".join([lines[0], rule, *lines[1:]]))
+        parts.append(fill(self.note, width))
+        return visible("\n\n".join(filter(None, parts)))
+
+
+_MAX_WORD = 26
+"""Longer words may be broken to make a table fit."""
+
+
+def _longest_word(cells: Iterable[str]) -> int:
+    return max((len(word) for cell in cells for word in cell.split()), default=0)
+
+
+def _aligned(cells: Sequence[str], formats: Sequence[tuple[str, int]]) -> str:
+    """Return a row, whose cells may take several lines; `formats` has their side and width."""
+    wrapped = [wrap(cell, size) for cell, (_, size) in zip(cells, formats, strict=True)]
+    return "\n".join(
+        "  ".join(f"{c:{s}{w}}" for c, (s, w) in zip(line, formats, strict=True)).rstrip()
+        for line in zip_longest(*wrapped, fillvalue="")
+    )
+
+
+def tables_text(tables: Sequence[Table]) -> str:
+    """Return tables for a terminal, with each note only below the last table that has it."""
+    notes = [table.note for table in tables]
+    shown = [
+        replace(table, note="") if table.note in notes[number + 1 :] else table
+        for number, table in enumerate(tables)
+    ]
+    return "\n\n".join(table.text() for table in shown)
 
 
 _TEX = {one: f"\\{one}" for one in "&%$#_{}"}
@@ -153,13 +201,9 @@ _TEX |= {"†": r"\textdagger{}", "±": r"$\pm$", "₂": "$_2$"}
 
 
 def _tex(text: str) -> str:
-    """Return a cell as LaTeX; what stands between `**` is bold."""
-    plain, *bold = text.split("**")
-    told = "".join(_TEX.get(one, one) for one in plain)
-    if not bold:
-        return told
-    inner, *rest = bold
-    return f"{told}\\textbf{{{_tex(inner)}}}{_tex('**'.join(rest))}"
+    """Return a cell as LaTeX; text between `**` is bold."""
+    parts = ["".join(_TEX.get(one, one) for one in part) for part in text.split("**")]
+    return "".join(f"\\textbf{{{p}}}" if n % 2 else p for n, p in enumerate(parts))
 
 
 def percent(value: float) -> str:
@@ -174,7 +218,7 @@ def points(value: float) -> str:
 
 
 def p_text(value: float) -> str:
-    """Return a p-value as `0.031` or `< 0.001`, a provisional one with †."""
+    """Return a p-value as `0.031` or `< 0.001`, with † if provisional."""
     text = "< 0.001" if value < 0.001 else f"{value:.3f}"
     return f"{text}†" if isinstance(value, Provisional) else text
 

@@ -1,4 +1,4 @@
-"""Text from templates: the one place for jinja2."""
+"""Text from templates. This is the only module that imports jinja2."""
 
 from collections.abc import Mapping
 from importlib import resources
@@ -8,11 +8,7 @@ from robomme_interference_data.errors import MissingExtraError
 
 
 def load_jinja2(what: str) -> Any:
-    """Return the library that fills templates in.
-
-    Args:
-        what: What is filled in, such as `the report`, for the message.
-    """
+    """Import jinja2; the error names `what` needs it, such as `the report`."""
     try:
         import jinja2
     except ImportError as error:
@@ -23,14 +19,10 @@ def load_jinja2(what: str) -> Any:
 def fill(
     package: str, name: str, values: Mapping[str, Any], *, what: str = "a template", **options: Any
 ) -> str:
-    """Fill in a template that lies in `templates/` of a package; it may include others of there.
+    """Render the template `name` in `templates/` of a package, which may include others there.
 
-    Args:
-        package: The package, such as `robomme_interference_data.cards`.
-        name: File of the template.
-        values: What it may name; it fails on any other name.
-        what: What is filled in, for the message.
-        options: Further ones of `jinja2.Environment`, such as `autoescape`, and `filters`.
+    Names that are not in `values` are errors. `options` are those of `jinja2.Environment`, and
+    `filters`.
     """
     jinja2 = load_jinja2(what)
     folder = resources.files(package).joinpath("templates")

@@ -27,7 +27,7 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.schema.conditions import KINDS, Kind, parse_condition
 from robomme_interference_data.schema.draw import UnitPool
-from robomme_interference_data.storage.digest import combine
+from robomme_interference_data.storage.arrays import combine
 
 FAMILIES = ("MoveCube", "InsertPeg", "PatternLock", "Drawer")
 

@@ -422,5 +422,5 @@ def test_stopped_it_leaves_what_was_there(
 
     monkeypatch.setattr(question_pictures, "picture", stopped)
     code, _, err = run("build", "questions", root)
-    assert code == 130 and f"go on with:\nrobomme-interference build questions {root}" in err
+    assert code == 130 and f"resume with:\nrobomme-interference build questions {root}" in err
     assert not (root / QUESTIONS_PATH).exists()

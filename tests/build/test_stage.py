@@ -36,7 +36,7 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.errors import BuildError, FormatError, SourceError
 from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.schema.records import EvidenceSpan, SpanDigests
-from robomme_interference_data.storage.digest import combine
+from robomme_interference_data.storage.arrays import combine
 from robomme_interference_data.storage.video import iter_frames
 
 NAME = "MoveCube/test/0"

@@ -163,7 +163,7 @@ def test_info_that_is_wrong(own_buffers: Path, before: str, after: str) -> None:
     info = own_buffers / "distractors" / "meta" / "info.json"
     assert before in info.read_text()
     info.write_text(info.read_text().replace(before, after))
-    expect(own_buffers, "info.json: does not have", "observation.state|is too long|is no path")
+    expect(own_buffers, "info.json: does not have", "observation.state|is too long|not a valid path")
 
 
 @pytest.mark.parametrize(
@@ -205,7 +205,7 @@ def test_links_that_lead_nowhere(own_buffers: Path) -> None:
         (DATA, as_text("timestamp"), "timestamp of episode 3 is of type string"),
         (DATA, first_changed("task_index", 0), "task_index of episode 3"),
         (DATA, first_changed("index", 5), "index of episode 3"),
-        (DATA, first_changed("frame_index", 1), "holds 32 rows of episode 3"),
+        (DATA, first_changed("frame_index", 1), "32 rows of episode 3"),
         (DATA, first_changed("episode_index", 4), "episode 3"),
         (RECORDS, first_changed("dataset_from_index", 7), "dataset_from_index"),
         (RECORDS, first_changed("dataset_to_index", 7), "dataset_to_index"),
@@ -247,7 +247,7 @@ def test_tables_that_mean_something_else(
     ("name", "field", "value", "told"),
     [
         ("stats", "action", None, "stats.json: action is not what follows"),
-        ("stats", "action", {"mean": [float("nan")]}, "NaN is no finite number"),
+        ("stats", "action", {"mean": [float("nan")]}, "NaN is not a finite number"),
         ("info", "total_frames", 1, "total_frames is 1"),
         ("info", "total_episodes", 1, "does not list the episodes"),
         ("info", "splits", {}, "splits is {}"),

@@ -122,7 +122,7 @@ def test_private_repositories(hub: HubServer, login: Login) -> None:
     assert all(one.private for one in hub.repositories.values())
     assert len(load_buffer_set(UNITS)) == 15
     login("stranger")
-    with pytest.raises(HubError, match="no dataset repository"):
+    with pytest.raises(HubError, match="dataset repository .* does not exist"):
         load_buffer_set(UNITS)
 
 
@@ -296,7 +296,7 @@ def test_a_token_without_rights(
         hub.push(f"datasets/{LESSONS}", {"README.md": b"to come"})
         hub.push(f"datasets/{UNITS}", {"README.md": b"to come"})
     login(**who)
-    with pytest.raises(HubError, match="may not write to someone/") as caught:
+    with pytest.raises(HubError, match="lacks the permission for .*someone/") as caught:
         publish(GOLDEN)
     assert "hf auth login" in str(caught.value.hint)
     assert hub.uploads() == [] and tags(hub, LESSONS) == {}
@@ -311,7 +311,7 @@ def test_nobody_is_logged_in(
     monkeypatch.setattr(checks, "check_buffer_set", lambda *_: pytest.fail("checks take hours"))
     code, _, err = run("publish", GOLDEN, "--repo-id", UNITS, "--yes")
     assert (code, len(hub.requests) <= 1) == (1, True)
-    assert "does not know this login" in err and "hf auth login" in err
+    assert "rejects your login" in err and "hf auth login" in err
     assert "was sent" not in err
 
 

@@ -10,7 +10,7 @@ from huggingface_hub.hf_api import RepoFile
 from hypothesis import given
 from hypothesis import strategies as st
 from support.buffer_sets import GOLDEN, contents, copy_buffer_set
-from support.hub_repositories import Blob
+from support.hub_server import Blob
 from support.machine import full_disk
 from support.publishing import content_of, plain_cards
 

@@ -126,7 +126,7 @@ def test_with_verify_other_frames_count_as_absent(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("bound", [0, -1])
 def test_bound_must_be_positive(tmp_path: Path, bound: int) -> None:
-    with pytest.raises(InvalidOptionError, match=f"bound of {bound} bytes is not positive"):
+    with pytest.raises(InvalidOptionError, match=f"max_bytes is {bound}"):
         DecodedCache(tmp_path, max_bytes=bound)
 
 

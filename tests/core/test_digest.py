@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from robomme_interference_data.storage.digest import FeatureDigests, combine
+from robomme_interference_data.storage.arrays import FeatureDigests, combine
 
 
 def images(count: int) -> NDArray[np.uint8]:

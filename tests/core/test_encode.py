@@ -17,12 +17,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from robomme_interference_data.errors import BuildError
-from robomme_interference_data.storage.encode import (
-    CLIP,
-    CODECS,
-    Codec,
-    VideoEncoder,
-)
+from robomme_interference_data.storage.encode import CLIP, CODECS, Codec, VideoEncoder
 from robomme_interference_data.storage.video import iter_frames
 
 LOSSLESS, LOSSY = CODECS["av1-lossless"], CODECS["lerobot-default"]

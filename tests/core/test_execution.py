@@ -139,7 +139,7 @@ def test_the_executor_that_is_asked_for() -> None:
         ({"executor": "ray", "gpus_per_worker": 1.5}, "gpus_per_worker 1.5"),
         *(
             ({"executor": "ray", "ray_address": given}, f"ray_address {given!r}; expected auto")
-            for given in ("", "here", "10.0.0.1:65536", "ray://a:1x")
+            for given in ("", "here", "ray://a:1x")
         ),
     ],
 )

@@ -52,22 +52,22 @@ for line in Path(sys.argv[1]).read_text().splitlines():
     name, kind, path = json.loads(line)
     try:
         read(kind, Path(path))
-        told = "nothing was wrong"
+        message = "nothing was wrong"
     except InterferenceError as error:
-        told = error.message
-    print(json.dumps([name, told]), flush=True)
+        message = error.message
+    print(json.dumps([name, message]), flush=True)
 """
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """What reading each bomb says, in one process that gets little memory."""
+def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The error of reading each bomb, in one process with little memory."""
     folder = tmp_path_factory.mktemp("bombs")
     lines = []
-    for number, (name, (kind, write)) in enumerate(BOMBS.items()):
+    for number, (name, bomb) in enumerate(BOMBS.items()):
         path = folder / f"{number}"
-        write(path)
-        lines.append(json.dumps([name, kind, str(path)]))
+        bomb.write(path)
+        lines.append(json.dumps([name, bomb.kind, str(path)]))
     (folder / "list").write_text("\n".join(lines))
     done = subprocess.run(
         [sys.executable, "-c", _CHILD, str(folder / "list"), str(MEGABYTES)],
@@ -81,41 +81,9 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return dict(map(json.loads, done.stdout.splitlines()))
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("one text many times", "once decoded"),
-        ("many equal numbers", "83,886,080 rows"),
-        ("compressed noughts", "once decoded"),
-        ("a page that lies", "values; 16384 are told"),
-        ("common prefixes", "common prefixes"),
-        ("many row groups", "cannot be read"),
-        ("large metadata", "bytes of metadata"),
-        ("a billion frames", "it declares 1000000000 frames"),
-        ("large frames", "decoding stopped"),
-        ("larger than told", "decoding stopped"),
-        ("a playlist", "no MP4, Matroska or AVI file"),
-        ("a list of files", "no MP4, Matroska or AVI file"),
-        ("long", "at most"),
-        ("deep", "not JSON"),
-        ("deep, but read by Python", "inside each other"),
-        ("sparse", "at most"),
-        ("sparse sums", "at most"),
-        ("sparse rows", "at most"),
-        ("a header alone", "128 bytes, of an array"),
-        ("an archive", "no array"),
-        ("pickled", "no array"),
-        ("a large image", "an image is damaged"),
-    ],
-)
-def test_a_bomb_is_refused_before_it_goes_off(
-    told: dict[str, str], name: str, message: str
-) -> None:
-    assert message in told[name]
-
-
-def test_every_bomb_has_its_message(told: dict[str, str]) -> None:
-    assert told.keys() == BOMBS.keys()
+@pytest.mark.parametrize("name", BOMBS)
+def test_a_bomb_is_refused_before_it_goes_off(outcomes: dict[str, str], name: str) -> None:
+    assert BOMBS[name].message in outcomes[name]
 
 
 @pytest.mark.parametrize(
@@ -173,7 +141,7 @@ def test_frames_that_take_too_much_at_once_are_refused(tmp_path: Path) -> None:
     buffer = load_buffer(QUERIES[0], "k7", buffer_set=root)
     short = load_buffer(QUERIES[0], "no-history", buffer_set=root)
     assert len(buffer) * 4096 * 4096 * 3 <= 16 * 2**30  # so its videos are looked at
-    with pytest.raises(FormatError, match="pixels; the dataset's info.json says 4096×4096"):
+    with pytest.raises(FormatError, match="pixels; expected 4096×4096"):
         buffer.frames()
     assert short.frames().shape == (0, 4096, 4096, 3)
     many = with_sessions(buffer.manifest, *buffer.manifest.sessions * 8)

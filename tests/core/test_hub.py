@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from huggingface_hub import HfApi, constants
+from huggingface_hub import constants
 from support.hub_server import HubServer
 from support.lerobot_layouts import write_lerobot
 
@@ -24,7 +24,6 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.storage.files import LocalFiles
 from robomme_interference_data.storage.hub import HubFiles, locate
-from robomme_interference_data.storage.hub_errors import HubCall
 
 Run = Callable[..., tuple[int, str, str]]
 REPO = "someone/small"
@@ -116,10 +115,15 @@ def test_missing_file(hub: HubServer) -> None:
 @pytest.mark.parametrize(
     ("repo", "revision", "telling", "hint"),
     [
-        ("someone/smal", None, "there is no dataset repository 'someone/smal'", "hf auth login"),
+        (
+            "someone/smal",
+            None,
+            "dataset repository 'someone/smal' .* does not exist",
+            "hf auth login",
+        ),
         (REPO, "v9", "has no revision 'v9'", "/tree/main"),
         (REPO, "0" * 40, "has no revision '0000", "/tree/main"),
-        ("someone/gated", None, "is gated", "/datasets/someone/gated, then type: hf auth login"),
+        ("someone/gated", None, "is gated", "/datasets/someone/gated, then log in: hf auth login"),
         ("someone/gated", "0" * 40, "is gated", "hf auth login"),
     ],
 )
@@ -133,22 +137,14 @@ def test_refusals(hub: HubServer, repo: str, revision: str, telling: str, hint: 
     assert hint in str(caught.value.hint)
 
 
-@pytest.mark.parametrize("why", ["not there", "offline", "unreachable"])
-def test_a_mistyped_folder_may_have_been_meant(
-    hub: HubServer, offline: Callable[[], None], monkeypatch: pytest.MonkeyPatch, why: str
-) -> None:
-    if why == "offline":
-        offline()
-    elif why == "unreachable":
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            monkeypatch.setattr(constants, "ENDPOINT", f"http://127.0.0.1:{free.getsockname()[1]}")
-    with pytest.raises(HubError, match="repository 'my/splt'") as caught:
+def test_an_unreachable_hub(hub: HubServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        endpoint = f"http://127.0.0.1:{free.getsockname()[1]}"
+        monkeypatch.setattr(constants, "ENDPOINT", endpoint)
+    with pytest.raises(HubError, match=f"'my/splt' on {endpoint} .* cannot be reached") as caught:
         HubFiles("my/splt").path("README.md")
-    assert "was meant: there is none called my/splt" in str(caught.value.hint)
-    with pytest.raises(HubError, match="repository 'my/splt'") as caught:
-        HubFiles("my/splt", "0" * 40).list("meta")
-    assert "folder" not in str(caught.value.hint)
+    assert "same command again" in str(caught.value.hint)
 
 
 @pytest.mark.parametrize("revision", [None, "0" * 40])
@@ -158,17 +154,9 @@ def test_a_token_that_is_no_more(
     hub.push(DATASET, FILES)
     login("someone")
     hub.tokens.clear()
-    with pytest.raises(HubError, match="does not know this login") as caught:
+    with pytest.raises(HubError, match="rejects your login") as caught:
         HubFiles(REPO, revision).path("README.md")
-    assert "may read, and type: hf auth login (HF_TOKEN" in str(caught.value.hint)
-
-
-def test_what_is_kept_is_said_of_files_alone(hub: HubServer) -> None:
-    hub.fault("GET", "/api/whoami-v2", status=500, times=50)
-    for sends, kept in ((False, False), (True, True)):
-        with pytest.raises(HubError) as caught:
-            HubCall(REPO, sends=sends).run(HfApi().whoami, token="any")
-        assert ("what was sent is kept" in str(caught.value.hint).lower()) == kept
+    assert "hf auth login (HF_TOKEN" in str(caught.value.hint)
 
 
 def test_a_hub_that_is_down(hub: HubServer) -> None:
@@ -180,7 +168,7 @@ def test_a_hub_that_is_down(hub: HubServer) -> None:
     assert files.path("README.md").read_bytes() == b"read me"
     with pytest.raises(HubError, match=r"not in the cache, .* busy \(503\)") as caught:
         HubFiles("someone/else").path("README.md")
-    assert "same command again in 1 minutes" in str(caught.value.hint)
+    assert "same command again" in str(caught.value.hint)
 
 
 def test_offline(hub: HubServer, offline: Callable[[], None]) -> None:
@@ -195,8 +183,7 @@ def test_offline(hub: HubServer, offline: Callable[[], None]) -> None:
     assert files.list("meta/deep") == ["meta/deep/a.parquet"]
     with pytest.raises(HubError, match="HF_HUB_OFFLINE is set") as caught:
         files.path("meta/part-2.json")
-    command = f"hf download --repo-type dataset {REPO} --revision {commit} meta/part-2.json"
-    assert f"HF_HUB_OFFLINE=0 {command}" in str(caught.value.hint)
+    assert "unset HF_HUB_OFFLINE" in str(caught.value.hint)
     for ask in (lambda: HubFiles("a/b").commit, lambda: HubFiles("a/b", "0" * 40).list("meta")):
         with pytest.raises(HubError, match="not in the cache, .* HF_HUB_OFFLINE is set"):
             ask()
@@ -229,8 +216,7 @@ def test_a_folder_of_a_folder_that_comes_damaged(hub: HubServer) -> None:
 
 
 @pytest.mark.parametrize(
-    "given",
-    ["", "not a url", "http://", "http://[", "http://a:b", "http://a b", "ftp://a", "a:9"],
+    "given", ["", "not a url", "http://", "http://[", "http://a:b", "http://a b", "ftp://a", "a:9"]
 )
 def test_no_address_of_a_hub(monkeypatch: pytest.MonkeyPatch, run: Run, given: str) -> None:
     monkeypatch.setenv("HF_ENDPOINT", given)

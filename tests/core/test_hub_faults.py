@@ -95,8 +95,8 @@ def test_a_full_disk_while_fetching(hub: HubServer, tmp_path: Path, run: Run, wh
         code, _, err = run(*command)
     place = constants.HF_HUB_CACHE if where == "cache" else f"-> {out}/"
     assert code == 1 and f"{place}" in err and "File too large" in err
-    assert "kept; once mended, go on with:\nrobomme-interference fetch" in err
-    assert "space left on the disk" in err
+    assert "kept; once this is fixed, resume with:\nrobomme-interference fetch" in err
+    assert "disk space" in err
     assert leftovers(tmp_path) == [] and not (out / "manifests" / "manifest.json").exists()
     assert run(*command)[0] == 0
     assert [*verify_buffer_set(load_buffer_set(out))] == []
@@ -110,7 +110,7 @@ def test_a_cache_that_cannot_be_written(
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "file" / "cache"))
     code, _, err = run(*command)
     assert code == 1 and f"Error: {tmp_path / 'file'}" in err and "Not a directory" in err
-    assert "go on with:\nrobomme-interference fetch" in err and "a folder is to be" in err
+    assert "resume with:\nrobomme-interference fetch" in err and "must be a folder" in err
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
     assert run(*command)[0] == 0
     assert whole()
@@ -135,7 +135,7 @@ def test_stopped_while_fetching(hub: HubServer, tmp_path: Path, run: Run) -> Non
     command = ("fetch", f"{BUFFER_SET}@{VERSION}", "--to", tmp_path / "out")
     hub.fault("GET", VIDEO, after=3, call=partial(os.kill, os.getpid(), signal.SIGINT))
     code, _, err = run(*command)
-    assert code == 130 and "kept; go on with:\nrobomme-interference fetch" in err
+    assert code == 130 and "kept; resume with:\nrobomme-interference fetch" in err
     assert leftovers(tmp_path) == [] and not (tmp_path / "out").exists()
     assert run(*command)[0] == 0
     came = [one.path for one in hub.asked if one.method == "GET" and one.status == 200]

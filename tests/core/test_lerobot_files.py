@@ -21,8 +21,7 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.storage.files import LocalFiles
-from robomme_interference_data.storage.lerobot import LeRobotFiles
-from robomme_interference_data.storage.lerobot_layout import fill_template
+from robomme_interference_data.storage.lerobot import LeRobotFiles, fill_template
 
 VIDEO = "videos/observation.images.front/"
 V21 = "chunk-000/episode_000002"
@@ -124,7 +123,7 @@ def test_any_template_is_filled_or_one_clear_error(template: str) -> None:
         ("../../etc/passwd", "leads out of it"),
         ("/etc/passwd", "leads out of it"),
         ("videos/../../outside.mkv", "leads out of it"),
-        ("videos/\ud800.mkv", "is no path"),
+        ("videos/\ud800.mkv", "is not a valid path"),
         ("x" * 1000, "is too long"),
         ("{file_index}" * 500, "_path is '"),
         ("linked.mkv", "is a link that leads out of the folder"),
@@ -203,7 +202,7 @@ GOOD = json.dumps(LINE) + "\n"
     ("text", "message"),
     [
         ("{\n", "line 1: "),
-        ("[0, 1]\n", "line 1: no JSON object"),
+        ("[0, 1]\n", "line 1: not a JSON object"),
         (GOOD + "[" * 100_000, "line 2: "),
         (GOOD, "the episodes 0 to 2, each once"),
         (GOOD * 3, "the episodes 0 to 2, each once"),
@@ -249,8 +248,8 @@ def test_episode_tables_that_are_wrong(v30: Path, columns: dict[str, Any]) -> No
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
-        ({"episode_index": [0] * 13 + [1] * 6 + [2] * 9}, "13 rows of episode 0; 12"),
-        ({"episode_index": [0, 1] * 14}, "14 rows of episode 0; 12"),
+        ({"episode_index": [0] * 13 + [1] * 6 + [2] * 9}, "13 rows of episode 0; .* 12,"),
+        ({"episode_index": [0, 1] * 14}, "14 rows of episode 0; .* 12,"),
         ({"frame_index": [0, 2, 1, *range(3, 12), *range(7), *range(9)]}, "one after the other"),
         ({"episode_index": None}, "no column 'episode_index'"),
         ({"observation.state": pa.array([[0.0]] * 28)}, "1 values a frame; info.json"),

@@ -89,5 +89,5 @@ def test_fewer_rows_than_the_file_says(tmp_path: Path) -> None:
     path = tmp_path / "rows.parquet"
     pq.write_table(pa.table({"n": range(5)}), path)
     assert RowSpan(path).part(3, 5).scalars("n").tolist() == [3, 4]
-    with pytest.raises(FormatError, match="2 rows of n, not 4"):
+    with pytest.raises(FormatError, match="2 rows of n; expected 4"):
         RowSpan(path).part(3, 7).scalars("n")

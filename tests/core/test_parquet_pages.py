@@ -13,8 +13,15 @@ from hypothesis import strategies as st
 
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.storage.parquet import RowSpan
-from robomme_interference_data.storage.untrusted.parquet_pages import decoded_size, read_chunks
-from robomme_interference_data.storage.untrusted.thrift import I32, I64, LIST, STRUCT, Thrift
+from robomme_interference_data.storage.untrusted.parquet_pages import (
+    I32,
+    I64,
+    LIST,
+    STRUCT,
+    Thrift,
+    decoded_size,
+    read_chunks,
+)
 
 GIBIBYTE = 1 << 30
 
@@ -137,10 +144,10 @@ def test_thrift(data: bytes, found: dict[int, Any]) -> None:
     ("data", "said"),
     [
         (b"\x16\x02\x00", "field 1 of its metadata is of kind 6"),
-        (b"\x15\x02\x05\x02\x02\x00", "or there twice"),
-        (b"\x29\x15\x02\x00", "list values of kind 5"),
-        (b"\x05\x82\x80\x08\x02\x00", "have a field 65537"),  # cut off to 16 bits it is 1
-        (b"\x05\x01\x02\x00", "have a field -1"),
+        (b"\x15\x02\x05\x02\x02\x00", "or occurs twice"),
+        (b"\x29\x15\x02\x00", "lists values of kind 5"),
+        (b"\x05\x82\x80\x08\x02\x00", "has a field 65537"),  # cut off to 16 bits it is 1
+        (b"\x05\x01\x02\x00", "has a field -1"),
         (b"\x15" + b"\xff" * 11, "too many bytes"),
         (b"\x4b\x00\x00", "a value of kind 11"),
         (b"\x4c" * 40, "nested too deeply"),

@@ -22,7 +22,7 @@ from robomme_interference_data.schema.codec import (
 from robomme_interference_data.schema.manifest import BufferManifest
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.schema.rollouts import Rollout
-from robomme_interference_data.storage.headers import read_header
+from robomme_interference_data.storage.files import read_header
 
 
 @dataclass(frozen=True)
@@ -148,9 +148,9 @@ class Header:
         ('{"name": "a"}', "has format version None"),
         ('{"format_version": 1}', "name is missing"),
         ('{"format_version": 1, "name": "a", "nmae": 1}', "unknown nmae"),
-        ("[]", "no JSON object"),
-        ("{", "not JSON"),
-        ("[" * 100_000, "not JSON"),
+        ("[]", "not a JSON object"),
+        ("{", "not valid JSON"),
+        ("[" * 100_000, "not valid JSON"),
     ],
 )
 def test_headers(tmp_path: Path, text: str, told: str) -> None:

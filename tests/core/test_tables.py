@@ -2,7 +2,7 @@
 
 import math
 
-from robomme_interference_data.viz.tables import Table
+from robomme_interference_data.viz.tables import Table, tables_text
 
 TABLE = Table.make(
     "rates",
@@ -47,3 +47,20 @@ def test_csv_has_fractions_and_json_no_nan() -> None:
         **{"system": "c", "n": None, "rate": None, "change": -0.0000001, "kept": -0.001},
         **{"p": 1.0, "complete": False},
     }
+
+
+def test_a_table_fits_the_terminal() -> None:
+    """Texts wrap; columns that do not fit continue below, beside the first column."""
+    words = Table.make("t", "Title " * 30, "name text", [("a", "word " * 40)], "note " * 30)
+    numbers = " ".join(f"column_{n}:count" for n in range(20))
+    many = Table.make("t", "", f"name {numbers}", [("row", *range(20))])
+    for table in (words, many):
+        assert max(map(len, table.text(80).splitlines())) <= 80
+    assert words.text(80).count("word") == 40
+    assert sum(line.startswith("row") for line in many.text(80).splitlines()) == 3
+
+
+def test_a_note_of_several_tables_is_printed_once() -> None:
+    text = tables_text([TABLE, TABLE])
+    assert text.count("Rates of systems") == 2 and text.count("How to read it.") == 1
+    assert text.endswith("How to read it.")

@@ -140,13 +140,13 @@ def test_times_with_a_gap_or_off_the_grid(tmp_path: Path) -> None:
     """Time bases in milliseconds cannot hold every frame time exactly."""
     path = write(tmp_path / "gap.mkv", times=[0, 1, 2, 3, 6, 7, 8])
     assert len(list(iter_frames(path, 6, 9, FPS))) == 3
-    with pytest.raises(FormatError, match=r"frame 4 is missing \(the next one found is 6"):
+    with pytest.raises(FormatError, match=r"frame 4 is missing; the next frame is 6"):
         list(iter_frames(path, 2, 8, FPS))
     base = Fraction(1, 1000)
     path = write(tmp_path / "rounded.mkv", times=[0, 101, 199, 300, 408], time_base=base)
     assert len(list(iter_frames(path, 0, 5, FPS))) == 5
     path = write(tmp_path / "uneven.mkv", times=[0, 100, 200, 340, 400], time_base=base)
-    with pytest.raises(FormatError, match=r"lies at 0\.3400 s, between frames 3 and 4"):
+    with pytest.raises(FormatError, match=r"at 0\.3400 s lies between frames 3 and 4"):
         list(iter_frames(path, 0, 5, FPS))
 
 
@@ -194,5 +194,5 @@ def test_a_header_that_is_not_text_and_frames_of_another_size(
     path.write_bytes(data.replace(b"VideoHandler", b"Video\xff\xfedler"))
     with pytest.raises(FormatError, match="is not a readable video"):
         next(iter_frames(path, 0, 1, FPS))
-    with pytest.raises(FormatError, match="80×64 pixels; .*says 32×64"):
+    with pytest.raises(FormatError, match="80×64 pixels; expected 32×64"):
         next(iter_frames(videos["ffv1.mkv"].path, 0, 1, FPS, (64, 32, 3)))

@@ -53,7 +53,7 @@ SAYS = {"policy": "python:support.own_policies:says"}
     ("changes", "error", "words"),
     [
         ({"policy": "websocket://a:1", "system": None}, InvalidOptionError, "need a name"),
-        ({"policy": "python:__main__:make"}, InvalidOptionError, "run another program"),
+        ({"policy": "python:__main__:make"}, InvalidOptionError, "__main__"),
         ({"simulator": "tabeltop"}, UnknownNameError, "no simulator 'tabeltop'"),
         ({"simulator": "tabletop"}, InvalidOptionError, "recorded on 'sample', the run is on"),
         ({"shift": "fog:1"}, InvalidOptionError, "shift 'fog:1'; expected none, or light"),

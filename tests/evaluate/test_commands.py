@@ -102,7 +102,7 @@ def test_a_full_disk_names_the_file_and_the_command_to_go_on(
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert isinstance(done.exception, OSError)
     assert done.exception.filename == str(tmp_path / "run" / "rollouts.jsonl")
-    told = f"Finished rollouts are in {tmp_path / 'run'}; once mended, go on with:\nrobomme-inter"
+    told = f"Finished rollouts are in {tmp_path / 'run'}; once this is fixed, resume with:\nrobomme-inter"
     assert told in done.stderr
 
 
@@ -116,7 +116,7 @@ def test_a_stop_tells_of_rollouts_only_where_there_are_some(
     monkeypatch.setattr(run_module, "_run_items" if begun else "plan_work", stop)
     line = f"evaluate {tiny_buffers} --policy noop {USUAL} --families MoveCube"
     done = type_in(f"{line} --out {tmp_path / 'run'}")
-    assert done.exit_code == 130 and "go on with:\nrobomme-interference" in done.stderr
+    assert done.exit_code == 130 and "resume with:\nrobomme-interference" in done.stderr
     assert (f"Finished rollouts are in {tmp_path / 'run'}" in done.stderr) == begun
 
 

@@ -9,8 +9,10 @@ from robomme_interference_data.evaluate.score.scoring import Score
 def test_bounds_neither_lead_nor_are_best(questions: Score) -> None:
     assert {r["system"] for r in records(questions, "main") if r["rank"]} == {OWN, BLANK}
     assert {r["system"] for r in records(questions, "systems")} == {BLANK}
-    assert headline(questions, "questions").startswith(f"{OWN} succeeds in 75.0% of 4")
+    assert headline(questions, "questions").startswith(
+        f"In questions, {OWN} succeeds in 75.0% of 4"
+    )
     (grid,) = questions.grids
-    assert "bounds: Questions-Recall-Full." in grid.note
+    assert "References, not ranked: Questions-Recall-Full." in grid.note
     # Of the three questions of k7, and of all four.
-    assert "Guessing would have 37.5% to 41.7%" in grid.note
+    assert "37.5% to 41.7%" in grid.note

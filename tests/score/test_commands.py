@@ -41,7 +41,7 @@ def again(path: Path) -> Path:
 @pytest.fixture
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures take most of the time, and have tests of their own."""
-    monkeypatch.setattr(figures, "draw_figures", lambda score, folder, png: {})
+    monkeypatch.setattr(figures, "draw_figures", lambda score, folder, suffixes: {})
 
 
 @made.needs_released
@@ -60,11 +60,7 @@ def test_score_and_export_on_the_command_line(
     assert value["rows"] == 1800 and value["expected"] == "benchmark"
     assert [one["successes"] for one in value["tables"]["main"]] == [202, 201, 202, 202]
     assert f"Report: {out / 'report.html'}" in done.stderr
-    beyond = {
-        "interference",
-        "by_evidence_kept",
-        "ceiling",
-    }  # what the paper's conditions do not have
+    beyond = {"interference", "by_evidence_kept", "ceiling"}  # not of the paper's conditions
     beyond |= {"systems", "ranks", "matrix", "interaction"}  # nor one system alone
     beyond |= {"equivalence", "chance"}  # nobody asked for it, or anybody anything
     assert {path.stem for path in (out / "tables").glob("*.csv")} == {*TABLES} - beyond
@@ -91,7 +87,7 @@ def test_what_is_printed(tmp_path: Path) -> None:
     assert lines[0] == "Success by system and condition, tabletop"
     assert lines[2].split() == ["system", "no-history", "k0", "k1", "k3", "k7"]
     assert "**58.3%** [32.0, 80.7] n=12" in lines[4]
-    assert "Rows of tabletop are not set against the paper's RoboMME." in done.stderr
+    assert "Rows of tabletop are not compared with the paper's RoboMME." in done.stderr
     done = run("compare", path, again(path))
     assert done.stdout.startswith("Two runs compared\n\nsimulator")
     value = json.loads(run("compare", path, again(path), "--json").stdout)
@@ -124,13 +120,12 @@ def test_lenient_leaves_bad_rows_out_and_counts_them(tmp_path: Path) -> None:
 def test_a_score_leaves_nothing_of_an_earlier_one_and_all_of_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def draw(score: Any, folder: Path, png: bool) -> dict[str, Path]:
+    def draw(score: Any, folder: Path, suffixes: Any) -> dict[str, Path]:
         folder.mkdir(parents=True, exist_ok=True)
         names = [f"success-{simulator}" for simulator in score.outcomes]
         for name in names:
-            (folder / f"{name}.svg").write_text(f"<svg>{MAKER}</svg>")
-            if png:
-                (folder / f"{name}.png").touch()
+            for suffix in suffixes:
+                (folder / f"{name}{suffix}").write_text(f"<svg>{MAKER}</svg>")
         return {name: folder / f"{name}.svg" for name in names}
 
     monkeypatch.setattr(figures, "draw_figures", draw)
@@ -139,7 +134,7 @@ def test_a_score_leaves_nothing_of_an_earlier_one_and_all_of_others(
     first = made.score(made.write_parquet(tmp_path / "a.parquet", both), paper=True)
     own = [row for row in rows if row.system == OWN]
     second = made.score(made.write_parquet(tmp_path / "b.parquet", own))
-    write_score(first, out, png=True)
+    write_score(first, out, formats=[".png", ".pdf"])
     assert {"tables/paper.csv", "tables/paper.md", "figures/success-robomme.png"} <= files(out)
     others = {"tables/notes.csv", "tables/mine.md", "figures/mine.svg", "figures/success-me.svg"}
     for name in (*others, "notes.txt"):
@@ -156,17 +151,8 @@ def test_without_a_library_nothing_is_written(
 ) -> None:
     path = made.write_csv(tmp_path / "a.csv", made.rows())
     monkeypatch.setitem(sys.modules, library, None)
-    given = (
-        "score",
-        path,
-        "--expected",
-        "observed",
-        "--out",
-        tmp_path / "o",
-        "--export",
-        tmp_path / "e",
-    )
-    done = run(*given)
+    folders = ("--out", tmp_path / "o", "--export", tmp_path / "e")
+    done = run("score", path, "--expected", "observed", *folders)
     assert isinstance(done.exception, MissingExtraError) and library in str(done.exception)
     assert "robomme-interference-data[score]" in (done.exception.hint or "")
     assert files(tmp_path) == {"a.csv"}

@@ -81,7 +81,7 @@ def test_what_a_shift_costs_is_measured(tmp_path: Path) -> None:
     (overall, _) = found.table.records()
     assert (overall["lost"], overall["gained"]) == (3, 0)
     (note,) = found.notes  # and no noise floor: the runs are no repeats
-    assert "a is of tabletop and b of tabletop+light:2" in note and "what the shift costs" in note
+    assert "a is of tabletop and b of tabletop+light:2" in note and "effect of the shift" in note
 
 
 @pytest.mark.parametrize(

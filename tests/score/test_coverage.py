@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from robomme_interference_data.evaluate.score.comparisons.effects import retained
-from robomme_interference_data.evaluate.score.comparisons.interaction import changes
 from robomme_interference_data.evaluate.score.comparisons.pairs import pair
+from robomme_interference_data.evaluate.score.comparisons.ranks import changes
 from robomme_interference_data.evaluate.score.outcomes import rate_of, success
 
 pytestmark = pytest.mark.slow

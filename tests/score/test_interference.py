@@ -83,7 +83,7 @@ def test_a_ceiling_is_behind_the_same_retrieval_step(tmp_path: Path) -> None:
     found = steps("siglip", "thumbnail")
     assert "ceiling" not in found.tables
     (note,) = found.notes
-    assert "other retrieval steps, siglip and thumbnail" in note
+    assert "retrieval steps differ: siglip and thumbnail" in note
     assert record(found, "effects")["against_system"] == "replay-full"  # that one has none
 
 
@@ -130,7 +130,7 @@ def test_the_headline_begins_with_the_papers_conditions(kinds: Score, tmp_path: 
     # From k0 to k3, not to the stale lesson that is compared with k0 too.
     assert "(k3" in falls and "stale" not in falls
     # Of five comparisons the largest loss: 2 of 6 for 5 of 6. p is 0.25, five times that at most 1.
-    assert "updating" in beyond and "stale-k0 against k0 \N{MINUS SIGN}50.0 points" in beyond
+    assert "updating" in beyond and "stale-k0 minus k0 is \N{MINUS SIGN}50.0 points" in beyond
     assert beyond.endswith("McNemar p = 1, corrected for 5 comparisons)")
     gains = {
         cell: "ssssss" if cell[1] == "stale-k0" else made.KINDS[REPLAY, "k0"] for cell in made.KINDS

@@ -27,7 +27,7 @@ def test_methods_are_those_of_the_rows(full: Score) -> None:
     for told in (
         "under 5 conditions of RoboMME-Interference [@rathi2026robomme] (no-history, k0, ",
         "25,200 rollouts of 450 episodes of 9 families. 56 of 56 cells (system × condition) are "
-        "complete. No rollout broke.",
+        "complete. No rollout ended with an error.",
         "exact McNemar tests",
         "200 draws of episodes",
         "robomme-interference-data ",
@@ -44,7 +44,12 @@ def test_methods_of_part_of_a_grid_with_repeats(tmp_path: Path) -> None:
     both = made.write_parquet(tmp_path / "a.parquet", [*rows, *made.changed(rows, model_seed=1)])
     found = made.score(both, margin=5.0)
     text, _ = methods(found)
-    for told in ("with 2 model seeds", "6 of 10 cells", "2 rollouts that broke", "of 5 points"):
+    for told in (
+        "with 2 model seeds",
+        "6 of 10 cells",
+        "2 rollouts ended with an error",
+        "of 5 points",
+    ):
         assert told in text
     assert {"fisher1935", "kish1965", "schuirmann1987"} <= cited(found)
 

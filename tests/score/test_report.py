@@ -214,7 +214,7 @@ def test_the_report_says_how_it_was_made(report: Path, run: Path) -> None:
         '"numpy": "2.2.0",',
         sha256_file(run / "rollouts.jsonl"),
         made.REVISION,
-        "those that any of the given rows is of",
+        "those that occur in any row",
     ):
         assert shown in html.unescape(text)
     assert "<script>alert" not in text and html.escape("<script>alert(1)") in text

@@ -1,10 +1,11 @@
-"""Small files that ask for much: of memory, or of time."""
+"""Small files that would take much memory or time."""
 
 import io
 import struct
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import av
 import numpy as np
@@ -24,37 +25,32 @@ def _one_text_many_times(path: Path) -> None:
     pq.write_table(pa.table({"v": texts}), path, store_schema=False)
 
 
-def _many_equal_numbers(path: Path) -> None:
-    """80 million noughts in runs."""
-    table = pa.table({"v": np.zeros(_MEGABYTE, np.int64)})
-    with pq.ParquetWriter(path, table.schema) as writer:
-        for _ in range(80):
+def _repeated(path: Path, values: Any, count: int, **options: Any) -> None:
+    table = pa.table({"v": values})
+    with pq.ParquetWriter(path, table.schema, write_statistics=False, **options) as writer:
+        for _ in range(count):
             writer.write_table(table)
+
+
+def _many_equal_numbers(path: Path) -> None:
+    """80 million zeros in runs."""
+    _repeated(path, np.zeros(_MEGABYTE, np.int64), 80)
 
 
 def _zeros(path: Path) -> None:
-    """2.5 GiB of compressed noughts."""
-    table = pa.table({"v": [bytes(64 * _MEGABYTE)]})
-    with pq.ParquetWriter(
-        path, table.schema, compression="zstd", use_dictionary=False, write_statistics=False
-    ) as writer:
-        for _ in range(40):
-            writer.write_table(table)
+    """2.5 GiB of compressed zeros."""
+    values = [bytes(64 * _MEGABYTE)]
+    _repeated(path, values, 40, compression="zstd", use_dictionary=False)
 
 
 def _page_that_lies(path: Path) -> None:
-    """A page of more values than the metadata say."""
-    pq.write_table(
-        pa.table({"v": np.zeros(1 << 14, np.int64)}),
-        path,
-        compression="none",
-        use_dictionary=False,
-        write_statistics=False,
-    )
+    """A page of more values than in the metadata."""
+    values = np.zeros(1 << 14, np.int64)
+    _repeated(path, values, 1, compression="none", use_dictionary=False)
     data = path.read_bytes()
-    told, more = b"\x15\x80\x80\x02", b"\x15\xfe\xff\x7f"  # as Thrift writes 16,384; 1,048,575
-    assert data.count(told) >= 1
-    path.write_bytes(data.replace(told, more, 1))
+    count, more = b"\x15\x80\x80\x02", b"\x15\xfe\xff\x7f"  # as Thrift writes 16,384; 1,048,575
+    assert data.count(count) >= 1
+    path.write_bytes(data.replace(count, more, 1))
 
 
 def _common_prefixes(path: Path) -> None:
@@ -162,31 +158,38 @@ def _large_image(path: Path) -> None:
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
 
 
-BOMBS: dict[str, tuple[str, Callable[[Path], None]]] = {
-    "one text many times": ("parquet", _one_text_many_times),
-    "many equal numbers": ("parquet", _many_equal_numbers),
-    "compressed noughts": ("parquet", _zeros),
-    "a page that lies": ("parquet", _page_that_lies),
-    "common prefixes": ("parquet", _common_prefixes),
-    "many row groups": ("parquet", _many_groups),
-    "large metadata": ("parquet", _large_footer),
-    "a billion frames": ("video", _declared_frames),
-    "large frames": ("video", _large_frames),
-    "larger than told": ("video", _larger_than_told),
-    "a playlist": ("video", _playlist),
-    "a list of files": ("video", _list_of_files),
-    "long": ("json", _long_json),
-    "deep": ("json", _deep_json),
-    "deep, but read by Python": ("json", _deep_readable_json),
-    "sparse": ("json", _sparse),
-    "sparse sums": ("sums", _sparse),
-    "sparse rows": ("lines", _sparse),
-    "a header alone": ("array", _long_array),
-    "an archive": ("array", _archive),
-    "pickled": ("array", _pickled),
-    "a large image": ("image", _large_image),
+class Bomb(NamedTuple):
+    """The kind of file, what writes it, and a part of the error of reading it."""
+
+    kind: str
+    write: Callable[[Path], None]
+    message: str
+
+
+BOMBS = {
+    "one text many times": Bomb("parquet", _one_text_many_times, "once decoded"),
+    "many equal numbers": Bomb("parquet", _many_equal_numbers, "83,886,080 rows"),
+    "compressed zeros": Bomb("parquet", _zeros, "once decoded"),
+    "a page that lies": Bomb("parquet", _page_that_lies, "values; its metadata has 16384"),
+    "common prefixes": Bomb("parquet", _common_prefixes, "common prefixes"),
+    "many row groups": Bomb("parquet", _many_groups, "cannot be read"),
+    "large metadata": Bomb("parquet", _large_footer, "bytes of metadata"),
+    "a billion frames": Bomb("video", _declared_frames, "it declares 1000000000 frames"),
+    "large frames": Bomb("video", _large_frames, "decoding stopped"),
+    "larger than told": Bomb("video", _larger_than_told, "decoding stopped"),
+    "a playlist": Bomb("video", _playlist, "no MP4, Matroska or AVI file"),
+    "a list of files": Bomb("video", _list_of_files, "no MP4, Matroska or AVI file"),
+    "long": Bomb("json", _long_json, "at most"),
+    "deep": Bomb("json", _deep_json, "not valid JSON"),
+    "deep, but read by Python": Bomb("json", _deep_readable_json, "nested arrays"),
+    "sparse": Bomb("json", _sparse, "at most"),
+    "sparse sums": Bomb("sums", _sparse, "at most"),
+    "sparse rows": Bomb("lines", _sparse, "at most"),
+    "a header alone": Bomb("array", _long_array, "128 bytes do not fit an array"),
+    "an archive": Bomb("array", _archive, "not an array"),
+    "pickled": Bomb("array", _pickled, "not an array"),
+    "a large image": Bomb("image", _large_image, "an image is damaged"),
 }
-"""Name to the kind of file, and what writes it."""
 
 
 def read(kind: str, path: Path) -> object:

@@ -1,7 +1,7 @@
-"""Readers as targets for bytes that anybody may have written, and how such bytes are made.
+"""Readers of untrusted files as targets of tests and fuzzing, and damaged files to feed them.
 
-A target takes the bytes of one file, puts it in its place among sound ones, and reads it. It comes
-back, or raises an `InterferenceError`; anything else is a finding.
+A target puts the bytes of one file among valid files, and reads it. It returns, or raises an
+`InterferenceError`; anything else is a finding.
 """
 
 import io
@@ -42,13 +42,7 @@ _MOST_LISTED = 64  # of what a file lists, so many are looked at: there may be a
 
 @dataclass(frozen=True)
 class Target:
-    """A reader.
-
-    Attributes:
-        path: Where its file lies in a folder of `places`.
-        read: Reads all there, given that folder.
-        seeds: Of sound files, besides the one that lies there.
-    """
+    """A reader: its file in a folder of `places`, what reads it, and further valid files."""
 
     path: str
     read: Callable[[Path], object]
@@ -204,8 +198,7 @@ TARGETS = {
     "run": Target(f"run/{RUN_HEADER}", _run),
     "record": Target(f"run/{RUN_RECORD}", _record),
 }
-"""All readers of what strangers write, by name."""
-
+"""All readers of untrusted files, by name."""
 
 _NUMBERS = [0, 1, 127, 128, 255, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**62, 2**63 - 1]
 _JSON = [
@@ -221,42 +214,32 @@ def mutated(sound: list[bytes], draw: random.Random) -> bytes:
         return _with_other_values(chosen, draw)
     data = bytearray(chosen)
     for _ in range(draw.randint(1, 6)):
-        place = draw.randrange(len(data) + 1)
-        _WAYS[draw.randrange(len(_WAYS))](data, place, draw)
+        _damage(data, draw)
     return bytes(data[: 1 << 20])
 
 
-def _flip(data: bytearray, place: int, draw: random.Random) -> None:
-    if data:
-        data[place % len(data)] ^= 1 << draw.randrange(8)
-
-
-def _byte(data: bytearray, place: int, draw: random.Random) -> None:
-    if data:
-        data[place % len(data)] = draw.choice((0, 1, 0x7F, 0x80, 0xFF, draw.randrange(256)))
-
-
-def _number(data: bytearray, place: int, draw: random.Random) -> None:
-    size, order = draw.choice((2, 4, 8)), draw.choice(("little", "big"))
-    value = draw.choice(_NUMBERS) & ((1 << 8 * size) - 1)
-    data[place : place + size] = value.to_bytes(size, order)  # type: ignore[arg-type]
-
-
-def _cut(data: bytearray, place: int, draw: random.Random) -> None:
-    del data[place : place + draw.choice((1, 4, 16, 256, len(data)))]
-
-
-def _copy(data: bytearray, place: int, draw: random.Random) -> None:
-    start = draw.randrange(len(data) + 1)
-    data[place:place] = data[start : start + draw.choice((1, 8, 64, 1024))]
-
-
-def _value(data: bytearray, place: int, draw: random.Random) -> None:
-    """Put another value of JSON where one stands."""
-    start = data.find(b":", place) + 1
-    stops = [at for at in (data.find(end, start) for end in (b",", b"}", b"\n")) if at >= 0]
-    if start and stops:
-        data[start : min(stops)] = draw.choice(_JSON)
+def _damage(data: bytearray, draw: random.Random) -> None:
+    """Change a bit, a byte, a number or a value of JSON, or remove or repeat a part."""
+    place = draw.randrange(len(data) + 1)
+    match draw.choice(("bit", "byte", "number", "value") * 2 + ("cut", "copy")):
+        case "bit" if data:
+            data[place % len(data)] ^= 1 << draw.randrange(8)
+        case "byte" if data:
+            data[place % len(data)] = draw.choice((0, 1, 0x7F, 0x80, 0xFF, draw.randrange(256)))
+        case "number":
+            size, order = draw.choice((2, 4, 8)), draw.choice(("little", "big"))
+            value = draw.choice(_NUMBERS) & ((1 << 8 * size) - 1)
+            data[place : place + size] = value.to_bytes(size, order)  # type: ignore[arg-type]
+        case "cut":
+            del data[place : place + draw.choice((1, 4, 16, 256, len(data)))]
+        case "copy":
+            start = draw.randrange(len(data) + 1)
+            data[place:place] = data[start : start + draw.choice((1, 8, 64, 1024))]
+        case "value":
+            start = data.find(b":", place) + 1
+            stops = [at for at in (data.find(end, start) for end in (b",", b"}", b"\n")) if at >= 0]
+            if start and stops:
+                data[start : min(stops)] = draw.choice(_JSON)
 
 
 _TEXTS = ("", "x", "../../x", "/x", "\0", "\x1b[2J", "x" * 70_000, "MoveCube/test/0", "lesson")
@@ -319,6 +302,3 @@ def _other(value: Any, draw: random.Random) -> Any:
     if isinstance(value, float):
         return draw.choice((0.0, -1.0, 1e308, float("nan"), float("inf"), None))
     return draw.choice((*_NUMBERS[:-1], -1, -(2**63), True, None))
-
-
-_WAYS = (_flip, _flip, _byte, _byte, _number, _number, _cut, _copy, _value, _value)

@@ -1,4 +1,4 @@
-"""A buffer set on a Hub on the loopback interface, as `publish` lays it out, and others who use it."""
+"""A buffer set on a Hub on the loopback interface, laid out like a published one."""
 
 import os
 import shutil
@@ -17,8 +17,7 @@ from support.hub_server import HubServer
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, MANIFEST_PATH
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.manifest import ManifestHeader
-from robomme_interference_data.storage.files import write_json
-from robomme_interference_data.storage.headers import read_header
+from robomme_interference_data.storage.files import read_header, write_json
 
 BUFFER_SET, BASE = "someone/units", "someone/demonstrations"
 
@@ -65,7 +64,7 @@ def kill_at(hub: HubServer, method: str, path: str, after: int, *arguments: str)
 def push_buffer_set(
     hub: HubServer, root: Path, work: Path, name: str = BUFFER_SET
 ) -> tuple[str, str]:
-    """Put a buffer set into two repositories; return the commits of buffer set and demonstrations."""
+    """Push a buffer set to two repositories; return the commits of it and its demonstrations."""
     base = hub.push(f"datasets/{BASE}", root / DEMONSTRATIONS)
     shutil.copytree(root / DISTRACTORS, work)
     shutil.copytree(root / "manifests", work / "manifests")

@@ -21,14 +21,7 @@ _SQUEEZED = 1024
 
 @dataclass
 class Request:
-    """What was asked, and what became of it.
-
-    Attributes:
-        method, target: As they came; `path` is the target without its query.
-        headers, body: As they came.
-        status: Of the answer; 0 if there was none.
-        sent: Bytes of the answer's body that were sent.
-    """
+    """A request, the status of its answer (0 for none), and the bytes sent of the answer's body."""
 
     method: str
     target: str
@@ -61,11 +54,7 @@ class Request:
 
 @dataclass
 class Answer:
-    """What is answered: a file's bytes or JSON.
-
-    Attributes:
-        plain: Whether it may be compressed on its way.
-    """
+    """An answer: a file's bytes or JSON, which is compressed if `plain`."""
 
     body: bytes
     status: int = 200
@@ -78,19 +67,13 @@ class Answer:
         return cls(json.dumps(value).encode(), status, told, plain=True)
 
     def fit(self, asked: HTTPMessage) -> None:
-        """Leave only the range that is asked for, or compress what may be and is worth it."""
-        span = re.fullmatch(r"bytes=(\d*)-(\d*)", asked.get("Range", ""))
+        """Leave only the requested end, or compress the body if it may be and is worth it."""
+        span = re.fullmatch(r"bytes=(\d+)-", asked.get("Range", ""))
         size = len(self.body)
         if span and self.status == 200:
-            first, last = span.groups()
-            start = int(first) if first else max(size - int(last), 0)
-            stop = min(int(last) + 1, size) if first and last else size
-            if start >= size:
-                self.status, self.body, told = 416, b"", f"bytes */{size}"
-            else:
-                self.status, self.body = 206, self.body[start:stop]
-                told = f"bytes {start}-{stop - 1}/{size}"
-            self.headers["Content-Range"] = told
+            start = int(span[1])
+            self.status, self.body = 206, self.body[start:]
+            self.headers["Content-Range"] = f"bytes {start}-{size - 1}/{size}"
         elif self.plain and size >= _SQUEEZED and "gzip" in asked.get("Accept-Encoding", ""):
             self.body = gzip.compress(self.body, 1)
             self.headers["Content-Encoding"] = "gzip"
@@ -101,15 +84,14 @@ class Fault:
     """What goes wrong with requests.
 
     Attributes:
-        method, path: Of which: a method, and a regular expression that is found in the path.
-        times: How many of them.
-        after: How many come through before.
-        status, headers: Answer this instead, such as 429 with `Retry-After`, or 503.
+        method, path: The requests' method, and a regular expression found in their path.
+        times, after: The number of requests, and of those that succeed before.
+        status: Answer this instead, such as 503.
         drop: Close the connection after so many bytes of the request's body, or of the answer's.
-        lost: Do what is asked, and close the connection instead of answering.
-        cut: Leave out so many bytes at the end of the answer, as if there were no more.
+        lost: Handle the request, and close the connection instead of answering.
+        cut: Omit so many bytes at the end of the answer.
         wrong: Change the last byte of the answer.
-        call: What happens just before, such as a commit by somebody else.
+        call: Called just before, such as for a commit by somebody else.
     """
 
     method: str
@@ -117,7 +99,6 @@ class Fault:
     times: int = 1
     after: int = 0
     status: int | None = None
-    headers: dict[str, str] = field(default_factory=dict)
     drop: int | None = None
     lost: bool = False
     cut: int | None = None
@@ -211,8 +192,7 @@ class LoopbackServer(ABC):
         """Return the answer to a request whose body has come."""
         time.sleep(self.latency)
         if fault.status is not None or self.down:
-            told = {"error": "something went wrong"}
-            answer = Answer.json(told, fault.status or 503, fault.headers)
+            answer = Answer.json({"error": "something went wrong"}, fault.status or 503)
         else:
             if fault.call is not None:
                 fault.call()

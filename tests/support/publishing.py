@@ -49,14 +49,12 @@ def content_of(root: Path, repo_id: str = UNITS, **options: Any) -> BufferSetCon
 def plan(
     root: Path,
     repo_id: str = UNITS,
-    waits: list[float] | None = None,
     private: bool = False,
     **options: Any,
 ) -> tuple[BufferSetContent, Publisher, list[RepoPlan]]:
-    """Plan to publish a buffer set; instead of waiting, seconds are added to `waits`."""
+    """Plan to publish a buffer set."""
     content = content_of(root, repo_id, **options)
-    wait = [] if waits is None else waits
-    publisher = Publisher(content.config, private=private, wait=wait.append)
+    publisher = Publisher(content.config, private=private)
     return content, publisher, plan_buffer_set(content, publisher)
 
 

@@ -25,8 +25,7 @@ from robomme_interference_data.retrieval.select import Similarities
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.manifest import layout_sessions
-from robomme_interference_data.storage.files import write_json
-from robomme_interference_data.storage.headers import read_header
+from robomme_interference_data.storage.files import read_header, write_json
 
 QUIET = WorkProgress(quiet=True)
 FRAMES = [3 * 49, 17 * 32]

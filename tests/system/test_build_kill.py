@@ -100,7 +100,7 @@ def test_stopped_at_random_moments(
         if finished.code > 0 and staged(out) != before:  # else it may not have begun yet
             assert "Stopped. " in finished.stderr, finished.stderr
             told = finished.stderr.split("Stopped. ")[1]
-            assert told.startswith("Finished episodes are kept; go on with:\nrobomme-interference")
+            assert told.startswith("Finished episodes are kept; resume with:\nrobomme-interference")
     finished = server.run(*command(out))
     assert finished.code == 0, finished.stderr
     assert contents(out) == expected
@@ -115,7 +115,7 @@ def test_a_build_that_is_terminated_tells_how_to_go_on(server: BuildServer, tmp_
     os.kill(pid, signal.SIGTERM)
     finished = server.wait(pid)
     assert finished.code == 143, finished.stderr
-    told = finished.stderr.split("go on with:\n")[1]
+    told = finished.stderr.split("resume with:\n")[1]
     assert told.startswith(
         f"robomme-interference build distractors {tmp_path} --source sample:MoveCube"
     )

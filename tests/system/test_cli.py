@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -70,6 +71,7 @@ def test_help_of_every_command(path: tuple[str, ...], run: Run) -> None:
     code, out, err = run(*path, "--help")
     assert (code, err) == (0, "")
     assert "Usage: robomme-interference" in out
+    assert max(map(len, out.splitlines())) <= 80
     assert "robomme-interference " in out.split("Usage:")[1].split("\n", 1)[1], "no example"
     for parameter in ALL[path].params:
         if parameter.name != "help":
@@ -78,6 +80,14 @@ def test_help_of_every_command(path: tuple[str, ...], run: Run) -> None:
                 assert max(parameter.opts, key=len) in out
     for name in getattr(ALL[path], "commands", {}):
         assert name in out
+
+
+def test_help_shows_options_in_groups_and_examples_last(run: Run) -> None:
+    out = run("build", "manifests", "--help")[1]
+    assert "[OPTIONS] BUFFER_SET\n" in out
+    out = run("index", "--help")[1]
+    order = ("\n  Embed", "Arguments:", "Options:", "Execution:", "--workers", "--json", "Example")
+    assert [word for word in sorted(order, key=out.index)] == list(order)
 
 
 def test_help_imports_nothing_heavy() -> None:
@@ -93,6 +103,29 @@ def test_help_imports_nothing_heavy() -> None:
     assert found.isdisjoint(
         {"numpy", "pyarrow", "av", "scipy", "matplotlib", "torch", "lerobot", "huggingface_hub"}
     )
+
+
+@pytest.mark.parametrize(("module", "times"), [("typer", 1), ("pyarrow", 1), ("pyarrow", 2)])
+def test_ctrl_c_during_an_import_prints_no_traceback(module: str, times: int) -> None:
+    code = f"""
+import os, signal, sys
+class Interrupt:
+    def find_spec(self, name, *_):
+        if name == "{module}":
+            sys.meta_path.remove(self)
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+            finally:
+                for _ in range({times - 1}):
+                    os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupt())
+sys.argv = ["robomme-interference", "conditions"]
+from robomme_interference_data.cli import run_program
+run_program()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode in {-signal.SIGINT, 128 + signal.SIGINT}, done
+    assert "Traceback" not in done.stderr and done.stdout == ""
 
 
 # --- usage errors ------------------------------------------------------------------------------
@@ -159,7 +192,7 @@ def test_nothing_is_written_among_the_hashed_files_of_a_buffer_set(
 ) -> None:
     before = contents(own_buffers)
     code, _, err = run(*in_buffer_set(arguments, own_buffers))
-    assert code == 1 and f"lies inside {own_buffers}" in err
+    assert code == 1 and f"inside {own_buffers}" in err
     assert contents(own_buffers) == before
 
 
@@ -178,7 +211,7 @@ def test_list(run: Run, tiny_buffers: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert (code, err) == (0, "")
     rows = table_rows(out)
     assert len(rows) == 15
-    assert rows[8] == [EPISODE, "k3", "easy", "48", "144", "0.34"]
+    assert rows[8] == [EPISODE, "k3", "easy", "48", "144", "34.4%"]
 
 
 @pytest.mark.parametrize(
@@ -217,7 +250,7 @@ def test_show(run: Run, tiny_buffers: Path) -> None:
     assert rows[0] == ["0", "lesson", "MoveCube", EPISODE, "0 to 47"]
     assert [row[4] for row in rows] == ["0 to 47", "48 to 79", "80 to 111", "112 to 143"]
     assert "144 history frames" in out
-    assert "34% lesson" in " ".join(out.split())  # 11 of an even 32-frame sample
+    assert "34% of an even 32-frame sample" in " ".join(out.split())
 
 
 def test_show_as_json_and_as_a_picture(run: Run, tiny_buffers: Path, tmp_path: Path) -> None:

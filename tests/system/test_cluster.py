@@ -38,9 +38,9 @@ ROLLOUTS = 2 * len(CONDITIONS)
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
     """A cluster of one's own, for nodes are taken away; its workers know the tests' world."""
-    own = {worlds.BUFFER_SET: str(GOLDEN), worlds.PAUSE: "0.03"}
+    variables = {worlds.BUFFER_SET: str(GOLDEN), worlds.PAUSE: "0.03"}
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in own.items():
+        for name, value in variables.items():
             patch.setenv(name, value)
         with running_cluster(3) as made:
             yield made
@@ -114,7 +114,7 @@ def test_ctrl_c_gives_all_workers_back(cluster: Any, tmp_path: Path) -> None:
     assert len(workers) == 3
     running.send_signal(signal.SIGINT)
     _, err = running.communicate(timeout=60)
-    assert running.returncode == 130 and "go on with:" in err
+    assert running.returncode == 130 and "resume with:" in err
     wait_until_gone(workers)
     assert 1 <= len(read_record(tmp_path / "run")) < ROLLOUTS
 
@@ -160,12 +160,13 @@ def connect(address: str, **environment: str) -> str:
 
 
 def test_a_cluster_that_is_not_there() -> None:
-    assert "WorkerError: no Ray cluster can be reached at '127.0.0.1:1'" in connect("127.0.0.1:1")
+    printed = connect("127.0.0.1:1")
+    assert "WorkerError: " in printed and "'127.0.0.1:1'" in printed
 
 
 def test_a_token_that_is_missing(cluster: Any, tmp_path: Path) -> None:
-    said = connect(cluster.address, RAY_AUTH_MODE="token", HOME=str(tmp_path))
-    assert "WorkerError" in said and "~/.ray/auth_token" in said
+    printed = connect(cluster.address, RAY_AUTH_MODE="token", HOME=str(tmp_path))
+    assert "WorkerError" in printed and "~/.ray/auth_token" in printed
 
 
 def test_a_build_has_the_bytes_of_one_process(cluster: Any, tmp_path: Path) -> None:

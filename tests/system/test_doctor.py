@@ -1,4 +1,4 @@
-"""What the doctor finds, and what it says of it."""
+"""The checks of the doctor, and how they are printed."""
 
 import subprocess
 import sys
@@ -13,7 +13,7 @@ from robomme_interference_data.cli import doctor
 from robomme_interference_data.cli.doctor import Check
 
 
-def test_the_table_shows_state_name_detail_and_the_command_that_mends(
+def test_the_table_shows_state_name_detail_and_fix(
     run: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = [Check("fine", True, "1.0"), Check("optional", None, "not installed", "pip install it")]
@@ -21,9 +21,9 @@ def test_the_table_shows_state_name_detail_and_the_command_that_mends(
     code, out, err = run("doctor")
     assert (code, err) == (0, "")
     assert out.splitlines()[2:] == [
-        "ok      fine      1.0",
-        "absent  optional  not installed",
-        "                  to mend: pip install it",
+        "ok        fine      1.0",
+        "optional  optional  not installed",
+        "                    fix: pip install it",
     ]
     rows.append(Check("needed", False, "broken"))
     assert run("doctor")[0] == 1
@@ -93,11 +93,22 @@ def test_requirements_of_the_core_and_of_an_extra(
 
 
 @pytest.mark.parametrize(
+    ("codecs", "ok"), [({"libdav1d", "libaom-av1"}, True), ({"libdav1d"}, None), (set(), False)]
+)
+def test_only_the_decoder_is_required(
+    codecs: set[str], ok: bool | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("av.codecs_available", codecs)
+    row = doctor.check_video()
+    assert row.ok is ok and (row.fix is None) is (ok is True)
+
+
+@pytest.mark.parametrize(
     ("program", "ok", "detail"),
     [
         ("print('llvmpipe')", True, "drawn with llvmpipe"),
         ("import sys; print('chatter', file=sys.stderr); sys.exit('no device')", None, "no device"),
-        ("import os; os.abort()", None, "a driver crashed (exit code -6)"),
+        ("import os; os.abort()", None, "crashed (exit code -6)"),
         ("import time; time.sleep(60)", None, "did not answer within 1 s"),
     ],
     ids=["draws", "refuses", "crashes", "hangs"],
@@ -117,8 +128,7 @@ def test_the_renderer_is_asked_whatever_its_driver_does(
 def test_robommes_interpreter_is_asked(
     robomme_python: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    row = doctor.check_robomme()
-    assert (row.ok, "ROBOMME_PYTHON is not set" in row.detail) == (None, True)
+    assert doctor.check_robomme().ok is None
     for python, ok, detail in (
         (str(robomme_python), True, "robomme_numpy 1."),
         (sys.executable, False, "RoboMME needs numpy < 2"),
@@ -128,20 +138,13 @@ def test_robommes_interpreter_is_asked(
         row = doctor.check_robomme()
         assert row.ok is ok
         assert detail in row.detail
-    # It has to play, not only to be there.
-    monkeypatch.setenv("ROBOMME_PYTHON", str(robomme_python))
-    monkeypatch.setattr(
-        "robomme_interference_data.simulators.robomme.simulator.ARMS", ("VideoSleep",)
-    )
-    assert (row := doctor.check_robomme()).ok is False
-    assert "VideoSleep" in row.detail
 
 
 def test_the_hub_is_asked_and_a_token_never_shown(
     hub: Any, login: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     row = doctor.check_hub()
-    assert (row.ok, row.fix) == (None, "hf auth login") and "without a token" in row.detail
+    assert (row.ok, row.fix) == (None, "hf auth login")
     login("ada")
     row = doctor.check_hub()
     assert row.ok is True and row.detail.endswith("answers ada") and "hf_ada" not in repr(row)

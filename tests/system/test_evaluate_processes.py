@@ -119,7 +119,7 @@ def test_the_command_may_be_killed_or_stopped_at_any_moment(
             assert header["status"] == "running" and set(header["counts"].values()) == {0}
             continue
         assert running.returncode == 128 + number
-        assert "Traceback" not in err and "go on with:\nrobomme-interference evaluate" in err
+        assert "Traceback" not in err and "resume with:\nrobomme-interference evaluate" in err
         assert sum(header["counts"].values()) == len(rows)
         assert header["starts"][-1]["stopped"] == "interrupted"
         assert len((out / "rollouts.csv").read_text().splitlines()) == len(rows) + 1

@@ -1,4 +1,4 @@
-"""Fetch after a kill: what has come is not asked for again, and the buffer set is the one on disk."""
+"""Fetch after a kill: downloaded files are kept, and the result is the buffer set on disk."""
 
 import json
 import re

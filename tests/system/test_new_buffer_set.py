@@ -120,7 +120,7 @@ def test_published_demonstrations_without_an_index(
     [
         (["--demonstrations", str(GOLDEN / "demonstrations")], "published"),
         (["--demonstrations", "someone/units"], "published"),
-        (["--demonstrations", "nobody/nothing"], "there is no dataset repository"),
+        (["--demonstrations", "nobody/nothing"], "dataset repository 'nobody/nothing'"),
         (["--demonstrations", BASE, "--conditions", "k3"], "needs 3 distractor units"),
         (["--demonstrations", BASE, "--conditions", "raw-k1"], "needs the dataset distractors-raw"),
         (["--demonstrations", BASE, "--cameras", "side"], "side"),

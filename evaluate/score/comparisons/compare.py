@@ -1,4 +1,4 @@
-"""Two runs, or two conditions of one, paired over the episodes that both have."""
+"""Compare two runs, or two conditions of one, paired over shared episodes."""
 
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -26,9 +26,8 @@ class RunComparison:
     """Two runs, compared.
 
     Attributes:
-        table: A row per condition, or for the two that are compared, then the same by family.
-        notes: What a reader must know: that revisions differ, how many episodes flip between two
-            runs of one system, what only one of the runs holds.
+        table: A row per condition, or for the two compared conditions, then the same by family.
+        notes: Warnings, the share of flips between two runs of one system, and what is left out.
         runs: The rows of the runs.
     """
 
@@ -44,13 +43,12 @@ def compare(
     lenient: bool = False,
     conditions: Sequence[str] = (),
 ) -> RunComparison:
-    """Compare two runs of one simulator over the conditions and episodes that both have.
+    """Compare two runs of one simulator over shared conditions and episodes.
 
-    A system that both runs hold is compared with itself, as a repeat is. If they hold none in
-    common and one each, these two are compared, as a system with and without retrieval are. Runs
-    under different shifts are compared as well: their scenes are the same. Differences are the
-    second's rate − the first's; without a second one, two `conditions` of the first are compared,
-    and without `conditions` each with itself.
+    Systems of both runs are compared with themselves. If the runs share no system and hold one
+    each, these two are compared. Runs under different shifts can be compared, because their scenes
+    are the same. Differences are the second's rate − the first's. Without a second run, two
+    `conditions` of the first are compared.
     """
     _check_arguments(first, second, conditions)
     one = read_rows([first], systems[0], lenient)
@@ -64,11 +62,11 @@ def compare(
         both = [(conditions[0], conditions[1])] if conditions else [(c, c) for c in a.conditions]
         both = [two for two in both if two[0] in a.conditions and two[1] in b.conditions]
         pairs = {(part, two): _pairs(a, b, two, part) for part in ("", *FAMILIES) for two in both}
-        for (family, (own, others)), here in pairs.items():
-            if here.n:
-                names = (a.outcomes.simulator, b.system, others, (a.system, own), "compare")
-                complete = a.complete(own) and b.complete(others)
-                found.append(Contrast(*names, here, complete, family=family))
+        for (family, (before, after)), compared in pairs.items():
+            if compared.n:
+                names = (a.outcomes.simulator, b.system, after, (a.system, before), "compare")
+                complete = a.complete(before) and b.complete(after)
+                found.append(Contrast(*names, compared, complete, family=family))
         if a.repeats(b, one, other) and not conditions:
             notes += _noise(a, b, {c: pairs["", (c, c)] for c, _ in both})
     if not found:
@@ -80,7 +78,7 @@ def compare(
         ]
         raise InvalidOptionError(
             f"no episode of {runs} counts on both sides under {under}",
-            f"There are {' and '.join(dict.fromkeys(existing))}. Compare the same episodes.",
+            f"They hold {' and '.join(dict.fromkeys(existing))}. Compare the same episodes.",
         )
     notes += _left_out("a", sides[0].values(), dict(matched), conditions)
     notes += _left_out("b", sides[1].values(), {b: a for a, b in matched}, conditions[::-1])
@@ -88,10 +86,10 @@ def compare(
         "Two runs compared" if second else "Two conditions compared",
         "simulator system_a=against_system system_b=system family condition_a=against_condition "
         f"condition_b=condition n rate_a=against_rate rate_b=rate difference {TEST} complete",
-        "Over the n episodes that count in both; the difference is b − a, gained and lost are from "
-        "a to b. {how}",
+        "Over the n episodes that count in both; difference is b − a, gained and lost are changes "
+        "from a to b. {how}",
         lambda c: (c.simulator, bool(c.family)),
-        "the rows of all families, and those of single ones, of a simulator",
+        "the rows of all families, and among those of single families, of a simulator",
     )
     table = comparison_table("compare", found, spec)
     table = replace(table, note=f"a: {first}; b: {second or first}. {table.note}")
@@ -130,7 +128,7 @@ class _Side:
         return bool(self.outcomes.complete[self.outcomes.cell(self.system, condition)])
 
     def repeats(self, other: "_Side", rows: Rows, others: Rows) -> bool:
-        """Whether another run's side is the same system, in the same scenes and histories."""
+        """Whether another run's side is the same system with the same scenes and histories."""
         name = self.outcomes.simulator
         same = (self.system, name) == (other.system, other.outcomes.simulator)
         return same and rows.revisions.get(name) == others.revisions.get(name)
@@ -155,11 +153,11 @@ def _sides(rows: Rows) -> _Sides:
 
 
 def _matched(runs: Sequence[Rows], sides: Sequence[_Sides]) -> Iterator[tuple[_Side, _Side]]:
-    """Yield what is compared, simulator by simulator, in the order of tables."""
+    """Yield the sides that are compared, in the order of tables."""
     simulators, systems = ([rows.names(name) for rows in runs] for name in ("simulator", "system"))
     shared = {name: name for name in simulators[0] if name in simulators[1]}
     plain = [{unshifted(name): name for name in names} for names in simulators]
-    # The same simulator, under a shift in one run and under another, or none, in the other.
+    # The same simulator under different shifts.
     shared = shared or {plain[0][name]: plain[1][name] for name in plain[0] if name in plain[1]}
     if not shared:
         raise InvalidOptionError(
@@ -179,8 +177,8 @@ def _matched(runs: Sequence[Rows], sides: Sequence[_Sides]) -> Iterator[tuple[_S
 
 
 def _check_scenes(one: Rows, other: Rows) -> None:
-    """Check that the two runs' scenes are the same: an episode's seed is one."""
-    known, found = (
+    """Check that the two runs have the same seed for each episode."""
+    known, others = (
         {
             (unshifted(row.simulator), row.family, row.split, row.episode): row.seed
             for row in rows
@@ -189,16 +187,16 @@ def _check_scenes(one: Rows, other: Rows) -> None:
         for rows in (one, other)
     )
     for key, seed in known.items():
-        if found.get(key, seed) != seed:
+        if others.get(key, seed) != seed:
             raise InvalidOptionError(
-                f"{'/'.join(map(str, key[1:]))} has the seed {seed} in one run and {found[key]} in "
-                "the other",
+                f"{'/'.join(map(str, key[1:]))} has the seed {seed} in one run and "
+                f"{others[key]} in the other",
                 "Different scenes cannot be paired: compare runs over the same episodes.",
             )
 
 
 def _pairs(a: _Side, b: _Side, conditions: tuple[str, str], family: str) -> Pairs:
-    """Compare two sides, each under its condition, over shared episodes, all or a family's."""
+    """Compare two sides over shared episodes, all or those of a family."""
     places = [{one: at for at, one in enumerate(side.outcomes.episodes)} for side in (a, b)]
     shared = [one for one in places[0] if one in places[1] and family in ("", one.family)]
     first, second = (
@@ -207,7 +205,7 @@ def _pairs(a: _Side, b: _Side, conditions: tuple[str, str], family: str) -> Pair
         ]
         for side, condition, at in zip((a, b), conditions, places, strict=True)
     )
-    # Model seeds that the runs share are paired; if they share none, the lowest with the lowest.
+    # Shared model seeds are paired; without any, the lowest with the lowest, and so on.
     seeds = a.outcomes.model_seeds, b.outcomes.model_seeds
     matched = [(seeds[0].index(one), seeds[1].index(one)) for one in seeds[0] if one in seeds[1]]
     matched = matched or [(place, place) for place in range(min(map(len, seeds)))]
@@ -220,33 +218,32 @@ def _differing(one: Rows, other: Rows, matched: Iterable[tuple[_Side, _Side]]) -
         if two[0] != two[1]:
             yield (
                 f"a is of {two[0]} and b of {two[1]}: the scenes are the same, and the difference "
-                "is what the shift costs."
+                "is the effect of the shift."
             )
         revisions = [rows.revisions.get(name) for rows, name in zip((one, other), two, strict=True)]
         if revisions[0] != revisions[1]:
             yield (
                 f"The rows of {two[0]} are of different buffer sets (revisions "
-                f"{' and '.join(one or 'not known' for one in revisions)}): the histories may "
+                f"{' and '.join(one or 'unknown' for one in revisions)}): the histories may "
                 "differ."
             )
 
 
 def _noise(a: _Side, b: _Side, pairs: Mapping[str, Pairs]) -> list[str]:
-    """Say how many episodes flip between two runs of the same system: the noise floor."""
+    """Return a note on the share of episodes that flip between two runs of a system."""
     shares = []
-    for condition, here in pairs.items():
-        if here.pairs:
-            low, high = wilson(here.gained + here.lost, here.pairs)
+    for condition, compared in pairs.items():
+        if compared.pairs:
+            low, high = wilson(compared.gained + compared.lost, compared.pairs)
             shares.append(
-                f"{condition} {percent(here.flips)} of {here.pairs} "
+                f"{condition} {percent(compared.flips)} of {compared.pairs} "
                 f"(95% interval {100 * low:.1f} to {100 * high:.1f})"
             )
-    apart = set(a.outcomes.model_seeds).isdisjoint(b.outcomes.model_seeds)
+    disjoint = set(a.outcomes.model_seeds).isdisjoint(b.outcomes.model_seeds)
     note = (
-        f"{a.system} ran in both, with {'other' if apart else 'the same'} model seeds, in "
-        f"{a.outcomes.simulator}. If nothing else "
-        "differs, this share of episodes flips by itself, which is the noise floor: "
-        f"{', '.join(shares)}."
+        f"{a.system} ran in both, with {'other' if disjoint else 'the same'} model seeds, in "
+        f"{a.outcomes.simulator}. If nothing else differs, this share of episodes flips by chance "
+        f"(the noise floor): {', '.join(shares)}."
     )
     return [note] if shares else []
 
@@ -254,12 +251,12 @@ def _noise(a: _Side, b: _Side, pairs: Mapping[str, Pairs]) -> list[str]:
 def _left_out(
     name: str, sides: Iterable[_Side], matched: Mapping[_Side, _Side], conditions: Sequence[str]
 ) -> list[str]:
-    """Say what one run has and the comparison leaves out, nothing if that is nothing."""
+    """Return a note on the episodes of a run that the comparison leaves out, if any."""
     parts = []
     for side in sides:
         other = matched[side].counted if side in matched else (lambda condition: set())
         both = [tuple(conditions)] if conditions else [(c, c) for c in side.conditions]
-        counts = {c: len(side.counted(c) - other(others)) for c, others in both}
+        counts = {c: len(side.counted(c) - other(second)) for c, second in both}
         if lone := ", ".join(f"{c} ({count:,})" for c, count in counts.items() if count):
             parts.append(f"{side.system} in {side.outcomes.simulator}, {lone}")
     return [f"Only in {name}, and left out (episodes): {'; '.join(parts)}."] if parts else []

@@ -1,9 +1,9 @@
-"""What is compared with what: one comparison, and which kinds of conditions make one."""
+"""One comparison, and which kinds of conditions are compared with which."""
 
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 from robomme_interference_data.schema.conditions import KINDS, NO_HISTORY, parse_condition
 from robomme_interference_data.stats.bootstrap import Interval
@@ -11,11 +11,11 @@ from robomme_interference_data.stats.bootstrap import Interval
 from .pairs import Pairs
 
 START = "k0"
-"""The condition that retention and contrasts begin at."""
+"""The condition that changes and retention are measured from."""
 
 
 class Comparison(NamedTuple):
-    """The kind that another is compared with, the first side, and what that measures."""
+    """The kind of condition that another kind is compared with, and what that measures."""
 
     reference: str
     asks: str
@@ -32,7 +32,7 @@ COMPARISONS = {
     "stale": Comparison("k", "updating"),
     "misled": Comparison(NO_HISTORY, "belief"),
 }
-"""Kind to what its conditions are compared for with equally many sessions, as tables order it."""
+"""Kind of condition to its comparison, with equally many sessions; in the order of tables."""
 
 
 NO_RETENTION = Interval(math.nan)
@@ -40,33 +40,23 @@ NO_RETENTION = Interval(math.nan)
 
 @dataclass(frozen=True)
 class Contrast:
-    """One comparison: what changes from `against` to the condition.
-
-    Attributes:
-        simulator, system, condition: Their names.
-        against: System and condition that it is compared with: the first side.
-        table: Name of the table that it is in (see `tables.SPECS`).
-        pairs: The comparison.
-        complete: Whether both cells are complete.
-        family: The only family whose episodes are compared; empty for all.
-        retention: Of a lift: what is left at the condition of the lift at k0.
-        retention_n: Episodes that count under all three conditions, of which retention is.
-    """
+    """One comparison: the change from `against` to the system and condition."""
 
     simulator: str
     system: str
     condition: str
-    against: tuple[str, str]
-    table: str
+    against: tuple[str, str]  # system and condition of the first side
+    table: str  # the table that lists it, see `tables.SPECS`
     pairs: Pairs
-    complete: bool
-    family: str = ""
-    retention: Interval = NO_RETENTION
-    retention_n: int | None = None
+    complete: bool  # whether both cells are
+    family: str = ""  # the only family whose episodes are compared; empty for all
+    retention: Interval = NO_RETENTION  # of a lift: the share of the lift at k0 that is left
+    retention_n: int | None = None  # episodes that count under all three conditions
+    more: Mapping[str, Any] = field(default_factory=dict)  # columns of a single table
 
     @property
     def asks(self) -> str:
-        """What a comparison of two kinds of conditions measures; empty for any other."""
+        """What a comparison between kinds of conditions measures; empty for any other."""
         kind = parse_condition(self.condition).kind.name
         return COMPARISONS[kind].asks if self.table == "interference" else ""
 
@@ -74,14 +64,14 @@ class Contrast:
 def comparable(
     system: str, conditions: Iterable[str], floor: tuple[str, str] | None
 ) -> Iterator[tuple[str, tuple[str, str]]]:
-    """Yield each condition that `COMPARISONS` has, with the system and condition it is against.
+    """Yield each condition in `COMPARISONS`, with the system and condition it is compared with.
 
-    `floor` is the system and condition that are the system's `no-history`, if there is one.
+    `floor` is the system and condition that serve as the system's `no-history`, if there are any.
     """
-    own = [parse_condition(name) for name in conditions]
-    cells = {(one.kind.name, one.k): (system, one.name) for one in own}
+    parsed = [parse_condition(name) for name in conditions]
+    cells = {(one.kind.name, one.k): (system, one.name) for one in parsed}
     cells |= {(NO_HISTORY, 0): floor} if floor else {}
-    for one in own:
+    for one in parsed:
         if comparison := COMPARISONS.get(one.kind.name):
             k = one.k if KINDS[comparison.reference].counted else 0
             if against := cells.get((comparison.reference, k)):

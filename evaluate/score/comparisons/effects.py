@@ -1,7 +1,7 @@
-"""What conditions do to a system: lift, decay, retention, kinds of interference, and noise.
+"""Effects of conditions on a system: lift, decay, retention, kinds of interference, and noise.
 
-All comparisons are paired: they use the episodes that count under both conditions, and the
-episode is what is drawn in the bootstrap.
+All comparisons are paired over the episodes that count under both conditions; the bootstrap draws
+episodes.
 """
 
 import math
@@ -32,17 +32,17 @@ from .pairs import pair
 def effects_of(
     outcomes: Outcomes, system: str, base: str | None, ceiling: str | None, draws: int
 ) -> tuple[list[Contrast], list[tuple[Any, ...]]]:
-    """Compare a system's conditions with each other, all intervals from the same draws.
+    """Compare a system's conditions, all bootstrap intervals from the same draws.
 
-    Each `k<n>` is compared with `no-history` and with k0, kinds of conditions as `COMPARISONS` has
-    it, and under each condition a system with retrieval with its `base`, the one without, whose
-    `no-history` is both systems', and any with the `ceiling` of its memory. Returns comparisons and
-    the row of `decay_table`, if there are at least two `k<n>`.
+    Each `k<n>` is compared with `no-history` and with k0, kinds of conditions as in `COMPARISONS`,
+    and under each condition the system with its `base` (the one without retrieval, whose
+    `no-history` serves both) and with its `ceiling` (the ideal observer). Returns the comparisons,
+    and the row of `decay_table` if there are at least two `k<n>`.
     """
     cells = [(name, c) for name in (system, base, ceiling) if name for c in outcomes.ran(name)]
     at = {cell: place for place, cell in enumerate(cells)}
-    own = [outcomes.there[outcomes.systems.index(name)] for name in (system, base) if name]
-    here = np.logical_or.reduce(own)
+    ran_in = [outcomes.has_episode[outcomes.systems.index(s)] for s in (system, base) if s]
+    here = np.logical_or.reduce(ran_in)
     sides = [outcomes.status[outcomes.cell(*cell)][here] for cell in cells]
     values = np.stack([success(side) for side in sides], axis=1)
     complete = [bool(outcomes.complete[outcomes.cell(*cell)]) for cell in cells]
@@ -56,14 +56,15 @@ def effects_of(
     compared |= {(c, (system, START)): "effects" for c in later}
     compared |= {(c, (base, c)): "effects" for c in ran if base and (base, c) in at}
     compared |= {(c, (base, START)): "equivalence" for c in later if base and (base, START) in at}
-    compared |= {(c, there): "interference" for c, there in comparable(system, ran, floor)}
+    compared |= {(c, other): "interference" for c, other in comparable(system, ran, floor)}
     compared |= {(c, (ceiling, c)): "ceiling" for c in ran if ceiling and (ceiling, c) in at}
     found = {}
-    for (c, there), table in compared.items():
-        pairs, both = pair(sides[at[there]], sides[at[system, c]]), (at[there], at[system, c])
+    for (c, other), table in compared.items():
+        both = at[other], at[system, c]
+        pairs = pair(*(sides[place] for place in both))
         whole = all(complete[place] for place in both)
-        found[c, there] = Contrast(outcomes.simulator, system, c, there, table, pairs, whole)
-    # A lift that is not above zero beyond doubt is nothing to have a share of.
+        found[c, other] = Contrast(outcomes.simulator, system, c, other, table, pairs, whole)
+    # Retention is a share of the lift at k0, so that lift must be significantly above zero.
     lift = found.get((START, floor)) if floor else None
     if floor and lift and lift.pairs.change.value > 0 and lift.pairs.p < ALPHA:
         for c in later:
@@ -87,19 +88,19 @@ def effects_of(
 def retained(values: Floats, lift: Interval, fall: Interval) -> Interval:
     """Return the share of the lift at k0 that is left, with Fieller's interval.
 
-    Where the condition equals no-history, or k0, in every episode, the ratio is 0, or 1, without
-    any spread: there the interval is that of the lift, or of the fall, divided by the lift at k0.
-    `values` are success under no-history, k0 and the condition, `(E, 3)`; `lift` is the condition's
-    change from no-history, `fall` that from k0.
+    `values` are success under no-history, k0 and the condition, `(E, 3)`; `lift` is the change from
+    no-history, `fall` that from k0. If the condition equals no-history (or k0) in every episode,
+    the ratio is 0 (or 1) without variance, and the interval is that of the lift (or the fall)
+    divided by the lift at k0.
     """
     none, start, end = values.T
     whole, share = (start - none), (end - none)
     if not len(values) or whole.mean() <= 0:
         return Interval(math.nan)
     ratio = float(share.mean() / whole.mean())
-    for sure, other, change in ((0.0, none, lift), (1.0, start, fall)):
+    for exact, other, change in ((0.0, none, lift), (1.0, start, fall)):
         if (end == other).all():
-            return Interval(sure, *(sure + bound / float(whole.mean()) for bound in change[1:]))
+            return Interval(exact, *(exact + bound / float(whole.mean()) for bound in change[1:]))
     if len(values) < 2:
         return Interval(ratio)
     spread = np.cov(share, whole) / len(values)
@@ -115,20 +116,20 @@ def retained(values: Floats, lift: Interval, fall: Interval) -> Interval:
 
 
 def decay_table(rows: Iterable[tuple[Any, ...]]) -> Table:
-    """Return each system's log-linear decay over the sessions in the buffer (see `effects_of`)."""
+    """Return each system's log-linear decay over the sessions in the buffer."""
     return Table.make(
         "decay",
         "Decay over sessions",
         "simulator system conditions n:count slope:points low:points high:points complete:flag",
         rows,
-        "slope: change of the success rate with each doubling of the sessions in the buffer, the "
-        "lesson included: the least-squares line over log2(k + 1). 95% BCa bootstrap interval, "
-        f"clustered by episode, where at least {MIN_EPISODES} episodes add to the slope.",
+        "slope: change of the success rate per doubling of the sessions in the buffer, the lesson "
+        "included (least-squares line over log2(k + 1)). 95% BCa bootstrap interval over episodes, "
+        f"if at least {MIN_EPISODES} episodes contribute to the slope.",
     )
 
 
 def noise_table(every: Iterable[Outcomes]) -> Table:
-    """Return how often two repeats of the same rollout disagree, where there are repeats."""
+    """Return how often two repeats of the same rollout disagree."""
     rows = []
     for outcomes in every:
         for s, c in np.argwhere(outcomes.has_rows).tolist():
@@ -146,8 +147,8 @@ def noise_table(every: Iterable[Outcomes]) -> Table:
         "Flips between repeats",
         "simulator system condition pairs:count flips:count rate:rate low:rate high:rate",
         rows,
-        "Repeats differ in the model seed alone; in each episode the two lowest that count are "
-        "compared. A share of flips between conditions (flips in the tables of effects) that is "
-        "not above this rate is noise. A flip rate is gross, a difference is net, gained less "
-        "lost: one that is smaller than this rate can still be real, and p tells.",
+        "Repeats differ only in the model seed; in each episode the two lowest that count are "
+        "compared. Between conditions, a share of flips (flips in the tables of effects) that does "
+        "not exceed this rate is noise. A difference is gained minus lost, so one below this rate "
+        "can still be significant: see p.",
     )

@@ -1,9 +1,8 @@
-"""Comparisons family by family, whether families differ, and what is said beyond these nine."""
+"""Comparisons family by family, whether families differ, and intervals beyond these nine."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +24,7 @@ from .tables import CELLS, TableSpec, comparison_table, corrected, provisional
 DRAWS = 2000
 """Permutations, and draws of families and episodes."""
 
-_CHUNK = 2**18  # numbers that are dealt out at a time
+_CHUNK = 2**18  # numbers that are permuted at a time
 
 _TABLES = ("lift", "effects", "interference")
 
@@ -48,22 +47,21 @@ _SPEC = TableSpec(
     "Effects over families",
     f"{CELLS} n families:count difference alike:points alike_low:points alike_high:points "
     "sample_low:points sample_high:points p_families:p p_families_holm:p complete",
-    "difference: over all episodes, as in the other tables and the headline, which speak of "
-    "these families as they are. alike: the mean of the families' own differences. alike_low "
-    "to alike_high: 95% bootstrap interval of it for these families, episodes drawn within "
-    "each. sample_low to sample_high: the same where families are drawn too, as a sample of "
-    "such families: what holds for tasks beyond these, and much wider; of so few families "
-    f"still too narrow. Both from {DRAWS:,} draws, where at least {MIN_EPISODES} episodes differ. "
-    "p_families: whether the difference is another one in other families, by a permutation "
-    f"test of {DRAWS:,} draws; p_families_holm: corrected by Holm's method within a simulator.",
+    "difference: over all episodes, as in the other tables. alike: the mean of the families' own "
+    "differences. alike_low to alike_high: its 95% bootstrap interval for these families, with "
+    "episodes drawn within each. sample_low to sample_high: the same with families drawn too, as a "
+    "sample of such families: for tasks beyond these, much wider, and with so few families still "
+    f"too narrow. Both from {DRAWS:,} draws, if at least {MIN_EPISODES} episodes differ. "
+    "p_families: a permutation test of whether the difference varies between families, with "
+    f"{DRAWS:,} permutations; p_families_holm: after Holm's correction within a simulator.",
     power=False,
 )
-_OVER = ("alike", "alike_low", "alike_high", "sample_low", "sample_high", "p_families")
+_COLUMNS = ("alike", "alike_low", "alike_high", "sample_low", "sample_high", "p_families")
 
 
 def families_table(every: Iterable[Outcomes], contrasts: Sequence[Contrast]) -> Table:
-    """Return each comparison with families weighing alike, and whether it differs over them."""
-    shown, more = list[Contrast](), list[dict[str, Any]]()
+    """Return each comparison with equally weighted families, and whether it varies over them."""
+    rows = list[Contrast]()
     for outcomes in every:
         labels = np.array([FAMILIES.index(one.family) for one in outcomes.episodes])
         found = []
@@ -78,12 +76,12 @@ def families_table(every: Iterable[Outcomes], contrasts: Sequence[Contrast]) -> 
         values = np.stack([differences for _, differences, _ in found], axis=1)
         numbers = over_families(values, labels, outcomes.simulator)
         holms = corrected([float(p) for *_, p in numbers], [0] * len(found))
-        for (one, _, count), told, p_holm in zip(found, numbers, holms, strict=True):
-            ps = {"p_families": told[-1], "p_families_holm": p_holm}
+        for (one, _, count), estimates, p_holm in zip(found, numbers, holms, strict=True):
+            ps = {"p_families": estimates[-1], "p_families_holm": p_holm}
             ps = {name: provisional(p, one.complete) for name, p in ps.items()}
-            more.append({"families": count, **dict(zip(_OVER, told, strict=True)), **ps})
-            shown.append(replace(one, table="families"))
-    return comparison_table("families", shown, _SPEC, more)
+            more = {"families": count, **dict(zip(_COLUMNS, estimates, strict=True)), **ps}
+            rows.append(replace(one, table="families", more=more))
+    return comparison_table("families", rows, _SPEC)
 
 
 def _of(outcomes: Outcomes, contrasts: Iterable[Contrast]) -> list[Contrast]:
@@ -95,33 +93,27 @@ def _of(outcomes: Outcomes, contrasts: Iterable[Contrast]) -> list[Contrast]:
 def over_families(
     values: Floats, labels: NDArray[np.int64], key: str, draws: int = DRAWS
 ) -> list[tuple[float, ...]]:
-    """Return what families have in common and what not, of several comparisons.
+    """Return, for each comparison, how its difference varies over families.
 
-    The permutation test: with the sum Sᶠ of a family's nᶠ differences, Σ Sᶠ² / nᶠ is the larger the
-    more families differ; p is the share of the draws that deal the episodes out to the families
-    anew and reach the observed value, itself counted as one of them. Families and episodes that are
-    not known take no part in any draw.
+    These are the mean of the families' means, its 95% interval for these families, the one for a
+    sample of such families (NaN if fewer than ten episodes differ), and p. `values` are second −
+    first of each episode, NaN where not both count, `(E, K)`; `labels` are the families, `(E,)`;
+    `key` seeds the draws. Unknown families and episodes take no part in any draw.
+
+    The permutation test: with the sum Sᶠ of a family's nᶠ differences, Σ Sᶠ² / nᶠ grows with the
+    differences between families; p is the share of permutations of the episodes over the families
+    that reach the observed value, which counts as one of them.
 
     Source: Davison and Hinkley (1997), Bootstrap Methods and their Application, sections 3.8 (draws
     of clusters, then within them) and 4.3 (permutations).
-
-    Args:
-        values: Second − first of each episode, NaN where not both count, `(E, K) float64`.
-        labels: Number of each episode's family, `(E,) int64`.
-        key: Text that seeds the draws.
-        draws: Their number.
-
-    Returns:
-        Of each comparison: the mean of the families' means; its 95% interval for these families,
-        and for a sample of such families, NaN where fewer than ten episodes differ; p.
     """
     masks, place = np.unique(~np.isnan(values), axis=1, return_inverse=True)
     found: list[tuple[float, ...]] = [()] * values.shape[1]
-    # Most comparisons lack the same episodes, mostly none: each set of them is drawn from once.
+    # Most comparisons lack the same episodes, or none: each distinct set is drawn from once.
     for at, known in enumerate(masks.T):
-        mine = np.flatnonzero(place == at)
-        told = _over(values[np.ix_(known, mine)], labels[known], key, draws)
-        for column, one in zip(mine.tolist(), told, strict=True):
+        columns = np.flatnonzero(place == at)
+        estimates = _over(values[np.ix_(known, columns)], labels[known], key, draws)
+        for column, one in zip(columns.tolist(), estimates, strict=True):
             found[column] = one
     return found
 
@@ -129,21 +121,21 @@ def over_families(
 def _over(
     values: Floats, labels: NDArray[np.int64], key: str, draws: int
 ) -> Iterator[tuple[float, ...]]:
-    """Yield what `over_families` returns, of values without a hole."""
+    """Yield what `over_families` returns, for values without NaN."""
     order = np.argsort(labels, kind="stable")
     labels, values = labels[order], values[order]
     starts = np.flatnonzero(np.diff(labels, prepend=-1))
     sizes = np.diff(starts, append=len(labels))[:, None]
     generator = generator_of(f"{key}, families")
 
-    def spread(deals: NDArray[np.int64]) -> Floats:
+    def variation(deals: NDArray[np.int64]) -> Floats:
         sums = np.add.reduceat(values[deals], starts, axis=1)
         return np.asarray((sums * sums / sizes).sum(axis=1).round(9))
 
     every = np.arange(len(values))[None]
-    observed, step = spread(every), max(1, _CHUNK // values.size)
+    observed, step = variation(every), max(1, _CHUNK // values.size)
     reached = sum(
-        (spread(generator.permuted(every.repeat(size, 0), axis=1)) >= observed).sum(axis=0)
+        (variation(generator.permuted(every.repeat(size, 0), axis=1)) >= observed).sum(axis=0)
         for size in (min(step, draws - at) for at in range(0, draws, step))
     )
     p = (1 + np.asarray(reached)) / (1 + draws)

@@ -24,41 +24,24 @@ from robomme_interference_data.stats.intervals import (
 from robomme_interference_data.stats.significance import mcnemar, sign_flip, two_proportions
 
 WITHIN = 0.90
-"""Level of the interval that lies within a margin where two one-sided tests at 5% say so."""
+"""Level of the interval that equivalence uses: two one-sided tests at 5%."""
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """Two sides, paired over the episodes that count on both.
+    """Two sides of a comparison, paired over the episodes that count on both."""
 
-    Attributes:
-        n: Episodes that count on both sides; of unpaired sides the fewer.
-        first: Mean success over them on the first side.
-        second: The same on the second side.
-        change: `second` − `first` with its 95% interval.
-        within: The same with its 90% interval.
-        interval: Kind of these intervals: `newcombe` of single rollouts, `clusters` with repeats,
-            `unpaired`; empty without an episode.
-        pairs: Pairs of rollouts, one an episode: of the lowest model seed that counts on both
-            sides; none of unpaired sides.
-        gained: Pairs that succeed on the second side alone.
-        lost: Pairs that succeed on the first side alone.
-        p: Two-sided p-value of the exact sign-flip test on the episodes' means, which of single
-            rollouts is McNemar's; of unpaired sides that of two proportions. NaN without episodes.
-        p_mid: Its mid-p; NaN of unpaired sides.
-    """
-
-    n: int
-    first: float
+    n: int  # episodes that count on both sides; of unpaired sides the fewer
+    first: float  # mean success over them on the first side
     second: float
-    change: Interval
-    within: Interval
-    interval: str
-    pairs: int
-    gained: int
-    lost: int
-    p: float
-    p_mid: float
+    change: Interval  # second − first, with its 95% interval
+    within: Interval  # the same with its 90% interval
+    interval: str  # `newcombe`, with repeats `clusters`, or `unpaired`; empty without an episode
+    pairs: int  # pairs of rollouts, one per episode: of the lowest shared model seed
+    gained: int  # pairs that succeed on the second side alone
+    lost: int  # pairs that succeed on the first side alone
+    p: float  # two-sided: McNemar's or sign-flip, exact; unpaired, of two proportions
+    p_mid: float  # its mid-p; NaN of unpaired sides
 
     @property
     def paired(self) -> bool:
@@ -75,19 +58,16 @@ NO_PAIRS = Pairs(
     *(0, math.nan, math.nan, Interval(math.nan), Interval(math.nan), "", 0, 0, 0),
     *(math.nan, math.nan),
 )
-"""What comes of no episode."""
+"""The comparison over no episode."""
 
 
 def pair(
     first: Statuses, second: Statuses, matched: Sequence[tuple[int, int]] | None = None
 ) -> Pairs:
-    """Compare two sides over the same episodes.
+    """Compare two sides over the same episodes: outcomes by episode and model seed, `(E, M) int8`.
 
-    Args:
-        first: Outcomes by episode and model seed, `(E, M) int8`.
-        second: The same of the second side, `(E, N) int8`.
-        matched: Places of model seeds that are paired, of the first and the second side, in the
-            order in which a pair is looked for; None for equal places.
+    `matched` lists the places of paired model seeds on both sides, in order of preference; by
+    default seeds at equal places are paired.
     """
     before, after = success(first), success(second)
     known = ~np.isnan(before + after)
@@ -102,16 +82,16 @@ def pair(
         one, other = zip(*matched, strict=True)
         first, second = first[:, one], second[:, other]
     both = counting(first) & counting(second)
-    found = np.flatnonzero(both.any(-1))
-    seed = both[found].argmax(-1)
-    old, new = (side[found, seed] == 0 for side in (first, second))
+    episodes = np.flatnonzero(both.any(-1))
+    seed = both[episodes].argmax(-1)
+    old, new = (side[episodes, seed] == 0 for side in (first, second))
     gained, lost = int((new & ~old).sum()), int((old & ~new).sum())
-    counts = (len(found), gained, lost)
+    counts = (len(episodes), gained, lost)
     return Pairs(n, rate, other_rate, change, within, "clusters", *counts, *tests)
 
 
 def _of_single(before: Floats, after: Floats) -> Pairs:
-    """Compare single rollouts, success 0 or 1 in each episode: four counts say it all."""
+    """Compare single rollouts: success is 0 or 1 in each episode, so four counts suffice."""
     n = len(before)
     if not n:
         return NO_PAIRS
@@ -134,8 +114,8 @@ def _clusters(first: Statuses, second: Statuses, level: float) -> Interval:
     before, after = (float(side.mean()) for side in values)
     spread = float(values[0].std() * values[1].std())
     phi = (float((values[0] * values[1]).mean()) - before * after) / spread if spread else 0.0
-    worth = [rate_of(side).trials for side in (first, second)]
-    old, new = (wilson(r * m, m, level) for r, m in zip((before, after), worth, strict=True))
+    trials = [rate_of(side).trials for side in (first, second)]
+    old, new = (wilson(r * m, m, level) for r, m in zip((before, after), trials, strict=True))
     return Interval(round(after - before, 12), *mover_interval(after, new, before, old, phi))
 
 

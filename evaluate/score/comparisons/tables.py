@@ -1,7 +1,7 @@
-"""Tables of comparisons: each is one specification; one function makes rows, Holm's p and notes."""
+"""Tables of comparisons: one specification each; one function makes rows, Holm's p and notes."""
 
 import math
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from operator import attrgetter
@@ -44,7 +44,7 @@ _VALUES: dict[str, tuple[str, Callable[[Contrast], Any]]] = {
     "retention_n": ("count", lambda c: c.retention_n),
     "complete": ("flag", attrgetter("complete")),
 }
-"""Column to its kind (see `viz.tables.Column`), and to its value in the row of a comparison."""
+"""Column to its kind (see `viz.tables.Column`) and its value for a comparison."""
 
 CELLS = "simulator system condition against_system against_condition"
 TEST = "low high interval pairs gained lost flips p p_mid p_holm:p"
@@ -55,14 +55,10 @@ _BOTH = "Over the n episodes that count on both sides. {how}"
 class TableSpec:
     """A table of comparisons.
 
-    Attributes:
-        title: Its title.
-        columns: Names of `_VALUES`; `name=value` renames one, `name:kind` adds one whose values
-            are given to `comparison_table`, and `p_holm` is p after Holm's correction.
-        note: How to read it; `{how}` is the explanation of intervals and tests.
-        group: The comparisons that Holm's correction counts together have the same of this.
-        among: The same in words.
-        power: Whether the note ends with what so many episodes can show.
+    `columns` names entries of `_VALUES`; `name=value` renames one, and `name:kind` shows an entry
+    of `Contrast.more`, or `p_holm`, which is p after Holm's correction. In the note, `{how}` is the
+    explanation of intervals and tests. Comparisons with equal `group` are corrected together;
+    `among` describes them. With `power` the note ends with what so many episodes can detect.
     """
 
     title: str
@@ -85,58 +81,57 @@ SPECS = {
         "simulator system condition no_history_of=against_system n rate "
         f"no_history_rate=against_rate lift=difference {TEST} retention retention_low "
         "retention_high retention_n complete",
-        f"{_BOTH} retention: lift divided by the lift "
-        f"at k0, where that one is above zero with p < {ALPHA}, with Fieller's interval; of the "
-        "retention_n episodes that count under no-history, k0 and the condition, which of cells "
-        "that are not complete can be fewer than n. A system with retrieval is, without history, "
-        "the system without it.",
+        f"{_BOTH} retention: lift divided by the lift at k0, with Fieller's interval, computed "
+        f"only if the lift at k0 is above zero with p < {ALPHA}; over the retention_n episodes "
+        "that count under no-history, k0 and the condition, which can be fewer than n in "
+        "incomplete cells. Without history, a system with retrieval is the system without it.",
     ),
     "effects": TableSpec("Effects between conditions", _EFFECT),
     "interference": TableSpec(
-        "Which interference hurts",
+        "Effect of each kind of interference",
         _EFFECT.replace("against_condition", "against_condition asks"),
-        "Two kinds of conditions with equally many sessions, which differ in what is asked. "
+        "Two kinds of conditions with equally many sessions that differ in one property (asks). "
         + _BOTH,
     ),
     "ceiling": TableSpec(
-        "Gap to the ceiling",
+        "Gap to the ideal observer",
         _EFFECT,
-        "The ceiling is the ideal observer with the same memory: it uses all of the evidence that "
-        f"the memory kept. {_BOTH}",
+        "The ideal observer has the same memory and uses all of the evidence that the memory kept. "
+        + _BOTH,
     ),
     "systems": TableSpec(
         "Difference to the best system",
         _EFFECT,
-        "Within each condition, complete cells against that of the highest rate, of equal ones the "
-        f"first. {_BOTH}",
+        "Within each condition, each complete cell against the one with the highest rate (the "
+        f"first of equal ones). {_BOTH}",
         *_WITHIN,
     ),
     "matrix": TableSpec(
         "All pairs of systems",
         _EFFECT,
-        f"Within each condition, of complete cells. {_BOTH}",
+        f"Complete cells within each condition. {_BOTH}",
         *_WITHIN,
     ),
     "interaction": TableSpec(
-        "Which system falls more",
+        "Which system loses more",
         "simulator system condition against_system n change:points=rate "
         f"against_change:points=against_rate difference {TEST} complete",
-        f"change: rate under the condition − rate at {START}; difference: of the changes, positive "
-        "where the system falls less than the other one, which is the best at k0, or the one "
-        "without retrieval. The best at k0 is chosen by that rate, which overstates its fall where "
+        f"change: rate under the condition − rate at {START}; difference: between the two changes, "
+        "positive if the system loses less than the other one, which is the best at k0 or the "
+        "system without retrieval. Choosing the best at k0 by its rate overstates its loss if "
         "others are about as good. Systems whose histories may differ are left out. Over the n "
-        "episodes that count in all four cells; pairs are episodes, gained and lost "
-        "those whose change is higher, or lower, than the other's. 95% "
-        "intervals: from those of both changes and their correlation. p: the exact sign-flip test "
-        "of the episodes' differences, p_mid its mid-p, p_holm corrected by Holm's method among "
-        "the tests of this table in one simulator.",
+        "episodes that count in all four cells; pairs are episodes, gained and lost those whose "
+        "change is higher or lower than the other system's. 95% intervals combine those of both "
+        "changes and their correlation. p: exact sign-flip test of the episodes' differences; "
+        "p_mid: its mid-p; p_holm: p after Holm's correction among the tests of this table in one "
+        "simulator.",
         power=False,
     ),
     "family_effects": TableSpec(
         "Effects by family",
         f"{CELLS} family n rate against_rate difference {TEST} complete",
-        "The lifts, effects and kinds of interference of the tables of those names, in each family "
-        "alone, over the n episodes that count on both sides. {how}",
+        "The comparisons of the tables lift, effects and interference within each family, over the "
+        "n episodes that count on both sides. {how}",
         power=False,
     ),
 }
@@ -144,26 +139,17 @@ SPECS = {
 
 
 def comparison_table(
-    name: str,
-    contrasts: Iterable[Contrast],
-    spec: TableSpec | None = None,
-    more: Sequence[Mapping[str, Any]] | None = None,
+    name: str, contrasts: Iterable[Contrast], spec: TableSpec | None = None
 ) -> Table:
-    """Return the table of the comparisons that name it.
-
-    Without a specification it is one of `SPECS`; `more` has for each row the values of the columns
-    that the specification adds.
-    """
+    """Return the table of the comparisons that name it, by default with its entry in `SPECS`."""
     spec = spec or SPECS[name]
     found = [one for one in contrasts if one.table == name]
     columns = [_column(text) for text in spec.columns.split()]
     holms = corrected([one.pairs.p for one in found], [spec.group(one) for one in found])
     rows = []
-    for place, one in enumerate(found):
-        added = {"p_holm": provisional(holms[place], one.complete), **(more[place] if more else {})}
-        rows.append(
-            tuple(added[key] if key in added else _VALUES[key][1](one) for _, key in columns)
-        )
+    for one, p_holm in zip(found, holms, strict=True):
+        more = {"p_holm": provisional(p_holm, one.complete), **one.more}
+        rows.append(tuple(more[key] if key in more else _VALUES[key][1](one) for _, key in columns))
     note = spec.note.format(how=_how_to_read(found, spec.among))
     if spec.power:
         pairs = [one.pairs for one in found if not one.family]
@@ -172,7 +158,7 @@ def comparison_table(
 
 
 def _column(text: str) -> tuple[str, str]:
-    """Return a column of a table, as `Table.make` reads it, and the name of its value."""
+    """Return a column in the notation of `Table.make`, and the name of its value."""
     shown, _, value = text.partition("=")
     name, _, kind = shown.partition(":")
     value = value or name
@@ -180,12 +166,12 @@ def _column(text: str) -> tuple[str, str]:
 
 
 def provisional(p: float, complete: bool) -> float:
-    """Return a p-value as tables show it: one of cells that are not complete is provisional."""
+    """Return a p-value, marked as provisional if a cell is incomplete."""
     return p if complete else Provisional(p)
 
 
 def corrected(p_values: Sequence[float], groups: Sequence[Hashable]) -> list[float]:
-    """Return p-values by Holm's method, those of one group corrected among themselves."""
+    """Return p-values after Holm's correction within each group."""
     adjusted = [math.nan] * len(p_values)
     for group in dict.fromkeys(groups):
         places = [place for place, one in enumerate(groups) if one == group]
@@ -198,22 +184,22 @@ def _how_to_read(found: Sequence[Contrast], among: str) -> str:
     """Explain the intervals and tests of some comparisons."""
     kinds = {one.pairs.interval for one in found}
     note = (
-        "95% intervals (interval): newcombe, Newcombe's paired score interval. p: McNemar's exact "
-        "test; p_mid: its mid-p, which is less cautious; p_holm: p corrected by Holm's method "
-        f"among {among}. pairs: one an episode; gained and lost: those whose outcome differs; "
-        "flips: their share."
+        "95% confidence intervals; interval names the method: newcombe is Newcombe's paired score "
+        "interval. p: McNemar's exact test; p_mid: its less conservative mid-p; p_holm: p after "
+        f"Holm's correction among {among}. pairs: one per episode; gained and lost: pairs whose "
+        "outcome changes; flips: their share."
     )
     if "clusters" in kinds:
         note += (
-            " With repeats (clusters) interval and p are of the episodes' means: the score "
-            "interval from Wilson's of each side by clusters, and the exact sign-flip test; pairs "
-            "are of the lowest model seed that counts on both sides."
+            " With repeats (clusters), interval and p use the episodes' means: the score interval "
+            "from cluster-adjusted Wilson intervals of both sides, and the exact sign-flip test; "
+            "pairs are of the lowest model seed that counts on both sides."
         )
     if "unpaired" in kinds:
         note += (
-            " Where histories may differ (unpaired) nothing is paired: Newcombe's hybrid score "
+            " If histories may differ (unpaired), nothing is paired: Newcombe's hybrid score "
             "interval, and the test of two proportions."
         )
     if not all(one.complete for one in found):
-        note += " p†: provisional, as a cell is not complete: looking early finds too much."
+        note += " p†: provisional, because a cell is incomplete; early looks find too much."
     return note

@@ -8,20 +8,13 @@ from typing import Any
 from robomme_interference_data.schema.conditions import NO_HISTORY, parse_condition
 from robomme_interference_data.viz.figure import INK, connect_right, right_of, tidy
 
-from .data import CHANCE, FEW, PUBLISHED, Data
+from .data import CHANCE, PUBLISHED, Data
 from .styles import SeriesStyle
 
 
-def shifts(systems: Sequence[str]) -> dict[str, float]:
-    """Return each system's shift on the x axis: where there are intervals, they do not overlap."""
-    step = 0.09 if len(systems) <= FEW else 0.0
+def shifts(systems: Sequence[str], step: float = 0.09) -> dict[str, float]:
+    """Return each system's shift on the x axis, which keeps intervals apart."""
     return {name: (place - (len(systems) - 1) / 2) * step for place, name in enumerate(systems)}
-
-
-def mark(artists: Any, system: str) -> None:
-    """Say of what is drawn which system it is of: pages set one apart by it."""
-    for artist in artists:
-        artist.set_gid(f"system:{system.removesuffix(PUBLISHED)}")
 
 
 def curve(
@@ -29,8 +22,8 @@ def curve(
 ) -> dict[str, float]:
     """Draw a system's rates over the conditions, in a part of the episodes or (empty) in all.
 
-    Points of incomplete cells are hollow. no-history is joined by a thin line: it is the rate
-    without memory, not a smaller k. Returns the system's last rate in percent, if there is any.
+    no-history is joined by a thin line: it is the rate without memory, not a smaller k. Returns
+    the system's last rate in percent, if there is one.
     """
     style = data.styles[system]
     found = [c for one in data.conditions if (c := data.cells.get((system, one.name, part)))]
@@ -46,51 +39,61 @@ def curve(
     ):
         xs, ys = zip(*(points[place][:2] for place in places), strict=True)
         if kind.counted:
-            line = {"linestyle": style.line, "linewidth": style.width}
-            drawn += axes.plot(xs, ys, color=style.colour, **line)
+            drawn += axes.plot(xs, ys, **style.stroke)
     if found[0].condition == NO_HISTORY and style.line != "none":
         if len(points) > 1:
             xs, ys = zip(*(point[:2] for point in points[:2]), strict=True)
-            drawn += axes.plot(xs, ys, ":", color=style.colour, linewidth=0.7)
+            drawn += axes.plot(xs, ys, ":", color=style.color, linewidth=0.7)
         elif len(data.conditions) > 1:  # without memory: the floor
             floor = {"linewidth": 0.8, "linestyle": "--", "zorder": 0}
-            drawn.append(axes.axhline(points[0][1], color=style.colour, **floor))
-    whole = [cell.complete for cell in found]
-    drawn += points_with_bars(axes, points, style, {"linestyle": "none"}, whole, bars=bars)
+            drawn.append(axes.axhline(points[0][1], color=style.color, **floor))
     mark(drawn, system)
+    draw_points(axes, points, style, system, [cell.complete for cell in found], bars=bars)
     return {system: points[-1][1]}
 
 
-def points_with_bars(
+def mark(artists: Any, system: str) -> None:
+    """Record in the SVG which system artists show, so that the report can highlight it."""
+    for artist in artists:
+        artist.set_gid(f"system:{system.removesuffix(PUBLISHED)}")
+
+
+def draw_points(
     axes: Any,
     points: Sequence[Sequence[float]],
     style: SeriesStyle,
-    line: Mapping[str, Any],
-    whole: Sequence[bool] | None = None,
+    system: str,
+    complete: Sequence[bool],
     *,
     bars: bool = True,
-) -> list[Any]:
-    """Draw points, `(x, value, low, high)` each, with their bars; hollow where not `whole`."""
+    lying: bool = False,
+) -> None:
+    """Draw `(place, value, low, high)` points with intervals, hollow where cells are incomplete.
+
+    Values go up, or to the right if `lying`. Intervals with NaN are left out.
+    """
+    known = [point for point in points if not math.isnan(point[2])]
     drawn = []
-    if bars:
-        xs, _, low, high = zip(*points, strict=True)
-        drawn.append(axes.vlines(xs, low, high, color=style.colour, linewidth=0.9, alpha=0.7))
-    full = whole or [True] * len(points)
-    for wanted, face in ((True, style.colour), (False, "white")):
-        chosen = [point[:2] for point, one in zip(points, full, strict=True) if one is wanted]
+    if bars and known:
+        places, _, low, high = zip(*known, strict=True)
+        lines, width = (axes.hlines, 1.5) if lying else (axes.vlines, 0.9)
+        drawn.append(lines(places, low, high, color=style.color, linewidth=width, alpha=0.8))
+    for whole, face in ((True, style.color), (False, "white")):
+        chosen = [p[:2] for p, one in zip(points, complete, strict=True) if one is whole]
         if chosen:
-            # Not clipped: whole at 0 and at 100%.
-            shape = style.point | {"markerfacecolor": face, **line}
-            drawn += axes.plot(*zip(*chosen, strict=True), **shape, clip_on=False, zorder=3)
-    return drawn
+            ends = zip(*(point[::-1] if lying else point for point in chosen), strict=True)
+            shape = style.point | {"markerfacecolor": face, "linestyle": "none"}
+            # Not clipped, so that points at 0 and at 100% are whole.
+            drawn += axes.plot(*ends, **shape, clip_on=False, zorder=3)
+    mark(drawn, system)
 
 
 def chance_level(axes: Any, data: Data, part: str) -> dict[str, float]:
-    """Draw, and return in percent, what guessing has in a part, where all are questions."""
+    """Draw the success of guessing in a part, and return it in percent, if all are questions."""
     if part not in data.chance:
         return {}
-    level, style = 100 * data.chance[part], data.styles[CHANCE]
-    axes.axhline(level, color=style.colour, linestyle=style.line, linewidth=style.width, zorder=0)
+    level = 100 * data.chance[part]
+    axes.axhline(level, **data.styles[CHANCE].stroke, zorder=0)
     return {CHANCE: level}
 
 
@@ -98,7 +101,7 @@ def chance_level(axes: Any, data: Data, part: str) -> dict[str, float]:
 
 
 def panel_grid(figure: Any, count: int, wide: int, *, sharex: bool = True) -> list[Any]:
-    """Return so many panels, `wide` in a row; the lowest of each column has labels below."""
+    """Return panels, `wide` in a row; the lowest of each column has labels below."""
     grid = figure.subplots(-(-count // wide), wide, sharex=sharex, sharey=True, squeeze=False)
     for number, axes in enumerate(grid.flat):
         if number >= count:
@@ -109,13 +112,10 @@ def panel_grid(figure: Any, count: int, wide: int, *, sharex: bool = True) -> li
 
 
 def set_axes(axes: Any, data: Data, systems: Sequence[str], ylabel: str) -> None:
-    """Name the conditions of some systems, start at zero, and take away what carries nothing.
-
-    Conditions of counted kinds are named by their k alone: those of one kind are joined.
-    """
+    """Label the conditions of some systems, start at zero, and remove clutter."""
     tidy(axes)
     conditions = data.shown(systems)
-    # Of kinds beside each other equal k have one place: it is named once.
+    # Conditions of several kinds with equal k share a place, which is labeled once.
     places = dict(sorted((data.x(one), short(one).rpartition("-")[2]) for one in conditions))
     axes.set_xticks(list(places), list(places.values()))
     axes.set_xlim(min(places) - 0.4, max(places) + 0.4)
@@ -125,21 +125,21 @@ def set_axes(axes: Any, data: Data, systems: Sequence[str], ylabel: str) -> None
 
 
 def short(condition: str) -> str:
-    """Return a condition as axes name it."""
+    """Return the label of a condition."""
     return "none" if condition == NO_HISTORY else condition
 
 
 def explained(data: Data, systems: Sequence[str], parts: Sequence[str], *notes: str) -> str:
-    """Return in words what the points of some cells mean, as far as it needs to be said."""
+    """Explain hollow points and dashes, where they occur."""
     drawn = [(s, c) for (s, _, part), c in data.cells.items() if s in systems and part in parts]
     hollow = any(not one.complete for _, one in drawn)
     dashes = any(system in (*data.absent, *data.beside) for system, _ in drawn)
-    said = ["hollow: cell not complete"] * hollow + ["dashes: published rates"] * dashes
-    return "; ".join([*said, *filter(None, notes)])
+    marks = ["hollow: incomplete cell"] * hollow + ["dashes: published rates"] * dashes
+    return "; ".join([*marks, *filter(None, notes)])
 
 
 def legend(figure: Any, note: str) -> None:
-    """Write a note at the foot of a figure, if there is any."""
+    """Write a note below a figure, if there is one."""
     if note:
         place = {"loc": "outside lower center", "frameon": False}
         figure.legend([], [], title=note, title_fontsize=7.5, **place)
@@ -153,11 +153,10 @@ def label_ends(
     size: float,
     of: str | None = None,
 ) -> None:
-    """Name the systems at the right ends of their lines, moved apart as far as need be.
+    """Label the right ends of lines with marker and name, moved apart as far as necessary.
 
-    Each stands behind the system's marker, in ink: not all colours can be read as letters. The
-    axes have their final limits, and are about `height` inches high; letters are `size` points.
-    Where the lines are not systems, but all `of` one, they are marked as that one's.
+    The axes have their final limits and are about `height` inches high; letters are `size` points.
+    If the lines all show one system, `of` is that system.
     """
     letters: dict[str, Any] = {"color": INK, "size": size, "va": "center"}
     top = axes.get_ylim()[1]
@@ -168,7 +167,7 @@ def label_ends(
         style = styles[system]
         place, words = (right_of(axes, inches * size) for inches in (0.029, 0.041))
         drawn = [
-            connect_right(axes, value, label, 0.02 * size, color=style.colour, linewidth=0.5),
+            connect_right(axes, value, label, 0.02 * size, color=style.color, linewidth=0.5),
             *axes.plot(1, label, **style.point, clip_on=False, transform=place),
             axes.text(1, label, style.label, transform=words, **letters),
         ]
@@ -179,10 +178,9 @@ def label_ends(
 def spread(
     values: Sequence[float], gap: float, low: float = -math.inf, high: float = math.inf
 ) -> list[float]:
-    """Return ascending values moved as little as need be to lie at least `gap` apart.
+    """Return ascending values, moved to be at least `gap` apart and, if possible, in the bounds.
 
-    Those that are too close form a stack around their mean; stacks that meet become one. All lie
-    from `low` to `high`, where there is room for that.
+    Values that are too close form a stack around their mean; stacks that meet are merged.
     """
     stacks: list[tuple[float, int]] = []  # mean and size
     for value in values:

@@ -1,4 +1,4 @@
-"""What the figures of a score show."""
+"""The data of the figures of a score."""
 
 import math
 from collections.abc import Container, Sequence
@@ -16,31 +16,29 @@ from robomme_interference_data.viz.figure import INK
 from .styles import SeriesStyle, styles_of
 
 PUBLISHED = ", published"
-CHANCE = "(chance)"  # among systems: no name of one has brackets
+CHANCE = "(chance)"  # used like a system; no system's name contains brackets
 
 FEW = 4
-"""Up to so many systems, curves have intervals."""
+"""The most systems that panels draw intervals for."""
 
 
 class Data:
-    """What the figures of one simulator show.
+    """The data of the figures of one simulator.
 
     Attributes:
-        simulator: Its name.
-        cells: System, condition and part to what is drawn: cells with rows, and published rates,
-            whose systems are named `<system>, published`.
-        systems: Those that have rows.
-        absent: Published ones without rows here, behind a retrieval step that has: drawn in full.
-        beside: Published ones of systems with rows: dashes beside their points.
-        styles: Of all of them, and of the chance level.
-        conditions: Of all of them, in the order of tables.
-        least: The fewest sessions that one of them counts.
-        contrasts: The comparisons of the systems that have rows.
+        cells: What is drawn, by system, condition and part; published systems are named
+            `<system>, published`.
+        systems: Systems with rows.
+        absent: Published systems without rows that a system with retrieval is compared with.
+        beside: Published systems that have rows, drawn as dashes.
+        styles: Style of each system and of the chance level.
+        conditions: Conditions of the cells, in the order of tables.
+        least: The fewest sessions of a condition with counted sessions.
+        contrasts: Comparisons of the systems that have rows.
         flips: Share of outcomes that differ between repeats; None without repeats.
-        apart: Condition and two systems that can be told apart under it.
+        distinguishable: Condition and pair of systems that differ significantly.
         by_evidence_kept: The rows of that table, without the simulator.
-        chance: Part of the episodes, or empty for all, to the share that guessing has: of those
-            that are all questions, as most episodes have it.
+        chance: Success of guessing by part of the episodes, if all are questions.
     """
 
     def __init__(self, score: Score, simulator: str):
@@ -51,14 +49,14 @@ class Data:
         repeats = [row[3:5] for row in score.tables["noise"].rows if row[0] == simulator]
         pairs, flips = map(sum, zip(*repeats, strict=True)) if repeats else (0, 0)
         self.flips = flips / pairs if pairs else None
-        self.apart = {
+        self.distinguishable = {
             (one["condition"], frozenset((one["system"], one["against_system"])))
             for one in (score.tables["matrix"].records() if "matrix" in score.tables else ())
             if one["simulator"] == simulator and one["p_holm"] < ALPHA
         }
-        access = score.tables.get("by_evidence_kept")
+        kept = score.tables.get("by_evidence_kept")
         self.by_evidence_kept = (
-            [row[1:] for row in access.rows if row[0] == simulator] if access else []
+            [row[1:] for row in kept.rows if row[0] == simulator] if kept else []
         )
         asked = sorted((one for one in found if one.chance >= 0), key=lambda one: one.n)
         self.chance = {one.part: one.chance for one in asked}
@@ -79,7 +77,7 @@ class Data:
                     (0, (4, 2)) if one.system in bases else "none",
                 )
                 label = f"{style.label}, published"
-                self.styles[name] = SeriesStyle(label, style.colour, "_", line, 1.2)
+                self.styles[name] = SeriesStyle(label, style.color, "_", line, 1.2)
                 self.cells[name, one.condition, one.part] = one
         conditions = {condition for _, condition, _ in self.cells}
         self.conditions: Sequence[Condition] = in_order(conditions) if conditions else ()
@@ -91,7 +89,7 @@ class Data:
         return list(dict.fromkeys(one.kind for one in self.conditions))
 
     def of(self, kinds: Container[Kind]) -> Self:
-        """Return what there is of some kinds of conditions, with the same places on the x axis."""
+        """Return the data of some kinds of conditions, at the same places on the x axis."""
         found = copy(self)
         found.conditions = [one for one in self.conditions if one.kind in kinds]
         names = {one.name for one in found.conditions}
@@ -100,22 +98,22 @@ class Data:
         return found
 
     def x(self, condition: str) -> float:
-        """Return the place on the x axis: log2(k + 1), right of conditions that do not count."""
+        """Return the place on the x axis: log2(k + 1), right of conditions without a count."""
         one, plain = parse_condition(condition), [c for c in self.conditions if not c.kind.counted]
         if not one.kind.counted:
             return 0.3 + 1.3 * plain.index(one)
         return 0.3 + 1.3 * len(plain) + math.log2((one.k + 1) / (self.least + 1))
 
     def parts(self, names: Sequence[str]) -> list[str]:
-        """Return those of some parts that any cell with rows is of."""
-        own = {part for system, _, part in self.cells if system in self.systems}
-        return [name for name in names if name in own]
+        """Return those of some parts that have cells with rows."""
+        with_rows = {part for system, _, part in self.cells if system in self.systems}
+        return [name for name in names if name in with_rows]
 
     def has_parts(self, system: str) -> bool:
-        """Whether any cell of a system is of a part of the episodes."""
+        """Whether a system has cells of a part of the episodes."""
         return any(name == system and part for name, _, part in self.cells)
 
     def shown(self, systems: Sequence[str]) -> list[str]:
-        """Return the conditions that any cell of some systems is of."""
+        """Return the conditions of the cells of some systems."""
         found = {condition for system, condition, _ in self.cells if system in systems}
         return [one.name for one in self.conditions if one.name in found]

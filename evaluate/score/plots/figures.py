@@ -21,32 +21,33 @@ from .data import FEW, Data
 
 _PAPER = {parse_condition(one).kind for one in DEFAULT_CONDITIONS}
 _ALL_KINDS = ("heatmap", "kinds", "interference", "ceiling")
-"""Figures of all kinds of conditions; the others show the paper's."""
+"""Figures that show all kinds of conditions; the others show the paper's."""
 
 _ALL = "All families"
 
 FIGURES = {
-    "effects": "What each condition changes, paired over episodes",
+    "effects": "Effect of each condition, paired over episodes",
     "success": "Success by condition, all families",
-    "families": "Success by condition, family by family",
-    "difficulty": "Success by condition, by difficulty",
-    "retention": "What is left of the lift at the most sessions",
+    "families": "Success by condition and family",
+    "difficulty": "Success by condition and difficulty",
+    "retention": "Share of the lift that is left at the most sessions",
     "heatmap": "Success by family and condition",
-    "retrieval": "Retrieval against the same system without it",
-    "kinds": "Success by condition, kind by kind",
-    "interference": "What kind of interference hurts",
-    "by_evidence_kept": "Success where all, some or none of the evidence was kept",
+    "retrieval": "Systems with and without retrieval",
+    "kinds": "Success by condition and kind of condition",
+    "interference": "Effect of each kind of interference",
+    "by_evidence_kept": "Success by whether the memory kept the evidence",
     "ceiling": "Gap to the ideal observer with the same memory",
-    "matrix": "Which systems can be told apart",
+    "matrix": "Which systems differ significantly",
 }
-"""Name to what a figure shows."""
+"""Figure to its title."""
 
 
-def draw_figures(score: Score, folder: Path, *, png: bool = False) -> dict[str, Path]:
-    """Draw every figure for which there is data, as `<figure>-<simulator>.svg`.
+def draw_figures(
+    score: Score, folder: Path, suffixes: Sequence[str] = (".svg",)
+) -> dict[str, Path]:
+    """Draw every figure that has data, as `<figure>-<simulator>` with each suffix.
 
-    Returns:
-        Name without suffix to the SVG, in the order of `FIGURES`.
+    Returns the SVGs by name without suffix, in the order of `FIGURES`.
     """
     drawn = {}
     for simulator in score.outcomes:
@@ -55,46 +56,36 @@ def draw_figures(score: Score, folder: Path, *, png: bool = False) -> dict[str, 
             with open_figure() as figure:
                 if draw_figure(kind, figure, data):
                     name = f"{kind}-{simulator}"
-                    for suffix in (".svg", *[".png"] * png):
+                    for suffix in suffixes:
                         save_figure(figure, folder / (name + suffix))
                     drawn[name] = folder / f"{name}.svg"
     return drawn
 
 
 def draw_figure(kind: str, figure: Any, data: Data) -> bool:
-    """Draw one of `FIGURES`, and tell whether there is data for it."""
-    drawers = (
-        *(forests.effects, _success, _families, _difficulty, forests.retention, _heatmap),
-        *(
-            _retrieval,
-            _kinds,
-            forests.interference,
-            forests.by_evidence_kept,
-            forests.ceiling,
-            _matrix,
-        ),
-    )
+    """Draw one of `FIGURES`; return False if there is no data for it."""
     shown = data if kind in _ALL_KINDS else data.of(_PAPER)
     figure.set_layout_engine("constrained")
-    if not (shown.cells and dict(zip(FIGURES, drawers, strict=True))[kind](figure, shown)):
+    if not (shown.cells and _DRAWERS[kind](figure, shown)):
         return False
     figure.get_layout_engine().execute(figure)
     figure.set_layout_engine("none")  # once, not again for each file
     for number, artist in enumerate(figure.findobj(lambda one: one.get_gid())):
-        artist.set_gid(f"{artist.get_gid()}:{number}")  # in a file an id occurs once
+        artist.set_gid(f"{artist.get_gid()}:{number}")  # ids must be unique in a file
     return True
 
 
 def _success(figure: Any, data: Data) -> bool:
     few = len(data.systems) <= FEW
-    places = curves.shifts([*data.systems, *data.absent])
+    systems = [*data.systems, *data.absent]
+    places = curves.shifts(systems, min(0.09, 0.55 / len(systems)))
     high = 4.2 if few else 5.5
     figure.set_size_inches(9, high)
     axes = figure.subplots()
     ends: dict[str, float] = {}
     for name, shift in places.items():
-        ends |= curve(axes, data, name, "", shift, bars=few)
-    # Beside many systems' own points the published ones would only clutter.
+        ends |= curve(axes, data, name, "", shift)
+    # With many systems, published points would be clutter.
     beside = data.beside if few else []
     for name in beside:
         shift = places[name.removesuffix(", published")]
@@ -104,8 +95,7 @@ def _success(figure: Any, data: Data) -> bool:
     curves.label_ends(axes, ends, data.styles, high - 1, 8)
     note = "published rates: in the table “paper”" if len(beside) < len(data.beside) else ""
     legend(figure, explained(data, [*places, *beside], [""], note))
-    bars = "with 95% Wilson intervals" if few else "intervals in the table “main”"
-    title = f"Success by condition, {data.simulator}, {bars}"
+    title = f"Success by condition, {data.simulator}, with 95% Wilson intervals"
     axes.set_title(title, loc="left", size=10, color=INK)
     return True
 
@@ -134,7 +124,7 @@ def _retrieval(figure: Any, data: Data) -> bool:
 def _kinds(figure: Any, data: Data) -> bool:
     if _PAPER.issuperset(data.kinds):
         return False
-    plain = [kind for kind in data.kinds if not kind.counted]  # in each panel, as the floor
+    plain = [kind for kind in data.kinds if not kind.counted]  # the floor of each panel
     counted = [kind for kind in data.kinds if kind.counted]
     panels = {kind.pattern: (data.of([*plain, kind]), "") for kind in counted}
     return _panels(figure, data, panels, data.systems)
@@ -143,10 +133,7 @@ def _kinds(figure: Any, data: Data) -> bool:
 def _panels(
     figure: Any, data: Data, panels: Mapping[str, tuple[Data, str]], systems: Sequence[str]
 ) -> bool:
-    """Draw panels, three in a row, on the axes of `data`.
-
-    `panels` has for each title which of the data it shows, and which part of the episodes.
-    """
+    """Draw panels, three in a row: each title to its data and its part of the episodes."""
     if not (panels and systems):
         return False
     wide, bars = 3, len(systems) <= FEW
@@ -156,7 +143,7 @@ def _panels(
     ends: list[dict[str, float]] = []
     for axes, (title, (shown, part)) in zip(grid, panels.items(), strict=True):
         ends.append({})
-        for system, shift in curves.shifts(systems).items():
+        for system, shift in curves.shifts(systems, 0.09 * bars).items():
             ends[-1] |= curve(axes, shown, system, part, shift, bars=bars)
         ends[-1] |= curves.chance_level(axes, shown, part)
         axes.set_title(title, size=9, color=INK, weight="bold" if title == _ALL else "normal")
@@ -178,7 +165,7 @@ def _heatmap(figure: Any, data: Data) -> bool:
     wide = -(-len(data.systems) // rows)
     figure.set_size_inches(1.3 + 1.65 * wide * many / 5, 0.6 + (0.6 + 0.24 * len(names)) * rows)
     panels = curves.panel_grid(figure, len(data.systems), wide, sharex=False)
-    colours = "cividis"  # the same to the colour-blind, and even in grey
+    colors = "cividis"  # readable with color vision deficiency, and in gray
     highest = max(cell.rate for (*_, part), cell in data.cells.items() if part in names)
     for axes, system in zip(panels, data.systems, strict=True):
         rates = np.full((len(names), len(conditions)), np.nan)
@@ -186,10 +173,10 @@ def _heatmap(figure: Any, data: Data) -> bool:
             if cell := data.cells.get((system, condition, name)):
                 rates[y, x] = cell.rate
                 text = f"{100 * cell.rate:.0f}" + ("" if cell.complete else "†")
-                ink = ink_on(mapped(colours, cell.rate / highest if highest else 0.0))
+                ink = ink_on(mapped(colors, cell.rate / highest if highest else 0.0))
                 inside: dict[str, Any] = {"ha": "center", "va": "center", "in_layout": False}
                 axes.text(x, y, text, **inside, size=7, color=ink)
-        axes.imshow(rates, cmap=colours, vmin=0, vmax=highest, aspect="auto")
+        axes.imshow(rates, cmap=colors, vmin=0, vmax=highest, aspect="auto")
         axes.set_xticks(range(len(conditions)), labels, size=7, rotation=turned)
         axes.set_yticks(range(len(names)), names, size=7)
         axes.tick_params(length=0)
@@ -208,7 +195,7 @@ def _matrix(figure: Any, data: Data) -> bool:
     if not panels:
         return False
     many = max(len({one.system for one in found}) for found in panels.values()) + 1
-    figure.set_size_inches(1.6 + 5.2 * len(panels), 2.1 + 0.3 * many)
+    figure.set_size_inches(2.6 + (1.6 + 0.3 * many) * len(panels), 2.8 + 0.3 * many)
     widest = 100 * max(abs(one.pairs.change.value) for one in pairs)
     for axes, (condition, found) in zip(
         figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True
@@ -222,13 +209,15 @@ def _matrix(figure: Any, data: Data) -> bool:
         values = np.full((len(systems), len(systems)), np.nan)
         for y, x in combinations(range(len(systems)), 2):
             row, column = systems[x], systems[y]
-            apart = (condition, frozenset((row, column))) in data.apart
+            differ = (condition, frozenset((row, column))) in data.distinguishable
             change = changes[column, row]
-            if apart:
+            if differ:
                 values[y, x] = change
-            look: dict[str, Any] = {"weight": "bold", "color": "black"} if apart else {"color": INK}
-            look |= {"ha": "center", "va": "center", "in_layout": False}
-            axes.text(x, y, f"{round(change) + 0:.0f}".replace("-", "−"), size=7, **look)
+            style: dict[str, Any] = (
+                {"weight": "bold", "color": "black"} if differ else {"color": INK}
+            )
+            style |= {"ha": "center", "va": "center", "in_layout": False}
+            axes.text(x, y, f"{round(change) + 0:.0f}".replace("-", "−"), size=7, **style)
         axes.imshow(values, cmap="RdBu", vmin=-2 * widest, vmax=2 * widest, aspect="auto")
         labels = [data.styles[system].label for system in systems]
         axes.set_xticks(range(len(systems)), labels, size=7, rotation=90)
@@ -237,5 +226,14 @@ def _matrix(figure: Any, data: Data) -> bool:
         axes.spines[:].set_visible(False)
         axes.set_title(condition, size=9, color=INK)
     figure.suptitle(f"Row − column, points, {data.simulator}", size=10, color=INK)
-    legend(figure, f"filled and bold: told apart, p < {ALPHA} after Holm's correction; else not")
+    legend(figure, f"filled and bold: p < {ALPHA} after Holm's correction")
     return True
+
+
+_DRAWERS = {
+    **{"effects": forests.effects, "success": _success, "families": _families},
+    **{"difficulty": _difficulty, "retention": forests.retention, "heatmap": _heatmap},
+    **{"retrieval": _retrieval, "kinds": _kinds, "interference": forests.interference},
+    **{"by_evidence_kept": forests.by_evidence_kept, "ceiling": forests.ceiling},
+    **{"matrix": _matrix},
+}

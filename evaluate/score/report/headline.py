@@ -1,4 +1,4 @@
-"""What the rows say, in a sentence or two for each simulator."""
+"""The main finding of each simulator's rows, in a few sentences."""
 
 import math
 from collections.abc import Sequence
@@ -14,12 +14,10 @@ from robomme_interference_data.viz.tables import percent, points
 
 
 def headline(score: Score, simulator: str) -> str:
-    """Return the main finding of one simulator's rows, computed from them.
+    """Return the main finding of one simulator's rows.
 
-    Only complete cells are compared with each other, and only they lead; how many there are is
-    said as well. Of several with the same rate the first in the order of tables leads, and the
-    others are named. A system that only bounds what a memory can reach leads where there is no
-    other.
+    Only complete cells are compared. Of equal rates the first in the order of tables leads, and the
+    others are named. A reference leads only if there is no other system.
     """
     found = [one for one in score.cells if one.simulator == simulator and not one.part]
     cells = [cell for cell in found if not is_bound(cell.system)] or found
@@ -32,19 +30,20 @@ def headline(score: Score, simulator: str) -> str:
 
 
 def _leading(score: Score, complete: Sequence[Cell]) -> list[str]:
-    """Say what the best system reaches at k0 and how far it falls, or the best rate there is."""
+    """State the best rate at k0 and how far it falls, or else the best rate."""
     best = _best(complete, START) or _best(complete, _best(complete)[0].condition)
     leader, others = best[0], best[1:]
-    own = ("effects", leader.simulator, leader.system, (leader.system, START))
+    key = ("effects", leader.simulator, leader.system, (leader.system, START))
     falls = [
         c
         for c in score.contrasts
-        if (c.table, c.simulator, c.system, c.against) == own and c.pairs.n
+        if (c.table, c.simulator, c.system, c.against) == key and c.pairs.n
     ]
     if leader.condition != START or not falls:
         first = (
-            f"{display_name(leader.system)} succeeds in {percent(leader.rate)} of {leader.n} "
-            f"episodes under {_named(leader.condition)} (95% interval {_interval(leader)})."
+            f"In {leader.simulator}, {display_name(leader.system)} succeeds in "
+            f"{percent(leader.rate)} of {leader.n} episodes under {_named(leader.condition)} "
+            f"(95% interval {_interval(leader)})."
         )
         return [first, *_alike(others), *_hurting(score, leader)]
     fall = max(falls, key=lambda one: parse_condition(one.condition).k)
@@ -75,11 +74,11 @@ def _listed(cells: Sequence[Cell]) -> str:
 def _nothing_complete(cells: Sequence[Cell]) -> str:
     counting = [cell for cell in cells if cell.n]
     if not counting:
-        return "No rollout counts yet."
+        return f"In {cells[0].simulator}, no rollout counts yet."
     nearest = min(counting, key=lambda cell: (len(cell.missing) + len(cell.other), -cell.n))
-    other = f", and {len(nearest.other)} that count are not of the grid" if nearest.other else ""
+    other = f", and {len(nearest.other)} are outside the grid" if nearest.other else ""
     return (
-        f"No cell is complete, so no system leads. Nearest to it is "
+        f"In {nearest.simulator}, no cell is complete, so no system leads. The most complete is "
         f"{display_name(nearest.system)} under {_named(nearest.condition)}: {len(nearest.missing)} "
         f"of {nearest.expected} episodes are missing{other}."
     )
@@ -88,14 +87,13 @@ def _nothing_complete(cells: Sequence[Cell]) -> str:
 def _corrected(score: Score, fall: Contrast) -> str:
     """Return the p of the leader's fall, corrected over all systems' falls.
 
-    The leader is the highest of all at k0, and the highest of equal ones is so by luck: its fall
-    is overstated, and it has to stand out from as many falls as it was chosen from.
+    Choosing the leader by its rate at k0 overstates its fall, so it is tested among all falls.
     """
-    own = (fall.simulator, fall.condition, "effects")
+    key = (fall.simulator, fall.condition, "effects")
     falls = [
         one
         for one in score.contrasts
-        if (one.simulator, one.condition, one.table) == own
+        if (one.simulator, one.condition, one.table) == key
         and one.against == (one.system, START)
         and (one is fall or one.complete)
         and not (is_bound(one.system) and one is not fall)
@@ -110,13 +108,9 @@ def _test(contrast: Contrast) -> str:
 
 
 def _hurting(score: Score, leader: Cell) -> list[str]:
-    """Say which kind of condition beyond the paper lowers the leader's rate most, if one does."""
-    own = ("interference", leader.simulator, leader.system)
-    found = [
-        one
-        for one in score.contrasts
-        if (one.table, one.simulator, one.system) == own and one.complete
-    ]
+    """Name the kind of condition beyond the paper that lowers the leader's rate most."""
+    key = ("interference", leader.simulator, leader.system)
+    found = [c for c in score.contrasts if (c.table, c.simulator, c.system) == key and c.complete]
     worst = min(found, key=lambda one: one.pairs.change.value, default=None)
     if worst is None or worst.pairs.change.value >= 0:
         return []
@@ -124,9 +118,9 @@ def _hurting(score: Score, leader: Cell) -> list[str]:
     p = holm([one.pairs.p for one in found])[found.index(worst)]
     among = f", corrected for {len(found)} comparisons" * (len(found) > 1)
     return [
-        f"Of what is beyond the paper, {worst.asks} costs it most: {worst.condition} against "
-        f"{_named(worst.against[1])} {points(change.value)} points ({points(change.low)} to "
-        f"{points(change.high)}; {_test(worst)} p = {_p(p)}{among})."
+        f"Of the conditions beyond the paper's, {worst.asks} costs it most: {worst.condition} "
+        f"minus {_named(worst.against[1])} is {points(change.value)} points "
+        f"({points(change.low)} to {points(change.high)}; {_test(worst)} p = {_p(p)}{among})."
     ]
 
 
@@ -134,24 +128,25 @@ def _from_start(leader: Cell, contrast: Contrast, tested: str) -> str:
     k = parse_condition(contrast.condition).k
     sessions = "distractor session" + ("s" if k > 1 else "")
     pairs, change = contrast.pairs, contrast.pairs.change
-    over = "" if contrast.complete else f", not complete, over the {pairs.n} episodes it has"
+    over = "" if contrast.complete else f", incomplete, over its {pairs.n} episodes"
     return (
-        f"{display_name(leader.system)} succeeds in {percent(leader.rate)} of {leader.n} episodes "
-        f"when the history holds the lesson alone ({START}, 95% interval {_interval(leader)}), and "
-        f"in {percent(pairs.second)} with {k} {sessions} behind it ({contrast.condition}{over}): "
-        f"{points(change.value)} points ({points(change.low)} to {points(change.high)}; "
-        f"{pairs.gained} episodes gained, {pairs.lost} lost, {tested})."
+        f"In {leader.simulator}, {display_name(leader.system)} succeeds in {percent(leader.rate)} "
+        f"of {leader.n} episodes if the history holds only the lesson ({START}, 95% interval "
+        f"{_interval(leader)}), and in {percent(pairs.second)} with {k} {sessions} after it "
+        f"({contrast.condition}{over}): {points(change.value)} points "
+        f"({points(change.low)} to {points(change.high)}; {pairs.gained} episodes gained, "
+        f"{pairs.lost} lost, {tested})."
     )
 
 
 def _equal(score: Score, fall: Contrast) -> list[str]:
-    """Say whether the leader's rate under a condition is shown to equal that at k0."""
+    """State whether the leader's rate under a condition is equivalent to that at k0."""
     if "equivalence" not in score.tables:
         return []
     sentences = []
-    own = {"simulator": fall.simulator, "system": fall.system, "condition": fall.condition}
+    key = {"simulator": fall.simulator, "system": fall.system, "condition": fall.condition}
     for one in score.tables["equivalence"].records():
-        if own.items() <= one.items() and one["against_condition"] == START:
+        if key.items() <= one.items() and one["against_condition"] == START:
             margin = f"{100 * one['margin']:g}"
             bounds = f"90% interval {points(one['low_90'])} to {points(one['high_90'])}"
             whose = "its own" if one["against_system"] == fall.system else ""
@@ -168,14 +163,14 @@ def _equal(score: Score, fall: Contrast) -> list[str]:
 
 
 def _beside_base(score: Score, contrast: Contrast) -> list[str]:
-    """Say how a system with retrieval stands to the published one without, if that is wanted."""
-    own = (contrast.simulator, base_of(contrast.system))
-    found = [one for one in score.published if (one.simulator, one.system) == own]
-    rates = {one.condition: one.rate for one in found}
+    """State the published fall of the system without retrieval."""
+    base = base_of(contrast.system)
+    key = (contrast.simulator, base)
+    rates = {c.condition: c.rate for c in score.published if (c.simulator, c.system) == key}
     if not {START, contrast.condition} <= {*rates}:
         return []
     return [
-        f"Without retrieval, {display_name(own[1] or '')} falls from {percent(rates[START])} to "
+        f"Without retrieval, {display_name(base or '')} falls from {percent(rates[START])} to "
         f"{percent(rates[contrast.condition])} (published)."
     ]
 

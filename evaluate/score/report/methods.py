@@ -1,4 +1,4 @@
-"""How a score was made, as a paragraph that can go into a paper, with what it cites."""
+"""The methods of a score as a paragraph for a paper, with its citations."""
 
 import re
 from importlib import resources
@@ -18,9 +18,9 @@ _CITED = re.compile(r"\[@([a-z0-9]+)\]")
 
 
 def methods(score: Score) -> tuple[str, str]:
-    """Return the paragraph as Markdown, citing as Pandoc reads it, and what it cites as BibTeX.
+    """Return the paragraph as Markdown with Pandoc citations, and its citations as BibTeX.
 
-    It tells nothing that the score does not hold: a method that no table needed is not named.
+    It names only methods that a table of the score uses.
     """
     intervals = {
         record["interval"]
@@ -50,7 +50,7 @@ def methods(score: Score) -> tuple[str, str]:
 
 
 def _part(score: Score, outcomes: Outcomes) -> dict[str, Any]:
-    there = np.flatnonzero(outcomes.there.any(axis=0)).tolist()
+    present = np.flatnonzero(outcomes.has_episode.any(axis=0)).tolist()
     cells = [one for one in score.cells if one.simulator == outcomes.simulator and not one.part]
     return {
         "simulator": outcomes.simulator,
@@ -58,8 +58,8 @@ def _part(score: Score, outcomes: Outcomes) -> dict[str, Any]:
         "systems": list(map(display_name, outcomes.systems)),
         "conditions": list(dict.fromkeys(one.condition for one in cells if one.n)),
         "rollouts": sum(sum(one.counts) for one in cells),
-        "episodes": len(there),
-        "families": len({outcomes.episodes[place].family for place in there}),
+        "episodes": len(present),
+        "families": len({outcomes.episodes[place].family for place in present}),
         "seeds": len(outcomes.model_seeds),
         "complete": sum(one.complete for one in cells),
         "cells": len(cells),

@@ -1,4 +1,4 @@
-"""One self-contained page about a score. It needs no network and no other file."""
+"""The report: one self-contained page that needs no network and no other file."""
 
 import json
 import math
@@ -32,34 +32,28 @@ from robomme_interference_data.viz.templates import fill
 from .headline import headline
 
 _LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
-"""What the numbers and pictures depend on."""
+"""Libraries that numbers and figures depend on."""
 
 _SHOWN_IN = {
     **{"effects": ("lift", "effects"), "success": ("main", "chance", "paper")},
     **{"families": ("family", "paper_family"), "heatmap": ("family",)},
     **{"difficulty": ("difficulty",), "retention": ("lift",)},
     **{"retrieval": ("effects", "family"), "kinds": ("main",), "interference": ("interference",)},
-    **{
-        "by_evidence_kept": ("by_evidence_kept",),
-        "ceiling": ("ceiling",),
-        "matrix": ("matrix", "systems", "ranks"),
-    },
+    **{"by_evidence_kept": ("by_evidence_kept",), "ceiling": ("ceiling",)},
+    **{"matrix": ("matrix", "systems", "ranks")},
 }
-"""Figure to the tables that have its numbers."""
+"""Figure to the tables with its numbers."""
 
 _GRIDS = {
     Expected.BENCHMARK: "the benchmark's: nine families, test episodes 0 to 49 each",
-    Expected.OBSERVED: "those that any of the given rows is of",
+    Expected.OBSERVED: "those that occur in any row",
 }
 
 
 def write_report(
     score: Score, figures: Mapping[str, Path], out: Path, command: str | None = None
 ) -> None:
-    """Write the page: the same bytes for the same rows, options and command.
-
-    Without the command line that made the score, it shows the call of `score`.
-    """
+    """Write the page: the same bytes for the same rows, options and command."""
     names = {name for one in score.outcomes.values() for name in one.conditions}
     conditions = [one.name for one in in_order(names)]
     values = {
@@ -83,13 +77,13 @@ def write_report(
 
 
 def _number(text: str) -> str:
-    """Return what a cell of a grid is sorted by; empty without any rate."""
+    """Return the sort key of a cell of a grid; empty without a rate."""
     found = re.match(r"\**([0-9.]+)%", text)
     return found[1] if found else ""
 
 
 def _leader(score: Score) -> str:
-    """Return the system that figures set apart at first; none of few."""
+    """Return the system that figures highlight initially; none if there are few."""
     best = [c.system for c in score.cells if c.rank == 1 and not c.part and c.condition == START]
     return (
         best[0]
@@ -99,7 +93,7 @@ def _leader(score: Score) -> str:
 
 
 def _inline(figures: Mapping[str, Path]) -> dict[str, str]:
-    """Return SVG as parts of one page: ids are their own, and what is drawn tells its system."""
+    """Return SVGs for one page: ids are unique, and drawn elements carry their system."""
     found = {}
     for number, (name, path) in enumerate(figures.items()):
         kind, _, simulator = name.partition("-")
@@ -115,7 +109,7 @@ def _inline(figures: Mapping[str, Path]) -> dict[str, str]:
 
 
 def _names(score: Score) -> dict[str, str]:
-    """Return what the systems that have rows are called."""
+    """Return the display names of the systems that have rows."""
     systems = {one: None for outcomes in score.outcomes.values() for one in outcomes.systems}
     return {system: display_name(system) for system in systems}
 
@@ -124,11 +118,11 @@ def _names(score: Score) -> dict[str, str]:
 
 
 def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
-    """Return what came of each episode as JSON that is safe inside a script element.
+    """Return the outcomes of each episode as JSON that is safe inside a script element.
 
-    `names` has what systems are called; `rows` a row for each system and episode: simulator,
-    system, family, the rest of the id, difficulty, the outcome under each condition, where it
-    flips, and the address of a video, from the page's folder, under each.
+    `names` holds the systems' display names; `rows` one row for each system and episode: simulator,
+    system, family, the rest of the id, difficulty, the outcome under each condition, the flips, and
+    the address of a video under each condition, relative to the page's folder.
     """
     videos = _videos(score.rows)
     rows = []
@@ -136,7 +130,7 @@ def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
         for place, system in enumerate(outcomes.systems):
             counts = outcomes.counts[place].transpose(1, 0, 2).tolist()
             rates = success(outcomes.status[place]).T.tolist()
-            for number in np.flatnonzero(outcomes.there[place]).tolist():
+            for number in np.flatnonzero(outcomes.has_episode[place]).tolist():
                 episode, hard = outcomes.episodes[number], int(outcomes.difficulty[number])
                 came = dict(zip(outcomes.conditions, counts[number], strict=True))
                 found = [
@@ -150,17 +144,17 @@ def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
                     [_address(one, folder) if one else "" for one in found],
                 )
                 rows.append(row)
-    told = {"names": _names(score), "rows": rows}
-    text = json.dumps(told, ensure_ascii=False, separators=(",", ":"))
+    data = {"names": _names(score), "rows": rows}
+    text = json.dumps(data, ensure_ascii=False, separators=(",", ":"))
     return text.replace("<", "\\u003c")
 
 
 def _address(video: Path, folder: Path) -> str:
-    return quote(os.fsencode(os.path.relpath(video, folder)))  # not all names are UTF-8
+    return quote(os.fsencode(os.path.relpath(video, folder)))  # names may not be UTF-8
 
 
 def flips(conditions: Sequence[str], rates: Sequence[float]) -> str:
-    """Return where an outcome changes between conditions of a kind, as `k3 lost, k7 gained`."""
+    """Return where an outcome changes between conditions of a kind: `k3 lost, k7 gained`."""
     known = [(c, r) for c, r in zip(conditions, rates, strict=True) if not math.isnan(r)]
     return ", ".join(
         f"{condition} {'gained' if rate > before else 'lost'}"
@@ -178,15 +172,12 @@ def _outcome(counts: Sequence[int]) -> str:
 
 
 def _videos(rows: Rows) -> dict[tuple[str, ...], Path]:
-    """Return the videos that are there, by simulator, system, condition and episode.
-
-    Of repeats it is that of the lowest model seed.
-    """
+    """Return the existing videos of the lowest model seeds, by rollout."""
     found: dict[tuple[str, ...], Path] = {}
-    for row in sorted((one for one in rows if one.video), key=lambda one: one.model_seed):
+    for row in sorted(rows, key=lambda one: one.model_seed):
         episode = f"{row.family}/{row.split}/{row.episode}"
         key = (row.simulator, row.system, row.condition, episode)
-        if key not in found and row.video.is_file():
+        if row.video and key not in found and row.video.is_file():
             found[key] = row.video
     return found
 
@@ -195,7 +186,7 @@ def _videos(rows: Rows) -> dict[tuple[str, ...], Path]:
 
 
 def _source(path: Path, run: RunHeader | None) -> dict[str, list[str]]:
-    """Return what there is to say of a file: commands to be copied, and all of `run.json`."""
+    """Return the facts about a file: its checksum, commands, and `run.json`."""
     facts = {"SHA-256": [sha256_file(path)]}
     if run is not None:
         lines = [line for start in run.starts for line in start.command]
@@ -205,7 +196,7 @@ def _source(path: Path, run: RunHeader | None) -> dict[str, list[str]]:
 
 
 def versions() -> str:
-    """Return what a score is computed with, in its versions."""
+    """Return the versions of Python and of the libraries."""
     libraries = [f"{name} {metadata.version(name)}" for name in _LIBRARIES]
     return ", ".join([f"Python {platform.python_version()}", *libraries])
 
@@ -214,7 +205,7 @@ def _facts(score: Score, command: str | None) -> dict[str, list[str]]:
     rows, settings = score.rows, score.settings
     call = {"command": command} if command else {"call": f"score({settings}, draws={score.draws})"}
     seeds = rows.names("model_seed")
-    told = {
+    facts = {
         **call,
         "scored with": versions(),
         "rows": f"{len(rows):,}",
@@ -228,4 +219,4 @@ def _facts(score: Score, command: str | None) -> dict[str, list[str]]:
         "note": " ".join(score.notes),
         "bad rows left out": f"{rows.refused:,}: {'; '.join(rows.refusals)}" * bool(rows.refused),
     }
-    return {name: [text] for name, text in told.items() if text}
+    return {name: [text] for name, text in facts.items() if text}

@@ -18,16 +18,14 @@ RELEASED_COLUMNS = (
     *("retrieval_model", "retrieval_selected_lesson_fraction"),
     *("retrieval_selected_filler_fraction", "retrieval_selected_query_fraction"),
 )
-"""The columns of the released retrieval rows, in their order. They name no system."""
+"""The columns of the released retrieval rows, in their order."""
 
 
 def export(rows: Rows, folder: Path) -> list[Path]:
-    """Write rows as `<system>-<simulator>_rollouts.csv`, a file each.
+    """Write rows in the released layout, a file `<system>-<simulator>_rollouts.csv` each.
 
-    The columns are those of the released retrieval rows, which name no system, buffer set or revision;
-    rows of another simulator than RoboMME have its name in one more, the last. A timeout is
-    `ongoing`, as there. The rows keep the order of their files, and are the same bytes whatever
-    files they come from.
+    The released columns name no system, buffer set or revision; rows of a simulator other than
+    RoboMME get its name as one more column. A timeout is written as `ongoing`.
     """
     seeds = len(rows.names("model_seed"))
     other = sum(row.split != "test" for row in rows)
@@ -36,15 +34,15 @@ def export(rows: Rows, folder: Path) -> list[Path]:
     wrong += [f"{rows.refused:,} bad rows"] * (rows.refused > 0)
     if wrong:
         raise InvalidOptionError(
-            f"rows to export: {', '.join(wrong)}; expected sound rows of test episodes and of one "
+            f"rows to export: {', '.join(wrong)}; expected valid rows of test episodes and of one "
             "model seed",
-            "The released layout has no column for more: export such rows only.",
+            "The released layout has no columns for these: export other rows.",
         )
     files = defaultdict[Path, list[Row]](list)
     for row in rows:
         files[folder / f"{row.system}-{row.simulator}_rollouts.csv"].append(row)
-    for path, found in files.items():
-        extra = ["simulator"] * (found[0].simulator != RELEASED_SIMULATOR)
+    for path, group in files.items():
+        extra = ["simulator"] * (group[0].simulator != RELEASED_SIMULATOR)
         columns = attrgetter(*RELEASED_COLUMNS, *extra)
         with (
             atomic_path(path) as partial,
@@ -52,7 +50,7 @@ def export(rows: Rows, folder: Path) -> list[Path]:
         ):
             writer = csv.writer(file)  # with CRLF, as released
             writer.writerow([*RELEASED_COLUMNS, *extra])
-            writer.writerows(columns(_released(row)) for row in found)
+            writer.writerows(columns(_released(row)) for row in group)
     return sorted(files)
 
 

@@ -1,13 +1,13 @@
-"""Find files of rollout rows and read them as plain values; `reading` judges the values."""
+"""Find files of rollout rows and read their columns; `reading` checks the values."""
 
 import codecs
 import csv
 import io
 import re
 from collections.abc import Mapping, Sequence
-from difflib import get_close_matches
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.json as pa_json
@@ -17,42 +17,29 @@ from robomme_interference_data.errors import FormatError, InvalidOptionError, Mi
 from robomme_interference_data.evaluate.run.log import MOST_BYTES, RunHeader, whole_lines
 from robomme_interference_data.schema.codec import arrow_schema
 from robomme_interference_data.schema.rollouts import KEY_COLUMNS, Rollout, Status
-from robomme_interference_data.storage.files import read_bytes
-from robomme_interference_data.storage.headers import read_header
+from robomme_interference_data.storage.files import read_bytes, read_header
 from robomme_interference_data.storage.parquet import open_parquet, read_table, reading
 
-_SCHEMA = arrow_schema(Rollout)
 _REQUIRED = ("family", "condition", "episode", "status", "success")
-_RUN_ONLY = {"buffer_set", "revision", "split", "shift", "model_seed", "protocol_version"}
-"""Key columns of a run's rows. The released layout is without them, and without `simulator`,
-which exported rows of other simulators have as one column more."""
-_MOST_ROWS = 1 << 20
-"""Rows of a file, at most: the paper's grid has 25,200."""
-
-_ALIASES = {"variant": "system"}  # its name in the paper's released tables
+_MAX_ROWS = 1 << 20
+"""Rows in a file, at most: the paper's grid has 25,200."""
 
 
-class Part(NamedTuple):
-    """The rows of one file.
-
-    Attributes:
-        columns: Column of `Rollout` to its value in each row.
-        lines: The line on which each row begins; in parquet its number from 1.
-        malformed: Line to why it is no row.
-    """
+@dataclass(frozen=True)
+class Part:
+    """The columns of one file, the line of each row, and why other lines are not rows."""
 
     columns: Mapping[str, Sequence[Any]]
     lines: Sequence[int]
-    malformed: Mapping[int, str] = {}
+    malformed: Mapping[int, str] = field(default_factory=dict)
 
 
 def find_sources(paths: Sequence[Path]) -> dict[Path, RunHeader | None]:
-    """Find the file of rows that each path stands for: of a run's folder it is the record.
+    """Return the file of rows of each path, with the header of the run that it belongs to.
 
-    Returns:
-        File to what `run.json` says about its run, None for a file outside a run's folder.
+    In a run's folder the file is the record.
     """
-    found: dict[Path, RunHeader | None] = {}
+    sources: dict[Path, RunHeader | None] = {}
     for given in paths:
         path = given / RUN_RECORD if given.is_dir() else given
         if not path.is_file():
@@ -60,66 +47,58 @@ def find_sources(paths: Sequence[Path]) -> dict[Path, RunHeader | None]:
                 f"there is no file {path}",
                 "Give folders of runs, or .csv, .parquet or .jsonl files.",
             )
-        if any(path.samefile(other) for other in found):
+        if any(path.samefile(other) for other in sources):
             raise InvalidOptionError(f"{path} is given twice", "Give each file once.")
-        run = path.parent / RUN_HEADER
-        of_run = path.name in (RUN_RECORD, *RUN_TABLES) and run.is_file()
-        found[path] = read_header(run, RunHeader) if of_run else None
-    return found
+        header = path.parent / RUN_HEADER
+        of_run = path.name in (RUN_RECORD, *RUN_TABLES) and header.is_file()
+        sources[path] = read_header(header, RunHeader) if of_run else None
+    return sources
 
 
 def system_of(path: Path) -> str | None:
     """Return the system in the name of an exported file (see `export`), or None."""
-    found = re.fullmatch(r"(.+)-[^-]+_rollouts\.csv", path.name)
-    return found[1] if found else None
+    match = re.fullmatch(r"(.+)-[^-]+_rollouts\.csv", path.name)
+    return match[1] if match else None
 
 
 def read_file(path: Path, names: Sequence[str], has_system: bool) -> Part:
-    """Read columns of a file's rows, as far as the file has them.
+    """Read those of the named columns that a file has.
 
-    It has to name systems itself unless the system of its rows is known (`has_system`).
+    The file must have a column `system` unless the system is known otherwise (`has_system`).
     """
     readers = {".parquet": _read_parquet, ".csv": _read_csv, ".jsonl": _read_record}
     reader = readers.get(path.suffix.lower())
     if reader is None:
-        raise FormatError(f"{path} is no {' or '.join(readers)} file", "Give a file of rows.")
+        raise FormatError(f"{path} is not a {' or '.join(readers)} file", "Give a file of rows.")
     with reading(path):
         return reader(path, names, has_system)
 
 
-def _match(
-    path: Path, existing: Sequence[str], names: Sequence[str], has_system: bool
+def _select(
+    path: Path, header: Sequence[str], names: Sequence[str], has_system: bool
 ) -> dict[str, str]:
-    """Return which of the wanted columns is which of the file's."""
-    ours = {_ALIASES.get(name, name): name for name in existing}
-    for name in existing:
-        known = [*_SCHEMA.names, *_ALIASES]
-        near = [] if name in known else get_close_matches(name, known, n=1, cutoff=0.8)
-        if near:
-            raise FormatError(f"{path} has the column {name!r}", f"Did you mean {near[0]!r}?")
-        if existing.count(name) > 1:
-            raise FormatError(f"{path} has two columns {name!r}", "Rename one of them.")
-    of_run = "simulator" in ours and not _RUN_ONLY.isdisjoint(ours)
-    required = dict.fromkeys((*KEY_COLUMNS, *_REQUIRED) if of_run else _REQUIRED)
-    if missing := [name for name in required if name not in ours]:
+    """Return the column of the file that holds each of the named columns."""
+    if twice := [name for name in header if header.count(name) > 1]:
+        raise FormatError(f"{path} has two columns {twice[0]!r}", "Rename one of them.")
+    columns = {"system" if name == "variant" else name: name for name in header}
+    if missing := [name for name in _REQUIRED if name not in columns]:
         raise FormatError(
-            f"{path} lacks the columns {', '.join(missing)}; it has "
-            f"{', '.join(existing) or 'none'}",
+            f"{path} lacks the columns {', '.join(missing)}; it has {', '.join(header) or 'none'}",
             "Expected the rows of a run, or of the released CSVs (docs/score.md).",
         )
-    if "system" not in ours and not has_system:
+    if "system" not in columns and not has_system:
         raise FormatError(
-            f"{path} names no system: it has no column 'system', nor is it called "
+            f"{path} names no system: it has no column 'system', and its name is not "
             "SYSTEM-SIMULATOR_rollouts.csv",
             'Name it, such as system="retrieval-framesamp-modul" '
             "(of two files that are compared: system_a, system_b).",
         )
-    return {name: ours[name] for name in names if name in ours}
+    return {name: columns[name] for name in names if name in columns}
 
 
-def _bound(rows: int) -> None:
-    if rows > _MOST_ROWS:
-        raise ValueError(f"more than {_MOST_ROWS:,} rows; expected at most so many")
+def _check_count(rows: int) -> None:
+    if rows > _MAX_ROWS:
+        raise ValueError(f"more than {_MAX_ROWS:,} rows; expected at most that many")
 
 
 def _columns(path: Path, table: pa.Table) -> dict[str, list[Any]]:
@@ -132,12 +111,13 @@ def _columns(path: Path, table: pa.Table) -> dict[str, list[Any]]:
 
 def _read_parquet(path: Path, names: Sequence[str], has_system: bool) -> Part:
     with open_parquet(path) as file:
-        _bound(file.metadata.num_rows)
-        chosen = _match(path, file.schema_arrow.names, names, has_system)
-        table = read_table(file, path, list(chosen.values()))
+        _check_count(file.metadata.num_rows)
+        selected = _select(path, file.schema_arrow.names, names, has_system)
+        table = read_table(file, path, list(selected.values()))
     columns = _columns(path, table)
-    found = {name: columns[existing] for name, existing in chosen.items()}
-    return Part(found, range(1, len(table) + 1))
+    return Part(
+        {name: columns[column] for name, column in selected.items()}, range(1, len(table) + 1)
+    )
 
 
 def _read_csv(path: Path, names: Sequence[str], has_system: bool) -> Part:
@@ -148,37 +128,43 @@ def _read_csv(path: Path, names: Sequence[str], has_system: bool) -> Part:
     malformed: dict[int, str] = {}
     try:
         header = next(reader, [])
-        chosen = _match(path, header, names, has_system)
+        selected = _select(path, header, names, has_system)
         line = reader.line_num + 1
         for fields in reader:
-            _bound(len(rows) + len(malformed))
+            _check_count(len(rows) + len(malformed))
             if len(fields) == len(header):
                 rows[line] = fields
             else:
                 malformed[line] = f"the line has {len(fields)} fields; expected {len(header)}"
-            line = reader.line_num + 1  # quoted text may hold line breaks
+            line = reader.line_num + 1  # quoted text may contain line breaks
     except csv.Error as error:
         raise ValueError(f"line {reader.line_num}: {error}") from None
-    places = {name: header.index(existing) for name, existing in chosen.items()}
-    columns = {name: [row[place] for row in rows.values()] for name, place in places.items()}
+    columns = {
+        name: [row[at] for row in rows.values()]
+        for name, column in selected.items()
+        for at in [header.index(column)]
+    }
     return Part(columns, list(rows), malformed)
 
 
 def _read_record(path: Path, names: Sequence[str], has_system: bool) -> Part:
-    """Read the record of a run: every finished row, and of other rollouts the last row."""
-    if not (whole := whole_lines(path)):
+    """Read a run's record: every finished row, and of other rollouts the last row.
+
+    The types are the schema's; a row object for each line would take ten times as long.
+    """
+    if not (data := whole_lines(path)):
         return Part({}, [])
-    _bound(whole.count(b"\n"))
-    schema = pa.schema([_SCHEMA.field(name) for name in dict.fromkeys((*names, *KEY_COLUMNS))])
-    options = pa_json.ParseOptions(schema, unexpected_field_behavior="ignore")
-    table = pa_json.read_json(pa.BufferReader(whole), parse_options=options)
-    columns = _columns(path, table)
+    _check_count(data.count(b"\n"))
+    fields = [arrow_schema(Rollout).field(name) for name in {*names, *KEY_COLUMNS}]
+    options = pa_json.ParseOptions(pa.schema(fields), unexpected_field_behavior="ignore")
+    columns = _columns(path, pa_json.read_json(pa.BufferReader(data), parse_options=options))
     keys = [*zip(*(columns[name] for name in KEY_COLUMNS), strict=True)]
-    last = dict(zip(keys, range(len(keys)), strict=True))
-    counts = [
-        place
-        for place, (key, status) in enumerate(zip(keys, columns["status"], strict=True))
-        if status != Status.ERROR or last[key] == place
+    last = {key: at for at, key in enumerate(keys)}
+    kept = [
+        at
+        for at, (key, status) in enumerate(zip(keys, columns["status"], strict=True))
+        if status != Status.ERROR or last[key] == at
     ]
-    found = {name: [columns[name][place] for place in counts] for name in names}
-    return Part(found, [place + 1 for place in counts])
+    return Part(
+        {name: [columns[name][at] for at in kept] for name in names}, [at + 1 for at in kept]
+    )

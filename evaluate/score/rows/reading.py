@@ -1,7 +1,7 @@
 """Rows of rollouts, checked: each by itself, and against those of the same episode or rollout."""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from operator import attrgetter
@@ -17,7 +17,7 @@ from robomme_interference_data.schema.shifts import NO_SHIFT
 from .files import Part, find_sources, read_file, system_of
 from .values import DEFAULTS, Row, parse, shifted
 
-_SHOWN = 10  # so many bad rows are named; the others are counted
+_SHOWN = 10  # bad rows that are listed; the others are counted
 
 _SUCCESS = {str(one): one == Status.SUCCESS for one in FINAL} | {str(Status.ERROR): None}
 _EPISODE = ("simulator", "family", "split", "episode")
@@ -32,10 +32,10 @@ class Rows:
         rows: The rows.
         sources: The files that were read (see `files.find_sources`).
         revisions: Simulator to the revision of its buffer set, where rows name one.
-        unpinned: Simulator and system of rows that name no revision, as released ones.
-        retrieval: Simulator and system to the retrieval steps in front of it, if there are any.
-        refusals: The first bad rows that were left out: place and reason.
-        refused: How many were.
+        unpinned: Simulator and system of rows that name no revision, such as released ones.
+        retrieval: Simulator and system to its retrieval steps, if it has any.
+        refusals: The first bad rows that were left out: location and reason.
+        refused: The number of bad rows.
     """
 
     rows: tuple[Row, ...]
@@ -53,15 +53,8 @@ class Rows:
         return iter(self.rows)
 
     def names(self, column: str) -> list[Any]:
-        """Return the values of a column, each once and sorted."""
+        """Return the distinct values of a column, sorted."""
         return sorted({getattr(row, column) for row in self.rows})
-
-    def by(self, column: str) -> dict[Any, list[Row]]:
-        """Return the rows of each value of a column, by value, sorted."""
-        found = defaultdict[Any, list[Row]](list)
-        for row in self.rows:
-            found[getattr(row, column)].append(row)
-        return dict(sorted(found.items()))
 
 
 def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = False) -> Rows:
@@ -69,10 +62,9 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
 
     Args:
         paths: Folders of runs, and `.jsonl`, `.parquet` and `.csv` files.
-        system: Name of the system of rows that name none; else that in the name of an exported
-            file.
-        lenient: Leave bad rows out, and count them. Of equal rows of one rollout the first stays,
-            of rows that contradict each other none.
+        system: System of rows that name none; by default the one in the name of an exported file.
+        lenient: Leave bad rows out, and count them. Of identical rows of one rollout the first is
+            kept, of rows that contradict each other none.
     """
     sources = find_sources(paths)
     checks = _Checks()
@@ -82,24 +74,26 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
             name_system(name)
         part = read_file(path, Row._fields, name is not None)
         checks.add(path, part, name, None if run is None else path.parent)
-    checks.check_together()
-    refusals = checks.refusals()
+    checks.check_alike("revision", ("simulator",), "rows of different buffer sets do not mix")
+    for column in ("difficulty", "seed", "chance"):
+        checks.check_alike(column, _EPISODE, "an episode has one")
+    checks.check_repeats()
+    refusals = [f"{checks.locate(at)}: {reason}" for at, reason in sorted(checks.reasons.items())]
     if refusals and not lenient:
         lines = [f"{len(refusals):,} bad row{'s' * (len(refusals) > 1)}:", *refusals[:_SHOWN]]
-        if more := len(refusals) - _SHOWN:
-            lines += [f"… and {more:,} more"] * (more > 0)
-        raise FormatError("\n".join(lines), "Mend them, or leave them out with lenient=True.")
+        lines += [f"… and {len(refusals) - _SHOWN:,} more"] * (len(refusals) > _SHOWN)
+        raise FormatError("\n".join(lines), "Correct them, or leave them out with lenient=True.")
     rows = tuple(checks.sound.values())
     cells = {(row.simulator, row.system, row.revision) for row in rows}
-    unpinned = frozenset((simulator, one) for simulator, one, revision in cells if revision is None)
-    pinned = {(simulator, one) for simulator, one, revision in cells if revision is not None}
-    revisions = {simulator: revision for simulator, _, revision in cells if revision is not None}
-    for simulator, one in sorted(pinned & unpinned):  # protocol, rule 5
-        raise InvalidOptionError(
-            f"some rows of {one} in {simulator} are of the buffer set with revision "
-            f"{revisions[simulator]}, others name no revision, as released rows do",
-            "Their histories may differ: score the files apart, or compare them.",
-        )
+    unpinned = frozenset((simulator, name) for simulator, name, revision in cells if not revision)
+    revisions = {simulator: revision for simulator, _, revision in cells if revision}
+    for simulator, name, revision in sorted(cells - {(*cell, None) for cell in unpinned}):
+        if (simulator, name) in unpinned:  # protocol, rule 5
+            raise InvalidOptionError(
+                f"some rows of {name} in {simulator} have the revision {revision} of a buffer "
+                "set, others name no revision, like released rows",
+                "Their histories may differ: score the files separately, or compare them.",
+            )
     steps = {(row.simulator, row.system, row.retrieval_model) for row in rows}
     retrieval = {
         cell: ", ".join(str(step) for *_, step in group)
@@ -109,106 +103,94 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
     return Rows(rows, sources, revisions, unpinned, retrieval, shown, len(refusals))
 
 
-class _Checks:
-    """All rows, and the reason against each bad one, by number of the file and line in it.
+_Location = tuple[int, int]
+"""Number of the file, and line in it."""
 
-    Attributes:
-        sound: The rows that passed every check so far.
-    """
+
+class _Checks:
+    """The rows that passed every check so far (`sound`), and why others did not (`reasons`)."""
 
     def __init__(self) -> None:
-        self.sound: dict[tuple[int, int], Row] = {}
+        self.sound: dict[_Location, Row] = {}
+        self.reasons: dict[_Location, str] = {}
         self._paths: list[Path] = []
-        self._reasons: dict[tuple[int, int], str] = {}
 
     def add(self, path: Path, part: Part, system: str | None, run: Path | None) -> None:
-        """Add the rows of a file, each checked by itself; videos are relative to `run`."""
-        number, count = len(self._paths), len(part.lines)
+        """Add the rows of a file, checking each by itself; videos are relative to `run`."""
+        number = len(self._paths)
         self._paths.append(path)
         default = {**dict.fromkeys(Row._fields), **DEFAULTS, "system": system}
-        columns, wrong = list[Sequence[Any]](), dict[int, str]()
-        for name in Row._fields:
-            if name in part.columns:
-                columns.append(_parsed(name, part.columns[name], run, wrong))
-            else:
-                columns.append([default[name]] * count)
+        wrong: dict[int, str] = {}
+        columns = [
+            _parsed(name, part.columns[name], run, wrong)
+            if name in part.columns
+            else [default[name]] * len(part.lines)
+            for name in Row._fields
+        ]
         rows = map(Row._make, zip(*columns, strict=True))
-        for place, (line, row) in enumerate(zip(part.lines, rows, strict=True)):
-            if place not in wrong and row.success is not _SUCCESS[row.status]:
+        for at, (line, row) in enumerate(zip(part.lines, rows, strict=True)):
+            if at not in wrong and row.success is not _SUCCESS[row.status]:
                 shown = "(empty)" if row.success is None else row.success
-                wrong[place] = f"success {shown} contradicts status {row.status!r}"
-            if place in wrong:
-                self._reasons[number, line] = wrong[place]
+                wrong[at] = f"success {shown} contradicts status {row.status!r}"
+            if at in wrong:
+                self.reasons[number, line] = wrong[at]
             elif row.shift == NO_SHIFT:
                 self.sound[number, line] = row
             else:
                 simulator = shifted(row.simulator, row.shift)
                 self.sound[number, line] = row._replace(simulator=simulator)
-        self._reasons |= {(number, line): reason for line, reason in part.malformed.items()}
+        self.reasons |= {(number, line): reason for line, reason in part.malformed.items()}
 
-    def check_together(self) -> None:
-        """Check rows against others."""
-        self._check_alike("revision", ("simulator",), "rows of different buffer sets do not mix")
-        for name in ("difficulty", "seed", "chance"):
-            self._check_alike(name, _EPISODE, "an episode has one")
-        self._check_repeats()
-
-    def refusals(self) -> list[str]:
-        """Return place and reason of each bad row, in the order of the files."""
-        return [f"{self._place(row)}: {reason}" for row, reason in sorted(self._reasons.items())]
-
-    def _place(self, row: tuple[int, int]) -> str:
+    def locate(self, row: _Location) -> str:
+        """Return where a row is, for messages."""
         path = self._paths[row[0]]
         return f"{path}, {'row' if path.suffix.lower() == '.parquet' else 'line'} {row[1]}"
 
-    def _refuse(self, row: tuple[int, int], reason: str) -> None:
-        del self.sound[row]
-        self._reasons[row] = reason
-
-    def _check_alike(self, name: str, of: Sequence[str], why: str) -> None:
-        """Compare a value with that of the first row with the same values in other columns."""
+    def check_alike(self, name: str, group: Sequence[str], why: str) -> None:
+        """Refuse rows whose value differs from that of the first row of the same group."""
         rows = self.sound.values()
-        keys, values = map(attrgetter(*of), rows), map(attrgetter(name), rows)
+        keys, values = map(attrgetter(*group), rows), map(attrgetter(name), rows)
         first: dict[Any, Any] = {}
-        wrong = [
-            (place, f"{name} {value!r} beside {first[key]!r}: {why}")
-            for place, key, value in zip(self.sound, keys, values, strict=True)
+        self._refuse(
+            (at, f"{name} {value!r} beside {first[key]!r}: {why}")
+            for at, key, value in zip(self.sound, keys, values, strict=True)
             if value is not None and value != first.setdefault(key, value)
-        ]
-        for place, reason in wrong:
-            self._refuse(place, reason)
+        )
 
-    def _check_repeats(self) -> None:
-        """Leave one row of each rollout, and none where its rows contradict each other."""
-        key: Callable[[Row], Any] = attrgetter(*_ROLLOUT)
-        groups = defaultdict[Any, list[tuple[int, int]]](list)
-        for place, row in self.sound.items():
-            groups[key(row)].append(place)
-        for numbers in groups.values():
-            if len(numbers) == 1:
-                continue
-            first, *others = numbers
-            contradicted = len({self.sound[number].status for number in numbers}) > 1
-            more = "; its rows contradict each other" * contradicted
+    def check_repeats(self) -> None:
+        """Keep one row of each rollout, and none where its rows contradict each other."""
+        groups = defaultdict[Any, list[_Location]](list)
+        for at, key in zip(
+            self.sound, map(attrgetter(*_ROLLOUT), self.sound.values()), strict=True
+        ):
+            groups[key].append(at)
+        for locations in [group for group in groups.values() if len(group) > 1]:
+            first, *others = locations
+            contradicted = len({self.sound[at].status for at in locations}) > 1
+            reason = "the same rollout as {}" + "; its rows contradict each other" * contradicted
             if contradicted:
-                self._refuse(first, f"the same rollout as {self._place(others[0])}{more}")
-            for number in others:
-                self._refuse(number, f"the same rollout as {self._place(first)}{more}")
+                self._refuse([(first, reason.format(self.locate(others[0])))])
+            self._refuse((at, reason.format(self.locate(first))) for at in others)
+
+    def _refuse(self, rows: Iterable[tuple[_Location, str]]) -> None:
+        for at, reason in list(rows):
+            del self.sound[at]
+            self.reasons[at] = reason
 
 
 def _parsed(name: str, values: Sequence[Any], run: Path | None, wrong: dict[int, str]) -> list[Any]:
-    """Return a column as rows have it; add the first reason against each bad place to `wrong`."""
-    known, reasons = dict[Any, Any](), dict[Any, str]()
+    """Return a column's parsed values; add the first reason against each bad row to `wrong`."""
+    parsed, reasons = dict[Any, Any](), dict[Any, str]()
     for value in set(values):  # of one type, and most occur in many rows
         try:
-            found = parse(name, value)
-            known[value] = run and run / found if name == "video" and found else found
+            known = parse(name, value)
+            parsed[value] = run and run / known if name == "video" and known else known
         except InterferenceError as error:
             reasons[value] = f"{error.message}. {error.hint or ''}".strip()
         except ValueError as error:
             shown = "(empty)" if value in (None, "") else repr(value)
             reasons[value] = f"{name} {shown}; expected {error}"
-    for place, value in enumerate(values if reasons else ()):
+    for at, value in enumerate(values if reasons else ()):
         if value in reasons:
-            wrong.setdefault(place, reasons[value])
-    return [*map(known.get, values)]
+            wrong.setdefault(at, reasons[value])
+    return [*map(parsed.get, values)]

@@ -1,9 +1,10 @@
-"""What each column of a row of a rollout may hold."""
+"""The columns that scoring reads of a rollout, and how their values are read from text."""
 
 import math
 import re
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple, get_type_hints
 
 from robomme_interference_data.constants import (
     DIFFICULTIES,
@@ -12,22 +13,22 @@ from robomme_interference_data.constants import (
     PROTOCOL_VERSION,
     SPLITS,
 )
-from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
+from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.schema.rollouts import FINAL, Status
 from robomme_interference_data.schema.shifts import NO_SHIFT, parse_shift
-from robomme_interference_data.simulators.registry import OFFICIAL, SIMULATORS
+from robomme_interference_data.simulators.registry import OFFICIAL
 
 RELEASED_SIMULATOR = OFFICIAL
 """The simulator of rows that name none."""
 
 
 class Row(NamedTuple):
-    """What scoring reads of a rollout: columns of `Rollout`; None is unknown.
+    """The columns of `Rollout` that scoring reads; None means unknown.
 
-    The simulator of rows under a shift has its name in it, such as `tabletop+light:2`, so that
-    rows under two shifts never mix. A video is a path, as the report finds it.
+    The simulator of a row under a shift includes the shift, such as `tabletop+light:2`, so that
+    rows under different shifts are never pooled. A video is a path that the report can open.
     """
 
     system: str
@@ -51,66 +52,58 @@ class Row(NamedTuple):
     retrieval_selected_filler_fraction: float | None
     retrieval_selected_query_fraction: float | None
     chance: float | None
-    video: Any
+    video: Path | None
 
 
 DEFAULTS = {
     **{"simulator": RELEASED_SIMULATOR, "split": "test"},
     **{"shift": NO_SHIFT, "model_seed": 0, "protocol_version": PROTOCOL_VERSION},
 }
-"""Values of columns that the released layout lacks; any other is None."""
+"""Values of columns that the released CSV lacks; any other is None."""
 
-_SEPARATOR = "+"  # no name of a simulator has it
-# File names contain it, so no `/`. A simulator of one's own is `module:function` in rows.
+_SEPARATOR = "+"  # between a simulator and its shift; no simulator's name contains it
+# Used in file names, so no `/`. A user's simulator is named `module:function`.
 _SIMULATOR = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._:-]{0,127}")
-_WHOLE = re.compile(r"([0-9]{1,18})(?:\.0+)?")  # programs save some whole numbers as floats
+_WHOLE = re.compile(r"([0-9]{1,18})(?:\.0+)?")  # some programs save whole numbers as floats
 _TRUTH = dict.fromkeys(("1", "true", "1.0"), True) | dict.fromkeys(("0", "false", "0.0"), False)
+_RANGES = {"steps": (0, MAX_STEPS), "protocol_version": (PROTOCOL_VERSION, PROTOCOL_VERSION)}
+_NAMES = {"family": FAMILIES, "split": SPLITS, "difficulty": DIFFICULTIES, "status": FINAL}
+_FRACTIONS = {"evidence_kept", "chance", *(f for f in Row._fields if f.endswith("_fraction"))}
+_OPTIONAL = {name for name, hint in get_type_hints(Row).items() if isinstance(None, hint)}
+_OPTIONAL -= {"revision"}  # a file that has the column states it in each row
 
 
 def parse(name: str, value: Any) -> Any:
-    """Return a value of a column as rows have it."""
+    """Return the value of a column from what a file holds: text, or a number of any type."""
     text = "" if value is None or value != value else str(value)  # noqa: PLR0124 - NaN
     if name in _OPTIONAL and text.lower() in ("", "nan", "none"):
         return None
-    return _PARSERS[name](text)
+    match name:
+        case "system" | "condition" | "shift" | "simulator":
+            _CHECKS[name](text)
+        case "revision" if not text:
+            raise ValueError("the revision of a buffer set")
+        case "status" if text == Status.ONGOING:
+            return str(Status.TIMEOUT)  # the released rows record a timeout as ongoing
+        case "family" | "split" | "difficulty" | "status":
+            if text not in _NAMES[name]:
+                raise InvalidOptionError.one_of(name, text, _NAMES[name])
+        case "success":
+            if text.lower() not in _TRUTH:
+                raise ValueError("1, 0, true, false or nothing")
+            return _TRUTH[text.lower()]
+        case "episode" | "model_seed" | "seed" | "steps" | "protocol_version":
+            return _whole(text, *_RANGES.get(name, (0, 10**18 - 1)))  # as in episode ids
+        case _ if name in _FRACTIONS:
+            return _fraction(text)
+    return text
 
 
-def _whole(low: int, high: int) -> Callable[[str], int]:
-    def parsed(text: str) -> int:
-        match = _WHOLE.fullmatch(text)
-        if not match or not low <= int(match[1]) <= high:
-            raise ValueError(f"a whole number from {low} to {high}")
-        return int(match[1])
-
-    return parsed
-
-
-def _one_of(name: str, known: tuple[str, ...]) -> Callable[[str], str]:
-    def parsed(text: str) -> str:
-        if text not in known:
-            raise InvalidOptionError.one_of(name, text, known)
-        return text
-
-    return parsed
-
-
-def _checked(check: Callable[[str], object]) -> Callable[[str], str]:
-    def parsed(text: str) -> str:
-        check(text)
-        return text
-
-    return parsed
-
-
-def _status(text: str) -> str:
-    # Released rows call a timeout what it is before the last step.
-    return _final(str(Status.TIMEOUT) if text == Status.ONGOING else text)
-
-
-def _success(text: str) -> bool:
-    if text.lower() not in _TRUTH:
-        raise ValueError("1, 0, true, false or nothing")
-    return _TRUTH[text.lower()]
+def _whole(text: str, low: int, high: int) -> int:
+    match = _WHOLE.fullmatch(text)
+    if not match or not low <= int(match[1]) <= high:
+        raise ValueError(f"a whole number from {low} to {high}")
+    return int(match[1])
 
 
 def _fraction(text: str) -> float:
@@ -123,45 +116,17 @@ def _fraction(text: str) -> float:
     return value
 
 
-def _revision(text: str) -> str:
-    if not text:
-        raise ValueError("the revision of a buffer set")
-    return text
-
-
 def _check_simulator(text: str) -> None:
     name, separator, shift = text.partition(_SEPARATOR)
     if separator:
         parse_shift(shift)
-    if name not in SIMULATORS and name.lower() in SIMULATORS:
-        raise UnknownNameError.none("simulator", name, SIMULATORS)
     if not _SIMULATOR.fullmatch(name):
         raise ValueError("up to 128 letters, digits, '.', '_', '-' and ':'")
 
 
-_final = _one_of("status", tuple(map(str, FINAL)))
-_number = _whole(0, 10**18 - 1)  # as in episode ids
-_FRACTIONS = (
-    *("evidence_kept", "chance"),
-    *(name for name in Row._fields if name.endswith("_fraction")),
-)
-_OPTIONAL = {"seed", "difficulty", "steps", "success", "video", "retrieval_model", *_FRACTIONS}
-_PARSERS: dict[str, Callable[[str], Any]] = {
-    "system": _checked(name_system),
-    "simulator": _checked(_check_simulator),
-    "revision": _revision,
-    "family": _one_of("family", FAMILIES),
-    "condition": _checked(parse_condition),
-    "split": _one_of("split", SPLITS),
-    "shift": _checked(parse_shift),
-    "protocol_version": _whole(PROTOCOL_VERSION, PROTOCOL_VERSION),
-    "difficulty": _one_of("difficulty", DIFFICULTIES),
-    "status": _status,
-    "success": _success,
-    "steps": _whole(0, MAX_STEPS),
-    **dict.fromkeys(("episode", "model_seed", "seed"), _number),
-    **dict.fromkeys(("video", "retrieval_model"), str),
-    **dict.fromkeys(_FRACTIONS, _fraction),
+_CHECKS: dict[str, Callable[[str], object]] = {
+    **{"system": name_system, "condition": parse_condition},
+    **{"shift": parse_shift, "simulator": _check_simulator},
 }
 
 

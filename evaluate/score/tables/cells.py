@@ -25,61 +25,40 @@ from robomme_interference_data.viz.tables import Table, percent
 
 _ERROR = STATUSES.index(Status.ERROR)
 _NOTE = (
-    "Rates with 95% Wilson intervals. n is the number of episodes that count: an error is neither "
-    "success nor failure. A cell marked † lacks episodes, or has others than the grid, and is not "
-    "ranked; one without any rollout is missing."
+    "Rates with 95% Wilson intervals. n: episodes that count; an error is neither success nor "
+    "failure. †: the cell lacks episodes, or has episodes outside the grid, and is not ranked; a "
+    "cell without any rollout is missing."
 )
 _BEST = (
-    " Best, and bold, is each of several that cannot be told from the highest rate: its p against "
-    "that one, corrected by Holm's method over the others, is 0.05 or more."
+    " Best (bold): above zero and not distinguishable from the highest rate; the p against it, "
+    "after Holm's correction over the others, is 0.05 or more."
 )
 
 
 @dataclass(frozen=True)
 class Cell:
-    """What came of one system under one condition, in all or in a part of the episodes.
-
-    Attributes:
-        simulator, system, condition: Their names.
-        part: Family or difficulty; empty for all episodes.
-        n: Episodes that count: at least one rollout that is no error.
-        rate: Mean over them of the success of their repeats; NaN if n is 0.
-        interval: Its 95% Wilson interval; `(0, 1)` if n is 0.
-        trials: How many independent ones the rate is worth: n, and with repeats more.
-        counts: Rollouts by status, as `STATUSES`.
-        chance: Mean over them of the share of right answers that guessing has; NaN unless each is
-            a question.
-        expected: How many episodes are expected.
-        missing: Those that do not count with every model seed of the condition.
-        broken: Episodes in which a rollout broke.
-        other: Episodes that count without being expected.
-        rank: Place among the complete cells of this simulator, condition and part, 1 for the
-            highest rate; None for an incomplete cell, and for a system that is a bound.
-        best: Whether it is among several ranked cells and cannot be told from the best of them:
-            it is the first of the highest rate, or Holm's p against that one, corrected over the
-            others, is 0.05 or more.
-    """
+    """The results of one system under one condition, in all or some of the episodes."""
 
     simulator: str
     system: str
     condition: str
-    part: str
-    n: int
-    rate: float
-    interval: tuple[float, float]
-    trials: float
-    counts: tuple[int, ...] = (0,) * len(STATUSES)
-    chance: float = math.nan
-    expected: int = 0
-    missing: Sequence[EpisodeId] = ()
-    broken: Sequence[EpisodeId] = ()
-    other: Sequence[EpisodeId] = ()
-    rank: int | None = None
-    best: bool = False
+    part: str  # family or difficulty; empty for all episodes
+    n: int  # episodes that count: at least one rollout that is not an error
+    rate: float  # mean over them of the success of their repeats; NaN if n is 0
+    interval: tuple[float, float]  # 95% Wilson; (0, 1) if n is 0
+    trials: float  # effective number of independent trials: n, and more with repeats
+    counts: tuple[int, ...] = (0,) * len(STATUSES)  # rollouts by status
+    chance: float = math.nan  # mean success of guessing; NaN unless all episodes are questions
+    expected: int = 0  # number of expected episodes
+    missing: Sequence[EpisodeId] = ()  # expected, but do not count with every model seed
+    broken: Sequence[EpisodeId] = ()  # with an error
+    other: Sequence[EpisodeId] = ()  # count without being expected
+    rank: int | None = None  # among complete cells, 1 for the highest rate; None for references
+    best: bool = False  # one of several, and not distinguishable from the highest rate
 
     @property
     def as_rate(self) -> Rate:
-        """Its rate, to be compared with another."""
+        """Its rate, for comparisons."""
         return Rate(self.n, self.rate, self.trials)
 
     @property
@@ -89,15 +68,15 @@ class Cell:
 
     @property
     def errors(self) -> int:
-        """Rollouts that broke."""
+        """The number of errors."""
         return self.counts[_ERROR]
 
 
 def cells_of(every: Iterable[Outcomes]) -> list[Cell]:
     """Return the cells of every system and condition, in the order of tables.
 
-    Each comes over all episodes, then by family and by difficulty. An expected episode of unknown
-    difficulty is missing in all three.
+    Each cell is followed by its parts by family and by difficulty. An expected episode of unknown
+    difficulty is missing in all three difficulties.
     """
     return [cell for outcomes in every for cell in _cells(outcomes)]
 
@@ -111,8 +90,8 @@ def _cells(outcomes: Outcomes) -> list[Cell]:
         parts[name] = (here, here | (outcomes.difficulty < 0))
     cells = []
     for s, c in np.argwhere(outcomes.due).tolist():
-        for name, (here, wanted) in parts.items():
-            if not ((here & outcomes.there[s]) | (wanted & outcomes.expected)).any():
+        for name, (here, due) in parts.items():
+            if not ((here & outcomes.has_episode[s]) | (due & outcomes.expected)).any():
                 continue
             counted, counts = here & outcomes.counted[s, c], outcomes.counts[s, c]
             rate = rate_of(outcomes.status[s, c, here])
@@ -122,8 +101,8 @@ def _cells(outcomes: Outcomes) -> list[Cell]:
                     *(*names, rate.n, rate.value, rate.interval, rate.trials),
                     counts=tuple(counts[here].sum(axis=0).tolist()),
                     chance=float(outcomes.chance[counted].mean()) if rate.n else math.nan,
-                    expected=int((wanted & outcomes.expected).sum()),
-                    missing=outcomes.chosen(wanted & outcomes.missing[s, c]),
+                    expected=int((due & outcomes.expected).sum()),
+                    missing=outcomes.chosen(due & outcomes.missing[s, c]),
                     broken=outcomes.chosen(here & (counts[:, _ERROR] > 0)),
                     other=outcomes.chosen(here & outcomes.other[s, c]),
                 )
@@ -137,30 +116,27 @@ def _ranked(outcomes: Outcomes, cells: list[Cell], parts: Mapping[str, Flags]) -
         if cell.complete and not is_bound(cell.system):
             groups[cell.condition, cell.part].append(place)
     for (condition, part), places in groups.items():
-        own = [cells[place] for place in places]
-        systems = [cell.system for cell in own]
+        group = [cells[place] for place in places]
+        systems = [cell.system for cell in group]
         best = tied_with_best(*to_best(outcomes, condition, systems, parts[part]))
-        for place, cell in zip(places, own, strict=True):
-            rank = 1 + sum(other.rate > cell.rate for other in own)
-            cells[place] = replace(cell, rank=rank, best=cell.system in best)
+        for place, cell in zip(places, group, strict=True):
+            rank = 1 + sum(other.rate > cell.rate for other in group)
+            cells[place] = replace(cell, rank=rank, best=cell.system in best and cell.rate > 0)
     return cells
 
 
 def rate_table(cells: Sequence[Cell], name: str) -> Table:
-    """Return cells as the table `main`, a row each, or their parts as `family` or `difficulty`.
-
-    Parts are shown of those that have any rollout.
-    """
+    """Return the table `main`, a row per cell, or of cells with rollouts `family`, `difficulty`."""
     parts = {"family": FAMILIES, "difficulty": DIFFICULTIES}.get(name, ())
     ran = {(c.simulator, c.system, c.condition) for c in cells if any(c.counts)}
     rows = []
     for cell in cells:
-        own: tuple[str, ...] = (cell.simulator, cell.system, cell.condition)
-        if cell.part in (parts or ("",)) and not (parts and own not in ran):
-            own += (cell.part,) if parts else ()
+        key: tuple[str, ...] = (cell.simulator, cell.system, cell.condition)
+        if cell.part in (parts or ("",)) and not (parts and key not in ran):
+            key += (cell.part,) if parts else ()
             bounds = cell.interval if cell.n else (math.nan, math.nan)
             more = (cell.complete, len(cell.missing), cell.rank, cell.best)
-            rows.append((*own, cell.n, cell.rate, *bounds, *cell.counts, *more))
+            rows.append((*key, cell.n, cell.rate, *bounds, *cell.counts, *more))
     return Table.make(
         name,
         f"Success by {name if parts else 'system and condition'}",
@@ -175,10 +151,10 @@ def rate_table(cells: Sequence[Cell], name: str) -> Table:
 def main_grids(cells: Sequence[Cell]) -> list[Table]:
     """Return the paper's main table of each simulator: a row per system, a column per condition.
 
-    Bold (between `**`) is what cannot be told from the best of its condition (see `Cell.best`).
-    The n that all rates have is told once, in the note; else each has its own.
+    The best of a condition (see `Cell.best`) are bold, between `**`. If all rates have the same n,
+    only the note states it.
     """
-    grids = []
+    grids: list[Table] = []
     whole = [cell for cell in cells if not cell.part]
     for simulator, group in groupby(whole, lambda cell: cell.simulator):
         found = list(group)
@@ -191,15 +167,17 @@ def main_grids(cells: Sequence[Cell]) -> list[Table]:
             for system in dict.fromkeys(cell.system for cell in found)
         )
         errors = sum(cell.errors for cell in found)
-        bounds = dict.fromkeys(display_name(c.system) for c in found if is_bound(c.system))
-        note = _NOTE if several or not episodes else f"n = {episodes.pop()} in each cell. {_NOTE}"
-        note += _BEST * any(cell.best for cell in found)
-        note += f" Not ranked either, as they only show bounds: {', '.join(bounds)}." * bool(bounds)
-        chances = [cell.chance for cell in found if not math.isnan(cell.chance)]
-        if chances:
+        references = dict.fromkeys(display_name(c.system) for c in found if is_bound(c.system))
+        notes = [] if several or not episodes else [f"n = {episodes.pop()} in each cell."]
+        if not grids:  # once for all grids
+            notes.append(_NOTE + _BEST * any(cell.best for cell in whole))
+        if references:
+            notes.append(f"References, not ranked: {', '.join(references)}.")
+        if chances := [cell.chance for cell in found if not math.isnan(cell.chance)]:
             levels = dict.fromkeys(percent(one(chances)) for one in (min, max))
-            note += f" Guessing would have {' to '.join(levels)}: see the table chance."
-        note += f" Rollouts that broke: {errors}." if errors else " No rollout broke."
+            notes.append(f"Guessing succeeds in {' to '.join(levels)}: see the table chance.")
+        notes.append(f"Errors: {errors}." if errors else "No errors.")
+        note = " ".join(notes)
         title = f"Success by system and condition, {simulator}"
         grids.append(Table.make(simulator, title, " ".join(["system", *conditions]), rows, note))
     return grids
@@ -219,10 +197,7 @@ def _shown(cell: Cell | None, with_n: bool) -> str:
 
 
 def coverage_table(cells: Iterable[Cell]) -> Table:
-    """Return which episodes each cell of a family lacks, and in which the rollout broke.
-
-    Expected cells without any rollout are listed as well: they lack all episodes.
-    """
+    """Return which episodes each cell of a family lacks, and which have errors."""
     rows = (
         (
             *(cell.simulator, cell.system, cell.condition, cell.part, cell.expected, cell.n),
@@ -238,8 +213,8 @@ def coverage_table(cells: Iterable[Cell]) -> Table:
         "simulator system condition family expected:count n:count errors:count complete:flag "
         "missing_episodes error_episodes other_episodes",
         rows,
-        "Episodes by split and index. An episode counts if one of its rollouts is no error. With "
-        "repeats, one that does not count with every model seed of the condition is missing.",
+        "Episodes by split and index. An episode counts if one of its rollouts is not an error. "
+        "With repeats, one that does not count with every model seed of the condition is missing.",
     )
 
 

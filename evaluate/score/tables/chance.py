@@ -1,4 +1,4 @@
-"""Answers to questions against guessing: how much of a rate is above chance, and how surely."""
+"""Answers to questions compared with guessing."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -12,25 +12,25 @@ from robomme_interference_data.viz.tables import Table
 from .cells import Cell
 
 _NOTE = (
-    "Where every episode is a question with a known chance, 1 / its options. chance: its mean over "
-    "the n episodes; above: (rate − chance) / (1 − chance), 1 where all is right, 0 as guessing, "
-    "with the ends of the rate's 95% Wilson interval set against the same mean. p: the exact "
-    "chance of as many right answers or more, were each question guessed by itself "
-    "(Poisson-binomial, one-sided); p_holm: p corrected by Holm's method among the tests of this "
-    "table in one simulator. An answer that names no option is wrong: who often names none lies "
-    "below chance. Who sees nothing of the past has to be at chance, such as the controls blank "
-    f"and text, and anyone under no-history: p_holm below {ALPHA} there is a leak, by which "
-    "questions are answered without memory; a larger one does not prove that there is none."
+    "For cells whose episodes are all questions with a known chance (1 / options). chance: the "
+    "mean over the n episodes; above: (rate − chance) / (1 − chance), which is 1 if all answers "
+    "are right and 0 for guessing; low and high: the same for the rate's 95% Wilson interval. p: "
+    "exact one-sided probability of at least as many right answers by guessing "
+    "(Poisson-binomial); p_holm: after Holm's correction among the tests of this table in one "
+    "simulator. An answer that names no option is wrong, so frequent refusals fall below chance. "
+    "Systems that see nothing of the past (the controls blank and text, and any under no-history) "
+    f"must be at chance: p_holm below {ALPHA} there means that questions can be answered without "
+    "memory; a larger one does not prove the opposite."
 )
 _REPEATS = (
-    " With repeats a question is one guess, however often it was asked: right answers are the sum "
-    "of the episodes' means, rounded down."
+    " With repeats, a question counts as one guess: right answers are the sum of the episodes' "
+    "means, rounded down."
 )
-_EARLY = " p†: provisional, as a cell is not complete."
+_EARLY = " p†: provisional, because a cell is incomplete."
 
 
 def chance_table(outcomes: Mapping[str, Outcomes], cells: Iterable[Cell]) -> Table:
-    """Return how far each cell is above chance, of those whose episodes are all questions."""
+    """Return how far above chance each cell is whose episodes are all questions."""
     found = [one for one in cells if not (one.part or math.isnan(one.chance))]
     ps = [_p(outcomes[one.simulator], one) for one in found]
     tests = zip(found, ps, corrected(ps, [one.simulator for one in found]), strict=True)

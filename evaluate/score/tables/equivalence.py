@@ -1,4 +1,4 @@
-"""Is a difference shown to be small: two one-sided tests, with a margin that the user states."""
+"""Equivalence: whether a difference is within a margin, by two one-sided tests."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -21,38 +21,33 @@ EQUIVALENT, BEYOND, OPEN = "equivalent", "beyond", "not shown"
 def equivalence_table(
     contrasts: Iterable[Contrast], cells: Iterable[Cell], published: Sequence[Cell], margin: float
 ) -> Table:
-    """Return which differences are shown to be within a margin.
+    """Return which differences are within a margin, in points.
 
     Each k is compared with k0, and a system with retrieval with the one without, under the same
-    condition and at k0; where that one has no rows, with its published k0. The margin is in points.
+    condition and at k0; if that one has no rows, with its published k0.
     """
     found = [one for one in contrasts if one.table in ("effects", "equivalence")]
     paired = {(one.simulator, one.system) for one in found if one.system != one.against[0]}
     alone = [one for one in cells if (one.simulator, one.system) not in paired]
-    shown = [(one, "rows") for one in found if one.pairs.n]
-    shown += [(one, "published") for one in _with_published(alone, published)]
-    more = [
-        {
-            "against_rows": rows,
-            "margin": margin / 100,
-            "verdict": verdict(one.pairs, margin) + "†" * (not one.complete),
-        }
-        for one, rows in shown
-    ]
+    compared = [(one, "rows") for one in found if one.pairs.n]
+    compared += [(one, "published") for one in _with_published(alone, published)]
+    rows = []
+    for one, source in compared:
+        outcome = verdict(one.pairs, margin) + "†" * (not one.complete)
+        more = {"against_rows": source, "margin": margin / 100, "verdict": outcome}
+        rows.append(replace(one, table="equivalence", more=more))
     spec = TableSpec(
         f"Equivalence within ±{margin:g} points",
         f"{CELLS} against_rows:text n difference low_90 high_90 margin:points verdict:text "
         "complete",
-        f"Two one-sided tests at 5%: {EQUIVALENT} if the 90% interval of the difference lies "
-        "within the margin, which is to be stated before the rows are looked at; "
-        f"{BEYOND} if it lies outside it; {OPEN} means neither. The intervals are of the kinds "
-        "that the other tables have; against published rates nothing is paired. Not corrected for "
-        "their number. "
-        "†: provisional, as a cell is not complete.",
+        f"Two one-sided tests at 5%: {EQUIVALENT} if the 90% interval of the difference is within "
+        f"the margin, {BEYOND} if it is outside, {OPEN} otherwise. State the margin before you see "
+        "the rows. The intervals are of the same methods as in the other tables, and unpaired for "
+        "published rates. Not corrected for multiple tests. †: provisional, because a cell is "
+        "incomplete.",
         power=False,
     )
-    named = [replace(one, table="equivalence") for one, _ in shown]
-    return comparison_table("equivalence", named, spec, more)
+    return comparison_table("equivalence", rows, spec)
 
 
 def _with_published(cells: Iterable[Cell], published: Sequence[Cell]) -> Iterator[Contrast]:
@@ -67,7 +62,7 @@ def _with_published(cells: Iterable[Cell], published: Sequence[Cell]) -> Iterato
 
 
 def verdict(pairs: Pairs, margin: float) -> str:
-    """Return whether a difference is shown to be within ± a margin, in points, or beyond it."""
+    """Return whether a difference is within ± a margin, in points, or beyond it."""
     low, high = (100 * bound for bound in pairs.within[1:])
     if -margin < low and high < margin:
         return EQUIVALENT

@@ -1,9 +1,4 @@
-"""Access against use: what came of rollouts whose memory kept the evidence, and of the others.
-
-A memory fails because the frames that show the answer are no longer in it (access), or because
-they are not used. Success where all of the evidence was kept tells the second; the gap to the
-ideal observer with the same memory is all that better use could win.
-"""
+"""Success by whether the memory kept the evidence: failures of access and failures of use."""
 
 from collections.abc import Iterable
 
@@ -15,10 +10,7 @@ from robomme_interference_data.viz.tables import Table
 
 
 def ceiling_of(system: str) -> str | None:
-    """Return the ideal observer with a system's memory; None for bounds, and where none is known.
-
-    Of a system with retrieval it is the observer behind the same step.
-    """
+    """Return the ideal observer with a system's memory and retrieval step, if one is known."""
     known = known_system(system)
     if known is None or known.sampling is None or known.bound:
         return None
@@ -26,11 +18,8 @@ def ceiling_of(system: str) -> str | None:
     return name + known.step
 
 
-def access_table(every: Iterable[Outcomes]) -> Table:
-    """Return the rates where all, some and none of the evidence was kept, by system and condition.
-
-    Cells of which no rollout tells what was kept are left out, and so are levels without episodes.
-    """
+def evidence_table(every: Iterable[Outcomes]) -> Table:
+    """Return the rates where all, some and none of the evidence was kept, where that is known."""
     rows = []
     for outcomes in every:
         kept = outcomes.evidence
@@ -44,11 +33,11 @@ def access_table(every: Iterable[Outcomes]) -> Table:
                     rows.append((*cell, rate.n, rate.value, *rate.interval))
     return Table.make(
         "by_evidence_kept",
-        "Success by the evidence that was kept",
+        "Success by the evidence that the memory kept",
         "simulator system condition kept n:count rate:rate low:rate high:rate",
         rows,
         "kept: whether all, some or none of the lesson's evidence spans have a frame in the memory "
-        "at the first step. Rates over the n episodes of which that is known, with 95% Wilson "
-        "intervals. They are of different episodes. Where all was kept, a failure is one of use; "
-        "where none was, a success is luck, or needs no memory.",
+        "at the first step. Rates over the n episodes for which that is known, with 95% Wilson "
+        "intervals. The levels have different episodes. If all evidence was kept, a failure is one "
+        "of use; if none was, a success is luck or needs no memory.",
     )

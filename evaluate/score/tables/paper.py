@@ -1,4 +1,4 @@
-"""The rates that the paper reports, and how ours compare."""
+"""The published rates, and how scored rates compare with them."""
 
 import csv
 from collections.abc import Iterable, Iterator, Sequence
@@ -18,29 +18,31 @@ from .cells import Cell
 
 _NOTE = (
     "Published: RoboMME-Interference: Benchmarking Robot Memory Under Interference (Rathi, August "
-    "2026), Tables 3 and 4. complete: over the benchmark's 450 episodes, as the published rates "
-    "are. 95% intervals: Wilson for rates; Newcombe's hybrid score for differences, which takes "
-    "both sides as independent samples: the paper's rows are not at hand to be paired. "
-    "published_best: it cannot be told from the highest published rate of its condition, by the "
-    "test of two proportions, corrected by Holm's method over the others (0.05 or more). A system "
-    "that is not the paper's stands beside all of them, if its cell is complete; that is no rank."
+    "2026), Tables 3 and 4. complete: over the benchmark's 450 episodes, like the published rates. "
+    "95% intervals: Wilson for rates; Newcombe's hybrid score for differences, with both sides as "
+    "independent samples, because the paper's rows are not available for pairing. published_best: "
+    "not distinguishable from the highest published rate of its condition, by the test of two "
+    "proportions after Holm's correction over the others (p of 0.05 or more). A system that is not "
+    "in the paper is listed beside all of them if its cell is complete; this is not a ranking."
 )
-
-
 _FAMILIES_NOTE = (
-    "By family the paper prints no rates. These are of its public repository "
-    "(SoumilRathi/robomme-interference, CC BY 4.0), which is of an earlier date, where they add up "
-    "to the paper's rate over all families. A system that is not the paper's stands beside all of "
-    "them, on whatever episodes it has: how many tells n, and the interval how little few say. "
-    "Families of different difficulty make no rank."
+    "The paper reports no rates by family. These are from its public repository "
+    "(SoumilRathi/robomme-interference, CC BY 4.0), an earlier version, where they add up to the "
+    "paper's rate over all families. A system that is not in the paper is listed beside all of "
+    "them, with any number of episodes (n). Families differ in difficulty: this is not a ranking."
 )
+_SIDES = (
+    "published_system n:count rate:rate low:rate high:rate published_n:count published_rate:rate "
+    "published_low:rate published_high:rate"
+)
+_CHANGE = "difference:points difference_low:points difference_high:points complete:flag"
 
 
 @cache
 def published() -> tuple[Cell, ...]:
     """Return all published rates, in the paper's order, as complete cells of its simulator.
 
-    They are printed to a tenth of a percent: of 450 episodes only one count rounds to each.
+    The paper prints tenths of a percent, which only one count of 450 episodes rounds to.
     """
     cells = []
     for row in _read("published.csv"):
@@ -54,7 +56,7 @@ def published() -> tuple[Cell, ...]:
 
 
 def _best(cells: Sequence[Cell]) -> set[tuple[str, str]]:
-    """Return system and condition of the published cells that cannot be told from the best."""
+    """Return system and condition of the published cells not distinguishable from the best."""
     best = max(cells, key=lambda cell: cell.rate)
     others = {c.system: compare_unpaired(best.as_rate, c.as_rate) for c in cells if c is not best}
     return {(system, best.condition) for system in tied_with_best(best.system, others)}
@@ -62,18 +64,14 @@ def _best(cells: Sequence[Cell]) -> set[tuple[str, str]]:
 
 @cache
 def by_family() -> tuple[Cell, ...]:
-    """Return the rates by family of the paper's repository where they are those of the paper.
-
-    It is of an earlier date: a system under a condition is left out where its families do not add
-    up to the published rate; see `differing`.
-    """
+    """Return the repository's rates by family, without those that contradict the paper."""
     others = {*differing()}
     return tuple(one for one in _repository() if (one.system, one.condition) not in others)
 
 
 @cache
 def differing() -> tuple[tuple[str, str], ...]:
-    """Return the systems and conditions of which paper and repository have other rates."""
+    """Return the systems and conditions whose rates differ between paper and repository."""
     won: dict[tuple[str, str], int] = {}
     for one in _repository():
         key = (one.system, one.condition)
@@ -103,11 +101,11 @@ def _read(name: str) -> Iterator[dict[str, str]]:
 
 
 def _comparable(cells: Iterable[Cell]) -> Iterator[tuple[Cell, Cell]]:
-    """Yield cells with what is published beside them.
+    """Yield cells with each published cell that they are compared with.
 
-    Of a system of the paper that is its own, and with retrieval also that of the one without; of
-    any other system all of them, over the families together only if the cell is complete: rates
-    over a few families are not to be set against rates over nine.
+    A system of the paper is compared with itself, one with retrieval also with the one without, and
+    any other system with all of them, over all families only if its cell is complete: rates over a
+    few families are not comparable with rates over nine.
     """
     known: dict[tuple[str, str, str], list[Cell]] = {}
     for one in (*published(), *by_family()):
@@ -120,66 +118,44 @@ def _comparable(cells: Iterable[Cell]) -> Iterator[tuple[Cell, Cell]]:
             beside = [one for name in names for one in beside if one.system == name]
         elif not (cell.part or cell.complete):
             beside = []
-        for found in beside:
-            yield cell, found
+        for paper in beside:
+            yield cell, paper
 
 
-_SIDES = (
-    "published_system n:count rate:rate low:rate high:rate published_n:count published_rate:rate "
-    "published_low:rate published_high:rate"
-)
-_CHANGE = "difference:points difference_low:points difference_high:points complete:flag"
-
-
-def paper_table(cells: Sequence[Cell]) -> Table:
-    """Return our rates, complete by the benchmark's grid, beside the published ones."""
-    whole = [one for one in cells if not one.part]
-    rows = [
-        (cell.system, cell.condition, *_sides(cell, paper), paper.best, *_change(cell, paper))
-        for cell, paper in _comparable(whole)
-    ]
-    note = " ".join([_NOTE, *not_compared(whole)])
-    columns = f"system condition {_SIDES} published_best:flag {_CHANGE}"
-    return Table.make("paper", "Beside the published rates", columns, rows, note)
-
-
-def paper_family_table(cells: Sequence[Cell]) -> Table:
-    """Return our rates by family beside those of the paper's repository; see `paper_table`."""
-    parts = [one for one in cells if one.part]
-    rows = [
-        (cell.system, cell.condition, cell.part, *_sides(cell, paper), *_change(cell, paper))
-        for cell, paper in _comparable(parts)
-    ]
-    ours = {name for cell in parts for name in (cell.system, base_of(cell.system))}
+def paper_table(cells: Sequence[Cell], *, by_part: bool = False) -> Table:
+    """Return rates beside the published ones: `paper`, or by family `paper_family`."""
+    cells = [one for one in cells if bool(one.part) == by_part]
+    rows = []
+    for cell, paper in _comparable(cells):
+        won = (cell.rate * cell.trials, cell.trials, round(paper.rate * paper.n), paper.n)
+        row: list[Any] = [cell.system, cell.condition, *[cell.part] * by_part, paper.system]
+        row += [cell.n, cell.rate, *cell.interval, paper.n, paper.rate, *paper.interval]
+        row += [paper.best] * (not by_part)
+        rows.append((*row, cell.rate - paper.rate, *newcombe(*won), cell.complete))
+    if not by_part:
+        columns = f"system condition {_SIDES} published_best:flag {_CHANGE}"
+        note = " ".join([_NOTE, *not_compared(cells)])
+        return Table.make("paper", "Comparison with the published rates", columns, rows, note)
+    ours = {name for cell in cells for name in (cell.system, base_of(cell.system))}
     others: dict[str, list[str]] = {}
     for system, condition in differing():
         if system in ours:
             others.setdefault(display_name(system), []).append(condition)
-    note = _FAMILIES_NOTE
-    if others:
-        told = "; ".join(f"{name} {', '.join(found)}" for name, found in others.items())
-        note += f" They do not under: {told}."
+    listed = "; ".join(f"{name} {', '.join(conditions)}" for name, conditions in others.items())
+    note = _FAMILIES_NOTE + f" They do not for: {listed}." * bool(others)
     columns = f"system condition family {_SIDES} {_CHANGE}"
-    return Table.make("paper_family", "Beside the published rates, by family", columns, rows, note)
-
-
-def _sides(cell: Cell, paper: Cell) -> tuple[Any, ...]:
-    return paper.system, cell.n, cell.rate, *cell.interval, paper.n, paper.rate, *paper.interval
-
-
-def _change(cell: Cell, paper: Cell) -> tuple[Any, ...]:
-    won = (cell.rate * cell.trials, cell.trials, round(paper.rate * paper.n), paper.n)
-    return cell.rate - paper.rate, *newcombe(*won), cell.complete
+    title = "Comparison with the published rates by family"
+    return Table.make("paper_family", title, columns, rows, note)
 
 
 def not_compared(cells: Sequence[Cell]) -> list[str]:
-    """Return in sentences what cannot be set against the published rates, if there is any."""
+    """Return sentences about what has no published counterpart, if anything."""
     simulators = {one.simulator for one in published()}
-    found = []
+    sentences = []
     if others := sorted({cell.simulator for cell in cells} - simulators):
-        found.append(f"Rows of {', '.join(others)} are not set against the paper's RoboMME.")
+        sentences.append(f"Rows of {', '.join(others)} are not compared with the paper's RoboMME.")
     compared = {cell.system for cell, _ in _comparable(c for c in cells if not c.part)}
     ours = dict.fromkeys(cell.system for cell in cells if cell.simulator in simulators)
     if alone := [system for system in ours if system not in compared]:
-        found.append(f"Not in the paper under these conditions: {', '.join(alone)}.")
-    return found
+        sentences.append(f"Not in the paper under these conditions: {', '.join(alone)}.")
+    return sentences
