@@ -1,9 +1,9 @@
-"""Run policies on the benchmark, and score what came out.
+"""Run policies on the benchmark, and implement policies of your own.
 
 ```python
 from pathlib import Path
 
-from . import RunConfig, run_evaluation
+from robomme_interference_data.evaluate import RunConfig, run_evaluation
 
 if __name__ == "__main__":  # worker processes import the script
     config = RunConfig(policy="replay", buffer_set=Path("demo/buffers"), out=Path("runs/replay"))
@@ -16,28 +16,42 @@ from typing import TYPE_CHECKING
 from robomme_interference_data.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from .policies.policy import Policy, RolloutInfo
+    from robomme_interference_data.schema.evidence import Evidence
+    from robomme_interference_data.schema.subgoal import Subgoal
+    from robomme_interference_data.simulators.base import Observation, Simulator
+
+    from .policies.policy import Frames, Policy, RolloutInfo
     from .run.config import AskConfig, RunConfig
     from .run.evaluation import RunResult, run_evaluation
     from .run.merge import Merged, merge_runs
 
 __all__ = [
+    # run
     "AskConfig",
     "Merged",
-    "Policy",
-    "RolloutInfo",
     "RunConfig",
     "RunResult",
     "merge_runs",
     "run_evaluation",
+    # implement a policy
+    "Evidence",
+    "Frames",
+    "Observation",
+    "Policy",
+    "RolloutInfo",
+    "Simulator",
+    "Subgoal",
 ]
 
 __getattr__ = lazy_exports(
     __name__,
     {
-        ".policies.policy": "Policy RolloutInfo",
+        ".policies.policy": "Frames Policy RolloutInfo",
         ".run.config": "AskConfig RunConfig",
         ".run.evaluation": "RunResult run_evaluation",
         ".run.merge": "Merged merge_runs",
+        "robomme_interference_data.schema.evidence": "Evidence",
+        "robomme_interference_data.schema.subgoal": "Subgoal",
+        "robomme_interference_data.simulators.base": "Observation Simulator",
     },
 )

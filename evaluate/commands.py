@@ -1,4 +1,4 @@
-"""The commands of rollouts and questions: `ceiling`, `evaluate`, `ask` and `merge`."""
+"""The commands `ceiling`, `evaluate`, `ask` and `merge`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -21,15 +21,14 @@ from .run.config import AskConfig, CeilingConfig, RunConfig
 
 @with_settings
 def ceiling(buffer_set: BufferSetFolder, config: CeilingConfig, as_json: AsJson = False) -> None:
-    """Tell what a memory keeps of the answers, before anybody has rolled out anything.
+    """Print the maximum success that a memory rule allows, without a rollout.
 
-    The share of the evidence that is kept, and, on tabletop, how often the ideal observer
-    succeeds: no policy with that memory can do better.
+    That is the share of the evidence that it keeps and, on tabletop, the success rate of the ideal
+    observer: no policy with that memory can do better.
 
     Examples:
     ```
     robomme-interference ceiling my-buffers --memory window
-    robomme-interference ceiling my-buffers --retrieval thumbnail --conditions k0,k7
     robomme-interference ceiling my-buffers --retrieval thumbnail --shift light:2
     ```
     """
@@ -45,7 +44,7 @@ def ceiling(buffer_set: BufferSetFolder, config: CeilingConfig, as_json: AsJson 
         return
     title = f"Ceiling on {opened.name}, memory {config.memory}"
     if config.retrieval is not None:
-        title += f", behind retrieval {config.retrieval}, rule {config.retrieval_rule}"
+        title += f", with retrieval {config.retrieval}, rule {config.retrieval_rule}"
         title += "" if config.shift == NO_SHIFT else f", shift {config.shift}"
     echo(module.ceiling_table(cells, title).text())
 
@@ -54,37 +53,21 @@ def ceiling(buffer_set: BufferSetFolder, config: CeilingConfig, as_json: AsJson 
 def evaluate(config: RunConfig, as_json: AsJson = False) -> None:
     r"""Roll out a policy under the benchmark's conditions, one row per rollout.
 
-    Before each episode the policy gets the history that the condition prescribes: nothing
-    (no-history), the lesson (k0), or the lesson and k sessions of other tasks. RUN/rollouts.jsonl
-    holds what came out, RUN/run.json what ran; tables are exported when the run ends. Stop it at
-    any time: the same command goes on, skips what is finished and repeats what broke.
+    Before each episode the policy gets the history of the condition: nothing (no-history), the
+    lesson (k0), or the lesson and k sessions of other tasks. OUT/rollouts.jsonl has a row for each
+    rollout, OUT/run.json the settings; tables are exported when the run ends. To resume an
+    interrupted run, re-run the same command: it skips finished rollouts and repeats errors.
 
     Examples:
     ```
-    robomme-interference evaluate S --policy replay:window \
-      --out runs/window
+    robomme-interference evaluate my-buffers --policy replay:window --out runs/window
 
-    robomme-interference evaluate S --policy websocket://localhost:8000 \
-      --system perceptual-framesamp-modul --out runs/mine \
-      --policy-option checkpoint=mme_vla_suite/perceptual-framesamp-modul/79999 \
-      --conditions k0,k7 --families MoveCube,RouteStick
+    robomme-interference evaluate my-buffers --policy websocket://localhost:8000 \
+      --system perceptual-framesamp-modul --conditions k0,k7 --out runs/framesamp \
+      --policy-option checkpoint=mme_vla_suite/perceptual-framesamp-modul/79999
 
-    robomme-interference evaluate S --policy websocket --workers 2 \
-      --serve 'python serve.py --port {port}' --system mine --out runs/served
-
-    robomme-interference evaluate S --policy lerobot:me/act@v1 \
+    robomme-interference evaluate my-buffers --policy lerobot:me/act@v1 \
       --system act-v1 --policy-option device=cpu --out runs/act
-
-    robomme-interference evaluate S --policy guess --conditions no-history \
-      --workers 2 --out runs/guess
-
-    robomme-interference evaluate S --policy replay --shift light:2 --out runs/light
-
-    robomme-interference evaluate S --policy oracle --episodes 0-4 --videos \
-      --out runs/oracle
-
-    robomme-interference evaluate S --policy replay --shard 2/8 \
-      --out runs/shard-2
     ```
     """
     _run(config, "Finished rollouts", "rollouts", as_json=as_json)
@@ -92,29 +75,25 @@ def evaluate(config: RunConfig, as_json: AsJson = False) -> None:
 
 @with_settings
 def ask(config: AskConfig, as_json: AsJson = False) -> None:
-    r"""Ask multiple-choice questions about what history buffers show, without a simulator.
+    r"""Ask a model multiple-choice questions about history buffers, without a simulator.
 
-    Of each query episode: the goal, the first live view with the possible answers marked, and the
-    frames of the buffer that are kept. Right or wrong measures whether the past can be read out of
-    memory. Rows are those of rollouts, and are scored alike; what was asked and answered is in
-    RUN/answers. Make the questions first: robomme-interference build questions BUFFER_SET.
+    It sees the goal, the first live view with the possible answers marked, and the history frames
+    that its memory keeps. Rows are scored like those of rollouts; OUT/answers has the transcripts.
+    First make the questions: robomme-interference build questions BUFFER_SET.
 
     Examples:
     ```
-    robomme-interference ask S --model recall --out runs/recall --conditions k0,k7
+    robomme-interference ask my-buffers --model recall --out runs/recall --conditions k0,k7
 
-    robomme-interference ask S --model openai:http://localhost:8000/v1#Qwen/Qwen3-VL-4B-Instruct \
-      --system qwen3-vl-4b --out runs/qwen --frames 32 --sampling framesamp
-
-    robomme-interference ask S --model transformers:my/model --control blank \
-      --system mine-blank --out runs/blank
+    robomme-interference ask my-buffers --system qwen3-vl-4b --out runs/qwen \
+      --model openai:http://localhost:8000/v1#Qwen/Qwen3-VL-4B-Instruct
     ```
     """
     _run(config, "Answers", "questions", as_json=as_json)
 
 
 def _run(config: RunConfig | AskConfig, kept: str, unit: str, *, as_json: bool) -> None:
-    """Run, and print the results; fails if something broke."""
+    """Run, and print the results; exit with 1 after errors."""
     from robomme_interference_data.schema.codec import to_dict
 
     from .run.evaluation import run_evaluation
@@ -137,21 +116,21 @@ def _run(config: RunConfig | AskConfig, kept: str, unit: str, *, as_json: bool) 
         print_status(f"Stopped: {result.stopped}", fg="red")
     if broken := result.counts["error"]:
         print_status(
-            f"{broken} {unit} broke (see {result.folder}/errors.log); the same command runs them "
-            f"again:\n{command_line()}"
+            f"{broken} {unit} broke (see {result.folder}/errors.log); re-run them with:\n"
+            f"{command_line()}"
         )
         raise typer.Exit(1)
 
 
 def merge(
     runs: Annotated[list[Path], typer.Argument(help="Folders of the shards of a run.")],
-    out: Annotated[Path, typer.Option(help="Folder of the joined run, new.")],
+    out: Annotated[Path, typer.Option(help="New folder of the merged run.")],
     as_json: AsJson = False,
 ) -> None:
-    """Join shards of a run into one, and tell which rollouts are missing or double.
+    """Merge the shards of a run, and list missing and duplicate rollouts.
 
-    The shards must agree in all settings that can change a result. The joined run scores like
-    any other, and evaluate with its folder as --out runs what is missing.
+    The shards must have the same settings, except those that cannot change a result. The merged run
+    can be scored like any other; evaluate with its folder as --out runs what is missing.
 
     Example:
     ```
@@ -165,11 +144,11 @@ def merge(
     merged = merge_runs(runs, out)
     lists = {name: getattr(merged, name) for name in _LISTS}
     if as_json:
-        told = {
+        listed = {
             name: [{"episode": str(one.episode), "condition": one.condition} for one in items]
             for name, items in lists.items()
         }
-        print_json({"planned": merged.planned, "rows": len(merged.rows), **told})
+        print_json({"planned": merged.planned, "rows": len(merged.rows), **listed})
         return
     echo(rate_table(merged.rows).text())
     for name, items in lists.items():
@@ -182,7 +161,7 @@ def merge(
 
 _LISTS = {
     "missing": "missing",
-    "broken": "broken, to be run again",
+    "broken": "broken, to run again",
     "duplicates": "in more than one run, the first one kept",
-    "conflicts": "of those did not end alike",
+    "conflicts": "of these have different results",
 }

@@ -1,21 +1,18 @@
 """The systems of the paper, and the benchmark's own controls, as data.
 
-A system is a policy together with its memory mechanism. Its name labels the rows of a run, so a
-name of this table promises the conditions and limits given here; see `name_system` for labels of
-your own.
+A system is a policy together with its memory mechanism. Its name labels the rows of a run; a name
+of this table implies the conditions and limits in it.
 """
 
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 from robomme_interference_data.constants import MAX_STEPS, POSITION_LIMIT
-from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, UnknownNameError
+from robomme_interference_data.errors import InvalidIdError, InvalidOptionError
 from robomme_interference_data.schema.conditions import NO_HISTORY
 
 _FREE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-_OF_QUESTIONS = "questions-"  # so begin the names of controls that are asked
 
 
 @dataclass(frozen=True)
@@ -25,20 +22,20 @@ class System:
     Attributes:
         name: Name in rows, options and file names.
         display: Name in tables and figures.
-        representation: What the memory is made of, such as `frames` or `tokens`; `none` without.
+        representation: Content of the memory, such as `frames` or `tokens`; `none` without memory.
         integration: How the memory enters the policy: `modulator`, `context`, `expert`,
             `subgoals`, or None.
-        with_history: Whether the other conditions apply.
-        subgoals: What a vision-language model in front of the policy writes:
-            `simple_subgoal`, `grounded_subgoal`, or None where there is none.
-        retrieval: Whether a retrieval step chooses what the memory gets.
-        step: What of that step is unusual, in the name of a control, such as `joined`.
-        sampling: By which of `sampling.MEMORIES` it keeps frames; None where that is not known, or
-            it keeps none.
-        position_limit: History and live frames together that the memory holds; None: no limit.
+        with_history: Whether conditions other than `no-history` apply.
+        subgoals: Output of a vision-language model in front of the policy: `simple_subgoal`,
+            `grounded_subgoal`, or None without a model.
+        retrieval: Whether a retrieval step selects what the memory gets.
+        step: Changes of that step from the paper's, in the name of a control, such as `joined`.
+        sampling: Rule of `sampling.MEMORIES` by which it keeps frames; None if unknown, or if it
+            keeps none.
+        position_limit: Maximum history and live frames together in memory; None: no limit.
         paper: Whether the paper reports it.
-        bound: Whether it only shows what can be reached: with the answer, with what a memory shows
-            of it, by chance, or by standing still. Such a system is never ranked.
+        bound: Whether it is only a reference: with the answer, with what a memory shows of it, by
+            chance, or without motion. Such a system is never ranked.
     """
 
     name: str
@@ -56,32 +53,36 @@ class System:
 
     @property
     def keeps_frames(self) -> bool | None:
-        """Whether its released server keeps frames; None where none was released under the name."""
+        """Whether its released server keeps frames; None if no server was released."""
         return self.position_limit is not None if self.paper else None
 
     @property
     def prompt(self) -> str:
-        """How the model in front of it is asked, unless another prompt is given."""
+        """Default prompt of the model in front of it."""
         if self.subgoals == "simple_subgoal":
             return "simple"
         return "memer" if self.name == "memer" else "grounded"
 
     def applies(self, condition: str) -> bool:
-        """Whether a condition says anything: retrieval needs a history, a memory-free one none."""
+        """Whether a condition applies: retrieval needs a history, a system without memory none."""
         return not self.retrieval if condition == NO_HISTORY else self.with_history
 
 
 def _released(
     name: str, display: str, memory: str, integration: str, *, retrieval: bool = False
 ) -> System:
-    """A system whose server keeps the frames, with an embedding for each of 4096 positions."""
-    own: dict[str, Any] = {"retrieval": retrieval, "position_limit": POSITION_LIMIT, "paper": True}
-    own["sampling"] = "framesamp" if memory == "frames" else None
-    return System(name, display, memory, integration, **own)
+    """A system whose server keeps frames, with an embedding for each of 4096 positions."""
+    return System(
+        *(name, display, memory, integration),
+        retrieval=retrieval,
+        position_limit=POSITION_LIMIT,
+        paper=True,
+        sampling="framesamp" if memory == "frames" else None,
+    )
 
 
 def _symbolic(name: str, display: str, memory: str, subgoals: str) -> System:
-    """A system whose server keeps nothing: the model in front of it reads the history."""
+    """A system whose server has no memory: the model in front of it reads the history."""
     return System(name, display, memory, "subgoals", subgoals=subgoals, paper=True)
 
 
@@ -147,10 +148,9 @@ SYSTEMS: dict[str, System] = {system.name: system for system in (*PAPER_SYSTEMS,
 
 
 def known_system(name: str) -> System | None:
-    """Return a system of the table, or a control behind another retrieval step than the usual.
+    """Return a system of the table, or a control with a changed retrieval step; else None.
 
-    Such a step stands behind the control's name, as in `retrieval-replay-window-joined`. None for
-    any other name.
+    The change follows the control's name, as in `retrieval-replay-window-joined`.
     """
     for control in _CONTROLS:
         step = name.removeprefix(f"{control.name}-")
@@ -160,41 +160,17 @@ def known_system(name: str) -> System | None:
 
 
 def name_system(name: str) -> System:
-    """Return a system that is known, or one with a name of your own.
-
-    A name of your own is free of conditions and limits. What differs from a name of the table only
-    in case and separators is an error, so that a slip does not pass for a system of its own; so is
-    one that begins as those of the controls that are asked questions.
-    """
+    """Return a system of the table, or one with a new name, without conditions and limits."""
     if not _FREE_NAME.fullmatch(name):
         raise InvalidIdError(
             f"{name!r} is not the name of a system",
             "Expected up to 64 letters, digits, '.', '_' and '-', such as my-memory.",
         )
-    if (known := known_system(name)) is not None:
-        return known
-    folded = {
-        _folded(text): one.name for one in SYSTEMS.values() for text in (one.name, one.display)
-    }
-    if (meant := folded.get(_folded(name))) is not None:
-        raise UnknownNameError(
-            f"{name!r} reads like the system {meant!r}, which it is not",
-            f"Write {meant!r} if that is what runs, or take another name.",
-        )
-    if name.lower().removeprefix("retrieval-").startswith(_OF_QUESTIONS):
-        raise UnknownNameError(
-            f"{name!r} reads like a control that is asked questions, which it is not",
-            f"Take a name that does not begin with {_OF_QUESTIONS!r}.",
-        )
-    return System(name, name, "own")
-
-
-def _folded(name: str) -> str:
-    return re.sub(r"[^a-z0-9]", "", name.lower())
+    return known_system(name) or System(name, name, "own")
 
 
 def display_name(name: str) -> str:
-    """Return the name for tables and figures; a name of your own stays as it is."""
+    """Return the name for tables and figures; a new name stays unchanged."""
     known = known_system(name)
     return name if known is None else known.display
 
@@ -209,16 +185,13 @@ def base_of(name: str) -> str | None:
 
 
 def is_bound(name: str) -> bool:
-    """Whether a system only bounds what a memory can reach; one of your own never does."""
+    """Whether a system is only a reference, see `System.bound`; a new one never is."""
     known = known_system(name)
     return known is not None and known.bound
 
 
 def check_history(system: System, frames: Mapping[str, int]) -> None:
-    """Refuse histories that, with a whole rollout after them, exceed the system's positions.
-
-    `frames` has the longest history of each condition.
-    """
+    """Check that the longest history of each condition and a rollout fit into the positions."""
     limit = system.position_limit
     over = [
         f"{count} frames under {name}"
@@ -227,7 +200,7 @@ def check_history(system: System, frames: Mapping[str, int]) -> None:
     ]
     if over:
         raise InvalidOptionError(
-            f"{system.name} numbers {limit} positions: {MAX_STEPS} steps leave no room for a "
-            f"history of {', '.join(over)}",
+            f"{system.name} has {limit} positions: {MAX_STEPS} steps leave no room for a history "
+            f"of {', '.join(over)}",
             "Leave out those conditions or episodes, or run a system without such a limit.",
         )

@@ -1,15 +1,14 @@
-"""An HTTP client whose limits cover a whole answer: its time, and its size."""
+"""An HTTP client that limits the time and the size of a whole answer."""
 
-import socket
-import threading
-from contextlib import suppress
 from typing import Any
 from weakref import WeakSet
 
 import httpx
 
+from robomme_interference_data.evaluate.deadline import shutdown_after
+
 MAX_BYTES = 16 << 20
-"""Bytes of an answer at most; those to a question have a few thousand."""
+"""Maximum bytes of an answer; a usual one has a few thousand."""
 
 
 class AnswerTooLongError(httpx.RequestError):
@@ -17,13 +16,10 @@ class AnswerTooLongError(httpx.RequestError):
 
 
 class BoundedClient(httpx.Client):
-    """An HTTP client for one thread, with limits that a server cannot stretch.
-
-    The read timeout of `httpx` starts anew with each byte: a server that sends one now and then,
-    or never ends its answer, would keep a client forever.
+    """An HTTP client for one thread whose limits a server cannot extend.
 
     Args:
-        answer_s: Most seconds from a request to the last byte of its answer.
+        answer_s: Maximum seconds from a request to the last byte of its answer.
     """
 
     def __init__(self, answer_s: float):
@@ -33,38 +29,28 @@ class BoundedClient(httpx.Client):
 
     def send(self, request: httpx.Request, **options: Any) -> httpx.Response:  # type: ignore[override]
         """Send a request and read its answer, uncompressed, within the limits."""
-        expired = threading.Event()
-
-        def expire() -> None:
-            expired.set()
-            for stream in self._streams:
-                with suppress(OSError):  # already closed
-                    # Not the method of a TLS socket, which another thread may not call.
-                    socket.socket.shutdown(stream.get_extra_info("socket"), socket.SHUT_RDWR)
-
         request.extensions = {**request.extensions, "trace": self._keep_stream}
-        timer = threading.Timer(self._answer_s, expire)
-        timer.daemon = True
-        timer.start()
-        try:
-            response = _read(super().send(request, **{**options, "stream": True}))
-        except httpx.TransportError:
-            if not expired.is_set():
-                raise
-        finally:
-            timer.cancel()
-        if expired.is_set():  # an ended connection may also have been taken for the answer's end
+        with shutdown_after(self._answer_s, self._sockets) as expired:
+            try:
+                response = _read(super().send(request, **{**options, "stream": True}))
+            except httpx.TransportError:
+                if not expired.is_set():
+                    raise
+        if expired.is_set():  # a shut down connection may look like the end of the answer
             raise httpx.ReadTimeout("no whole answer in time", request=request)
         return response
 
+    def _sockets(self) -> list[Any]:
+        return [stream.get_extra_info("socket") for stream in self._streams]
+
     def _keep_stream(self, event: str, info: dict[str, Any]) -> None:
-        """Keep the connections that are opened, to end them: see httpx's `trace` extension."""
+        """Remember connections as they open; see httpx's `trace` extension."""
         if event.endswith((".connect_tcp.complete", ".start_tls.complete")):
             self._streams.add(info["return_value"])
 
 
 def _read(response: httpx.Response) -> httpx.Response:
-    """Return a streamed response as one that was read."""
+    """Read a streamed response."""
     content = bytearray()
     try:
         for chunk in response.iter_raw():

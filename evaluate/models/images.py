@@ -1,4 +1,4 @@
-"""Images and videos as models are sent them."""
+"""Images and videos in the form in which models get them."""
 
 import base64
 import tempfile
@@ -14,46 +14,39 @@ from .model import Message, Part, Video
 
 
 def within(messages: Iterable[Message], images: int | None) -> list[Message]:
-    """Return messages with at most so many images.
+    """Return messages with at most so many images; None: unchanged.
 
-    Videos become images, evenly spread ones, and give way first, the longer ones before others.
-
-    Args:
-        messages: The messages.
-        images: Images at most in all; single ones are never left out. None: videos stay videos.
+    Videos become evenly spread images, and the longest ones are thinned out first.
     """
-    asked = list(messages)
     if images is None:
-        return asked
-    parts = [part for message in asked for part in message.parts]
+        return list(messages)
+    messages = list(messages)
+    parts = [part for message in messages for part in message.parts]
     lengths = [len(part.frames) for part in parts if isinstance(part, Video)]
     left = max(0, images - sum(isinstance(part, np.ndarray) for part in parts))
     shares = iter(_shares(lengths, left))
     return [
-        Message(
-            message.role,
-            tuple(one for part in message.parts for one in _shortened(part, shares)),
-        )
-        for message in asked
+        Message(message.role, tuple(one for part in message.parts for one in _thin(part, shares)))
+        for message in messages
     ]
 
 
 def _shares(lengths: Sequence[int], left: int) -> list[int]:
-    """Return how many of so many frames each video keeps, so that they are `left` at most."""
+    """Return how many frames each video keeps, so that they are `left` at most."""
     top = max(lengths, default=0)
     while sum(min(length, top) for length in lengths) > left:
         top -= 1
     return [min(length, top) for length in lengths]
 
 
-def _shortened(part: Part, shares: Iterable[int]) -> tuple[Part, ...]:
+def _thin(part: Part, shares: Iterable[int]) -> tuple[Part, ...]:
     if not isinstance(part, Video):
         return (part,)
     return tuple(part.frames[place] for place in spread(0, len(part.frames), next(iter(shares))))
 
 
 def mp4(video: Video) -> bytes:
-    """Return a video as H.264 in MP4; a row or column too many for it is left out."""
+    """Return a video as H.264 in MP4, without an odd last row or column."""
     height, width = (side // 2 * 2 for side in video.frames.shape[1:3])
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "video.mp4"
@@ -65,5 +58,5 @@ def mp4(video: Video) -> bytes:
 
 
 def data_url(kind: str, data: bytes) -> str:
-    """Return bytes as a `data:` address; `kind` is such as `image/png`."""
+    """Return bytes as a `data:` URL; `kind` is a media type such as `image/png`."""
     return f"data:{kind};base64,{base64.b64encode(data).decode()}"

@@ -1,4 +1,4 @@
-"""What every vision-language model is to the harness, wherever it runs."""
+"""The interface of vision-language models."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Video:
-    """Frames that follow each other.
+    """Consecutive frames.
 
     Attributes:
         frames: `(T, H, W, 3) uint8` RGB, T at least 1.
@@ -23,7 +23,7 @@ class Video:
 
 
 Part = str | NDArray[np.uint8] | Video
-"""Words, an image, `(H, W, 3) uint8` RGB, or a video."""
+"""Text, an image `(H, W, 3) uint8` RGB, or a video."""
 
 
 @dataclass(frozen=True)
@@ -36,13 +36,13 @@ class Message:
 
 @dataclass(frozen=True)
 class Reply:
-    """What a model answered.
+    """The answer of a model.
 
     Attributes:
-        text: Its words; empty if it refused, or had nothing to say.
-        tokens: Tokens of question and answer together; None if it does not say.
-        calls: How often it was asked for this answer: more than once after faults.
-        seconds: Until the answer was there, waiting before further calls included.
+        text: Its text; empty after a refusal.
+        tokens: Tokens of question and answer together; None if not reported.
+        calls: Number of calls for this answer: more than one after faults.
+        seconds: Time of all calls, with the pauses between them.
     """
 
     text: str
@@ -52,11 +52,11 @@ class Reply:
 
 
 class ChatModel(ABC):
-    """A vision-language model. It keeps nothing from one call to the next.
+    """A vision-language model, without state between calls.
 
     Attributes:
-        images: Images of a question at most: frames of videos, which count, too, are thinned out.
-            None if it is sent videos as such, which have no bound.
+        images: Maximum images of a question, with the frames of videos, which are thinned out. None
+            if the model takes videos as such.
     """
 
     images: int | None = None
@@ -67,7 +67,7 @@ class ChatModel(ABC):
 
     @abstractmethod
     def metadata(self) -> dict[str, Any]:
-        """Return plain values that say which model this is, for the record of the run."""
+        """Return plain values that identify the model, for `run.json`."""
 
     def close(self) -> None:
-        """Release everything."""
+        """Release all resources."""

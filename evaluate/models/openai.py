@@ -1,7 +1,4 @@
-"""Models behind a chat endpoint as OpenAI has it: the only file that imports openai.
-
-vLLM, SGLang and ms-swift serve open models, with adapters too, in the same way.
-"""
+"""Models behind an OpenAI-compatible chat endpoint, such as vLLM, SGLang or ms-swift serve."""
 
 import math
 import os
@@ -19,13 +16,13 @@ from .bounded_http import AnswerTooLongError, BoundedClient
 from .images import data_url, mp4, within
 from .model import ChatModel, Message, Part, Reply, Video
 
-_WAITS = "The same command goes on where it stopped."
+_WAITS = "Re-run the same command to resume."
 
 _PAUSE_S = 0.5
-"""Seconds to wait after the first answer that is none; twice as many after each further one."""
+"""Seconds to wait after the first invalid answer; they double after each further one."""
 
 _LONGEST_PAUSE_S = 8.0
-"""As the client has it after other faults."""
+"""The longest pause; as the client has it after other faults."""
 
 _DAY_S = 86_400.0
 
@@ -33,22 +30,21 @@ _DAY_S = 86_400.0
 class OpenAIModel(ChatModel):
     """A chat endpoint that takes images.
 
-    What fails for the moment (no connection, no answer in time, 429, 5xx, an answer that is none)
-    is asked again up to `repeats` times, later each time, or when the server says so
-    (`Retry-After`; more than two minutes end it). A refusal is an answer without words. The key is
-    `OPENAI_API_KEY`; servers of one's own mostly want none.
+    After a temporary fault (no connection, no answer in time, 429, 5xx, an invalid answer) a
+    question is repeated up to `repeats` times, with growing pauses or after `Retry-After`, at most
+    two minutes. A refusal is an answer without text. The API key is
+    `OPENAI_API_KEY`; local servers mostly need none.
 
     Args:
-        url: Its base, such as `http://localhost:8000/v1`.
-        model: Name of the model there.
-        max_tokens: Tokens of an answer at most.
-        temperature: 0 for the likeliest words, as far as the server is deterministic.
-        images: Images in a question at most; videos are thinned out.
-        video: How frames that follow each other are sent: `images`, or `mp4`, one address of a
-            video (`video_url`, as vLLM and SGLang take it).
-        repeats: Further times that a question is asked.
-        connect_s: Most seconds until there is a connection.
-        response_s: Most seconds until the whole answer is there, which has 16 MiB at most.
+        url: The base, such as `http://localhost:8000/v1`.
+        model: Name of the model at the endpoint.
+        max_tokens: Maximum tokens of an answer.
+        temperature: 0 for the most likely answer, as far as the server is deterministic.
+        images: Maximum images in a question; videos are thinned out.
+        video: How videos are sent: as `images`, or `mp4`, one `video_url` as vLLM and SGLang take.
+        repeats: Maximum repetitions of a question.
+        connect_s: Maximum seconds until a connection is open.
+        response_s: Maximum seconds until the end of an answer, which has 16 MiB at most.
     """
 
     def __init__(
@@ -66,16 +62,15 @@ class OpenAIModel(ChatModel):
     ):
         if video not in ("images", "mp4"):
             raise InvalidOptionError.one_of("video", video, ("images", "mp4"))
-        sound = 0 <= temperature < math.inf  # not so of NaN
-        if min(max_tokens, images) < 1 or repeats < 0 or not sound:
+        if min(max_tokens, images) < 1 or repeats < 0 or not 0 <= temperature < math.inf:
             raise InvalidOptionError(
                 f"max_tokens {max_tokens}, images {images}, temperature {temperature}, repeats "
                 f"{repeats}; expected at least 1, 1, 0 and 0"
             )
         if not (0 < connect_s <= _DAY_S and 0 < response_s <= _DAY_S):
             raise InvalidOptionError(
-                f"connect_s {connect_s}, response_s {response_s}; expected seconds above 0, a day "
-                "at most"
+                f"connect_s {connect_s}, response_s {response_s}; expected seconds above 0, at "
+                "most a day"
             )
         self._url, self._model = url, model
         self._settings: dict[str, Any] = {"max_tokens": max_tokens, "temperature": temperature}
@@ -91,20 +86,20 @@ class OpenAIModel(ChatModel):
         )
 
     def reply(self, messages: Sequence[Message]) -> Reply:
-        """Ask, and ask again what fails for the moment; see `ChatModel.reply`."""
-        asked: Any = [
+        """Ask, with repetitions after temporary faults; see `ChatModel.reply`."""
+        conversation: Any = [
             {"role": message.role, "content": _content(message.parts)}
             for message in within(messages, self.images)
         ]
-        began, calls, why = time.perf_counter(), 0, ""
+        began, calls, fault = time.perf_counter(), 0, ""
         while calls <= self._repeats:
             try:
                 client = self._client.with_options(max_retries=self._repeats - calls)
                 response = client.chat.completions.with_raw_response.create(
-                    model=self._model, messages=asked, **self._settings
+                    model=self._model, messages=conversation, **self._settings
                 )
             except openai.NotFoundError as error:
-                self.metadata()  # raises, and names what is served, if it is not this model
+                self.metadata()  # raises, with the served models, if this is none of them
                 raise self._error(error) from error
             except openai.APIError as error:
                 raise self._error(error) from error
@@ -112,16 +107,16 @@ class OpenAIModel(ChatModel):
             try:
                 return _read(response.parse(), calls, time.perf_counter() - began)
             except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
-                why = f"{type(error).__name__}: {first_line(error)}"
+                fault = f"{type(error).__name__}: {first_line(error)}"
             if calls <= self._repeats:
                 time.sleep(min(_PAUSE_S * 2 ** (calls - 1), _LONGEST_PAUSE_S))
         raise ModelError(
-            f"{self._url} answers what is no chat completion ({why}), asked {calls} times",
+            f"{self._url} answers {calls} calls without a chat completion ({fault})",
             f"Is it the base of an OpenAI-compatible endpoint, mostly ending in /v1? {_WAITS}",
         )
 
     def metadata(self) -> dict[str, Any]:
-        """Return the model's name; the endpoint is asked whether it serves it."""
+        """Return the model's name, after checking that the endpoint serves it."""
         try:
             known = [one.id for one in self._client.models.list()]
         except openai.APIError as error:
@@ -145,24 +140,22 @@ class OpenAIModel(ChatModel):
     def _error(self, error: openai.APIError) -> ModelError:
         status = getattr(error, "status_code", None)
         if isinstance(error, openai.APITimeoutError):
-            return ModelError(
-                f"{self._url} gave no answer in time", f"Raise response_s, or ask less. {_WAITS}"
-            )
+            return ModelError(f"{self._url} gave no answer in time", f"Raise response_s. {_WAITS}")
         if isinstance(error.__cause__, AnswerTooLongError):
-            return ModelError(f"{self._url} gives no end to an answer: {error.__cause__}")
+            return ModelError(f"{self._url} sends too long an answer: {error.__cause__}")
         if isinstance(error, openai.APIConnectionError):
             cause = first_line(error.__cause__ or error)
             return ModelError(
                 f"{self._url} cannot be reached: {cause}", f"Is the server running? {_WAITS}"
             )
         hints = {
-            401: "Give its key: export OPENAI_API_KEY=…",
+            401: "Set its API key: export OPENAI_API_KEY=…",
             404: f"Does it serve the model {self._model!r}? Is the base right, mostly …/v1?",
-            429: f"It has too much to do, or a limit was reached. {_WAITS}",
+            429: f"It is overloaded, or a limit was reached. {_WAITS}",
         }
-        told = first_line(error)[:500]
+        text = first_line(error)[:500]
         return ModelError(
-            f"{self._url} answers {status or 'an error'}: {told}", hints.get(status or 0)
+            f"{self._url} answers {status or 'an error'}: {text}", hints.get(status or 0)
         )
 
 
@@ -194,10 +187,10 @@ def _content(parts: Sequence[Part]) -> Any:
 
 
 def _read(answer: Any, calls: int, seconds: float) -> Reply:
-    """Read a completion; what is none raises one of the errors of looking into it."""
+    """Read a completion; an invalid one raises an error of attribute access."""
     message = answer.choices[0].message
     text = message.content
     if text is not None and not isinstance(text, str):
         raise TypeError(f"content is {text!r}")
     tokens = getattr(answer.usage, "total_tokens", None)
-    return Reply(text or "", tokens if isinstance(tokens, int) else None, calls, seconds)
+    return Reply(text or "", tokens if type(tokens) is int else None, calls, seconds)

@@ -1,4 +1,4 @@
-"""Prompts as files: words with places for images and for what is told; pure but for the reading."""
+"""Prompts as files: text with placeholders for images and text."""
 
 import hashlib
 import re
@@ -19,20 +19,16 @@ _MOST_BYTES = 1 << 16
 def fill(
     text: str, words: Mapping[str, str], views: Mapping[str, Sequence[Part]]
 ) -> tuple[Part, ...]:
-    """Return a prompt's text with what stands for its places, words and images in order.
+    """Return the parts of a text whose placeholders, `{goal}` or `<history>`, are replaced.
 
-    Args:
-        text: The text.
-        words: Places such as `{goal}`, and the words for them.
-        views: Places such as `<history>`, and the images for them; `none` is written where there
-            are none.
+    A placeholder without images becomes the word `none`.
     """
     parts: list[Part] = []
     rest = 0
     for match in re.finditer("|".join(map(re.escape, (*words, *views))), text):
-        found = match.group()
-        here = [words[found]] if found in words else views[found] or ["none"]
-        for part in (text[rest : match.start()], *here):
+        name = match.group()
+        values = [words[name]] if name in words else views[name] or ["none"]
+        for part in (text[rest : match.start()], *values):
             _add(parts, part)
         rest = match.end()
     _add(parts, text[rest:])
@@ -40,73 +36,58 @@ def fill(
 
 
 def check_places(name: str, text: str, places: Sequence[str]) -> None:
-    """Refuse what looks like a place and is none: it would be shown to the model as it stands.
-
-    Only what is near a place is refused: a model has special words of its own, such as `<think>`.
-    """
+    """Reject misspelled placeholders; others are special tokens of models, such as `<think>`."""
     for found in re.findall(r"<\w+>|\{\w+\}", text):
         if found not in places and (hint := nearest(found, places, more="")):
-            raise ValueError(f"its {name} has {found}, which is no place. {hint}")
+            raise ValueError(f"its {name} has the unknown placeholder {found}. {hint}")
 
 
 def _add(parts: list[Part], part: Part) -> None:
-    """Add a part; words go to the words before them."""
+    """Add a part; text is appended to text before it."""
     if isinstance(part, str) and parts and isinstance(parts[-1], str):
         parts[-1] += part
     elif not isinstance(part, str) or part:
         parts.append(part)
 
 
-def told(parts: Sequence[Part]) -> str:
-    """Return what a model was asked as records have it: `[image]`, `[video of n frames]`."""
-    return "".join(
-        f"[video of {len(part.frames)} frames]"
-        if isinstance(part, Video)
-        else part
-        if isinstance(part, str)
-        else "[image]"
-        for part in parts
-    )
+def as_text(parts: Sequence[Part]) -> str:
+    """Return a prompt for transcripts, with `[image]` and `[video of n frames]`."""
+    texts = []
+    for part in parts:
+        image = f"[video of {len(part.frames)} frames]" if isinstance(part, Video) else "[image]"
+        texts.append(part if isinstance(part, str) else image)
+    return "".join(texts)
 
 
 def read_prompt[T](
     record: type[T], package: str, names: Sequence[str], name: str, page: str
 ) -> tuple[T, str]:
-    """Read a prompt: one that comes with the package, or a TOML file by its path.
+    """Read a prompt of the package by name, or a TOML file; return it with its SHA-256.
 
-    Args:
-        record: Its dataclass, of texts and whole numbers; raises `ValueError` for what it may not
-            be.
-        package: The package with `prompts/<name>.toml`.
-        names: Those that come with it.
-        name: Which is wanted.
-        page: Of the documentation, for messages.
-
-    Returns:
-        The prompt, and the SHA-256 of its file.
+    `record` is its dataclass, of text and integers, `page` the documentation for messages.
     """
     path: Any = Path(name)
     if name in names:
         path = resources.files(package) / "prompts" / f"{name}.toml"
     elif not path.is_file():
         raise UnknownNameError(
-            f"there is no prompt {name!r}, and no such file",
-            f"Give {', '.join(names)}, or the path of a file like those ({page}).",
+            f"there is no prompt or file {name!r}",
+            f"Expected {', '.join(names)}, or the path of a TOML file ({page}).",
         )
     data = path.read_bytes()
     known = {one.name: one for one in fields(record)}  # type: ignore[arg-type]
     try:
         if len(data) > _MOST_BYTES:
             raise ValueError(f"{len(data)} bytes; expected at most {_MOST_BYTES}")
-        given = tomllib.loads(data.decode())
-        for key, value in given.items():
+        values = tomllib.loads(data.decode())
+        for key, value in values.items():
             if key not in known:
                 raise ValueError(f"it has {key!r}; expected {', '.join(known)}")
             if type(value) is not known[key].type:
                 raise ValueError(f"{key} is {value!r}")
-        needed = (key for key, one in known.items() if one.default is MISSING)
-        if missing := [key for key in needed if key not in given]:
+        required = (key for key, one in known.items() if one.default is MISSING)
+        if missing := [key for key in required if key not in values]:
             raise ValueError(f"it lacks {', '.join(missing)}")
-        return record(**given), hashlib.sha256(data).hexdigest()
-    except (ValueError, RecursionError) as error:  # what is no TOML, UTF-8 or option is one too
-        raise FormatError(f"{name} is no prompt: {error}", f"{page} says what one has.") from None
+        return record(**values), hashlib.sha256(data).hexdigest()
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"{name} is no prompt: {error}", f"See {page}.") from None

@@ -4,11 +4,17 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 from urllib.parse import urlsplit
 
-from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.runtime.specs import Kind, Registry, Spec, bind_options
-from robomme_interference_data.storage.hub import HubFiles, locate
+from robomme_interference_data.runtime.specs import Kind, Registry
 
-from .model import ChatModel
+
+def _is_endpoint(target: str) -> bool:
+    """Whether a URL has a host, and no key, which messages would show."""
+    try:
+        parts = urlsplit(target.partition("#")[0])
+        return bool(parts.hostname) and parts.port != 0 and "@" not in parts.netloc
+    except ValueError:  # an invalid port
+        return False
+
 
 MODELS = Registry(
     "model",
@@ -19,72 +25,28 @@ MODELS = Registry(
             r"(?P<url>https?://[^#\s]+)#(?P<model>\S+)",
             extra="vlm",
             no_effect=("connect_s", "response_s", "repeats"),
+            valid=_is_endpoint,
         ),
         "transformers": Kind(
             "transformers:NAMESPACE/NAME[@REVISION] or transformers:FOLDER",
             f"{__package__}.transformers:TransformersModel",
             r"(?P<path>.+)",
             extra="vlm",
-            # Files are known by their digests, wherever they lie.
+            # Digests identify files, wherever they are.
             no_effect=("device", "adapter", "model", "revision"),
+            on_hub=True,
         ),
     },
 )
 
 
-def parse_model(text: str) -> Spec:
-    """Read a model as it is written."""
-    spec = MODELS.parse(text)
-    if spec.kind == "openai" and not _is_endpoint(spec.given["url"]):
-        raise InvalidOptionError.expected("model", text, MODELS.kinds["openai"].form)
-    return spec
-
-
-def _is_endpoint(url: str) -> bool:
-    """Whether it has a host and no key, which would be shown with it; that has a variable."""
-    try:
-        parts = urlsplit(url)
-        return bool(parts.hostname) and parts.port != 0 and "@" not in parts.netloc
-    except ValueError:  # its port
-        return False
-
-
-def pin_model(text: str) -> str:
-    """Return the one text of a model: one on the Hub has its commit, asked for once."""
-    spec = parse_model(text)
-    if spec.kind == "transformers":
-        files = locate(spec.given["path"], "model")
-        if isinstance(files, HubFiles):
-            return f"transformers:{files.repo_id}@{files.commit}"
-    return text
-
-
-def make_model(text: str, options: Sequence[str] = (), also: Sequence[str] = ()) -> ChatModel:
-    """Make a model in this process. No endpoint is reached before the first question.
-
-    Args:
-        text: The model as it is written, see `parse_model`.
-        options: Its options, each `NAME=VALUE`: see `OpenAIModel` and `TransformersModel`.
-        also: Names of options that something else takes from the same list, for messages.
-    """
-    spec = parse_model(text)
-    factory = MODELS.factory(spec)
-    bound = bind_options(f"model {text!r}", factory, spec.given, options, also)
-    made: ChatModel = factory(**spec.given, **bound)
-    return made
-
-
 def model_identity(
     text: str, options: Sequence[str], metadata: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return what of a model can change an answer, as plain values.
-
-    Where it is served or lies is no part of it, a digest of its files is.
-    """
-    spec = parse_model(text)
-    bound = bind_options(f"model {text!r}", MODELS.factory(spec), spec.given, options)
+    """Return what of a model can change an answer, as plain values: digests, but no addresses."""
+    spec = MODELS.parse(text)
     return {
         "kind": spec.kind,
         **MODELS.identity(spec, metadata),
-        "options": MODELS.identity(spec, bound),
+        "options": MODELS.identity(spec, MODELS.options(text, options)),
     }

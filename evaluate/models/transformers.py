@@ -1,4 +1,4 @@
-"""Models in this process, through transformers: the only file here that imports it."""
+"""Vision-language models in this process, with transformers."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -29,17 +29,17 @@ _FILES = ("*.json", "*.safetensors", "*.jinja", "*.txt", "*.model")
 
 
 class TransformersModel(ChatModel):
-    """A vision-language model and its processor, as `save_pretrained` leaves them.
+    """A vision-language model and its processor, as `save_pretrained` writes them.
 
-    It answers with the likeliest words, so that the same question has the same answer on one
-    machine. Frames of videos are shown as images.
+    It decodes greedily, so the same question has the same answer on one machine. Frames of videos
+    are shown as images.
 
     Args:
         path: A folder, or a model on the Hub, `namespace/name` or `namespace/name@revision`.
-        adapter: A PEFT adapter for it, by folder or as on the Hub.
-        device: `cpu`, `cuda` or `cuda:1`; None for the first GPU, if there is one.
-        max_tokens: Tokens of an answer at most.
-        images: Images in a question at most; videos are thinned out.
+        adapter: A PEFT adapter for it, a folder or on the Hub.
+        device: `cpu`, `cuda` or `cuda:1`; None for the first GPU, or else the CPU.
+        max_tokens: Maximum tokens of an answer.
+        images: Maximum images in a question; videos are thinned out.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class TransformersModel(ChatModel):
             torch.empty(0, device=self._device)
         except (RuntimeError, AssertionError) as error:
             what = f"device {device!r} cannot be used: {first_line(error)}"
-            raise InvalidOptionError(what, "Give device=cpu.") from None
+            raise InvalidOptionError(what, "Set device=cpu.") from None
         files = locate(path, "model")
         self._path, self._folder = path, files.snapshot(*_FILES)
         self._metadata: dict[str, Any] = {"sha256": digest_weights(self._folder, _FILES)}
@@ -89,11 +89,11 @@ class TransformersModel(ChatModel):
             raise ModelError(
                 f"transformers cannot load the model {self._path}: {first_line(error)}",
                 "Expected an image-text-to-text model with its processor, as save_pretrained "
-                "leaves both.",
+                "writes both.",
             ) from error
 
     def _load(self) -> Any:
-        """Load the weights, when they are first needed: a driver needs only their digest."""
+        """Load the weights on first use: the driver needs only their digest."""
         with self._explained():
             models: Any = transformers.AutoModelForImageTextToText
             model = models.from_pretrained(self._folder, dtype="auto")
@@ -108,7 +108,7 @@ class TransformersModel(ChatModel):
         if self._model is None:
             self._model = self._load()
         began = time.perf_counter()
-        asked = [
+        conversation = [
             {
                 "role": message.role,
                 "content": [
@@ -122,7 +122,7 @@ class TransformersModel(ChatModel):
         ]
         try:
             inputs = self._processor.apply_chat_template(
-                asked,
+                conversation,
                 add_generation_prompt=True,
                 tokenize=True,
                 return_dict=True,
@@ -134,13 +134,13 @@ class TransformersModel(ChatModel):
                 )[0]
         except (RuntimeError, ValueError, TypeError, IndexError, TemplateError) as error:
             raise ModelError(
-                f"the model broke: {type(error).__name__}: {first_line(error)}",
-                "With too little memory, give fewer images (images=16) or another device.",
+                f"the model failed: {type(error).__name__}: {first_line(error)}",
+                "If memory is too small, set fewer images (images=16) or another device.",
             ) from error
         answer = tokens[inputs["input_ids"].shape[1] :]
         text = self._processor.batch_decode(answer[None], skip_special_tokens=True)[0]
         return Reply(text.strip(), len(tokens), 1, time.perf_counter() - began)
 
     def metadata(self) -> dict[str, Any]:
-        """Return the SHA-256 over its files, and those of its adapter; on the Hub its commit."""
+        """Return the SHA-256 of its files and of its adapter's; on the Hub also the commit."""
         return dict(self._metadata)

@@ -1,4 +1,4 @@
-"""The built-in policies, none with learned weights: the benchmark's controls."""
+"""The built-in policies, without learned weights: the benchmark's controls."""
 
 from typing import Any
 
@@ -14,31 +14,30 @@ from robomme_interference_data.simulators.base import Observation, Simulator
 from .policy import Frames, Policy, RolloutInfo
 
 THUMBNAIL = 16
-"""Side of the small image by which frames are compared."""
+"""Side of the thumbnail with which frames are compared, px."""
 
 MAX_MOVE = 0.08
-"""Most that a joint target moves from one step to the next, rad."""
+"""Maximum change of a joint target from one step to the next, rad."""
 
 GRIP_CHANGE = 5e-4
-"""Way of a finger, m, from one kept frame to the next that counts as closing or opening."""
+"""Minimum motion of a finger between two kept frames that counts as closing or opening, m."""
 
 GRIP_STEPS = 5
-"""Steps to wait for the gripper where frames between two kept ones are missing."""
+"""Steps to wait for the gripper where frames between two kept frames are missing."""
 
 
 class ReplayPolicy(Policy):
     """`replay`: a memory.
 
-    It keeps what its memory rule lets it keep of the frames that it was given, takes up the
-    trajectory at the kept frame that looks most like the first live view, and follows the states
-    that come after it; at their end, it holds. It knows nothing of sessions, families or answers,
-    so its success tells only whether the right frames are still in memory.
+    It keeps history frames by its memory rule, finds the kept frame that looks most like the first
+    live view, and follows the states after it; at the last state it stops. It knows nothing about
+    sessions, families or answers, so its success shows only whether the right frames are still in
+    memory.
 
     Args:
         memory: `full`, `framesamp` or `window`.
-        extrapolate: Where the last frames that it was given are not among those that it keeps, go on for
-            as many steps as they were, as it moved last. Off by default: its rows are another
-            system's.
+        extrapolate: Continue the last motion for as many steps as history frames follow the last
+            kept one. Such rows are those of another system.
     """
 
     cameras = ("front",)
@@ -49,21 +48,21 @@ class ReplayPolicy(Policy):
         self.memory, self._extrapolate = memory, extrapolate
 
     def reset(self, info: RolloutInfo) -> None:
-        """Forget everything."""
+        """Clear the memory."""
         self._views: list[NDArray[np.float32]] = []
         self._states: list[NDArray[np.float32]] = []
         self._plan: NDArray[np.float32] | None = None
         self._done = 0
 
     def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
-        """Take frames into memory. What the rule keeps depends on how many follow."""
+        """Store frames; the memory rule selects from them at the first action."""
         self._views.append(thumbnails(frames["front"]))
         self._states.append(np.array(states, np.float32))
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the next 16 targets of the trajectory, `(16, 8) float32`."""
         if self._plan is None:
-            self._plan = self._take_up(observation)
+            self._plan = self._start_plan(observation)
         steps = np.arange(self._done, self._done + ACTION_CHUNK)
         self._done += ACTION_CHUNK
         return self._plan[np.minimum(steps, len(self._plan) - 1)]
@@ -72,14 +71,14 @@ class ReplayPolicy(Policy):
         """Return name and memory rule."""
         return {"policy": "replay", "memory": self.memory}
 
-    def _take_up(self, observation: Observation) -> NDArray[np.float32]:
+    def _start_plan(self, observation: Observation) -> NDArray[np.float32]:
         live = sum(len(states) for states in self._states)
         kept = np.array(MEMORIES[self.memory](live), np.int64)
         if not len(kept):
             return follow(observation.state, kept, observation.state[None][:0])
         views = np.concatenate(self._views)[kept]
         view = thumbnails(observation.images["front"][None])
-        # The first of equals: the one with most of a trajectory after it.
+        # The first of equals, because most of a trajectory follows it.
         nearest_view = int(np.argmin(((views - view) ** 2).mean(axis=(1, 2, 3))))
         kept = kept[nearest_view:]
         states = np.concatenate(self._states)[kept]
@@ -89,11 +88,7 @@ class ReplayPolicy(Policy):
 
 
 def thumbnails(frames: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return the mean colours of 16×16 tiles, `(T, 16, 16, 3) float32`.
-
-    Args:
-        frames: `(T, H, W, 3) uint8`, H and W at least 16; what does not fill a tile is left out.
-    """
+    """Return the mean colors of 16 × 16 tiles, `(T, 16, 16, 3) float32`."""
     count, height, width, _ = frames.shape
     tall, wide = height // THUMBNAIL, width // THUMBNAIL
     cut = frames[:, : tall * THUMBNAIL, : wide * THUMBNAIL]
@@ -104,37 +99,23 @@ def thumbnails(frames: NDArray[np.uint8]) -> NDArray[np.float32]:
 def extrapolate(
     kept: NDArray[np.int64], states: NDArray[np.float32], last: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Add a last frame to kept ones, where its joints would be had they moved on as before.
-
-    Args:
-        kept: Indices of the frames, `(n,) int64`, ascending.
-        states: Their states, `(n, 8) float32`.
-        last: Index of the last frame; nothing is added if it is kept, or only one is.
-    """
+    """Append a last frame, index `last`, with the joints that a constant speed would give."""
     if len(kept) < 2 or kept[-1] >= last:
         return kept, states
     speed = (states[-1] - states[-2]) / np.float32(kept[-1] - kept[-2])
     end = states[-1] + speed * np.float32(last - kept[-1])
-    end[7] = states[-1][7]  # the gripper stays
+    end[7] = states[-1][7]  # the gripper does not move
     return np.append(kept, last), np.vstack([states, end])
 
 
 def follow(
     now: NDArray[np.float32], kept: NDArray[np.int64], states: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Return joint targets that go through states at the pace at which they were seen.
+    """Return joint targets through states, `(n, 8)`, at their recorded pace: `(m, 8)`, m ≥ 1.
 
-    Between two kept frames the targets are interpolated, one step for each frame that lies
-    between; more where a joint would move over 0.08 rad in a step. The gripper closes when the
-    way of its finger shrinks, opens when it grows, and else stays.
-
-    Args:
-        now: Present state, `(8,) float32`.
-        kept: Indices of the frames, `(n,) int64`, ascending.
-        states: Their states, `(n, 8) float32`.
-
-    Returns:
-        `(m, 8) float32`, m at least 1: 7 joint targets in rad, gripper −1 closed or 1 open.
+    Between two kept frames the targets are interpolated, one step for each missing frame, and more
+    where a joint would move over 0.08 rad in a step. The gripper closes when its opening shrinks,
+    opens when it grows, and else keeps its command.
     """
     grip = 1.0 if now[7] > 0.02 else -1.0
     targets = [np.append(now[:7], np.float32(grip))]
@@ -142,26 +123,23 @@ def follow(
     for state, seen in zip(states, kept.tolist(), strict=True):
         frames = 1 if index is None else seen - index
         change = 0.0 if index is None else float(state[7] - at[7])
-        wanted = grip if abs(change) <= GRIP_CHANGE else (-1.0 if change < 0 else 1.0)
-        whole = frames == 1  # no frame is missing: the gripper moves when it was seen to
+        next_grip = grip if abs(change) <= GRIP_CHANGE else (-1.0 if change < 0 else 1.0)
+        whole = frames == 1  # no frame is missing: the gripper moves at this frame
         if whole:
-            grip = wanted
+            grip = next_grip
         steps = max(frames, int(np.ceil(np.abs(state[:7] - at[:7]).max() / MAX_MOVE)))
         for step in range(1, steps + 1):
             joints = at[:7] + (state[:7] - at[:7]) * (step / steps)
             targets.append(np.append(joints, grip))
-        if not whole and wanted != grip:
-            grip = wanted
+        if not whole and next_grip != grip:
+            grip = next_grip
             targets += [np.append(state[:7], grip)] * GRIP_STEPS
         at, index = state, seen
     return np.array(targets[1:] or targets, np.float32)
 
 
 class Privileged(Policy):
-    """`oracle` or `guess`: the simulator's own scripts, with the hidden answer or a drawn one.
-
-    These and `Noop` are the benchmark's ends.
-    """
+    """`oracle` or `guess`: the simulator's own scripts, with the hidden answer or a random one."""
 
     privileged = True
 
@@ -174,24 +152,24 @@ class Privileged(Policy):
         self._simulator = info.simulator
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
-        """Return the script's next action, `(1, 8) float32`: a script is asked step by step."""
-        return self._asked().act(self.name)[None]
+        """Return the script's next action, `(1, 8) float32`."""
+        return self._running().act(self.name)[None]
 
     def metadata(self) -> dict[str, Any]:
         """Return its name."""
         return {"policy": self.name}
 
-    def _asked(self) -> Simulator:
+    def _running(self) -> Simulator:
         if self._simulator is None:
-            raise PolicyError(f"the policy {self.name} needs the simulator itself")
+            raise PolicyError(f"the policy {self.name} needs the simulator, and got None")
         return self._simulator
 
 
 class FollowSubgoals(Privileged):
-    """`follow-subgoals`: does what subgoals say, by the simulator's own script.
+    """`follow-subgoals`: the simulator's script that carries out subgoals.
 
-    It finds what their words and points name among all that the scene allows, and knows no answer.
-    Without subgoals it does what `guess` does.
+    It matches their words and points with what the scene allows, and does not know the answer.
+    Without subgoals it acts like `guess`.
     """
 
     def __init__(self) -> None:
@@ -199,16 +177,15 @@ class FollowSubgoals(Privileged):
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the script's next action, `(1, 8) float32`; see `Privileged.act`."""
-        return self._asked().follow_subgoal(observation.subgoal)[None]
+        return self._running().follow_subgoal(observation.subgoal)[None]
 
 
 class Recall(Privileged):
     """`recall`: the ideal observer, the ceiling of every policy with its memory rule.
 
-    It knows those parts of the hidden answer of whose evidence its memory keeps a frame, and
-    nothing else; of two lessons that show the same part the newer one counts. Among the answers
-    that agree it draws one from the episode's seed, and the simulator's script does that. It looks
-    at no picture.
+    It knows the parts of the hidden answer of whose evidence its memory keeps a frame; of two
+    lessons that show the same part, the newer one counts. It draws one of the answers that agree
+    from the episode's seed, and the simulator's script carries it out. It reads no images.
 
     Args:
         memory: `full`, `framesamp` or `window`.
@@ -220,18 +197,18 @@ class Recall(Privileged):
         self.memory = memory
 
     def reset(self, info: RolloutInfo) -> None:
-        """See what the memory keeps."""
+        """Determine which parts of the answer the memory keeps."""
         super().reset(info)
         if info.evidence is None:
             raise PolicyError(
-                "recall needs to know which frames show the answer, and this is unknown",
+                "recall needs to know which frames show the answer, which is unknown here",
                 "Build the buffer set from a source with evidence: see docs/sources.md.",
             )
         self._known = known_parts(info.evidence, MEMORIES[self.memory](info.history_frames))
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the script's next action, `(1, 8) float32`; see `Privileged.act`."""
-        return self._asked().act(self.name, self._known)[None]
+        return self._running().act(self.name, self._known)[None]
 
     def metadata(self) -> dict[str, Any]:
         """Return name and memory rule."""
@@ -239,10 +216,10 @@ class Recall(Privileged):
 
 
 class Noop(Policy):
-    """Holds the pose that the arm has, so that nothing happens."""
+    """`noop`: holds the current pose."""
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
-        """Return the present joint positions as targets, gripper open, `(16, 8) float32`."""
+        """Return the current joint positions as targets, gripper open, `(16, 8) float32`."""
         action = np.append(observation.state[:7], np.float32(1.0))
         return np.tile(action, (ACTION_CHUNK, 1))
 

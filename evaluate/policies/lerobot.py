@@ -1,7 +1,6 @@
 """LeRobot policies, from a folder or the Hub, with the processors that were saved with them.
 
-What can be seen from the configuration is checked when the policy is made; the weights are
-loaded at the first rollout.
+The configuration is checked when the policy is made; weights are loaded at the first rollout.
 """
 
 import sys
@@ -52,14 +51,14 @@ _NEEDED = (
 class LeRobotPolicy(Policy):
     """A policy trained with LeRobot, such as one of its ACT, diffusion or VLA models.
 
-    A policy that acts on one observation takes no history and runs `no-history` only. One that
-    acts on the last few (`n_obs_steps` above 1, as diffusion policies do) gets them in its own
-    queue: at first the end of the history, then live ones.
+    A policy that acts on one observation uses no history and runs under `no-history` only. One that
+    acts on the last few (`n_obs_steps` above 1, such as diffusion policies) gets them in its own
+    queue: first the end of the history, then live observations.
 
     Args:
         path: Folder that `save_pretrained` wrote, or a model on the Hub, `namespace/name` or
             `namespace/name@revision`.
-        device: `cpu`, `cuda` or `cuda:1`; by default the first GPU, if there is one.
+        device: `cpu`, `cuda` or `cuda:1`; by default the first GPU, or else the CPU.
     """
 
     def __init__(self, path: str, *, device: str | None = None):
@@ -86,7 +85,7 @@ class LeRobotPolicy(Policy):
         self._seed = self._asked = 0
 
     def reset(self, info: RolloutInfo) -> None:
-        """Empty the policy's queues, loading its weights first if need be."""
+        """Empty the policy's queues, loading its weights first if necessary."""
         if self._model is None:
             with _explained(str(self._folder)):
                 kind = get_policy_class(self._config.type)
@@ -98,11 +97,11 @@ class LeRobotPolicy(Policy):
         self._seed, self._asked = info.seed, 0
 
     def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
-        """Keep the last few frames; a policy that acts on one observation is given none."""
+        """Keep the last few frames."""
         self.observe(frames, states)
 
     def observe(self, frames: Frames, states: NDArray[np.float32]) -> None:
-        """Keep the last few frames as LeRobot's processors take them: one each, images 0 to 1."""
+        """Keep the last few frames as LeRobot's processors take them: images from 0 to 1."""
         for index in range(max(0, len(states) - self._steps), len(states)):
             state = torch.from_numpy(np.array(states[index], np.float32))
             one: dict[str, Any] = {STATE: state[None]}
@@ -117,14 +116,14 @@ class LeRobotPolicy(Policy):
         self._recent.clear()
         with torch.inference_mode(), self._seeded():
             chunk = self._ask(earlier, last) if self._has_queue else self._predict(last)
-            # One at a time: a step may refer to the one observation that was processed.
+            # One at a time: a processor step may refer to a single processed observation.
             actions = [self._after(action) for action in chunk[:ACTION_CHUNK]]
-        found: NDArray[np.float32] = torch.cat(actions).to("cpu", torch.float32).numpy()
-        return found
+        result: NDArray[np.float32] = torch.cat(actions).to("cpu", torch.float32).numpy()
+        return result
 
     @property
     def _has_queue(self) -> bool:
-        """Whether the policy keeps observations in a queue, beside its queue of actions."""
+        """Whether the policy has a queue of observations besides its queue of actions."""
         queues = getattr(self._model, "_queues", None) or {}
         return ACTION in queues and len(queues) > 1
 
@@ -133,7 +132,7 @@ class LeRobotPolicy(Policy):
         queue = self._model._queues[ACTION]
         for one in earlier:
             queue.clear()
-            # It predicts only when no action is left: this one it hands back.
+            # The policy predicts only when no action is left: it returns this one.
             queue.append(torch.zeros(1, ACTION_SIZE))
             self._model.select_action(one)
         queue.clear()
@@ -151,7 +150,7 @@ class LeRobotPolicy(Policy):
 
     @contextmanager
     def _seeded(self) -> Iterator[None]:
-        """Draw from the rollout's seed, and leave PyTorch's generators as they were."""
+        """Seed PyTorch for one call, and restore its generators afterwards."""
         devices = [torch.device(self._device)] if self._device.startswith("cuda") else []
         with torch.random.fork_rng(devices):
             torch.manual_seed((self._seed << 16) + self._asked)
@@ -159,7 +158,7 @@ class LeRobotPolicy(Policy):
             yield
 
     def metadata(self) -> dict[str, Any]:
-        """Return what is loaded, with the SHA-256 of its files, and the device."""
+        """Return the source, the SHA-256 of its files, and the device."""
         return {
             "policy": "lerobot",
             "source": self._source,
@@ -170,12 +169,12 @@ class LeRobotPolicy(Policy):
         }
 
     def close(self) -> None:
-        """Let go of the weights."""
+        """Release the weights."""
         self._model = None
 
 
 def _choose_device(device: str | None) -> str:
-    """Return the device, or for None the first GPU, if there is one, else `cpu`."""
+    """Return the device; for None the first GPU, or `cpu` without one."""
     gpus = [f"cuda:{number}" for number in range(torch.cuda.device_count())]
     known = ["cpu", *gpus, *(["cuda"] if gpus else [])]
     if device is not None and device not in known:
@@ -184,21 +183,21 @@ def _choose_device(device: str | None) -> str:
 
 
 def find_policy(path: str) -> tuple[Path, str]:
-    """Return the folder with a policy's files, and what names it: with its commit, on the Hub."""
+    """Return the folder with a policy's files, and its source, on the Hub with the commit."""
     files = locate(path, "model")
     folder, name = files.snapshot(*_FILES), files.location
     missing = [one for one in _NEEDED if not (folder / one).is_file()]
     if missing:
         raise MissingFileError(
             f"{', '.join(missing)} missing in {name}",
-            "Expected what LeRobot 0.6 saves, such as …/checkpoints/last/pretrained_model.",
+            "Expected a folder of LeRobot 0.6, such as …/checkpoints/last/pretrained_model.",
         )
     return folder, name
 
 
 @contextmanager
 def _explained(path: str) -> Iterator[None]:
-    """Turn what LeRobot raises while loading into errors of this package."""
+    """Convert exceptions of LeRobot while loading into errors of this package."""
     try:
         with redirect_stdout(sys.stderr):  # it prints
             yield
@@ -215,7 +214,7 @@ def _explained(path: str) -> Iterator[None]:
 
 
 def _feature_names(before: Any) -> dict[str, str]:
-    """Return under which name each observation reaches the policy."""
+    """Return the name under which each observation reaches the policy."""
     names = {name: name for name in (FRONT, WRIST, STATE)}
     for step in before.steps:
         renames = getattr(step, "rename_map", None) or {}
@@ -224,15 +223,15 @@ def _feature_names(before: Any) -> dict[str, str]:
 
 
 def _check_features(path: str, config: Any, names: dict[str, str]) -> None:
-    """Compare the policy's features with what the simulators give and take."""
+    """Compare the policy's features with the simulators' observations and actions."""
     given = {names[FRONT]: _IMAGE_SHAPE, names[WRIST]: _IMAGE_SHAPE, names[STATE]: (ACTION_SIZE,)}
     wrong = []
     for name, feature in (config.input_features or {}).items():
         shape = tuple(feature.shape)
         if name not in given:
-            wrong.append(f"wants {name} {shape}, which the simulators do not give")
+            wrong.append(f"wants {name} {shape}, which the simulators do not provide")
         elif shape != given[name]:
-            wrong.append(f"wants {name} of shape {shape}; the simulators give {given[name]}")
+            wrong.append(f"wants {name} of shape {shape}; the simulators provide {given[name]}")
     actions = {
         name: tuple(feature.shape)
         for name, feature in (config.output_features or {}).items()
@@ -246,5 +245,5 @@ def _check_features(path: str, config: Any, names: dict[str, str]) -> None:
         raise PolicyError(
             f"the policy {path} does not fit: it {'; it '.join(wrong)}",
             f"Train it on {FRONT}, {WRIST}, {STATE} and {ACTION} of a buffer set's demonstrations; "
-            "docs/systems.md says how.",
+            "see docs/systems.md.",
         )

@@ -1,4 +1,4 @@
-"""What every policy is to the harness, whatever is behind it."""
+"""The interface of policies: implement `Policy` to evaluate a policy of your own."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -12,21 +12,22 @@ from robomme_interference_data.schema.evidence import Evidence
 from robomme_interference_data.simulators.base import Observation, Simulator
 
 Frames = Mapping[str, NDArray[np.uint8]]
-"""Camera name (`front`, `wrist`) to `(T, H, W, 3) uint8` RGB."""
+"""Camera name (`front`, `wrist`) to `(T, H, W, 3) uint8` RGB; both simulators draw 256 × 256."""
 
 
 @dataclass(frozen=True)
 class RolloutInfo:
-    """What a policy is told when a rollout begins.
+    """What a policy knows when a rollout begins.
 
     Attributes:
         goal: The goal in words.
-        history_frames: Frames of history that will follow; 0 under `no-history`.
-        seed: Seed for whatever the policy draws at random.
-        simulator: The running simulator, for the built-in policies that may ask it for actions
-            (`oracle`, `guess`, `recall`); None for every policy that is not privileged.
-        evidence: Which frames of the history that will follow show a part of the hidden answer,
-            for `recall`; None where that is unknown, and for every policy that is not privileged.
+        history_frames: Number of history frames that `add_history` will bring in all; 0 under
+            `no-history`.
+        seed: Seed for everything that the policy draws at random.
+        simulator: The running simulator, for privileged policies (`oracle`, `guess`, `recall`);
+            None for all others.
+        evidence: Which history frames show a part of the hidden answer, for privileged policies;
+            None where that is unknown, and for all others.
     """
 
     goal: str
@@ -42,19 +43,21 @@ class Policy(ABC):
     The calls come in this order:
 
     `reset`; `add_history` for each chunk of the history, in order; `observe` with the first live
-    observation; `act`; up to 16 of its actions are executed; `observe` with what was seen after
-    each of them; `act`; and so on.
+    observation; `act`; up to 16 of its actions are executed; `observe` with the observations after
+    each of them; `act`; and so on, for at most 1300 actions.
 
-    A policy of one's own need not be a subclass; one that is needs only `act` and `metadata`.
+    A policy need not be a subclass; a subclass must define `act` and `metadata` only. Frames come
+    at 10 Hz: an action controls the robot for 0.1 s. A state is `(8,) float32`: 7 joint positions
+    in rad, then the gripper's opening in m, the way of one finger, from 0 (closed) to 0.04 (open).
 
     Attributes:
-        cameras: Cameras whose live frames it wants, such as `("front", "wrist")`: no others are
-            drawn.
-        history_cameras: Cameras whose history it wants: no others are decoded.
-        wants_history: Whether history makes a difference to it; if not, it runs `no-history` only.
+        cameras: Cameras whose live frames it reads, such as `("front", "wrist")`: no others are
+            drawn. Default: none.
+        history_cameras: Cameras whose history it reads: no others are decoded. Default: none.
+        wants_history: Whether it uses history; if not, it runs under `no-history` only.
         privileged: Whether it gets `RolloutInfo.simulator` and `RolloutInfo.evidence`.
-        every_frame: Whether it wants what is seen after each action; if not, `observe` gets only
-            the observation on which it acts next, and simulators need not draw the others.
+        every_frame: Whether `observe` gets the observations after every action; if not, only the
+            one on which it acts next, and simulators need not draw the others.
     """
 
     cameras: tuple[str, ...] = ()
@@ -64,37 +67,43 @@ class Policy(ABC):
     every_frame: bool = False
 
     def reset(self, info: RolloutInfo) -> None:
-        """Forget everything and prepare for a rollout."""
+        """Clear the memory and prepare for a rollout."""
 
     def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
-        """Take the next chunk of the history.
+        """Add the next chunk of the history to the memory.
 
         Args:
-            frames: `(T, H, W, 3) uint8` of each of `history_cameras`.
-            states: `(T, 8) float32`.
+            frames: `(T, H, W, 3) uint8` RGB of each of `history_cameras`, T at least 1.
+            states: `(T, 8) float32`, one for each frame: rad and m, see `Policy`.
             exec_start_idx: Number of history frames in all, the same with every chunk.
         """
 
     def observe(self, frames: Frames, states: NDArray[np.float32]) -> None:
-        """Take the live observations since the last call.
+        """Add the live observations since the last call to the memory, oldest first.
 
         Args:
-            frames: `(T, H, W, 3) uint8` of each of `cameras`.
-            states: `(T, 8) float32`.
+            frames: `(T, H, W, 3) uint8` RGB of each of `cameras`, T from 1 to 16.
+            states: `(T, 8) float32`, one for each frame: rad and m, see `Policy`.
         """
 
     @abstractmethod
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
-        """Return the next actions, `(n, 8) float32`, n at least 1; 16 at most are executed.
+        """Return the next actions.
 
         Args:
-            observation: What is seen now; `observe` has had it.
+            observation: The current observation, the last one that `observe` got: its `images` are
+                `(H, W, 3) uint8` RGB of each of `cameras`, its `state` is `(8,) float32`, and its
+                `subgoal` is what to do next, if something writes subgoals.
             goal: The goal in words.
+
+        Returns:
+            `(n, 8) float32`, n at least 1; at most the first 16 are executed, one each 0.1 s. An
+            action is 7 absolute joint targets in rad, then the gripper, −1 (close) to 1 (open).
         """
 
     @abstractmethod
     def metadata(self) -> dict[str, Any]:
-        """Return plain values that say which policy this is, for the record of the run."""
+        """Return plain values that identify the policy, such as its checkpoint, for `run.json`."""
 
     def close(self) -> None:
-        """Release everything."""
+        """Release all resources."""

@@ -1,4 +1,4 @@
-"""Locks on policy servers: one holds one memory, so two runs that drive it spoil each other."""
+"""Locks on policy servers: a server holds one memory, so two runs would spoil each other."""
 
 import logging
 import os
@@ -15,20 +15,15 @@ logger = logging.getLogger(__name__)
 _THIS_MACHINE = ("localhost", "127.0.0.1", "::1", "0.0.0.0")
 
 _PORTS = range(18000, 19000)
-"""Where servers listen that workers start."""
+"""Ports of servers that workers start."""
 
 
 @contextmanager
 def lock_server(host: str, port: int, holder: str) -> Iterator[None]:
-    """Keep other runs from a policy server until the block ends.
+    """Keep other runs from a policy server in the block; `holder` is for their error message.
 
-    The lock is a file in this user's cache, and goes with the process, however it ends. Where it
-    cannot be written, a warning says so, and the run goes on without.
-
-    Args:
-        host: Name or address of the server.
-        port: Its port.
-        holder: Who drives it, for the `PolicyServerError` of whoever comes next.
+    The lock is a file in this user's cache that the kernel releases with the process. If it cannot
+    be written, the run continues with a warning.
     """
     machine = socket.gethostname() if host in _THIS_MACHINE else host
     folder = default_cache_folder().parent / "servers"
@@ -56,12 +51,11 @@ def lock_server(host: str, port: int, holder: str) -> Iterator[None]:
 
 @contextmanager
 def reserve_port() -> Iterator[int]:
-    """Choose a free port for a server on this machine, and keep it until the block ends.
+    """Choose a free port on this machine, and keep other workers from it in the block.
 
-    A server listens only when its model is loaded. Were the port just free until then, two that
-    load at once might get the same, and one of them both rollouts. So its number is also the name
-    of an abstract socket (Linux), which every user and container that could listen there sees, and
-    which goes with the process.
+    A server listens only after its model is loaded. Two servers that load at once could choose the
+    same port, and one of them would get both rollouts. So the reservation is an abstract socket
+    (Linux) with the port in its name, which all users and containers that share the port see.
     """
     with ExitStack() as stack:
         for port in _PORTS:
@@ -72,5 +66,8 @@ def reserve_port() -> Iterator[int]:
                 name.bind(f"\0robomme-interference-{port}")
                 break
         else:
-            raise PolicyServerError(f"no port from {_PORTS[0]} to {_PORTS[-1]} is free here")
+            raise PolicyServerError(
+                f"all ports from {_PORTS[0]} to {_PORTS[-1]} are in use on this machine",
+                "End other policy servers.",
+            )
         yield port

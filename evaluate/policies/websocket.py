@@ -1,7 +1,7 @@
 """Policies behind a websocket: openpi's server protocol, as MME-VLA extends it.
 
-The server holds the memory of one rollout, so a lost connection loses the rollout; only when a
-rollout begins is a server connected again. `wire.py` has the bytes of the messages.
+The server holds the memory of one rollout, so a lost connection ends the rollout; the next rollout
+connects again. `wire.py` defines the bytes of the messages.
 """
 
 import os
@@ -33,33 +33,33 @@ from .policy import Frames, Policy, RolloutInfo
 from .server_lock import reserve_port
 
 _NO_FRAMES = "history feats is empty"
-"""In the error of a server that keeps frames and is asked for actions before it has any."""
+"""In the error of a server that keeps frames when it must act before it has any."""
 
 _DEATH_S = 0.5
-"""Seconds after which a server that closed its connection is taken to be alive."""
+"""Seconds to wait for the end of a server that closed its connection."""
 
 _LOG_BYTES = 1 << 20
-"""How much of what a server printed is kept: its end."""
+"""Bytes of a server's output that are kept, from its end."""
 
 
 class WebsocketPolicy(Policy):
     """A policy server, by host and port.
 
-    The seed of a rollout means nothing to a server: it was started with a seed of its own, to
-    which it returns at every reset. A server without a memory ignores the frames that it is sent.
-    Every call raises `PolicyServerError` if the server cannot be reached, reports an error, is gone
-    or too slow.
+    A server ignores the seed of a rollout: it has its own, to which it returns at every reset. A
+    server without memory ignores the frames that it gets. Every call raises `PolicyServerError` if
+    the server cannot be reached, reports an error, closes the connection or is too slow.
 
     Args:
         host: Name or address of the server.
         port: Its port.
-        checkpoint: Which checkpoint it serves, for the record; needed where the server does not say
-            so itself.
-        chunk_frames: Most frames in a message. Its default is what a live message carries too: a
-            server that compiles for each length (JAX) compiles no further ones for the history.
-        connect_s: Most seconds to wait until the server can be used: loading takes minutes.
-        response_s: Most seconds from a message to its answer. The first of a kind takes long, as
-            servers compile then.
+        checkpoint: Which checkpoint it serves, for the record; required if the server does not
+            report it.
+        chunk_frames: Maximum frames in a message. The default is the length of live messages: a
+            server that compiles for each length (JAX) then compiles no others for the history.
+        connect_s: Maximum seconds to wait until the server accepts connections: loading a model
+            takes minutes.
+        response_s: Maximum seconds from a message to the end of its answer. First answers take
+            long, because servers compile then.
     """
 
     cameras = ("front", "wrist")
@@ -87,18 +87,18 @@ class WebsocketPolicy(Policy):
         self._server = ServerConnection(
             host, port, connect_s=connect_s, response_s=response_s, check=self._check
         )
-        self._history = 0  # frames that were announced
-        self._live = False  # whether the first live observation came
+        self._history = 0  # history frames in this rollout
+        self._live = False  # whether a live observation was sent
         self._held: tuple[NDArray[np.uint8], NDArray[np.float32]] | None = None
 
     def _check(self) -> str | None:
-        """Raise if it is known that the server will not answer; return what to do, or None."""
+        """Raise if it is known why the server does not answer; else return a hint, or None."""
         return None
 
     def reset(self, info: RolloutInfo) -> None:
         """Empty the server's memory, connecting first, or again if the connection was lost."""
         self._history, self._live, self._held = info.history_frames, False, None
-        # It may have broken since the last rollout; there is no memory yet that it could lose.
+        # The connection may have broken since the last rollout; no memory is lost at a reset.
         with suppress(PolicyServerError):
             if self._server.is_open:
                 self._server.request({"reset": True}, "reset_finished")
@@ -107,15 +107,15 @@ class WebsocketPolicy(Policy):
         self._server.request({"reset": True}, "reset_finished")
 
     def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
-        """Send history in whole chunks; what is left waits for the first live observation."""
+        """Send history in whole chunks; the rest waits for the first live observation."""
         images, states = self._with_held(frames["front"], states)
         whole = len(images) // self._chunk * self._chunk
         self._send(images[:whole], states[:whole])
-        # A copy, for the caller may use its arrays again.
+        # A copy, because the caller may reuse its arrays.
         self._held = images[whole:].copy(), states[whole:].copy()
 
     def observe(self, frames: Frames, states: NDArray[np.float32]) -> None:
-        """Send live observations; the first of them ends the last chunk of the history."""
+        """Send live observations; the first one completes the last chunk of the history."""
         self._send(*self._with_held(frames["front"], states))
         self._live = True
 
@@ -128,28 +128,28 @@ class WebsocketPolicy(Policy):
         return np.concatenate([held[0], images]), np.concatenate([held[1], states])
 
     def _send(self, images: NDArray[np.uint8], states: NDArray[np.float32]) -> None:
-        """Add frames to the server's memory, which counts them on."""
+        """Add frames to the server's memory."""
         for start in range(0, len(images), self._chunk):
             part = slice(start, start + self._chunk)
             message = {
                 "add_buffer": True,
                 "images": images[part, None],  # one view: the front camera
                 "state": np.asarray(states[part], np.float32),
-                # Above 0 it sets the length of the history, whichever chunk brings it.
+                # A number above 0 sets the length of the history, with any chunk.
                 "exec_start_idx": 0 if self._live else self._history,
             }
             self._server.request(message, "add_buffer_finished")
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
-        """Return the actions that the server gives, `(n, 8)`; they are checked where executed."""
+        """Return the server's actions, `(n, 8)`; the rollout checks them."""
         message = self.message(observation, goal)
         actions: NDArray[np.float32] = self._server.request(message, "actions")["actions"]
         return actions
 
     def message(self, observation: Observation, goal: str) -> dict[str, Any]:
-        """Return what the server is asked for actions with; a subclass may send more.
+        """Return the message that requests actions; a subclass may add to it.
 
-        A subgoal goes both ways, with places and without: a server reads that of its kind.
+        It has a subgoal in both forms, with points and without: a server reads the form it needs.
         """
         message = {
             "observation/image": observation.images["front"],
@@ -163,14 +163,11 @@ class WebsocketPolicy(Policy):
         return message
 
     def keeps_frames(self) -> bool:
-        """Return whether the server keeps frames: one that does refuses to act when it has none.
-
-        It is reset, and lost to a rollout that runs.
-        """
+        """Reset the server, and return whether it keeps frames: then it refuses to act without."""
         try:
             try:
                 self._act_at_once()
-            except ServerKeepaliveError:  # it compiled for long; now it has
+            except ServerKeepaliveError:  # it compiled; the second call is fast
                 self._act_at_once()
         except PolicyServerError as error:
             if _NO_FRAMES in error.message:
@@ -184,11 +181,11 @@ class WebsocketPolicy(Policy):
         self.act(Observation(dict.fromkeys(self.cameras, view), state), "nothing")
 
     def metadata(self) -> dict[str, Any]:
-        """Return the server's address and what it said of itself, connecting if need be."""
+        """Return the server's address and its metadata, connecting if necessary."""
         if self._server.metadata is None:
             self._server.open()
-        said = self._server.metadata
-        return {"policy": "websocket", "server": self._server.name, "server_metadata": said}
+        metadata = self._server.metadata
+        return {"policy": "websocket", "server": self._server.name, "server_metadata": metadata}
 
     def close(self) -> None:
         """Close the connection."""
@@ -196,15 +193,15 @@ class WebsocketPolicy(Policy):
 
 
 class ServedPolicy(WebsocketPolicy):
-    """A policy server by the command that starts it, which is run when it is first needed.
+    """A policy server that this process starts on first use, by a command with `{port}` in it.
 
-    The command is run without a shell, in this process's folder and environment, and listens at a
-    port that no other worker's server has on this machine. It ends, with all that it has started,
-    with `close`, or with this process, however that ends. A call that finds it ended raises
-    `ServerDiedError`, with what it printed last.
+    The command runs without a shell, in this process's folder and environment, with a port that no
+    other worker's server has on this machine. It ends, with all processes that it started, at
+    `close`, or when this process ends for any reason. A call after its end raises
+    `ServerDiedError` with its last output.
 
     Args:
-        command: The command, with `{port}` in it.
+        command: The command.
         checkpoint, chunk_frames, connect_s, response_s: See `WebsocketPolicy`.
 
     Attributes:
@@ -235,19 +232,19 @@ class ServedPolicy(WebsocketPolicy):
         )
 
     def reset(self, info: RolloutInfo) -> None:
-        """Empty the server's memory, starting it first if it was not."""
+        """Empty the server's memory, starting the server first if necessary."""
         self._start()
         super().reset(info)
 
     def metadata(self) -> dict[str, Any]:
-        """Return the command, and what the server said of itself, starting it if it was not."""
+        """Return the command and the server's metadata, starting the server if necessary."""
         self._start()
         return super().metadata() | {"server": self._command}
 
     def log(self) -> bytes:
-        """Return what the server has printed, at most its last MiB."""
+        """Return the server's output, at most its last MiB."""
         size = os.fstat(self._log.fileno()).st_size
-        # Not `read`: that would move the place at which the server writes.
+        # Not `read`: it would move the position at which the server writes.
         return os.pread(self._log.fileno(), _LOG_BYTES, max(0, size - _LOG_BYTES))
 
     def close(self) -> None:
@@ -265,8 +262,8 @@ class ServedPolicy(WebsocketPolicy):
         words = [word.replace("{port}", str(self._port)) for word in shlex.split(self._command)]
         if shutil.which(words[0]) is None:
             raise InvalidOptionError(
-                f"the command {self._command!r} cannot be run: there is no program {words[0]}",
-                "Give a program and its arguments: there is no shell.",
+                f"the command {self._command!r} cannot be run: no program {words[0]} exists",
+                "Give a program and its arguments; they run without a shell.",
             )
         self.started = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
         self._process = subprocess.Popen(
@@ -283,11 +280,11 @@ class ServedPolicy(WebsocketPolicy):
         with suppress(subprocess.TimeoutExpired):
             code = self._process.wait(_DEATH_S)
             raise ServerDiedError(
-                f"the policy server that a worker had started ended, exit code {code}",
+                f"the policy server that a worker started ended, exit code {code}",
                 printed_last(self.log().splitlines()),
             )
         hint = (
-            "A worker started it, and it runs: it has to listen at {port}; if it needs longer, "
-            "give the policy's option connect_s=SECONDS"
+            "A worker started it, and it still runs. It must listen at {port}; if it needs more "
+            "time, set the policy's option connect_s=SECONDS."
         )
         return "\n".join(filter(None, (hint, printed_last(self.log().splitlines()))))

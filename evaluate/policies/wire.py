@@ -14,15 +14,14 @@ from numpy.typing import NDArray
 from robomme_interference_data.errors import FormatError
 
 _KINDS = "biufSU"
-"""Of NumPy data in messages: booleans, numbers, and texts of fixed length."""
+"""Kinds of NumPy data in messages: booleans, numbers, and texts of fixed length."""
 
 _NOTHING_ELSE = (
     "Messages hold maps, lists, texts, bytes, numbers and arrays of these, nothing else."
 )
 
-
 _NOT_READ = (KeyError, OverflowError, SyntaxError, TypeError, ValueError, msgpack.UnpackException)
-"""What msgpack and NumPy raise over bytes that are not what they say."""
+"""What msgpack and NumPy raise for invalid bytes."""
 
 
 def pack(message: Any) -> bytes:

@@ -1,4 +1,4 @@
-"""Questions as the work of a run: what is checked of them, and what identifies their run."""
+"""Questions as a kind of run: the checks before it starts, and what identifies it."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -12,15 +12,12 @@ from robomme_interference_data.errors import (
     UnknownNameError,
     nearest,
 )
-from robomme_interference_data.evaluate.models.registry import (
-    model_identity,
-    parse_model,
-    pin_model,
-)
+from robomme_interference_data.evaluate.models.registry import MODELS, model_identity
 from robomme_interference_data.evaluate.run.config import (
     AskConfig,
     check_shared,
-    non_default_retrieval,
+    nothing_to_retrieve,
+    with_retrieval,
 )
 from robomme_interference_data.evaluate.run.kind import Run, RunKind
 from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
@@ -37,13 +34,13 @@ class Questions(RunKind[AskConfig]):
     """Multiple-choice questions about what history buffers show."""
 
     def prepare(self) -> None:
-        """Check the settings, and ask what answers."""
+        """Check the settings, and identify the model."""
         config = self.config
         _check_settings(config)
         self._questions = read_questions(self.buffer_set)
         self.metadata, self._images = {"model": config.model}, None
         if config.model not in OWN:
-            self.config = config = dataclasses.replace(config, model=pin_model(config.model))
+            self.config = config = dataclasses.replace(config, model=MODELS.pin(config.model))
         self.system = _name(config)
         if config.model not in OWN:
             with closing(ModelResponder(config)) as responder:
@@ -53,22 +50,19 @@ class Questions(RunKind[AskConfig]):
         """Return why a condition does not apply, or None."""
         if self.config.retrieval is None or condition != NO_HISTORY:
             return None
-        return InvalidOptionError(
-            f"a retrieval step has nothing to retrieve from under {NO_HISTORY}",
-            f"Leave {NO_HISTORY} out of `conditions`.",
-        )
+        return nothing_to_retrieve(f"Leave {NO_HISTORY} out of `conditions`.")
 
     def check(self, plan: Plan, items: Sequence[WorkItem]) -> None:
-        """Check that what is shown fits, and that the ideal observer knows what is possible."""
+        """Check that the images fit, and that the ideal observer knows the possible answers."""
         config = self.config
         if config.model == "recall":
             for episode in {item.episode for item in items}:
                 if recorded_scene(self.buffer_set.query(episode)) is None:
                     raise InvalidOptionError(
-                        f"recall does not know what may have been the answer in {episode}",
+                        f"recall does not know the possible answers in {episode}",
                         "Ask a model, or guess.",
                     )
-        # How much of a history a retrieval step chooses is not known before.
+        # How many frames a retrieval step selects is unknown before.
         if self._images is None or (config.retrieval is not None and config.sampling == "full"):
             return
         for item in items:
@@ -76,13 +70,13 @@ class Questions(RunKind[AskConfig]):
             kept = len(MEMORIES[config.sampling](history, config.frames))
             if kept + 1 > self._images:
                 raise InvalidOptionError(
-                    f"{item.episode}, {item.condition}: {kept} frames are kept, and shown with "
-                    f"the picture; the model takes {self._images} images at most",
+                    f"{item.episode}, {item.condition}: {kept} history frames and the picture; "
+                    f"the model takes {self._images} images at most",
                     f'Set model_options=("images={kept + 1}",), or fewer `frames`.',
                 )
 
     def task(self, run: Run[AskConfig]) -> AskTask:
-        """Return what asks."""
+        """Return the function that asks questions."""
         return AskTask(run)
 
     def identity(self, plan: Plan) -> dict[str, Any]:
@@ -102,13 +96,12 @@ class Questions(RunKind[AskConfig]):
 
 def _check_settings(config: AskConfig) -> None:
     """Check the settings by themselves and against each other."""
-    if config.sampling not in MEMORIES:
-        raise InvalidOptionError.one_of("sampling", config.sampling, MEMORIES)
+    for name, known in (("sampling", MEMORIES), ("control", CONTROLS)):
+        if getattr(config, name) not in known:
+            raise InvalidOptionError.one_of(name, getattr(config, name), known)
     if config.frames < 2:
         raise InvalidOptionError.expected("frames", config.frames, "2 or more")
     check_shared(config)
-    if config.control not in CONTROLS:
-        raise InvalidOptionError.one_of("control", config.control, CONTROLS)
     if config.model in OWN:
         unused = ["model_options", "control", "prompt"]
         if config.model == "guess":
@@ -125,33 +118,25 @@ def _check_settings(config: AskConfig) -> None:
             nearest(config.model, OWN, more=""),
         )
     else:
-        parse_model(config.model)
-
-
-def _default_system(config: AskConfig) -> str:
-    """Return the name of who answers without a model, that of a bound (see `is_bound`)."""
-    parts = ["questions", config.model]
-    parts += [config.sampling] if config.model == "recall" else []
-    if config.retrieval is None:
-        return "-".join(parts)
-    return "-".join(["retrieval", *parts, *non_default_retrieval(config).values()]).replace(
-        "/", "-"
-    )
+        MODELS.parse(config.model)
 
 
 def _name(config: AskConfig) -> str:
-    """Return the name under which rows stand: of the table only that of who answers."""
-    own = _default_system(config) if config.model in OWN else None
-    name = config.system or own
+    """Return the label of the rows: a name of the table only for the responder that it names."""
+    default = None
+    if config.model in OWN:
+        memory = (config.sampling,) if config.model == "recall" else ()
+        default = with_retrieval("-".join(("questions", config.model, *memory)), config)
+    name = config.system or default
     if name is None:
         raise InvalidOptionError(
             f"the rows of {config.model} need a name",
             "Set `system`, such as qwen3-vl-4b, or qwen3-vl-4b-blank for a control.",
         )
     name_system(name)
-    if name != own and known_system(name) is not None:
+    if name != default and known_system(name) is not None:
         raise InvalidOptionError(
-            f"{name} is a system that acts, or answers, otherwise than {config.model}",
+            f"{name} is the name of another system than {config.model}",
             "Set `system` to a name of your own.",
         )
     return name

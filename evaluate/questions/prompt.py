@@ -1,4 +1,4 @@
-"""How a question is put to a model, and how its answer is read: pure; prompts are files."""
+"""Prompts for questions, and how answers are parsed; prompts are files."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -9,13 +9,13 @@ from robomme_interference_data.evaluate.models.model import Message, Part
 from robomme_interference_data.evaluate.models.prompts import fill, read_prompt
 
 PROMPTS = ("choice",)
-"""The prompt that comes with the package."""
+"""The prompts of the package."""
 
 _ONE = r"\b(?!\s*(?:[,/]|or\b|and\b)\s*[A-H]\b)"
-"""After a letter: it is not the first of several."""
+"""After a letter: not the first of several."""
 
 _LETTER = rf"([A-H]|[a-h](?![ '’]\w)){_ONE}"
-"""An option's letter, and no article."""
+"""The letter of an option, not an article."""
 
 _ANSWER = re.compile(rf"(?i:\banswer\b\W*(?:(?:is|option|letter)\b\W*)*){_LETTER}")
 _FIRST = re.compile(rf"^[^\w\n]*([A-H]){_ONE}(?=[*_`'\"]*(?:[.:,)\]]|\s+[-–—]|\s*$))", re.MULTILINE)
@@ -28,9 +28,9 @@ class QuestionPrompt:
     """A prompt, as its TOML file has it.
 
     Attributes:
-        system: What the model is told first.
-        question: What it is asked; holds `<history>`, `<picture>`, `{question}` and `{options}`,
-            and `{goal}` if it is to be told.
+        system: The system message.
+        question: The question, with `<history>`, `<picture>`, `{question}`, `{options}` and,
+            optionally, `{goal}`.
     """
 
     system: str
@@ -46,36 +46,25 @@ class QuestionPrompt:
     def fill(
         self, goal: str, question: Question, views: Mapping[str, Sequence[Part]]
     ) -> list[Message]:
-        """Return the conversation that a model is to answer.
-
-        Args:
-            goal: The goal in words.
-            question: The question.
-            views: Images for `<history>` and `<picture>`.
-        """
+        """Return the conversation, with the images of `<history>` and `<picture>`."""
         options = "\n".join(question.lines)
         words = {"{goal}": goal, "{question}": question.text, "{options}": options}
-        asked = fill(self.question, words, views)
-        return [Message("system", (self.system,)), Message("user", asked)]
+        text = fill(self.question, words, views)
+        return [Message("system", (self.system,)), Message("user", text)]
 
 
 def read_letter(text: str, letters: str) -> str | None:
-    """Return the option that an answer names, or None.
+    """Return the option that an answer names, or None, given the letters of all options.
 
-    That is, whatever stands around it: the letter that is all of the answer; else the last one
-    after the word answer; else the one with which a line begins, as in "B. Because …"; else the one
-    after the words option or letter; else the one that stands alone, in capitals. Where one of
-    these finds several letters, or one of no option, none was named. What a model wrote while it
-    thought, before `</think>`, is left aside.
-
-    Args:
-        text: What the model wrote.
-        letters: Letters of the options, such as `ABCD`.
+    That is the first of these: the only letter of the answer; the last letter after the word
+    answer; the letter at the beginning of a line, as in "B. Because …"; the letter after the words
+    option or letter; a single capital letter. If several letters match, or one that is no option,
+    the answer names none. Text before `</think>` is ignored.
     """
-    said = text.rpartition("</think>")[2]
-    bare = re.sub(r"[^A-Za-z]", "", said)
-    ways = [[bare] if len(bare) == 1 else [], _ANSWER.findall(said)[-1:]]
-    ways += [pattern.findall(said) for pattern in (_FIRST, _OPTION, _ALONE)]
+    answer = text.rpartition("</think>")[2]
+    bare = re.sub(r"[^A-Za-z]", "", answer)
+    ways = [[bare] if len(bare) == 1 else [], _ANSWER.findall(answer)[-1:]]
+    ways += [pattern.findall(answer) for pattern in (_FIRST, _OPTION, _ALONE)]
     named = {letter.upper() for letter in next(filter(None, ways), ())}
     return named.pop() if len(named) == 1 and named <= {*letters} else None
 

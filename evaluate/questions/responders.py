@@ -1,4 +1,4 @@
-"""Who answers questions: the ideal observer, chance, or a model."""
+"""Responders to questions: the ideal observer, chance, or a model."""
 
 import hashlib
 from collections.abc import Callable, Mapping
@@ -13,30 +13,23 @@ from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.questions import Question
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.evaluate.models.model import Video
-from robomme_interference_data.evaluate.models.prompts import told
-from robomme_interference_data.evaluate.models.registry import make_model
+from robomme_interference_data.evaluate.models.prompts import as_text
+from robomme_interference_data.evaluate.models.registry import MODELS
 from robomme_interference_data.evaluate.run.config import AskConfig
 from robomme_interference_data.simulators.registry import recorded_scene
 from robomme_interference_data.storage.encode import decode_image
 
 from .prompt import load_prompt, read_letter
 
+CAMERA = "front"
+
 CONTROLS = ("none", "blank", "text")
-"""What is kept from a model: nothing; what the frames of the history show; all images."""
+"""What a model does not see: nothing; the content of the history frames; all images."""
 
 
 @dataclass(frozen=True)
 class Prompted:
-    """A question, with what may be known of the past.
-
-    Attributes:
-        question: The question.
-        query: Its query episode.
-        seed: Seed for what is drawn.
-        known: Parts of the answer that the kept frames show, by number, in words; None where it is
-            unknown what they show.
-        frames: Decodes the kept frames of the history, `(n, H, W, 3) uint8`, n may be 0.
-    """
+    """A question, with the parts of the answer that kept frames show; `frames` decodes these."""
 
     question: Question
     query: Query
@@ -45,21 +38,14 @@ class Prompted:
     frames: Callable[[], NDArray[np.uint8]]
 
     def draw(self, letters: str) -> str:
-        """Draw one of some letters: the same for the same episode and seed."""
+        """Draw one of some letters, a function of episode and seed."""
         lot = hashlib.sha256(f"{self.query.episode_id}/{self.seed}".encode()).digest()
         return letters[int.from_bytes(lot) % len(letters)]
 
 
 @dataclass(frozen=True)
 class Answer:
-    """An answer, for row and record.
-
-    Attributes:
-        letter: The option that was chosen; None if none was named.
-        prompt: What a model was asked, in words; None without a model.
-        text: What it wrote.
-        tokens, calls, seconds: As `Reply` has them.
-    """
+    """An answer, for the row and the transcript; the letter is None if no option was named."""
 
     letter: str | None
     prompt: str | None = None
@@ -75,36 +61,30 @@ def guess(prompted: Prompted) -> str:
 
 
 def recall(prompted: Prompted) -> str:
-    """Answer as the ideal observer: draw one of the options that agree with what frames show.
-
-    It draws from all, if all can be ruled out.
-    """
+    """Draw one of the options that agree with what the kept frames show; of all if none does."""
     question, scene = prompted.question, recorded_scene(prompted.query)
     if scene is None or max(question.answers) >= len(scene.answers):
         raise FormatError(
-            f"the options of {question.episode_id} are no answers that its scene allows",
+            f"the options of {question.episode_id} are not answers that its scene allows",
             "recall needs a simulator whose possible answers are known, such as tabletop.",
         )
-    left = {scene.choice(answer) for answer in scene.agreeing(prompted.known or {})}
+    agreeing = {scene.choice(answer) for answer in scene.agreeing(prompted.known or {})}
     choices = [scene.choice(scene.answers[number]) for number in question.answers]
-    fits = [one for one, choice in zip(question.letters, choices, strict=True) if choice in left]
+    fits = [
+        one for one, choice in zip(question.letters, choices, strict=True) if choice in agreeing
+    ]
     return prompted.draw("".join(fits) or question.letters)
 
 
 OWN = {"recall": recall, "guess": guess}
-"""Who answers without a model."""
+"""The responders without a model."""
 
 
 class ModelResponder:
-    """A vision-language model that answers, one question at a time.
-
-    Attributes:
-        images: Images that it can be shown with a question, the picture among them; None if there
-            is no bound.
-    """
+    """A vision-language model; `images` is the maximum for a question, None without a limit."""
 
     def __init__(self, config: AskConfig):
-        self._model = make_model(config.model, config.model_options)
+        self._model = MODELS.make(config.model, config.model_options)
         self._control = config.control
         self.images = None if config.control == "text" else self._model.images
         self._prompt, self._sha256 = load_prompt(config.prompt)
@@ -125,11 +105,11 @@ class ModelResponder:
         messages = self._prompt.fill(prompted.query.goal, prompted.question, views)
         reply = self._model.reply(messages)
         letter = read_letter(reply.text, prompted.question.letters)
-        told_parts = told(messages[-1].parts)
-        return Answer(letter, told_parts, reply.text, reply.tokens, reply.calls, reply.seconds)
+        prompt = as_text(messages[-1].parts)
+        return Answer(letter, prompt, reply.text, reply.tokens, reply.calls, reply.seconds)
 
     def metadata(self) -> dict[str, Any]:
-        """Return what the model says of itself, and the SHA-256 of the prompt's file."""
+        """Return the model's metadata, and the SHA-256 of the prompt's file."""
         return {"model": self._model.metadata(), "prompt_sha256": self._sha256}
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Clips of rollouts: the lesson, what was given of the history, and how it went, side by side."""
+"""Clips of rollouts: the lesson, the history that was given, and the live views, side by side."""
 
 import textwrap
 import traceback
@@ -27,12 +27,12 @@ from robomme_interference_data.viz.filmstrip import session_colors
 
 _VIEW = 256  # side of a camera's picture
 _HEADS = ("lesson", "given", "front", "wrist")
-_WIDTH = (len(_HEADS) + 1) * _VIEW  # and the facts
+_WIDTH = (len(_HEADS) + 1) * _VIEW  # and the text
 _HEAD = 24
 _HEIGHT = _VIEW + _HEAD
 _COLUMNS = 8
 _THUMB = _VIEW // _COLUMNS
-_SMALL = _THUMB - 4  # of a frame; its session's line is under it
+_SMALL = _THUMB - 4  # side of a frame, above the line of its session
 _COLORS = {
     Status.ONGOING: "#555555",
     Status.SUCCESS: Hue.GREEN,
@@ -41,17 +41,17 @@ _COLORS = {
     Status.ERROR: "#000000",
 }
 _LAST = 10
-"""Frames for which the end stays."""
+"""Frames for which the last picture stays."""
 
 _LETTERS = 34
-"""Letters in a line of the facts."""
+"""Maximum letters in a line of text."""
 
 _LINES = 14
-"""Lines of the facts."""
+"""Maximum lines of text."""
 
 
 def check_drawing() -> None:
-    """Check that clips can be drawn."""
+    """Check that Pillow is installed."""
     try:
         import PIL  # noqa: F401
     except ImportError as error:
@@ -59,7 +59,7 @@ def check_drawing() -> None:
 
 
 def _harmless[**P](method: Callable[P, None]) -> Callable[P, None]:
-    """Keep what goes wrong in a method of a clip as its `problem`."""
+    """Turn exceptions of a method of a clip into its `problem`."""
 
     @wraps(method)
     def attempt(*arguments: P.args, **named: P.kwargs) -> None:
@@ -69,21 +69,16 @@ def _harmless[**P](method: Callable[P, None]) -> Callable[P, None]:
                 method(*arguments, **named)
             except Exception:
                 clip.problem = f"the clip failed:\n{traceback.format_exc()}"
-                with suppress(Exception):  # a full disk fails once more
+                with suppress(Exception):  # a full disk fails again
                     clip._file.close()
 
     return attempt
 
 
 class Clip:
-    """Draws a rollout as it goes, 10 pictures a second, and has them encoded at once.
+    """Draws a rollout at 10 pictures a second and encodes them; `data` is the closed MP4 file.
 
-    What goes wrong with the clip never reaches the rollout: its traceback is kept as `problem`,
-    and there is no clip.
-
-    Attributes:
-        data: The clip, an MP4 file, once it is closed; None if there is none.
-        problem: What went wrong, or None.
+    A fault in the clip does not break the rollout: `problem` has its traceback, and `data` is None.
     """
 
     def __init__(self, item: WorkItem, system: str, folder: str | None = None):
@@ -105,7 +100,7 @@ class Clip:
     def begin(
         self, buffer: Buffer, given: Sequence[int], first: Observation, info: EpisodeInfo
     ) -> None:
-        """Take what is known before the first step, and which frames of the buffer were given."""
+        """Draw the first picture, with the history frames that were given."""
         self._goal = info.goal
         self._given = f"history given: {len(given)} frames" if given else "no history"
         self._views = {"given": history_picture(buffer, given)}
@@ -119,7 +114,7 @@ class Clip:
 
     @_harmless
     def step(self, observation: Observation, status: Status, subgoal: Subgoal | None) -> None:
-        """Take what came of a step, with the images of both cameras, and the subgoal of it."""
+        """Draw a step, with the images of both cameras, and its subgoal."""
         if self._encoder is not None:
             self._steps += 1
             self._subgoal = subgoal
@@ -128,10 +123,7 @@ class Clip:
 
     @_harmless
     def close(self, status: Status, error: str | None = None) -> None:
-        """Hold the end for a second, and end the clip.
-
-        There is none of a rollout that broke before its first observation.
-        """
+        """Show the end for a second, and close the clip, if it began."""
         if self._encoder is not None:
             picture = self._picture(status, error=error)
             for _ in range(_LAST):
@@ -141,13 +133,13 @@ class Clip:
             self._file.close()
 
     def _show(self, observation: Observation) -> None:
-        """Take what is seen, and the lesson's next frame, while there is one."""
+        """Set the live views, and the lesson's next frame, if it has one."""
         self._views |= observation.images
         for frame in islice(self._lesson, 1):
             self._views["lesson"] = frame
 
     def _picture(self, status: Status, *, error: str | None = None) -> NDArray[np.uint8]:
-        """Return the clip's present picture, `(280, 1280, 3) uint8`."""
+        """Return the current picture, `(280, 1280, 3) uint8`."""
         canvas = np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
         for place, name in enumerate(_HEADS):
             if name in self._views:
@@ -159,17 +151,17 @@ class Clip:
             _cross(canvas[_HEAD:, front : front + _VIEW], y, x)
         lines = [*self._heading, "", *textwrap.wrap(self._goal, _LETTERS)]
         subgoal = self._subgoal and self._subgoal.simple
-        for head, text in (("subgoal:", subgoal), ("what broke:", error)):
+        for head, text in (("subgoal:", subgoal), ("error:", error)):
             if text:
                 lines += ["", head, *textwrap.wrap(text, _LETTERS)]
-        # The last two lines always have their place, however long the words before them are.
+        # The last two lines always fit, however long the text before them is.
         lines = [*lines[: _LINES - 3], "", f"step {self._steps} of {MAX_STEPS}", str(status)]
         heads = ["lesson" if "lesson" in self._views else "no lesson", self._given, *_HEADS[2:]]
         return _lettered(canvas, heads, lines, _COLORS[status])
 
 
 def _lesson_of(buffer: Buffer) -> Generator[NDArray[np.uint8]]:
-    """Yield the front frames of a buffer's lesson, `(H, W, 3) uint8`, as they are wanted."""
+    """Yield the front frames of a buffer's lesson, `(H, W, 3) uint8`."""
     lesson = [one for one in buffer.sessions if one.role == "lesson"]
     indices = [index for one in lesson for index in range(one.start, one.stop)]
     for chunk in buffer.stream(1, ("front",), indices):
@@ -177,18 +169,14 @@ def _lesson_of(buffer: Buffer) -> Generator[NDArray[np.uint8]]:
 
 
 def _cross(view: NDArray[np.uint8], y: int, x: int) -> None:
-    """Mark a point of a view, black on white: seen on any ground."""
-    for wide, colour in ((2, 255), (1, 0)):
-        view[max(y - 5, 0) : y + 6, max(x - wide + 1, 0) : x + wide] = colour
-        view[max(y - wide + 1, 0) : y + wide, max(x - 5, 0) : x + 6] = colour
+    """Mark a point of a view, in black and white: visible on any background."""
+    for wide, shade in ((2, 255), (1, 0)):
+        view[max(y - 5, 0) : y + 6, max(x - wide + 1, 0) : x + wide] = shade
+        view[max(y - wide + 1, 0) : y + wide, max(x - 5, 0) : x + 6] = shade
 
 
 def history_picture(buffer: Buffer, given: Sequence[int]) -> NDArray[np.uint8]:
-    """Return 64 of some frames of a buffer, evenly spread, `(256, 256, 3) uint8`.
-
-    Each has a line under it in the colour of its session, the lesson's as in the film strip.
-    Without frames the picture is white.
-    """
+    """Return 64 evenly spread history frames, `(256, 256, 3) uint8`, underlined by session."""
     picture = np.full((_VIEW, _VIEW, 3), 255, np.uint8)
     colors, sessions = session_colors(buffer.sessions), buffer.session_index
     for place, chosen in enumerate(spread(0, len(given), _COLUMNS * _COLUMNS)):
@@ -206,7 +194,7 @@ def history_picture(buffer: Buffer, given: Sequence[int]) -> NDArray[np.uint8]:
 def _lettered(
     canvas: NDArray[np.uint8], heads: Sequence[str], lines: Sequence[str], color: str
 ) -> NDArray[np.uint8]:
-    """Write the lines beside the views, and what the parts are above them."""
+    """Write headings above the views, and lines beside them."""
     from PIL import Image, ImageDraw, ImageFont
 
     image = Image.fromarray(canvas)

@@ -1,4 +1,4 @@
-"""Rollouts as the work of a run: what is checked of them, and what identifies their run."""
+"""Rollouts as a kind of run: the checks before it starts, and what identifies it."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -13,13 +13,18 @@ from robomme_interference_data.errors import (
     SimulatorCrashError,
 )
 from robomme_interference_data.evaluate.policies.identity import (
-    check_kind,
-    check_served,
+    check_memory_kind,
+    check_metadata,
+    check_servers_memory,
     describe_policy,
-    hold_servers,
+    lock_servers,
     policy_identity,
 )
-from robomme_interference_data.evaluate.policies.registry import pin_policy, served_policy
+from robomme_interference_data.evaluate.policies.registry import (
+    POLICIES,
+    policy_options,
+    with_server,
+)
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.kind import Run, RunKind
 from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
@@ -40,32 +45,32 @@ class Rollouts(RunKind[RunConfig]):
     """Rollouts of a policy in a simulator."""
 
     def __init__(self, config: RunConfig, buffer_set: BufferSet):
-        policy = served_policy(config.policy, config.serve)
+        policy = with_server(config.policy, config.serve)
         config = dataclasses.replace(config, policy=policy)
         self.system = config.system or default_system(config)
-        # One commit for all workers.
-        policy, subgoals = pin_policy(policy), pin_subgoals(config.subgoals)
+        # The commit of a model is the same for all workers.
+        policy, subgoals = POLICIES.pin(policy), pin_subgoals(config.subgoals)
         super().__init__(dataclasses.replace(config, policy=policy, subgoals=subgoals), buffer_set)
 
-    def claim(self, folder: Path) -> AbstractContextManager[None]:
+    def lock(self, folder: Path) -> AbstractContextManager[None]:
         """Keep other runs from the policy's servers."""
-        return hold_servers(self.config.policy, folder)
+        return lock_servers(self.config.policy, folder)
 
     def prepare(self) -> None:
-        """Check the settings; ask what the policy is, and what writes its subgoals."""
+        """Check the settings, and identify the policy and the writer of its subgoals."""
         config = self.config
-        self._policy, self._of_policy = describe_policy(
+        self._policy, self._policy_metadata = describe_policy(
             config.policy, config.policy_options, workers=config.workers
         )
         check_settings(config, self.system, self.buffer_set, self._policy)
         self._system = name_system(self.system)
-        self.config, self._of_subgoals = describe_subgoals(config, self._system)
-        self.metadata = self._of_policy | self._of_subgoals
+        self.config, self._subgoal_metadata = describe_subgoals(config, self._system)
+        self.metadata = self._policy_metadata | self._subgoal_metadata
         self.versions = simulator_versions(config.simulator, config.robomme_python)
 
     def refusal(self, condition: str) -> InterferenceError | None:
         """Return why a condition does not apply to the system and its policy, or None."""
-        # A policy without memory may have a model that reads the history for it.
+        # A policy without memory may have a subgoal writer that reads the history.
         reads = self._policy.wants_history or self.config.subgoals is not None
         return condition_refusal(self._system, reads, condition)
 
@@ -74,35 +79,38 @@ class Rollouts(RunKind[RunConfig]):
         check_plan(self.config, self._system, self.buffer_set, plan, items)
 
     def task(self, run: Run[RunConfig]) -> RolloutTask:
-        """Return what rolls out."""
+        """Return the function that runs rollouts."""
         return RolloutTask(run)
 
     def needs_session(self, todo: Sequence[WorkItem]) -> bool:
-        """Whether there is work, or a server that only workers start has to be asked."""
+        """Whether there is work, or a server that only workers start must be identified."""
         return bool(todo) or self.config.serve is not None
 
     def open(self, session: Session, todo: Sequence[WorkItem]) -> None:
-        """Have a worker start the policy's server, and the simulator, before the first rollout.
+        """Let a worker start the policy's server, and the simulator, before the first rollout.
 
-        A simulator of the user's own is made at the first rollout.
+        A simulator of the user is made at the first rollout.
         """
         config = self.config
         if config.serve is not None:
-            self._of_policy, keeps = _opened(session, "server", None)
-            check_served(config.policy, config.policy_options, self._system, self._of_policy, keeps)
-            self.metadata = self._of_policy | self._of_subgoals
+            self._policy_metadata, keeps = _opened(session, "server", None)
+            options = policy_options(config.policy, config.policy_options)
+            check_metadata([self._policy_metadata], options["checkpoint"])
+            if keeps is not None:
+                check_memory_kind(keeps, self._policy_metadata["server"], self._system)
+            self.metadata = self._policy_metadata | self._subgoal_metadata
         if todo:
             if config.simulator in SIMULATORS:
-                _opened(session, "simulator", config.simulator_timeout)
-            check_kind(config.policy, config.policy_options, self._system)
+                _opened(session, "simulator", config.simulator_timeout_s)
+            check_servers_memory(config.policy, config.policy_options, self._system)
 
     def identity(self, plan: Plan) -> dict[str, Any]:
         """Return what of simulator, policy and subgoals can change a result."""
         config = self.config
         return {
             "simulator_version": dict(self.versions),
-            "subgoals": subgoals_identity(config, self._of_subgoals),
-            **policy_identity(config.policy, config.policy_options, self._of_policy),
+            "subgoals": subgoals_identity(config, self._subgoal_metadata),
+            **policy_identity(config.policy, config.policy_options, self._policy_metadata),
         }
 
 
@@ -114,7 +122,7 @@ def _opened(session: Session, what: str, time_limit: float | None) -> Any:
         raise PolicyServerError(f"the policy's server cannot be started: {outcome.error}")
     if outcome.error is not None:
         raise SimulatorCrashError(
-            f"the simulator cannot be made: {outcome.error}",
+            f"the simulator cannot be started: {outcome.error}",
             "Check what works on this machine.",
             "doctor",
         )

@@ -1,4 +1,4 @@
-"""Whether the simulator plays the episode that the dataset recorded."""
+"""Check that the simulator plays the episode that the dataset recorded."""
 
 from typing import Any
 
@@ -10,23 +10,19 @@ from robomme_interference_data.errors import RunError
 from robomme_interference_data.simulators.base import Demonstration, EpisodeInfo, Observation
 
 STATE_TOLERANCE = 0.01
-"""How far, rad or m, the first live state may be from the recorded one: on another machine floating
-point differs in its last bits, and an episode of another version of the suite by more."""
+"""Maximum distance, rad or m, of the first live state from the recorded one: between machines only
+the last bits differ, between versions of the suite more."""
 
 
 def check_episode(
     query: Query, played: Demonstration, first: Observation, info: EpisodeInfo
 ) -> None:
-    """Check, without decoding a frame, that the simulator plays the episode that was recorded.
-
-    Seed, difficulty, length of the demonstration and goal must agree, and the first live state
-    within `STATE_TOLERANCE`.
-    """
+    """Compare seed, difficulty, lesson length, goal and first live state with the recorded ones."""
     compared: dict[str, tuple[Any, Any]] = {
         "seed": (query.seed, info.seed),
         "difficulty": (query.difficulty, info.difficulty),
         "length of the demonstration": (query.lesson_frames, len(played)),
-        # Any of its wordings: which one comes first may depend on the source.
+        # Any of its wordings: their order may depend on the source.
         "goal": (query.goal, query.goal if query.goal in info.goals else info.goal),
     }
     wrong = [
@@ -34,10 +30,10 @@ def check_episode(
         for name, (recorded, given) in compared.items()
         if recorded is not None and recorded != given
     ]
-    apart = float(np.abs(query.state() - first.state).max())
-    if not apart <= STATE_TOLERANCE:
+    distance = float(np.abs(query.state() - first.state).max())
+    if not distance <= STATE_TOLERANCE:
         wrong.append(
-            f"the first live state is {apart:.4f} away from the recorded one; expected at most "
+            f"the first live state is {distance:.4f} away from the recorded one; expected at most "
             f"{STATE_TOLERANCE}"
         )
     if wrong:
@@ -51,9 +47,10 @@ def check_episode(
 def check_lesson(
     query: Query, played: Demonstration, first: Observation, *, views: bool = True
 ) -> None:
-    """Compare a recorded demonstration and first live observation with what the simulator played.
+    """Compare a recorded demonstration, and the first live `views`, with the simulator's playback.
 
-    Only cameras that the simulator drew are compared, and the first live views only if asked to.
+    Cameras that the simulator did not draw are left out. The recorded frames were compared with
+    their SHA-256 before.
     """
     dataset, episode, frames = query.dataset, query.record.episode_index, query.lesson_frames
     if not np.array_equal(dataset.read_vectors(episode, STATE, 0, frames), played.states):
@@ -67,7 +64,9 @@ def check_lesson(
                 raise RunError(
                     f"{query.episode_id}: frame {number} of the lesson's {camera} camera is not "
                     "what the simulator shows",
-                    "Another renderer or machine made the dataset; the states agree.",
+                    "Another renderer or machine made the dataset, or its video is damaged; the "
+                    "states agree.",
+                    "verify BUFFER_SET",
                 )
         if views and not np.array_equal(query.frame(camera), first.images[camera]):
             raise RunError(

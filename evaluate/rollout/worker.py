@@ -4,27 +4,26 @@ import logging
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from robomme_interference_data.constants import CAMERA_PREFIX
-from robomme_interference_data.data.buffer_set import BufferSet
-from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import (
     PolicyServerError,
     ServerKeepaliveError,
     WorkerRetiredError,
     first_line,
 )
-from robomme_interference_data.evaluate.policies.identity import plain, policy_metadata
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.run.config import RunConfig
-from robomme_interference_data.evaluate.run.identity import make_selector, package_versions
-from robomme_interference_data.evaluate.run.kind import Job, Run
-from robomme_interference_data.evaluate.run.log import clip_name, transcript_file
+from robomme_interference_data.evaluate.run.kind import Job, Run, RunTask
 from robomme_interference_data.evaluate.run.plan import WorkItem
-from robomme_interference_data.evaluate.subgoals.registry import make_writer
-from robomme_interference_data.evaluate.subgoals.writer import CAMERA, ORACLE, SubgoalWriter
+from robomme_interference_data.evaluate.subgoals.writer import (
+    CAMERA,
+    ORACLE,
+    OracleWriter,
+    SubgoalWriter,
+)
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.codec import to_dict
@@ -36,11 +35,7 @@ from robomme_interference_data.simulators.registry import (
     simulator_versions,
 )
 
-from .clips import Clip
 from .rollout import run_rollout
-
-if TYPE_CHECKING:
-    from robomme_interference_data.retrieval.selector import Selector
 
 logger = logging.getLogger(__name__)
 
@@ -52,51 +47,44 @@ class Opening:
     what: str
 
 
-class RolloutTask:
-    """Runs rollouts, as an executor's task; simulator, policy and buffer set are made at the first one.
-
-    What breaks is raised, and simulator and policy are made anew for the next rollout: nothing
-    that broke is used again. Clips, subgoals and the log of a server that it started are sent.
-    """
+class RolloutTask(RunTask[RunConfig]):
+    """Runs rollouts; makes policy and simulator at the first one, and again after an error."""
 
     def __init__(self, run: Run[RunConfig]):
-        self._run = run
+        super().__init__(run)
         self._simulator: Simulator | None = None
         self._policy: Policy | None = None
-        self._checked = False  # whether the policy is what the run began with
+        self._checked = False  # whether the policy's server is the one that the run began with
         self._writer: SubgoalWriter | None = None
-        self._buffer_set: BufferSet | None = None
         self._logs: dict[str, bytes] = {}
-        self._selector: Selector | None = None
 
-    def __call__(self, task: Job | Opening, worker: Worker) -> Any:
-        """Run a rollout; return its row, and what befell its clip, or None. Or open something."""
-        try:
-            if isinstance(task, Opening):
-                return self._open(task, worker)
-            return self._run_job(task, worker)
-        except Exception:
-            self.close()
-            raise
+    def work(self, task: Job | Opening, worker: Worker) -> Any:
+        """Run a rollout; return its row, and the problem of its clip or None. Or open something."""
+        return self._open(task, worker) if isinstance(task, Opening) else self._run(task, worker)
 
     def _open(self, opening: Opening, worker: Worker) -> Any:
-        """Open the simulator; or the policy, and return what it reports, and if it keeps frames.
+        """Open the simulator; or the policy, and return its metadata and whether it keeps frames.
 
-        Whether it does is asked only where that is known of the system.
+        The latter is None if it is unknown whether it should.
         """
         policy = self._open_policy(worker)
         if opening.what == "simulator":
             self._open_simulator(policy, worker)
             return None
-        known = name_system(self._run.system).keeps_frames is not None
+        from robomme_interference_data.evaluate.policies.identity import policy_metadata
+
+        known = name_system(self.run.system).keeps_frames is not None
         return (
-            policy_metadata(self._run.config.policy, policy),
+            policy_metadata(self.run.config.policy, policy),
             cast("Any", policy).keeps_frames() if known else None,
         )
 
-    def _run_job(self, job: Job, worker: Worker) -> tuple[Rollout, str | None]:
-        item, config = job.item, self._run.config
-        clip = Clip(item, self._run.system, worker.folder) if config.videos else None
+    def _run(self, job: Job, worker: Worker) -> tuple[Rollout, str | None]:
+        item, config, clip = job.item, self.run.config, None
+        if config.videos:
+            from .clips import Clip
+
+            clip = Clip(item, self.run.system, worker.folder)
         try:
             row = self._roll(job, worker, clip)
         except Exception as error:
@@ -106,111 +94,110 @@ class RolloutTask:
                 logger.warning("%s: %s. It is started again, once.", item, error.message)
             if isinstance(error, PolicyServerError) and config.serve is None:
                 self.close()
-                self._check_server(worker)
+                self._check_reachable(worker)
             raise
-        # Whatever became of what is to be looked at, the rollout ended as it did.
         self._send_files(item, worker, clip, Status(row.status))
         return row, clip.problem if clip else None
 
     def _open_policy(self, worker: Worker) -> Policy:
-        config = self._run.config
+        config = self.run.config
         if self._policy is None:
             self._policy = make_policy(config.policy, config.policy_options, worker=worker.number)
             self._checked = False
         return self._policy
 
     def _open_simulator(self, policy: Policy, worker: Worker) -> Simulator:
-        config = self._run.config
+        config = self.run.config
         if self._simulator is None:
             options = simulator_options(config, policy.cameras)
-            with worker.limit(config.simulator_timeout, "the simulator's start"):
+            with worker.limit(config.simulator_timeout_s, "the simulator's start"):
                 self._simulator = make_simulator(config.simulator, **options)
         return self._simulator
 
-    def _roll(self, job: Job, worker: Worker, clip: Clip | None) -> Rollout:
-        config = self._run.config
-        if self._buffer_set is None:
-            self._buffer_set = load_buffer_set(config.buffer_set, cache=config.cache, threads=1)
-            self._selector = make_selector(config)
+    def _open_writer(self) -> SubgoalWriter | None:
+        config = self.run.config
+        if self._writer is None and config.subgoals == ORACLE:
+            self._writer = OracleWriter()
+        elif self._writer is None and config.subgoals is not None:
+            from robomme_interference_data.evaluate.subgoals.registry import make_writer
+
+            self._writer = make_writer(config)
+        return self._writer
+
+    def _roll(self, job: Job, worker: Worker, clip: Any) -> Rollout:
         policy = self._open_policy(worker)
         if not self._checked:
             self._check_served(policy, job.metadata)
             self._send_logs(worker)
             self._checked = True
-        if self._writer is None:
-            self._writer = make_writer(config)
         return run_rollout(
-            self._run,
+            self.run,
             job.item,
             simulator=self._open_simulator(policy, worker),
             policy=policy,
-            buffer_set=self._buffer_set,
-            selector=self._selector,
-            writer=self._writer,
+            buffer_set=self.buffer_set,
+            history=self.history,
+            selector=self.selector,
+            writer=self._open_writer(),
             clip=clip,
             worker=worker,
         )
 
     def describe(self) -> dict[str, str]:
-        """Return the buffer set's revision and all versions, where it would run."""
-        config = self._run.config
-        versions = simulator_versions(config.simulator, config.robomme_python)
-        revision = load_buffer_set(config.buffer_set).revision
-        return package_versions(config) | versions | {"the buffer set's revision": revision}
+        """Return the buffer set's revision and all versions."""
+        config = self.run.config
+        return super().describe() | simulator_versions(config.simulator, config.robomme_python)
 
     def close(self) -> None:
-        """Release simulator, policy and what writes subgoals."""
-        for thing in (self._policy, self._simulator, self._writer):
-            # It may be broken already, and the first error is the one to tell.
+        """Release simulator, policy and subgoal writer."""
+        for resource in (self._policy, self._simulator, self._writer):
+            # It may be broken already, and the first error is the one to report.
             with suppress(Exception):
-                if thing is not None:
-                    thing.close()
+                if resource is not None:
+                    resource.close()
         self._policy = self._simulator = self._writer = None
 
     def _send_files(
-        self,
-        item: WorkItem,
-        worker: Worker,
-        clip: Clip | None,
-        status: Status,
-        error: str | None = None,
+        self, item: WorkItem, worker: Worker, clip: Any, status: Status, error: str | None = None
     ) -> None:
         """Send the subgoals of a rollout, its clip, and logs of servers that it started."""
         self._send_logs(worker)
         if status is not Status.ERROR:
             self._logs.clear()
         if self._writer is not None:
-            worker.send_file(*transcript_file("subgoals", item, map(to_dict, self._writer.turns)))
+            worker.send_file(*item.transcript("subgoals", map(to_dict, self._writer.turns)))
         if clip is not None:
             clip.close(status, error)
             if clip.data is not None:
-                worker.send_file(clip_name(item), clip.data)
+                worker.send_file(item.clip, clip.data)
 
     def _send_logs(self, worker: Worker) -> None:
-        """Send what servers that the worker started have printed.
+        """Send the output of servers that the worker started.
 
-        Of one that broke again with the next rollout: the files of an attempt may be lost.
+        Logs of earlier attempts are sent again, because the files of an attempt may be lost.
         """
         server: Any = self._policy
-        if self._run.config.serve is not None and server is not None:
+        if self.run.config.serve is not None and server is not None:
             self._logs[f"servers/{server.started}-{worker.number}.log"] = server.log()
         for log in self._logs.items():
             worker.send_file(*log)
 
-    def _check_served(self, policy: Policy, began: Mapping[str, Any]) -> None:
-        """Retire the worker if the server that it reaches is not what the run began with."""
-        if "server_metadata" not in began:
+    def _check_served(self, policy: Policy, metadata: Mapping[str, Any]) -> None:
+        """Retire the worker if its server reports other metadata than at the start of the run."""
+        if "server_metadata" not in metadata:
             return
-        found, first = (one["server_metadata"] for one in (plain(policy.metadata()), began))
-        if found != first:
+        from robomme_interference_data.evaluate.run.identity import plain
+
+        reported, first = (one["server_metadata"] for one in (plain(policy.metadata()), metadata))
+        if reported != first:
             raise WorkerRetiredError(
-                f"a worker's policy server reports {found}; the run began with {first}",
+                f"a worker's policy server reports {reported}; the run began with {first}",
                 "Serve the same checkpoint everywhere; on a cluster localhost is each node's own.",
             )
 
-    def _check_server(self, worker: Worker) -> None:
-        """Retire the worker unless the policy's server is still there."""
-        config = self._run.config
+    def _check_reachable(self, worker: Worker) -> None:
+        """Retire the worker if the policy's server cannot be reached."""
+        config = self.run.config
         policy = make_policy(config.policy, config.policy_options, worker=worker.number)
         try:
             policy.metadata()  # connects
@@ -220,25 +207,21 @@ class RolloutTask:
             policy.close()
 
 
-def simulator_options(config: RunConfig, watched: Iterable[str]) -> dict[str, Any]:
-    """Return the options of a run's simulator: it draws only what somebody looks at.
-
-    `watched` has the cameras that the policy wants.
-    """
-    wanted = {*watched}
+def simulator_options(config: RunConfig, policy_cameras: Iterable[str]) -> dict[str, Any]:
+    """Return the options of a run's simulator, which draws only the cameras that are used."""
+    used = {*policy_cameras}
     if config.subgoals not in (None, ORACLE):
-        wanted.add(CAMERA)
+        used.add(CAMERA)
     if config.retrieval is not None:
-        wanted.add(config.retrieval_camera.removeprefix(CAMERA_PREFIX))
+        used.add(config.retrieval_camera.removeprefix(CAMERA_PREFIX))
     if config.videos or config.check_lesson:
-        wanted |= {*CAMERAS}
-    cameras = tuple(name for name in CAMERAS if name in wanted)
+        used |= {*CAMERAS}
     settings = {
-        "cameras": cameras,
+        "cameras": tuple(name for name in CAMERAS if name in used),
         "shift": config.shift,
         "python": config.robomme_python,
         "subgoals": config.subgoals == ORACLE,
-        # Its own limit ends a little before the worker's: its error shows what it printed.
-        "answer_s": 0.9 * config.simulator_timeout,
+        # Its own limit ends a little before the worker's: its error shows its output.
+        "answer_s": 0.9 * config.simulator_timeout_s,
     }
     return {name: settings[name] for name in simulator_class(config.simulator).settings}

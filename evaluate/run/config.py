@@ -1,4 +1,4 @@
-"""The settings of a run, each declared once: what Python gives, and the options of `evaluate`."""
+"""The settings of a run: the Python API, and the options of `evaluate`, `ask` and `ceiling`."""
 
 import math
 from dataclasses import dataclass, fields
@@ -8,77 +8,104 @@ from typing import ClassVar
 from robomme_interference_data.constants import SAMPLE_FRAMES, SPLITS
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.runtime.executor import WorkersConfig
+from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.settings import setting
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP
+
+_EPISODES, _POLICY, _MODEL, _SUBGOALS = "Episodes", "Policy", "Model", "Subgoals"
+_RETRIEVAL, _SIMULATOR, _EXECUTION = "Retrieval", "Simulator", "Execution"
 
 
 @dataclass(frozen=True, kw_only=True)
 class RetrievalConfig:
     """The retrieval step in front of a policy, or of a memory."""
 
-    retrieval: str | None = setting(None, help="Put a retrieval step with this encoder in front.")
-    retrieval_rule: str = setting("max", help="METHOD or METHOD/CUT, as for retrieval-score.")
+    retrieval: str | None = setting(
+        None, group=_RETRIEVAL, help="Encoder of a retrieval step: thumbnail, siglip or siglip:ID."
+    )
+    retrieval_rule: str = setting(
+        "max", group=_RETRIEVAL, help="METHOD or METHOD/CUT, as for retrieval-score."
+    )
     retrieval_camera: str = setting(
-        "front", help="Camera whose frames the retrieval step compares."
+        "front", group=_RETRIEVAL, help="Camera whose frames are compared."
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorkConfig(WorkersConfig, RetrievalConfig):
-    """Which episodes and conditions, under which name, and how the work is done."""
+    """Which episodes and conditions to run, under which name, and how to execute the run."""
 
     conditions: tuple[str, ...] = setting(
-        (), help="no-history, k0, k1, …; by default all that apply."
+        (), group=_EPISODES, help="no-history, k0, k1, …; default: all that apply."
     )
-    families: tuple[str, ...] = setting((), help="Families; by default all.")
-    episodes: str | None = setting(None, help="Numbers, such as 0-49 or 0,3,10-12; default: all.")
-    split: str = setting("test", help="train, val or test.")
-    shard: str = setting("1/1", help="Part of the plan to run, such as 2/8; see merge.")
-    system: str | None = setting(None, help="Name for the rows; see docs/systems.md.")
-    model_seed: int = setting(0, help="Seed for what is drawn at random.")
-    rollout_timeout: float = setting(
-        3600.0, help="Seconds that a rollout, or a question, may take."
+    families: tuple[str, ...] = setting((), group=_EPISODES, help="Task families; default: all.")
+    episodes: str | None = setting(
+        None, group=_EPISODES, help="Episode numbers, such as 0-49 or 0,3,10-12; default: all."
     )
-    cache: bool = setting(False, help="Keep decoded history frames on disk: later runs are faster.")
-    max_errors: int = setting(10, help="Errors in a row after which the run stops.", metavar="N")
-    no_resume: bool = setting(False, help="Refuse a folder that holds a run already.")
+    split: str = setting("test", group=_EPISODES, help="train, val or test.")
+    shard: str = setting(
+        "1/1", group=_EPISODES, help="Part of the plan to run, such as 2/8; see merge."
+    )
+    system: str | None = setting(
+        None, group=_EPISODES, help="Label of the rows; see docs/systems.md."
+    )
+    model_seed: int = setting(0, group=_EXECUTION, help="Seed for all random draws.")
+    rollout_timeout_s: float = setting(
+        3600.0, group=_EXECUTION, help="Maximum seconds of a rollout or question."
+    )
+    cache: bool = setting(
+        False, group=_EXECUTION, help="Keep decoded frames on disk for later runs."
+    )
+    max_errors: int = setting(
+        10, group=_EXECUTION, metavar="N", help="Stop after N errors in a row."
+    )
+    no_resume: bool = setting(
+        False, group=_EXECUTION, help="Fail if the folder already holds a run."
+    )
 
 
 @dataclass(frozen=True)
 class RunConfig(WorkConfig):
-    """What to roll out, and how."""
+    """The settings of an evaluation: what to roll out, and how."""
 
     policy: str = setting(
-        help="replay, recall (both also with :framesamp or :window), oracle, guess, follow-subgoals, noop, "
-        "websocket://HOST:PORT (several with commas), websocket with --serve, "
-        "lerobot:REPO[@REVISION], lerobot:FOLDER or python:module:factory."
+        group=_POLICY,
+        help="replay or recall (both also with :framesamp or :window), oracle, guess, "
+        "follow-subgoals, noop, websocket://HOST:PORT (several with commas), websocket with "
+        "--serve, lerobot:REPO[@REVISION], lerobot:FOLDER or python:module:factory.",
     )
     buffer_set: str = setting(
         name="-", metavar="BUFFER_SET", help="Folder of the buffer set, or its NAMESPACE/NAME."
     )
-    out: Path = setting(help="Folder of the run; an earlier run is gone on with.")
-    simulator: str = setting("tabletop", help="tabletop, robomme or module:function of your own.")
-    shift: str = setting(NO_SHIFT, help=SHIFT_HELP)
+    out: Path = setting(help="Folder of the run; an existing run resumes.")
     policy_options: tuple[str, ...] = setting(
         (),
         name="--policy-option",
         whole=True,
         metavar="NAME=VALUE",
-        help="Options of the policy, such as device=cpu or response_s=60.",
+        group=_POLICY,
+        help="Options of the policy, such as device=cpu; see docs/systems.md.",
     )
+    simulator: str = setting(
+        "tabletop", group=_SIMULATOR, help="tabletop, robomme or module:function."
+    )
+    shift: str = setting(NO_SHIFT, group=_SIMULATOR, help=SHIFT_HELP)
     serve: str | None = setting(
         None,
         metavar="COMMAND",
-        help="Starts the server of --policy websocket, beside each worker: a command with {port}.",
+        group=_POLICY,
+        help="Command with {port} that starts a server for each worker of --policy websocket.",
     )
     subgoals: str | None = setting(
         None,
-        help="What writes subgoals for the policy: openai:URL#MODEL, transformers:ID or oracle.",
+        group=_SUBGOALS,
+        help="Writer of subgoals: openai:URL#MODEL, transformers:ID or oracle.",
     )
     subgoal_prompt: str | None = setting(
         None,
         metavar="NAME|FILE",
-        help="How a model is asked: simple, grounded, memer or a file; see docs/subgoals.md.",
+        group=_SUBGOALS,
+        help="Prompt of a model: simple, grounded, memer or a file; see docs/subgoals.md.",
         shown="as the system's",
     )
     subgoal_options: tuple[str, ...] = setting(
@@ -86,51 +113,60 @@ class RunConfig(WorkConfig):
         name="--subgoal-option",
         whole=True,
         metavar="NAME=VALUE",
-        help="Options of what writes subgoals, such as frames=32 or response_s=60.",
+        group=_SUBGOALS,
+        help="Options of the writer, such as frames=32 or response_s=60.",
     )
     robomme_python: str | None = setting(
-        None, help="Interpreter that has RoboMME.", env="ROBOMME_PYTHON"
+        None, group=_SIMULATOR, help="Python interpreter with RoboMME.", env="ROBOMME_PYTHON"
     )
-    videos: bool = setting(False, help="Write a video of each rollout.")
+    videos: bool = setting(False, group=_EXECUTION, help="Write a video of each rollout.")
     check_lesson: bool = setting(
-        False, help="Compare each lesson with what the simulator plays, bit for bit."
+        False,
+        group=_SIMULATOR,
+        help="Compare each lesson with the simulator's playback, bit for bit.",
     )
-    simulator_timeout: float = setting(
-        1800.0, help="Seconds that a reset, or 16 steps, may take before the simulator hung."
+    simulator_timeout_s: float = setting(
+        1800.0, group=_SIMULATOR, help="Maximum seconds of a reset, or of 16 steps."
     )
-    history_chunk: int = setting(64, help="Frames of history handed over at a time.", metavar="N")
+    history_chunk: int = setting(
+        64, group=_EXECUTION, metavar="N", help="History frames that the policy gets at a time."
+    )
 
 
 @dataclass(frozen=True)
 class AskConfig(WorkConfig):
-    """Which questions are asked, of whom, and what is shown of the past."""
+    """The settings of a run of questions: the model, and what it sees of the past."""
 
     model: str = setting(
-        help="openai:URL#MODEL, transformers:ID or transformers:FOLDER; recall, the ideal "
-        "observer, or guess."
+        group=_MODEL,
+        help="openai:URL#MODEL, transformers:ID or transformers:FOLDER; recall (the ideal "
+        "observer) or guess.",
     )
     buffer_set: str = setting(
         name="-", metavar="BUFFER_SET", help="Folder of the buffer set, with its questions."
     )
-    out: Path = setting(help="Folder of the run; an earlier run is gone on with.")
+    out: Path = setting(help="Folder of the run; an existing run resumes.")
     frames: int = setting(
-        SAMPLE_FRAMES, help="Frames that are kept, that of now among them.", metavar="N"
+        SAMPLE_FRAMES, group=_MODEL, metavar="N", help="Frames in memory, with the current one."
     )
-    sampling: str = setting("framesamp", help="Which are kept: full, framesamp or window.")
+    sampling: str = setting(
+        "framesamp", group=_MODEL, help="Which frames are kept: full, framesamp or window."
+    )
     control: str = setting(
-        "none", help="blank: the history's frames are grey; text: no images at all."
+        "none", group=_MODEL, help="blank: history frames are gray; text: no images at all."
     )
-    prompt: str = setting("choice", metavar="NAME|FILE", help="How a model is asked.")
+    prompt: str = setting("choice", group=_MODEL, metavar="NAME|FILE", help="Prompt of the model.")
     model_options: tuple[str, ...] = setting(
         (),
         name="--model-option",
         whole=True,
         metavar="NAME=VALUE",
+        group=_MODEL,
         help="Options of the model, such as max_tokens=64 or response_s=60.",
     )
 
     simulator: ClassVar[str] = "questions"
-    """What their rows have for a simulator: they are not rollouts."""
+    """The simulator in their rows: they are not rollouts."""
 
     shift: ClassVar[str] = NO_SHIFT
     videos: ClassVar[bool] = False
@@ -138,22 +174,23 @@ class AskConfig(WorkConfig):
 
 @dataclass(frozen=True)
 class CeilingConfig(RetrievalConfig):
-    """Of which memory a ceiling is, and of which buffers."""
+    """The settings of a ceiling: which memory, and which buffers."""
 
     memory: str = setting("framesamp", help="full, framesamp or window.")
-    conditions: tuple[str, ...] = setting((), help="Conditions; by default all that are planned.")
+    conditions: tuple[str, ...] = setting((), help="Conditions; default: all of the buffer set.")
     shift: str = setting(NO_SHIFT, help=SHIFT_HELP)
 
 
 def check_shared(config: WorkConfig) -> None:
-    """Check the settings that both kinds of work share, by themselves."""
+    """Check the settings that rollouts and questions share."""
     from robomme_interference_data.retrieval.select import Rule
 
-    for name in ("workers", "history_chunk", "max_errors", "rollout_timeout", "simulator_timeout"):
+    positive = ("workers", "max_errors", "rollout_timeout_s")
+    for name in (*positive, "history_chunk", "simulator_timeout_s"):
         value = getattr(config, name, 1)
         if not 0 < value < math.inf:
             raise InvalidOptionError.expected(
-                name, value, "more than 0", "Leave it out for the default."
+                name, value, "a number above 0", "Leave it out for the default."
             )
     if config.split not in SPLITS:
         raise InvalidOptionError.one_of("split", config.split, SPLITS)
@@ -164,10 +201,25 @@ def check_shared(config: WorkConfig) -> None:
 def non_default_retrieval(config: RetrievalConfig) -> dict[str, str]:
     """Return the settings of the retrieval step that are not the paper's."""
     defaults = {one.name: one.default for one in fields(RetrievalConfig) if one.name != "retrieval"}
-    found = {name: value for name in defaults if (value := getattr(config, name)) != defaults[name]}
-    for name in found if config.retrieval is None else ():
+    values = {name: getattr(config, name) for name in defaults}
+    changed = {name: value for name, value in values.items() if value != defaults[name]}
+    if changed and config.retrieval is None:
         raise InvalidOptionError(
-            f"`{name}` has no effect without a retrieval step",
+            f"`{next(iter(changed))}` has no effect without a retrieval step",
             'Set `retrieval`, such as retrieval="siglip", or leave it out.',
         )
-    return found
+    return changed
+
+
+def with_retrieval(name: str, config: RetrievalConfig) -> str:
+    """Return a system's default name with the retrieval step: `retrieval-…`, then its changes."""
+    if config.retrieval is None:
+        return name
+    return "-".join(("retrieval", name, *non_default_retrieval(config).values())).replace("/", "-")
+
+
+def nothing_to_retrieve(hint: str) -> InvalidOptionError:
+    """Return the error for a retrieval step without a history."""
+    return InvalidOptionError(
+        f"a retrieval step has nothing to retrieve from under {NO_HISTORY}", hint
+    )

@@ -1,4 +1,4 @@
-"""Run an evaluation: check everything, then do what is not done yet, and never lose a row."""
+"""Run an evaluation: check the settings, run what is not finished, and write each row to disk."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -16,7 +16,6 @@ from robomme_interference_data.errors import (
     SimulatorCrashError,
     first_line,
 )
-from robomme_interference_data.evaluate.policies.identity import plain
 from robomme_interference_data.runtime.executor import (
     Executor,
     Outcome,
@@ -28,23 +27,24 @@ from robomme_interference_data.schema.rollouts import Rollout, Status
 from robomme_interference_data.storage.files import atomic_path
 
 from .config import AskConfig, RunConfig
-from .identity import invocation, now, run_identity
+from .identity import invocation, now, plain, run_identity
 from .kind import Job, Run, RunKind
-from .log import RunLog, clip_name, count_statuses, is_done, open_log, read_record, row_line, row_of
+from .log import RunLog, count_statuses, is_done, open_log, read_record, row_line, row_of
 from .plan import WorkItem, plan_work, shuffle_work
 
 _ERROR_LETTERS = 2000
-"""Most letters of what broke that a row has."""
+"""Maximum length of an error text in a row."""
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run came to.
+    """The result of a run.
 
     Attributes:
-        rows: Rows of all rollouts that were asked for and have ended, in canonical order.
-        planned: Rollouts that were asked for.
-        counts: Rows by status.
+        folder: The folder of the run.
+        rows: Rows of all planned rollouts that ended, in canonical order.
+        planned: Number of planned rollouts.
+        counts: Number of rows by status.
         stopped: Why the run ended early, or None.
     """
 
@@ -56,13 +56,13 @@ class RunResult:
 
 
 class ProgressCallback(Protocol):
-    """Is called as a run goes on, to show it."""
+    """Shows the progress of a run."""
 
     def start(self, items: Sequence[WorkItem], done: Sequence[Rollout]) -> None:
-        """Take what is planned, and the rows that an earlier run finished."""
+        """Receive the plan, and the rows of earlier invocations."""
 
     def row(self, row: Rollout, node: str | None) -> None:
-        """Take a row that has just been written, and the node of a cluster that it is from."""
+        """Receive a row that was written, and the node of a cluster that it comes from."""
 
 
 def run_evaluation(
@@ -74,36 +74,36 @@ def run_evaluation(
 ) -> RunResult:
     """Roll out a policy, or ask questions, under the benchmark's protocol; one row each.
 
-    Rows are on the disk as rollouts end. Run again with the same `out`, it skips what is finished,
-    repeats errors, and adds what is newly asked for. Rows of questions are those of rollouts:
-    `simulator` is `questions`, and `success` whether the answer is right.
+    Rows are on disk as rollouts end. With the same `out`, a run resumes: it skips finished
+    rollouts, repeats errors, and adds newly planned ones. Rows of questions are like those of
+    rollouts: `simulator` is `questions`, and `success` is whether the answer is right.
 
-    Worker processes import the script that runs: call it under `if __name__ == "__main__":`.
+    Worker processes import the running script: call this under `if __name__ == "__main__":`.
 
     Args:
-        config: What to roll out, or to ask, and how.
-        executor: Who does it; by default what `config` says.
-        progress: Is called as the run goes on.
+        config: What to roll out or to ask, and how.
+        executor: What executes it; by default according to `config`.
+        progress: Called while the run proceeds.
         command: The command line, for the record.
 
     Raises:
-        UnknownNameError, InvalidOptionError, InvalidIdError: A setting is not what it may be.
+        UnknownNameError, InvalidOptionError, InvalidIdError: A setting is invalid.
         InvalidOptionError: A buffer exceeds the system's position limit.
-        MissingFileError: The buffer set is not there, or has no questions.
-        RunError: `out` holds another run, or something else.
+        MissingFileError: The buffer set does not exist, or has no questions.
+        RunError: `out` holds another run, or other files.
         PolicyError: The policy cannot be made.
-        PolicyServerError: A policy server cannot be reached, or no longer any of them; another run
-            drives it; or it is not what the system's is.
-        ModelError: The model cannot be reached, or is not there.
+        PolicyServerError: No policy server can be reached, another run drives it, or it serves
+            another kind of model than the system's.
+        ModelError: The model cannot be reached, or does not exist.
         WorkerError: The worker processes cannot start.
-        HubError: The Hub does not know the model, or cannot be reached.
+        HubError: The Hub does not have the model, or cannot be reached.
         FormatError: Files of a run in `out`, or the questions, are damaged.
         MissingExtraError: A library is not installed.
     """
     end_if_starting()
     buffer_set, folder = load_buffer_set(config.buffer_set), Path(config.out)
     kind = _kind(dataclasses.replace(config, buffer_set=buffer_set.location), buffer_set)
-    with kind.claim(folder), ExitStack() as stack:
+    with kind.lock(folder), ExitStack() as stack:
         kind.prepare()
         config = kind.config
         plan = plan_work(
@@ -119,7 +119,9 @@ def run_evaluation(
         for condition in plan.conditions:
             if (refusal := kind.refusal(condition)) is not None:
                 raise refusal
-            buffer_set.manifest(buffer_set.episode_ids[0], condition)  # raises with what there is
+            buffer_set.manifest(
+                buffer_set.episode_ids[0], condition
+            )  # raises, with the available ones
         kind.check(plan, items)
         existing = read_record(folder)
         todo = [item for item in items if item not in existing or not is_done(existing[item])]
@@ -132,7 +134,7 @@ def run_evaluation(
         identity = run_identity(kind, plan)
         with open_log(folder, identity, buffer_set.name, resume=not config.no_resume) as log:
             log.begin(invocation(kind, plan, command))
-            # The same buffer set may be in another folder by now: rows keep one label for it.
+            # The buffer set may have moved to another folder: its label in rows stays the same.
             run = dataclasses.replace(run, buffer_set=log.header.buffer_set)
             return _run_items(run, kind, session, items, log, progress)
 
@@ -155,7 +157,7 @@ def _run_items(
     log: RunLog,
     progress: ProgressCallback | None,
 ) -> RunResult:
-    """Do what is not done yet, and write its rows as they come."""
+    """Run what is not finished, and write its rows as they come."""
     done = {item: row for item, row in log.rows.items() if is_done(row)}
     if progress is not None:
         progress.start(items, [done[item] for item in items if item in done])
@@ -166,7 +168,7 @@ def _run_items(
         if session is not None:
             outcomes = session.run(
                 [Job(one, kind.metadata) for one in shuffle_work(set(items) - done.keys())],
-                time_limit=run.config.rollout_timeout,
+                time_limit=run.config.rollout_timeout_s,
                 again=(SimulatorCrashError, ServerKeepaliveError, ServerDiedError),
             )
             stack.callback(outcomes.close)
@@ -185,7 +187,7 @@ def _run_items(
         except InterferenceError as error:  # no worker is left
             stopped = error.message
             raise
-        except OSError:  # what cannot take a row cannot take tables
+        except OSError:  # a disk without space for a row has none for tables
             full = True
             raise
         finally:
@@ -201,10 +203,9 @@ def _run_items(
 def _row(
     run: Run[Any], outcome: Outcome, buffer_set: BufferSet, log: RunLog
 ) -> tuple[Rollout, str | None]:
-    """Write the files of an outcome; return its row, and what broke, with its traceback, or None.
+    """Write the files of an outcome; return its row, and the traceback of an error or None.
 
-    A row that could not be read again, such as with a number of 100 bits from somebody's
-    simulator, is an error.
+    A row that could not be read again, such as one with a number of 100 bits, becomes an error.
     """
     item: WorkItem = outcome.task.item
     error, trace = outcome.error, outcome.trace
@@ -213,30 +214,28 @@ def _row(
         row = dataclasses.replace(row, buffer_set=run.buffer_set)
         try:
             row_of(row_line(row))
-        except ValueError as refused:
-            error = RuntimeError(f"its row cannot be stored: {first_line(refused)}")
+        except (ValueError, OverflowError, RecursionError) as unstorable:
+            error = RuntimeError(f"its row cannot be stored: {first_line(unstorable)}")
     if error is not None:
         query = buffer_set.query(item.episode)
         row = run.row(
             item,
+            Status.ERROR,
             seed=query.seed,
             difficulty=query.difficulty,
             goal=None,
-            status=str(Status.ERROR),
-            success=None,
             steps=0,
             history_frames=0,
             lesson_frames=0,
             lesson_share=None,
             error=_error_text(error),
         )
-    clip = clip_name(item)
-    (log.folder / clip).unlink(missing_ok=True)  # of an earlier attempt
-    # Rows matter more than what is to be looked at beside them: a full disk costs a clip.
+    (log.folder / item.clip).unlink(missing_ok=True)  # of an earlier attempt
+    # Rows matter more than clips: a full disk costs a clip only.
     lost = [problem for one in outcome.files.items() if (problem := _write(log.folder, *one))]
     row = dataclasses.replace(
         row,
-        video=clip if (log.folder / clip).exists() else None,
+        video=item.clip if (log.folder / item.clip).exists() else None,
         attempt=(log.rows[item].attempt if item in log.rows else 0) + outcome.attempts,
         finished_at=now(),
     )
@@ -244,7 +243,7 @@ def _row(
 
 
 def _write(folder: Path, path: str, data: bytes) -> str | None:
-    """Write a file that a task sent, whole or not at all; return what went wrong, or None."""
+    """Write a file of a task atomically; return the problem, or None."""
     try:
         with atomic_path(folder / path) as partial:
             partial.write_bytes(data)
@@ -254,7 +253,7 @@ def _write(folder: Path, path: str, data: bytes) -> str | None:
 
 
 def _error_text(error: BaseException) -> str:
-    """Return an error and its hint in one line, as text that any file can hold."""
+    """Return an error and its hint in one line, as text that every file can hold."""
     text = str(error)
     if isinstance(error, InterferenceError):
         hint = f" ({error.hint})" if error.hint else ""

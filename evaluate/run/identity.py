@@ -1,30 +1,30 @@
-"""What makes a run the one that it is, and what the record says of an invocation."""
+"""What identifies a run, and what the record has about an invocation."""
 
 import dataclasses
 import datetime
+import math
+import os
 import platform
 import subprocess
-from collections.abc import Sequence
-from importlib import metadata
+from collections.abc import Mapping, Sequence
+from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
 
 from robomme_interference_data.constants import PROTOCOL_VERSION
-from robomme_interference_data.data.buffer_set import BufferSet
-from robomme_interference_data.evaluate.policies.identity import plain
-from robomme_interference_data.simulators.registry import simulator_class
 
-from .config import AskConfig, RetrievalConfig, RunConfig
-from .kind import RunKind
+from .kind import RunKind, make_selector, package_versions
 from .log import Invocation
 from .plan import Plan
 
-if TYPE_CHECKING:
-    from robomme_interference_data.retrieval.selector import Selector
+_DEEPEST = 20
+"""Maximum depth of lists and maps in metadata that is recorded as such."""
 
 
 def run_identity(kind: RunKind[Any], plan: Plan) -> dict[str, Any]:
-    """Return what can change a result, as plain values: it makes the run the one that it is."""
+    """Return what can change a result, as plain values: it identifies the run."""
     config = kind.config
     return {
         "system": kind.system,
@@ -33,37 +33,25 @@ def run_identity(kind: RunKind[Any], plan: Plan) -> dict[str, Any]:
         "split": config.split,
         "shift": config.shift,
         "model_seed": config.model_seed,
-        "retrieval_index": _retrieval_index(config, kind.buffer_set, plan),
+        "retrieval_index": _retrieval_index(kind, plan),
         "protocol_version": PROTOCOL_VERSION,
         **kind.identity(plan),
     }
 
 
-def make_selector(config: RetrievalConfig) -> "Selector | None":
-    """Make the retrieval step of a run, None if it has none; see `Selector` for its errors."""
-    if config.retrieval is None:
-        return None
-    from robomme_interference_data.retrieval.selector import Selector
-
-    return Selector(config.retrieval, rule=config.retrieval_rule, camera=config.retrieval_camera)
-
-
-def _retrieval_index(config: RetrievalConfig, buffer_set: BufferSet, plan: Plan) -> Any:
-    """Return what the retrieval step's choices depend on; None without one.
-
-    Looks for the index of every dataset that a planned condition needs.
-    """
-    selector = make_selector(config)
+def _retrieval_index(kind: RunKind[Any], plan: Plan) -> Any:
+    """Return what the retrieval step depends on; raise if a planned condition lacks its index."""
+    selector = make_selector(kind.config)
     if selector is None:
         return None
-    found = None  # the same for all: the buffers of a condition need the same datasets
+    index = None  # the same for all: the buffers of a condition need the same datasets
     for name in plan.conditions:
-        found = selector.identity(next(buffer_set.buffers(condition=name)))
-    return plain(found)
+        index = selector.identity(next(kind.buffer_set.buffers(condition=name)))
+    return plain(index)
 
 
 def invocation(kind: RunKind[Any], plan: Plan, command: Sequence[str]) -> Invocation:
-    """Return what is recorded of an invocation that begins now."""
+    """Return the record of an invocation that begins now."""
     return Invocation(
         command=tuple(map(plain, command)),
         settings=plain(dataclasses.asdict(kind.config)),
@@ -74,27 +62,6 @@ def invocation(kind: RunKind[Any], plan: Plan, command: Sequence[str]) -> Invoca
         policy=dict(kind.metadata),
         started=now(),
     )
-
-
-def package_versions(config: RunConfig | AskConfig) -> dict[str, str]:
-    """Return the versions of Python and of what a run uses, by name; what is missing is left out.
-
-    RoboMME's interpreter has others: see `simulator_versions`.
-    """
-    names = ["robomme-interference-data", "numpy", "av", "torch"]
-    if isinstance(config, RunConfig) and config.policy.startswith("lerobot:"):
-        names.append("lerobot")
-    if config.retrieval is not None:
-        names.append("transformers")
-    if isinstance(config, RunConfig):
-        names += simulator_class(config.simulator).packages
-    found = {"python": platform.python_version()}
-    for name in names:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return found
 
 
 def now() -> str:
@@ -113,3 +80,28 @@ def _git() -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip() if (root / ".git").exists() else None
+
+
+def plain(value: Any, depth: int = 0) -> Any:
+    """Return a value as the files of a run can hold it; `ValueError` for NaN or an infinity.
+
+    Integers above 63 bits, long arrays, and what is nested too deeply become text.
+    """
+    if isinstance(value, np.generic | np.ndarray):
+        large = value.size > 32
+        value = f"{value.dtype} array {value.shape}" if large else value.tolist()
+    if isinstance(value, Mapping | list | tuple) and depth >= _DEEPEST:
+        value = f"{type(value).__name__} of {len(value)}"
+    if isinstance(value, Mapping):
+        pairs = [(plain(str(key)), plain(entry, depth + 1)) for key, entry in value.items()]
+        return dict(sorted(pairs, key=itemgetter(0)))  # in the order in which JSON is written
+    if isinstance(value, list | tuple):
+        return [plain(entry, depth + 1) for entry in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(str(value))
+    if value is None or isinstance(value, float):
+        return value
+    if isinstance(value, int):  # a bool too
+        return value if -(1 << 63) <= value < 1 << 63 else hex(value)
+    text = os.fspath(value) if isinstance(value, str | os.PathLike) else repr(value)
+    return str(text).encode("utf-8", "backslashreplace").decode()

@@ -1,30 +1,36 @@
-"""What the two kinds of work, rollouts and questions, do differently in a run."""
+"""A run of rollouts or questions: what its workers do, and what differs between the two kinds."""
 
+import platform
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, field
+from functools import cached_property
+from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from robomme_interference_data.constants import PROTOCOL_VERSION
+from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.data.buffer_set import BufferSet
+from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import InterferenceError
-from robomme_interference_data.runtime.executor import Session, Task
-from robomme_interference_data.schema.rollouts import Rollout
+from robomme_interference_data.runtime.executor import Session, Worker
+from robomme_interference_data.schema.rollouts import Rollout, Status
+from robomme_interference_data.schema.sampling import even_sample, lesson_frames, lesson_share
+from robomme_interference_data.simulators.registry import simulator_class
 
-from .config import AskConfig, RunConfig
+from .config import AskConfig, RetrievalConfig, RunConfig
+from .history import HistoryReader
 from .plan import Plan, WorkItem
+
+if TYPE_CHECKING:
+    from robomme_interference_data.retrieval.selector import Selector
 
 
 @dataclass(frozen=True)
 class Job:
-    """What a worker does next.
-
-    Attributes:
-        item: What to roll out, or to ask.
-        metadata: What the policy, or the model, reports of itself in this run.
-    """
+    """A work item for a worker, with the metadata that the policy or model reported to the run."""
 
     item: WorkItem
     metadata: Mapping[str, Any] = field(default_factory=dict)
@@ -32,11 +38,11 @@ class Job:
 
 @dataclass(frozen=True)
 class Run[C: RunConfig | AskConfig]:
-    """A run whose settings were checked: what its workers need, and what all its rows share.
+    """A run with checked settings: what its workers need, and what all its rows share.
 
     Attributes:
-        config: Its settings; the system is named, and a model on the Hub has its commit.
-        system: The label under which its results are reported.
+        config: Its settings; a model on the Hub has its commit.
+        system: The label of its rows.
         buffer_set: Label of the buffer set in its rows.
         revision: `BufferSet.revision`.
     """
@@ -46,8 +52,8 @@ class Run[C: RunConfig | AskConfig]:
     buffer_set: str
     revision: str
 
-    def row(self, item: WorkItem, **values: Any) -> Rollout:
-        """Return the row of a work item: `values`, and what identifies it."""
+    def row(self, item: WorkItem, status: Status, **values: Any) -> Rollout:
+        """Return the row of a work item."""
         return Rollout(
             system=self.system,
             simulator=self.config.simulator,
@@ -60,41 +66,146 @@ class Run[C: RunConfig | AskConfig]:
             shift=self.config.shift,
             model_seed=self.config.model_seed,
             protocol_version=PROTOCOL_VERSION,
+            status=str(status),
+            success=None if status is Status.ERROR else status is Status.SUCCESS,
             **values,
         )
 
 
-def stored_count(count: int | None) -> int | None:
-    """Return a count that a model reports; None for one that no file of a run can hold."""
-    return count if count is not None and 0 <= count < 1 << 63 else None
+def make_selector(config: RetrievalConfig) -> "Selector | None":
+    """Make the retrieval step of a run; None if it has none."""
+    if config.retrieval is None:
+        return None
+    from robomme_interference_data.retrieval.selector import Selector
+
+    return Selector(config.retrieval, rule=config.retrieval_rule, camera=config.retrieval_camera)
+
+
+def package_versions(config: RunConfig | AskConfig) -> dict[str, str]:
+    """Return the versions of Python and of the packages that a run uses, if installed.
+
+    RoboMME's interpreter has others: see `simulator_versions`.
+    """
+    names = ["robomme-interference-data", "numpy", "av", "torch"]
+    if isinstance(config, RunConfig) and config.policy.startswith("lerobot:"):
+        names.append("lerobot")
+    if config.retrieval is not None:
+        names.append("transformers")
+    if isinstance(config, RunConfig):
+        names += simulator_class(config.simulator).packages
+    versions = {"python": platform.python_version()}
+    for name in names:
+        with suppress(metadata.PackageNotFoundError):
+            versions[name] = metadata.version(name)
+    return versions
+
+
+def history_columns(
+    buffer: Buffer, given: Sequence[int], selector: "Selector | None"
+) -> dict[str, Any]:
+    """Return the columns about the frames of a buffer that a policy or model was given."""
+    share = lesson_share(buffer.sessions, given) if given else None
+    columns: dict[str, Any] = {
+        "history_frames": len(given),
+        "lesson_frames": lesson_frames(buffer.sessions, given),
+        "lesson_share": share,
+        "retrieval_model": selector.name if selector else None,
+    }
+    if selector is not None and share is not None:
+        columns |= {"retrieval_start": given[0], "retrieval_stop": given[-1] + 1}
+        frames = len(even_sample(len(given)))
+        filler = (frames - 1 - round(share * frames)) / frames
+        for part, fraction in {"lesson": share, "filler": filler, "query": 1 / frames}.items():
+            columns[f"retrieval_selected_{part}_fraction"] = fraction
+    return columns
+
+
+def model_columns(calls: int, tokens: Sequence[int | None], faults: int) -> dict[str, Any]:
+    """Return the columns about a vision-language model, given the tokens of each answer.
+
+    A total that the files of a run cannot hold becomes None, and counts as a fault.
+    """
+    counts = [count for count in tokens if count is not None]
+    total = sum(counts)
+    stored = all(count >= 0 for count in counts) and total < 1 << 63
+    return {
+        "model_calls": calls,
+        "model_tokens": total if counts and stored else None,
+        "model_faults": faults + (not stored),
+    }
+
+
+class RunTask[C: RunConfig | AskConfig](ABC):
+    """The function of a worker; it opens the buffer set and the retrieval step on first use.
+
+    After an exception it closes and makes anew everything else that it uses.
+    """
+
+    def __init__(self, run: Run[C]):
+        self.run = run
+
+    @cached_property
+    def buffer_set(self) -> BufferSet:
+        """The buffer set."""
+        return load_buffer_set(self.run.config.buffer_set, cache=self.run.config.cache, threads=1)
+
+    @cached_property
+    def selector(self) -> "Selector | None":
+        """The retrieval step."""
+        return make_selector(self.run.config)
+
+    @cached_property
+    def history(self) -> HistoryReader:
+        """Reads history frames."""
+        return HistoryReader(self.buffer_set.datasets)
+
+    def __call__(self, task: Any, worker: Worker) -> Any:
+        """Do a task."""
+        try:
+            return self.work(task, worker)
+        except Exception:
+            self.close()
+            raise
+
+    def describe(self) -> dict[str, str]:
+        """Return what must be the same on all machines that run the task."""
+        revision = load_buffer_set(self.run.config.buffer_set).revision
+        return package_versions(self.run.config) | {"the buffer set's revision": revision}
+
+    @abstractmethod
+    def work(self, task: Any, worker: Worker) -> Any:
+        """Do a task; of a `Job`, return the row, and a problem with its files or None."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release everything that may be broken after an exception."""
 
 
 class RunKind[C: RunConfig | AskConfig](ABC):
-    """One kind of work: `evaluation.run_evaluation` calls its methods in their order here.
+    """Rollouts or questions: `evaluation.run_evaluation` calls the methods in their order here.
 
     Attributes:
-        config: The settings; `prepare` names the commits of models in them.
+        config: The settings; `prepare` adds the commits of models.
         buffer_set: The buffer set.
-        system: The label under which the rows are reported; set by `prepare`.
-        metadata: What the policy, or the model, reports of itself; set by `prepare`.
+        system: The label of the rows; set by `prepare`.
+        metadata: What the policy or model reports of itself; set by `prepare`.
         versions: Versions of the simulator; set by `prepare`.
     """
 
     system: str
-    metadata: dict[str, Any]
-    versions: Mapping[str, str]
 
     def __init__(self, config: C, buffer_set: BufferSet):
         self.config, self.buffer_set = config, buffer_set
-        self.metadata, self.versions = {}, {}
+        self.metadata: dict[str, Any] = {}
+        self.versions: Mapping[str, str] = {}
 
-    def claim(self, folder: Path) -> AbstractContextManager[None]:
-        """Keep other runs from what only one run may use, in the block."""
+    def lock(self, folder: Path) -> AbstractContextManager[None]:
+        """Keep other runs from policy servers in the block; `folder` is this run's."""
         return nullcontext()
 
     @abstractmethod
     def prepare(self) -> None:
-        """Check the settings, and find out what is run."""
+        """Check the settings, and identify the policy or model."""
 
     @abstractmethod
     def refusal(self, condition: str) -> InterferenceError | None:
@@ -102,18 +213,18 @@ class RunKind[C: RunConfig | AskConfig](ABC):
 
     @abstractmethod
     def check(self, plan: Plan, items: Sequence[WorkItem]) -> None:
-        """Check what is planned."""
+        """Check the plan."""
 
     @abstractmethod
-    def task(self, run: Run[C]) -> Task:
-        """Return what workers do with a `Job`: it returns a row, and a problem or None."""
+    def task(self, run: Run[C]) -> RunTask[C]:
+        """Return the function of the workers."""
 
     def needs_session(self, todo: Sequence[WorkItem]) -> bool:
-        """Whether workers have to be asked for something."""
+        """Whether the run needs workers."""
         return bool(todo)
 
     def open(self, session: Session, todo: Sequence[WorkItem]) -> None:
-        """Check by a worker what it will use; what it opens stays open for its first job."""
+        """Let a worker open what the run uses, and check it."""
 
     @abstractmethod
     def identity(self, plan: Plan) -> dict[str, Any]:

@@ -1,8 +1,8 @@
-"""The folder of a run: one record, a line a rollout, and what was asked of it in `run.json`.
+"""The folder of a run: `rollouts.jsonl` with a line for each rollout, and `run.json`.
 
-A line of `rollouts.jsonl` is on the disk before the next rollout is counted; one that a crash cut
-short is dropped, and only that one. Of a rollout that broke and ran again, the last row counts;
-what is finished never runs again. The tables beside it are exported when a run ends.
+A line is on disk before the next rollout is counted; only a last line that a crash cut short is
+dropped. Of a rollout that broke and ran again, the last row counts; a finished rollout never runs
+again. The tables beside it are exported when a run ends.
 """
 
 import os
@@ -36,28 +36,10 @@ from .plan import Plan, WorkItem
 ERRORS_LOG = "errors.log"
 
 MOST_BYTES = 2 << 30
-"""Bytes of a file of rows, at most: two million rollouts have less."""
+"""Maximum bytes of a file of rows: two million rollouts have fewer."""
 
 _MOST_ROLLOUTS = 1 << 20
-"""Rollouts that all plans of a run ask for, at most: the paper's grid has 25,200."""
-
-
-def item_name(item: WorkItem) -> str:
-    """Return what a rollout's own files are called, such as `MoveCube_test_3_k7`."""
-    return f"{str(item.episode).replace('/', '_')}_{item.condition}"
-
-
-def clip_name(item: WorkItem) -> str:
-    """Return the path of a rollout's clip inside the run's folder."""
-    return f"videos/{item_name(item)}.mp4"
-
-
-def transcript_file(
-    kind: str, item: WorkItem, lines: Iterable[Mapping[str, Any]]
-) -> tuple[str, bytes]:
-    """Return path and bytes of what models were asked and answered in a rollout."""
-    text = "".join(canonical_json(dict(line)) + "\n" for line in lines)
-    return f"{kind}/{item_name(item)}.jsonl", text.encode("utf-8", "backslashreplace")
+"""Maximum rollouts of all plans of a run: the paper's grid has 25,200."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +50,7 @@ class Invocation:
         command: The command line; empty from Python.
         versions: Of Python, this package, what it used, and the simulator.
         git: Commit of the source tree, with `-dirty` if it was changed; None if there is none.
-        policy: What the policy said of itself.
+        policy: Metadata of the policy.
         started: When, UTC, `2026-01-31T12:00:00Z`.
         ended: When; None while it runs, or if it was killed.
         stopped: Why it ended early, or None.
@@ -91,13 +73,14 @@ class RunHeader:
     """`run.json`.
 
     Attributes:
-        identity: What can change a result: it makes the run the one that it is.
+        identity: What can change a result: it identifies the run.
         buffer_set: Label of the buffer set in all rows.
-        plans: What was asked for, each plan once.
-        status: `running`; or `complete` or, if something is missing or broke, `incomplete`.
-        planned: Rollouts that were asked for by all plans together.
+        plans: The plans of all invocations, each once.
+        status: `running`, `complete`, or, if something is missing or broke, `incomplete`.
+        planned: Rollouts of all plans together.
         counts: Rows by status.
-        merged: Names of the folders that a joined run is made of.
+        starts: The invocations.
+        merged: Names of the folders that a merged run is made of.
     """
 
     format_version: int
@@ -117,11 +100,11 @@ class RunHeader:
 
     @property
     def items(self) -> tuple[WorkItem, ...]:
-        """All rollouts that were asked for, each once, in canonical order."""
+        """All planned rollouts, each once, in canonical order."""
         return tuple(sorted({item for plan in self.plans for item in plan.items()}))
 
     def standing(self, rows: Mapping[WorkItem, Rollout], status: str = "") -> "RunHeader":
-        """Return the header with how the folder stands, over all of its plans."""
+        """Return the header with status and counts for these rows, over all of its plans."""
         items = self.items
         whole = all(item in rows and is_done(rows[item]) for item in items)
         status = status or ("complete" if whole else "incomplete")
@@ -130,32 +113,27 @@ class RunHeader:
 
 
 class RunLog:
-    """A run's folder that is written, see `open_log`.
-
-    Attributes:
-        rows: The row that counts of each rollout, as of the opening, and of the end once that is
-            written: rows between are on the disk, and not in memory.
-    """
+    """A run's folder that is open for writing, see `open_log`; `rows` are updated at its end."""
 
     def __init__(self, folder: Path, header: RunHeader, rows: dict[WorkItem, Rollout]):
         self.folder, self.header, self.rows = folder, header, rows
 
     def begin(self, start: Invocation) -> None:
-        """Note a start of the command."""
+        """Record an invocation."""
         plans = self.header.plans
         plans += () if start.plan in plans else (start.plan,)
         header = replace(self.header, plans=plans, starts=(*self.header.starts, start))
         self._write_header(header.standing(self.rows, "running"))
 
     def append(self, row: Rollout, trace: str | None = None) -> None:
-        """Write a row, and where it broke; when this returns, the row is on the disk."""
+        """Write a row to the disk, and the traceback of an error."""
         path = self.folder / RUN_RECORD
         try:
             with path.open("ab") as file:
                 file.write(row_line(row))
                 file.flush()
                 os.fsync(file.fileno())
-        except OSError as error:  # from writing, it names no file
+        except OSError as error:  # it names no file
             raise OSError(error.errno, error.strerror, str(path)) from error
         if trace:
             log = self.folder / ERRORS_LOG
@@ -164,13 +142,13 @@ class RunLog:
                 file.write(f"{visible(trace.rstrip())}\n\n")
 
     def write_all(self, rows: Iterable[Rollout]) -> None:
-        """Write all rows anew, whole or not at all."""
+        """Replace all rows atomically."""
         with atomic_path(self.folder / RUN_RECORD) as partial:
             partial.write_bytes(b"".join(map(row_line, rows)))
 
     def end(self, header: RunHeader) -> None:
-        """Export the tables, in canonical order, and write a header with how the folder stands."""
-        # As they are on the disk: Ctrl-C may have come between a row's writing and its counting.
+        """Export the tables, in canonical order, and write a header with status and counts."""
+        # Read from the disk: Ctrl-C may come between the writing and the counting of a row.
         self.rows = dict(sorted(read_record(self.folder).items()))
         table = to_table(self.rows.values(), arrow_schema(Rollout))
         parquet, text = (self.folder / name for name in RUN_TABLES)
@@ -189,21 +167,21 @@ class RunLog:
 def open_log(
     folder: Path, identity: Mapping[str, Any], buffer_set: str, *, resume: bool = True
 ) -> Iterator[RunLog]:
-    """Open or make the folder of a run, and hold it; a run that is there keeps its label."""
+    """Open or create the folder of a run, and lock it; an existing run keeps its label."""
     folder.mkdir(parents=True, exist_ok=True)
-    there = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
-    if there == [RUN_RECORD] and not (folder / RUN_RECORD).stat().st_size:
-        there = []  # a full disk, or a kill, came before the header
-    if there and RUN_HEADER not in there:
+    existing = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+    if existing == [RUN_RECORD] and not (folder / RUN_RECORD).stat().st_size:
+        existing = []  # left by a full disk, or a kill, before the header
+    if existing and RUN_HEADER not in existing:
         raise RunError(
-            f"{folder} holds other files ({', '.join(there[:3])}) and no {RUN_HEADER}",
+            f"{folder} holds other files ({', '.join(existing[:3])}) and no {RUN_HEADER}",
             "Set `out` to a new folder.",
         )
     busy = RunError(
         f"another process is writing {folder}", "Wait for it to end, or set another `out`."
     )
     with file_lock(folder / ".lock", busy):
-        if not there:
+        if not existing:
             (folder / RUN_RECORD).touch()
             header = RunHeader(FORMAT_VERSION, dict(identity), buffer_set)
             write_json(folder / RUN_HEADER, to_dict(header))
@@ -218,19 +196,19 @@ def open_log(
 
 
 def read_run(folder: Path) -> tuple[RunHeader, dict[WorkItem, Rollout]]:
-    """Read a run: its header, standing as its record says, and its rows."""
+    """Read the header of a run, with status and counts for its rows, and the rows."""
     for name in (RUN_HEADER, RUN_RECORD):
         if not (folder / name).is_file():
             raise RunError(
                 f"{folder} holds no run: {name} is missing",
-                "Give a folder that an evaluation wrote, all of it.",
+                "Give a complete folder of a run.",
             )
     header, rows = read_header(folder / RUN_HEADER, RunHeader), read_record(folder)
     return header.standing(rows), rows
 
 
 def read_record(folder: Path) -> dict[WorkItem, Rollout]:
-    """Read a run's record: the row that counts of each rollout; empty where there is none."""
+    """Read the row that counts of each rollout; none from a missing file."""
     path = folder / RUN_RECORD
     rows: dict[WorkItem, Rollout] = {}
     if not path.exists():
@@ -241,8 +219,8 @@ def read_record(folder: Path) -> dict[WorkItem, Rollout]:
             item = WorkItem.of(row)
             if item in rows and is_done(rows[item]):
                 raise ValueError(f"it is a second one of {item}")
-            if row.video not in (None, clip_name(item)):  # which would be read and written there
-                raise ValueError(f"video {row.video!r}; expected {clip_name(item)} or null")
+            if row.video not in (None, item.clip):  # a path that would be read and written
+                raise ValueError(f"video {row.video!r}; expected {item.clip} or null")
         except ValueError as error:
             raise FormatError(
                 f"{path}, line {number} is no row of a rollout: {first_line(error)}",
@@ -266,39 +244,28 @@ def row_line(row: Rollout) -> bytes:
 
 
 def whole_lines(record: Path) -> bytes:
-    """Return a record's bytes, without a last line that a crash cut short."""
+    """Return the bytes of `rollouts.jsonl`, without a last line that a crash cut short."""
     data = read_bytes(record, MOST_BYTES)
     return data[: data.rfind(b"\n") + 1]
 
 
-def check_same_run(folder: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    """Check that a folder's run is the one that is wanted, by their identities."""
-    there, here = _flat(found), _flat(wanted)
-    told = [
-        f"{name} is {there.get(name, 'unknown')} there, {here.get(name, 'unknown')} here"
-        for name in sorted({*there, *here})
-        if there.get(name) != here.get(name)
+def check_same_run(folder: Path, existing: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
+    """Check that a folder holds the expected run, by their identities."""
+    old, new = _flat(existing), _flat(expected)
+    differences = [
+        f"{name} is {old.get(name, 'unknown')} there, {new.get(name, 'unknown')} here"
+        for name in sorted({*old, *new})
+        if old.get(name) != new.get(name)
     ]
-    if told:
+    if differences:
         raise RunError(
-            f"{folder} holds another run: {'; '.join(told)}",
-            f"Set another `out`, or the settings of the run that is there (see {RUN_HEADER}).",
+            f"{folder} holds another run: {'; '.join(differences)}",
+            f"Set another `out`, or the settings of the existing run (see {RUN_HEADER}).",
         )
 
 
-def is_done(row: Rollout) -> bool:
-    """Tell whether a rollout need not be run again: all but errors."""
-    return row.status != Status.ERROR
-
-
-def count_statuses(rows: Iterable[Rollout]) -> dict[str, int]:
-    """Count rows by status."""
-    counts = Counter(row.status for row in rows)
-    return {str(status): counts[status] for status in FINAL}
-
-
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """Return values as text, those of inner maps under names such as `policy_metadata.sha256`."""
+    """Return values as text, under names such as `policy_metadata.sha256`."""
     flat: dict[str, str] = {}
     for name, value in values.items():
         if isinstance(value, Mapping):
@@ -306,3 +273,14 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
         else:
             flat[prefix + name] = repr(value)
     return flat
+
+
+def is_done(row: Rollout) -> bool:
+    """Whether a rollout need not run again: all but errors."""
+    return row.status != Status.ERROR
+
+
+def count_statuses(rows: Iterable[Rollout]) -> dict[str, int]:
+    """Count rows by status."""
+    counts = Counter(row.status for row in rows)
+    return {str(status): counts[status] for status in FINAL}

@@ -1,25 +1,23 @@
-"""What a run has to do: pure, without files or processes."""
+"""The plan of a run: pure, without files or processes."""
 
 import hashlib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId, count_numbers, format_numbers, parse_numbers
 from robomme_interference_data.schema.conditions import in_order, parse_condition
 from robomme_interference_data.schema.rollouts import Rollout
+from robomme_interference_data.storage.files import canonical_json
 
 _SHARD = re.compile(r"(\d{1,6})/(\d{1,6})")
 
 
 @dataclass(frozen=True)
 class WorkItem:
-    """One rollout: within a run, the key of its row.
-
-    They sort in the canonical order, by episode and condition.
-    """
+    """One rollout or question: the key of its row within a run; sorts by episode and condition."""
 
     condition: str
     episode: EpisodeId
@@ -29,29 +27,44 @@ class WorkItem:
 
     @classmethod
     def of(cls, row: Rollout) -> Self:
-        """Return the rollout that a row is of."""
+        """Return the work item of a row."""
         return cls(row.condition, row.episode_id)
 
     def __str__(self) -> str:
         return f"{self.episode} under {self.condition}"
 
+    @property
+    def file_name(self) -> str:
+        """Stem of the names of its own files, such as `MoveCube_test_3_k7`."""
+        return f"{str(self.episode).replace('/', '_')}_{self.condition}"
+
+    @property
+    def clip(self) -> str:
+        """Path of its clip inside the run's folder."""
+        return f"videos/{self.file_name}.mp4"
+
+    def transcript(self, kind: str, lines: Iterable[Mapping[str, Any]]) -> tuple[str, bytes]:
+        """Return path and bytes of what models were asked and answered."""
+        text = "".join(canonical_json(dict(line)) + "\n" for line in lines)
+        return f"{kind}/{self.file_name}.jsonl", text.encode("utf-8", "backslashreplace")
+
     def __lt__(self, other: "WorkItem") -> bool:
-        mine, others = (
+        first, second = (
             (item.episode.sort_key, parse_condition(item.condition).sort_key)
             for item in (self, other)
         )
-        return mine < others
+        return first < second
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Rollouts that were asked for, as `run.json` has them.
+    """The planned rollouts, as `run.json` has them.
 
     Attributes:
         episodes: Family and split of the query episodes, such as `MoveCube/test`, to their
             numbers, such as `0-49`.
-        conditions: Names.
-        shard: The part of them that is run: `2/8` is the second of eight.
+        conditions: Names of the conditions.
+        shard: The part to run: `2/8` is the second of eight.
     """
 
     episodes: dict[str, str]
@@ -59,7 +72,7 @@ class Plan:
     shard: str = "1/1"
 
     def __post_init__(self) -> None:
-        # Without a list of the rollouts: in a file, there may be plans of millions.
+        # Without listing the rollouts: a file may have plans of millions.
         _read_shard(self.shard)
         in_order(self.conditions)
         for group, numbers in self.episodes.items():
@@ -68,15 +81,14 @@ class Plan:
 
     @property
     def most(self) -> int:
-        """Rollouts of all shards; more, where a number of an episode comes twice."""
+        """Upper bound of the rollouts of all shards; exact unless a number occurs twice."""
         return len(self.conditions) * sum(map(count_numbers, self.episodes.values()))
 
     def items(self) -> tuple[WorkItem, ...]:
         """Return the rollouts of the shard in canonical order: by episode and condition.
 
-        An episode's conditions follow each other, so that even a run that is cut off compares
-        conditions over the same episodes. Shards take episodes in turn from the shuffled order:
-        no two have one in common, together they are the plan, and they differ by one at most.
+        Shards take episodes in turn from the shuffled order: they are disjoint, together they are
+        the plan, and their sizes differ by at most one episode.
         """
         number, of = _read_shard(self.shard)
         known = [
@@ -84,9 +96,9 @@ class Plan:
             for group, numbers in self.episodes.items()
             for index in parse_numbers(numbers)
         ]
-        mine = sorted(sorted(known, key=_lot)[number - 1 :: of])
+        episodes = sorted(sorted(known, key=_shuffle_key)[number - 1 :: of])
         names = [one.name for one in in_order(self.conditions)]
-        return tuple(WorkItem(name, episode) for episode in mine for name in names)
+        return tuple(WorkItem(name, episode) for episode in episodes for name in names)
 
 
 def _read_shard(text: str) -> tuple[int, int]:
@@ -107,49 +119,46 @@ def plan_work(
     split: str = "test",
     shard: str = "1/1",
 ) -> Plan:
-    """Return the plan of a run over the query episodes of a buffer set: `known`; see `RunConfig`."""
-    there = sorted(known)
-    here: dict[str, list[int]] = {episode.family: [] for episode in there}
-    for episode in there:
+    """Return the plan of a run over a buffer set's query episodes, `known`; see `RunConfig`."""
+    every = sorted(known)
+    available: dict[str, list[int]] = {episode.family: [] for episode in every}
+    for episode in every:
         if episode.split == split:
-            here[episode.family].append(episode.index)
+            available[episode.family].append(episode.index)
     for family in families:
-        if family not in here:
-            raise UnknownNameError.among("family", family, "the buffer set", here)
-    asked = None if episodes is None else parse_numbers(episodes)
-    chosen = {}
-    for family in [name for name in here if not families or name in families]:
-        numbers, group = here[family], f"{family}/{split}"
-        missing = sorted(set(asked or ()) - set(numbers))
+        if family not in available:
+            raise UnknownNameError.among("family", family, "the buffer set", available)
+    selected = None if episodes is None else parse_numbers(episodes)
+    planned = {}
+    for family in [name for name in available if not families or name in families]:
+        numbers, group = available[family], f"{family}/{split}"
+        missing = sorted(set(selected or ()) - set(numbers))
         if missing or (families and not numbers):
             raise UnknownNameError(
                 f"the buffer set has no query episode {group}/{(missing or [0])[0]}"
                 + (f" and {len(missing) - 1} more" if len(missing) > 1 else ""),
-                f"It has episodes {format_numbers(numbers)} of {group}; `split` asks for others."
-                if numbers
-                else f"It has none of {group}: see `split`.",
+                f"Its episodes of {group} are {format_numbers(numbers) or 'none'}; see `split`.",
             )
         if numbers:
-            chosen[group] = format_numbers(asked or numbers)
+            planned[group] = format_numbers(selected or numbers)
     names = tuple(one.name for one in in_order(conditions))
-    if not chosen:
-        splits = sorted({one.split for one in there})
+    if not planned:
+        splits = sorted({one.split for one in every})
         raise InvalidOptionError(
-            f"there is nothing to run: the buffer set has no {split} episode",
-            f"Set `split`; there are {', '.join(splits)}.",
+            f"the buffer set has no {split} episode to run",
+            f"Set `split` to one of {', '.join(splits)}.",
         )
-    return Plan(chosen, names, shard)
+    return Plan(planned, names, shard)
 
 
 def shuffle_work(items: Iterable[WorkItem]) -> tuple[WorkItem, ...]:
-    """Return rollouts in the order in which they are run: episodes shuffled by a fixed seed.
+    """Return rollouts in the order in which they run: shuffled by episode, always the same order.
 
-    However early a run is cut off, it has seen all families and difficulties alike. The order of
-    two episodes is always the same, whatever else is planned; an episode's conditions stay
-    together.
+    A run that stops early has covered all families and difficulties evenly, and each episode under
+    all of its conditions.
     """
-    return tuple(sorted(items, key=lambda item: _lot(item.episode)))
+    return tuple(sorted(items, key=lambda item: _shuffle_key(item.episode)))
 
 
-def _lot(episode: EpisodeId) -> bytes:
+def _shuffle_key(episode: EpisodeId) -> bytes:
     return hashlib.sha256(str(episode).encode()).digest()

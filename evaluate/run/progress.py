@@ -1,4 +1,4 @@
-"""Show how a run goes: success rates by family and condition, and the time left."""
+"""Show the progress of a run: success rates by family and condition, and the time left."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,17 +15,13 @@ from .log import is_done
 from .plan import WorkItem
 
 Cell = tuple[str, str]
-"""A family, and a condition."""
+"""Family and condition."""
 
 
 class RunProgress:
-    """A table of successes so far above a progress bar, on stderr; use as a context manager.
+    """A table of successes above a progress bar, on stderr; use as a context manager.
 
-    Where stderr is no terminal, a line is written whenever a family's condition is done.
-
-    Args:
-        quiet: Show nothing.
-        unit: What is counted.
+    If stderr is no terminal, it prints a line whenever a family is done under a condition.
     """
 
     def __init__(self, *, quiet: bool = False, unit: str = "rollouts"):
@@ -33,8 +29,8 @@ class RunProgress:
         self._bar = WorkProgress(unit=unit, quiet=quiet, above=self.rates)
         self._console = self._bar.console
         self._planned: Counter[Cell] = Counter()
-        self._ended: dict[Cell, Counter[str]] = {}  # by status: whole rows would be too many
-        self._left = 0  # rollouts that are still to end
+        self._ended: dict[Cell, Counter[str]] = {}  # by status
+        self._left = 0  # unfinished rollouts
 
     def __enter__(self) -> Self:
         if self._console.is_terminal:
@@ -46,16 +42,16 @@ class RunProgress:
             self._bar.__exit__(*exception)
 
     def start(self, items: Sequence[WorkItem], done: Sequence[Rollout]) -> None:
-        """Take what is planned, and the rows that an earlier run finished."""
+        """Show the plan, and the rows of earlier invocations."""
         self._planned = Counter((item.episode.family, item.condition) for item in items)
         self._ended, self._left = _count(done), len(items) - len(done)
         self._bar.start("evaluate", len(items))
         self._bar.advance(len(done), before=True)
         if done and not self._console.is_terminal:
-            self._console.print(f"{len(done)} of {len(items)} {self._unit} are done already")
+            self._console.print(f"{len(done)} of {len(items)} {self._unit} are already done")
 
     def row(self, row: Rollout, node: str | None = None) -> None:
-        """Count a row, and which node of a cluster it is from."""
+        """Count a row, and the node of a cluster that it comes from."""
         cell = (row.family, row.condition)
         ended = self._ended.setdefault(cell, Counter())
         ended[row.status] += 1
@@ -75,7 +71,7 @@ class RunProgress:
 
 
 def rate_table(rows: Iterable[Rollout]) -> Table:
-    """Return successes of all that ended, by family and condition, errors apart."""
+    """Return the success rates by family and condition, with errors apart."""
     return _table(_count(rows))
 
 
@@ -102,10 +98,10 @@ def _table(ended: Mapping[Cell, Counter[str]]) -> Table:
 
 
 def _rate(counts: Counter[str]) -> str:
-    """Return `3/5 60%`, errors apart, and how many broke; of very many only the share."""
+    """Return `3/5 60%`, or of 100 and more `60%`, and the number of errors."""
     broken, won = counts[Status.ERROR], counts[Status.SUCCESS]
     scored = counts.total() - broken
-    # So that nine families by five conditions fit into 80 columns.
+    # Nine families by five conditions fit into 80 columns.
     number = f"{won}/{scored} " if scored < 100 else ""
     rate = f"{number}{won / scored:.0%}" if scored else ""
     return ", ".join(filter(None, (rate, f"{broken} broke" if broken else "")))

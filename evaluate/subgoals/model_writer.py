@@ -1,4 +1,4 @@
-"""Subgoals that a vision-language model writes: it reads the history and what is seen now."""
+"""Subgoals from a vision-language model that reads the history and the current view."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -9,35 +9,30 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.models.model import ChatModel, Message, Part, Reply
-from robomme_interference_data.evaluate.models.prompts import told
+from robomme_interference_data.evaluate.models.prompts import as_text
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.schema.sampling import spread
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Observation, Simulator
 
 from .prompt import Answer, load_prompt, merge_near
-from .writer import (
-    CAMERA,
-    History,
-    SubgoalWriter,
-    Turn,
-)
+from .writer import CAMERA, History, SubgoalWriter, Turn
 
 
 class ModelWriter(SubgoalWriter):
     """A vision-language model in front of a policy.
 
-    With a prompt that shows recent frames, the model may keep some of them: of those that lie
-    near each other their median is kept (`MemER`), and all come before later questions. An answer
-    that cannot be used leaves the subgoal what it was, the goal itself at first.
+    With a prompt that shows recent frames, the model may select key frames, which later prompts
+    show; of frames near each other the median is kept (`MemER`). After an invalid answer the
+    subgoal stays unchanged; at first it is the goal.
 
     Args:
         model: The model.
-        prompt: How it is asked: see `load_prompt`.
-        frames: Frames of the history that it is shown, evenly spread.
-        recent: Live frames that it is shown, where the prompt does.
-        stride: From one of them to the next.
-        near: Frames at most so far apart are near each other.
+        prompt: The prompt: see `load_prompt`.
+        frames: Number of history frames that the model sees, evenly spread.
+        recent: Number of live frames that it sees, if the prompt shows them.
+        stride: Steps from one of them to the next.
+        near: Maximum distance of frames near each other.
     """
 
     def __init__(
@@ -63,7 +58,7 @@ class ModelWriter(SubgoalWriter):
         self._seen: deque[NDArray[np.uint8]] = deque(maxlen=(recent - 1) * stride + 1)
 
     def start(self, history: History, info: RolloutInfo, simulator: Simulator) -> None:
-        """Decode what the model is shown of the history."""
+        """Decode the history frames that the model sees."""
         super().start(history, info, simulator)
         places = spread(0, len(history), self._frames)
         self._history: list[Part] = [history.video(places)] if places else []
@@ -72,16 +67,16 @@ class ModelWriter(SubgoalWriter):
         self._earlier: list[Subgoal] = []
         self._kept: dict[int, NDArray[np.uint8]] = {}
         self._seen.clear()
-        self._count = 0  # live frames that were seen
+        self._count = 0  # live frames so far
 
     def watch(self, observations: Sequence[Observation]) -> None:
-        """Keep the last live frames, where the model is shown them."""
+        """Keep the last live frames, if the prompt shows them."""
         for one in observations:
             self._seen.append(one.images[CAMERA])
             self._count += 1
 
     def next(self, observation: Observation, step: int) -> Subgoal:
-        """Ask the model; what it does not say is left as it was."""
+        """Ask the model; an invalid answer leaves the subgoal unchanged."""
         image = observation.images[CAMERA]
         size = (image.shape[0], image.shape[1])
         recent = self._recent_frames()
@@ -92,21 +87,21 @@ class ModelWriter(SubgoalWriter):
             "<recent>": list(images.values()),
             "<image>": [image],
         }
-        asked = self.prompt.fill(self._goal, self._earlier, size, views)
+        question = self.prompt.fill(self._goal, self._earlier, size, views)
         reply = self._model.reply(
-            [Message("system", (self.prompt.system,)), Message("user", asked)]
+            [Message("system", (self.prompt.system,)), Message("user", question)]
         )
         answer, fault = self._read(reply, size, len(recent))
         if answer is not None:
             self._subgoal = answer.subgoal
             if answer.subgoal.simple not in [one.simple for one in self._earlier[-1:]]:
-                self._earlier.append(answer.subgoal)  # not where only its points have moved
+                self._earlier.append(answer.subgoal)  # not if only its points moved
             self._keep(images, [recent[place] for place in answer.keyframes])
         self.turns.append(
             Turn(
                 step,
                 self._subgoal.grounded,
-                prompt=told(asked),
+                prompt=as_text(question),
                 answer=reply.text,
                 fault=fault,
                 keyframes=tuple(sorted(self._kept)),
@@ -118,7 +113,7 @@ class ModelWriter(SubgoalWriter):
         return self._subgoal
 
     def metadata(self) -> dict[str, Any]:
-        """Return what the model says of itself, and the SHA-256 of the prompt's file."""
+        """Return the model's metadata, and the SHA-256 of the prompt's file."""
         return {"model": self._model.metadata(), "prompt_sha256": self._sha256}
 
     def close(self) -> None:
@@ -129,19 +124,19 @@ class ModelWriter(SubgoalWriter):
         self, reply: Reply, size: tuple[int, int], shown: int
     ) -> tuple[Answer | None, str | None]:
         if not reply.text.strip():
-            return None, "it refused, or said nothing"
+            return None, "an empty answer"
         try:
             return self.prompt.read(reply.text, size, shown), None
         except InvalidOptionError as error:
             return None, error.message
 
     def _recent_frames(self) -> list[int]:
-        """Return the numbers of the live frames that the model is shown, the last one of now."""
+        """Return the numbers of the live frames that the model sees, the current one last."""
         if not self.prompt.watches:
             return []
         first = self._count - len(self._seen)
         return list(range(self._count - 1, first - 1, -self._stride))[: self._recent][::-1]
 
     def _keep(self, images: dict[int, NDArray[np.uint8]], chosen: Sequence[int]) -> None:
-        there = self._kept | {number: images[number] for number in chosen}
-        self._kept = {number: there[number] for number in merge_near([*there], self._near)}
+        frames = self._kept | {number: images[number] for number in chosen}
+        self._kept = {number: frames[number] for number in merge_near([*frames], self._near)}

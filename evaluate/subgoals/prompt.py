@@ -1,4 +1,4 @@
-"""How a model is asked for subgoals, and how its answers are read; prompts are files."""
+"""Prompts for subgoals, and how answers are parsed; prompts are files."""
 
 import json
 import re
@@ -16,23 +16,18 @@ PROMPTS = ("simple", "grounded", "memer")
 """The prompts that come with the package: for SimpleSG, GroundSG and MemER."""
 
 VIEWS = ("<history>", "<keyframes>", "<recent>", "<image>")
-"""Where images stand in a prompt: the history, key frames that were kept, the last live frames
-(`MemER`), and what is seen now. A list without an image is the word `none`."""
+"""Placeholders of images: the history, the selected key frames, the last live frames (`MemER`), and
+the current view."""
 
 _MOST_LETTERS = 300
 
 _SPECIAL = re.compile(r"<\|\w+\|>")
-"""Special tokens of a model, such as `<|box_start|>`: servers mostly leave them out of answers."""
+"""Special tokens of a model, such as `<|box_start|>`: most servers remove them from answers."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What an answer says.
-
-    Attributes:
-        subgoal: What to do next.
-        keyframes: Numbers of the recent frames that are to be kept, from 0.
-    """
+    """A parsed answer: the subgoal, and the numbers of the recent frames to keep, from 0."""
 
     subgoal: Subgoal
     keyframes: tuple[int, ...] = ()
@@ -43,15 +38,15 @@ class Prompt:
     """A prompt, as its TOML file has it.
 
     Attributes:
-        system: What the model is told first.
-        first: What it is asked at first; may hold `VIEWS`, and `{goal}`.
-        then: What it is asked later; also `{subgoals}`, the earlier ones, numbered.
-        answer: `text`, or `json`.
-        subgoal_key: Of a JSON answer: the key of the subgoal.
-        keyframes_key: Of a JSON answer: the key of the numbers of frames to keep, from 1.
-        point: How a point is written, with `{y}` and `{x}`.
-        box: How a box is written, with `{y0}`, `{x0}`, `{y1}` and `{x1}`; its middle counts.
-        grid: What `{y}` and `{x}` go up to over the whole image; 0 if they are pixels.
+        system: The system message.
+        first: The first question; may contain `VIEWS` and `{goal}`.
+        then: Later questions; may also contain `{subgoals}`, the earlier ones, numbered.
+        answer: `text` or `json`.
+        subgoal_key: Key of the subgoal in a JSON answer.
+        keyframes_key: Key of the numbers of frames to keep, from 1, in a JSON answer.
+        point: Format of a point, with `{y}` and `{x}`.
+        box: Format of a box, with `{y0}`, `{x0}`, `{y1}` and `{x1}`; its center counts.
+        grid: Maximum of `{y}` and `{x}` over the whole image; 0 if they are pixels.
     """
 
     system: str
@@ -82,7 +77,7 @@ class Prompt:
 
     @property
     def watches(self) -> bool:
-        """Whether it shows the last live frames: then the model may keep some of them."""
+        """Whether it shows the last live frames, of which the model may keep some."""
         return any("<recent>" in text for text in (self.first, self.then))
 
     def fill(
@@ -92,16 +87,9 @@ class Prompt:
         size: tuple[int, int],
         views: Mapping[str, Sequence[Part]],
     ) -> tuple[Part, ...]:
-        """Return what the model is asked, words and images in order.
-
-        Args:
-            goal: The goal in words.
-            earlier: Subgoals before this one; without any, `first` is asked.
-            size: Height and width of the front image in pixels.
-            views: Images for each of `VIEWS`.
-        """
-        told = [f"{n}. {self.write(subgoal, size)}" for n, subgoal in enumerate(earlier, 1)]
-        words = {"{goal}": goal, "{subgoals}": "; ".join(told)}
+        """Return the question, text and images in order, for images of `size`, (H, W) px."""
+        numbered = [f"{n}. {self.write(subgoal, size)}" for n, subgoal in enumerate(earlier, 1)]
+        words = {"{goal}": goal, "{subgoals}": "; ".join(numbered)}
         return fill(
             self.then if earlier else self.first,
             words,
@@ -117,32 +105,26 @@ class Prompt:
         return write_points(subgoal.text, points)
 
     def read(self, text: str, size: tuple[int, int], shown: int = 0) -> Answer:
-        """Read an answer.
-
-        Args:
-            text: What the model wrote.
-            size: Height and width of the front image in pixels.
-            shown: How many recent frames it was shown.
-        """
+        """Parse an answer about an image of `size`, (H, W) px, and `shown` recent frames."""
         keyframes: tuple[int, ...] = ()
         if self.answer == "json":
-            said = _json_object(text)
-            text = said.get(self.subgoal_key)  # type: ignore[assignment]
+            fields = _json_object(text)
+            text = fields.get(self.subgoal_key)  # type: ignore[assignment]
             if not isinstance(text, str):
                 raise InvalidOptionError.expected(f"its {self.subgoal_key}", text, "text")
-            keyframes = _places(said.get(self.keyframes_key) or [], shown)
+            keyframes = _places(fields.get(self.keyframes_key) or [], shown)
         lines = [line.strip().strip("\"'`*").strip() for line in text.strip().splitlines()]
         words = _SPECIAL.sub("", next(filter(None, lines), ""))
         if not 0 < len(words) <= _MOST_LETTERS:
             raise InvalidOptionError.expected(
-                "the answer", words[:60], f"a subgoal of up to {_MOST_LETTERS} letters in a line"
+                "the answer", words[:60], f"a subgoal of up to {_MOST_LETTERS} letters in one line"
             )
-        found, numbers = read_points(words, self._pattern)
-        return Answer(Subgoal(found, tuple(self._pixel(one, size) for one in numbers)), keyframes)
+        plain, numbers = read_points(words, self._pattern)
+        return Answer(Subgoal(plain, tuple(self._pixel(one, size) for one in numbers)), keyframes)
 
     @cached_property
     def _pattern(self) -> re.Pattern[str]:
-        """What a box or a point looks like; blanks may stand anywhere in it."""
+        """Pattern of a box or a point, with any spaces."""
         forms = []
         for name, form in (("b", self.box), ("p", self.point)):
             parts = re.split(r"(\{\w+\})|\s+", _SPECIAL.sub("", form))
@@ -175,23 +157,22 @@ def _to_grid(pixel: int, side: int, grid: int) -> int:
 
 
 def _json_object(text: str) -> dict[str, Any]:
-    """Return the JSON object in an answer, whatever stands around it."""
+    """Return the JSON object in an answer, with any text around it."""
     start, stop = text.find("{"), text.rfind("}")
     try:
-        said = json.loads(text[start : stop + 1])
+        value = json.loads(text[start : stop + 1])
     except (ValueError, RecursionError):
-        said = None
-    if not isinstance(said, dict):
+        value = None
+    if not isinstance(value, dict):
         raise InvalidOptionError.expected("the answer", text[:60], "a JSON object")
-    return said
+    return value
 
 
 def _places(given: Any, shown: int) -> tuple[int, ...]:
-    """Return numbers of frames, which answers count from 1, counted from 0."""
-    sound = isinstance(given, list) and all(
-        type(number) is int and 1 <= number <= shown for number in given
-    )
-    if not sound:
+    """Return numbers of frames, from 0, of an answer, which counts them from 1."""
+    if not isinstance(given, list) or any(
+        type(number) is not int or not 1 <= number <= shown for number in given
+    ):
         raise InvalidOptionError.expected(
             "its frames to keep", given, f"numbers from 1 to {shown}, the recent frames shown"
         )
@@ -201,8 +182,7 @@ def _places(given: Any, shown: int) -> tuple[int, ...]:
 def merge_near(frames: Sequence[int], distance: int) -> list[int]:
     """Return the median of each group of frames, of an even number the upper one, ascending.
 
-    A frame belongs to the group of the one before it if it is at most `distance` after it (the
-    rule of the released MemER client).
+    A frame at most `distance` after another is in the same group, as in the released MemER client.
     """
     groups: list[list[int]] = []
     for frame in sorted(set(frames)):
@@ -214,9 +194,5 @@ def merge_near(frames: Sequence[int], distance: int) -> list[int]:
 
 
 def load_prompt(name: str) -> tuple[Prompt, str]:
-    """Read a prompt: one of `PROMPTS`, or a TOML file by its path.
-
-    Returns:
-        The prompt, and the SHA-256 of its file.
-    """
+    """Read one of `PROMPTS`, or a TOML file; return it with the SHA-256 of its file."""
     return read_prompt(Prompt, __package__, PROMPTS, name, "docs/subgoals.md")

@@ -1,4 +1,4 @@
-"""What writes subgoals for a policy, before each chunk of its actions."""
+"""The interface of subgoal writers, which run before each chunk of a policy's actions."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -12,55 +12,51 @@ from robomme_interference_data.constants import FPS
 from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.evaluate.models.model import Video
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
+from robomme_interference_data.evaluate.run.history import HistoryReader
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Observation, Simulator
 
 CAMERA = "front"
 
 ORACLE = "oracle"
-"""The writer that is no model."""
+"""Name of the writer that reads the simulator."""
 
 
 class History:
-    """The history that a policy is given, in the front camera's images; decoded when asked for.
+    """The history frames that a policy gets, of the front camera; decoded on request."""
 
-    Args:
-        buffer: The buffer.
-        given: Its frames that are given, ascending.
-    """
-
-    def __init__(self, buffer: Buffer, given: Sequence[int]):
-        self._buffer, self._given = buffer, given
+    def __init__(self, buffer: Buffer, given: Sequence[int], reader: HistoryReader):
+        self._buffer, self._given, self._reader = buffer, given, reader
 
     def __len__(self) -> int:
         return len(self._given)
 
     def frames(self, places: Sequence[int]) -> NDArray[np.uint8]:
-        """Decode some of the frames, `(n, H, W, 3) uint8` RGB, by their places, ascending."""
+        """Decode frames by their ascending places, `(n, H, W, 3) uint8` RGB."""
         indices = [self._given[place] for place in places]
-        [chunk] = self._buffer.stream(len(indices), (CAMERA,), indices)
-        return chunk.frames[CAMERA]
+        chunks = self._reader.stream(self._buffer, 64, (CAMERA,), indices)
+        return np.concatenate([chunk.frames[CAMERA] for chunk in chunks])
 
     def video(self, places: Sequence[int]) -> Video:
-        """Decode frames as a video that takes as long as they did."""
+        """Decode frames as a video in real time."""
         seconds = (places[-1] - places[0]) / FPS
         return Video(self.frames(places), (len(places) - 1) / seconds if seconds else FPS)
 
 
 @dataclass(frozen=True)
 class Turn:
-    """One subgoal, for the record: a line in the run's folder.
+    """One subgoal: a line of a transcript in the run's folder.
 
     Attributes:
-        step: Actions that were executed before it.
-        subgoal: What the policy was told, with places as `<y, x>`.
-        prompt: What the model was asked; images are written `[image]` and `[video of n frames]`.
-        answer: What it answered.
-        fault: Why the answer could not be used; None if it could.
-        keyframes: Live frames that are kept, by the number of actions before them.
-        tokens: Tokens of question and answer; None if the model does not say.
-        calls: How often the model was asked.
-        seconds: Until the answer was there.
+        step: Number of actions before it.
+        subgoal: The subgoal, with points as `<y, x>`.
+        prompt: The prompt of the model, with `[image]` and `[video of n frames]`.
+        answer: The answer of the model.
+        fault: Why the answer is invalid; None if it is valid.
+        keyframes: The selected key frames, by the number of actions before them.
+        tokens: Tokens of prompt and answer; None if not reported.
+        calls: Number of calls of the model.
+        seconds: Time until the answer.
     """
 
     step: int
@@ -78,12 +74,12 @@ class SubgoalWriter(ABC):
     """Writes subgoals, one rollout at a time.
 
     The calls come in this order: `start`; `watch` with the first live observation; `next`; up to
-    16 actions are executed; `watch` with what was seen after them; `next`; and so on.
+    16 actions are executed; `watch` with the observations after them; `next`; and so on.
 
     Attributes:
-        every_frame: Whether `watch` is to get what is seen after each action; if not, only what
-            the policy acts on next.
-        turns: What it has written in this rollout.
+        every_frame: Whether `watch` gets the observations after every action; if not, only the one
+            on which the policy acts next.
+        turns: The subgoals of this rollout.
     """
 
     every_frame: bool = False
@@ -92,27 +88,27 @@ class SubgoalWriter(ABC):
         self.turns: list[Turn] = []
 
     def start(self, history: History, info: RolloutInfo, simulator: Simulator) -> None:
-        """Forget everything and prepare for a rollout; only `oracle` may use the simulator."""
+        """Clear the state and prepare for a rollout; only `oracle` may use the simulator."""
         self.turns = []
 
     def watch(self, observations: Sequence[Observation]) -> None:
-        """Take what was seen since the last call; the last one is of now."""
+        """Receive the observations since the last call, the current one last."""
 
     @abstractmethod
     def next(self, observation: Observation, step: int) -> Subgoal:
-        """Return what is to be done next.
+        """Return the next subgoal.
 
         Args:
-            observation: What is seen now; `watch` has had it.
-            step: Actions that were executed.
+            observation: The current observation, the last one of `watch`.
+            step: Number of actions so far.
         """
 
     @abstractmethod
     def metadata(self) -> dict[str, Any]:
-        """Return plain values that say which writer this is, for the record of the run."""
+        """Return plain values that identify the writer, for `run.json`."""
 
     def close(self) -> None:
-        """Release everything."""
+        """Release all resources."""
 
 
 class OracleWriter(SubgoalWriter):

@@ -1,7 +1,7 @@
 """Specs, such as `kind:target`, with `NAME=VALUE` options, and the factories that they select.
 
-Policies, models and simulators are selected by specs. A factory is imported when it is first used,
-since it may import large libraries.
+Policies, models, encoders and simulators are named by such texts. A factory is imported on first
+use, because it may import large libraries.
 """
 
 import inspect
@@ -37,8 +37,10 @@ class Kind:
         target: Regular expression of the target; its named groups are arguments of the factory.
         default: The target of a spec without one.
         given: Further arguments of the factory.
-        extra: The extra that installs its libraries.
-        no_effect: Options, and keys of metadata, that do not affect results.
+        extra: The extra that has its libraries.
+        no_effect: Options, and keys of metadata, that change no result.
+        valid: Further check of the target.
+        on_hub: Whether the target is a folder, or a model on the Hub that `pin` pins.
     """
 
     form: str
@@ -48,11 +50,13 @@ class Kind:
     given: Mapping[str, Any] = field(default_factory=dict)
     extra: str = ""
     no_effect: tuple[str, ...] = ()
+    valid: Callable[[str], bool] = lambda target: True
+    on_hub: bool = False
 
 
 @dataclass(frozen=True)
 class Spec:
-    """A parsed spec: its kind, its target, and the factory's arguments."""
+    """A parsed text: its kind, what follows the colon, and the arguments in that."""
 
     kind: str
     target: str = ""
@@ -69,7 +73,7 @@ class Registry:
         self._what, self.kinds = what, kinds
 
     def parse(self, text: str) -> Spec:
-        """Parse a spec."""
+        """Parse a text: `UnknownNameError` for an unknown kind, else `InvalidOptionError`."""
         name, colon, target = text.partition(":")
         if name not in self.kinds:
             forms = ", ".join(kind.form for kind in self.kinds.values())
@@ -80,20 +84,44 @@ class Registry:
         kind = self.kinds[name]
         target = target if colon else kind.default
         match = re.fullmatch(kind.target, target, re.DOTALL)
-        if match is None or bool(colon) > bool(target):
+        if match is None or bool(colon) > bool(target) or not kind.valid(target):
             raise InvalidOptionError.expected(self._what, text, kind.form)
         return Spec(name, target, {**kind.given, **match.groupdict()})
 
+    def pin(self, text: str) -> str:
+        """Return the full text, with the commit of a model on the Hub: a branch may move."""
+        spec = self.parse(text)
+        if self.kinds[spec.kind].on_hub:
+            from robomme_interference_data.storage.hub import HubFiles, locate
+
+            files = locate(spec.target, "model")
+            if isinstance(files, HubFiles):
+                return f"{spec.kind}:{files.repo_id}@{files.commit}"
+        return str(spec)
+
     def factory(self, spec: Spec, name: str | None = None) -> Factory:
-        """Import the factory of a spec, or another name in its module."""
+        """Import the factory of a spec, or another name of the same module."""
         kind = self.kinds[spec.kind]
         module, _, default = kind.factory.partition(":")
         return load_extra(module, name or default, f"the {self._what} {spec}", kind.extra)
 
+    def options(
+        self, text: str, options: Iterable[str], also: Iterable[str] = ()
+    ) -> dict[str, Any]:
+        """Return all options, defaults included; see `bind_options`."""
+        spec = self.parse(text)
+        what = f"{self._what} {text!r}"
+        return bind_options(what, self.factory(spec), spec.given, options, also)
+
+    def make(self, text: str, options: Iterable[str] = (), also: Iterable[str] = ()) -> Any:
+        """Make what a text and its `NAME=VALUE` options describe; see `bind_options`."""
+        spec = self.parse(text)
+        return self.factory(spec)(**spec.given, **self.options(text, options, also))
+
     def identity(self, spec: Spec, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the options, or entries of metadata, that can affect results."""
-        ignored = self.kinds[spec.kind].no_effect
-        return {name: value for name, value in sorted(values.items()) if name not in ignored}
+        """Return the options, or entries of metadata, that can change a result."""
+        without = self.kinds[spec.kind].no_effect
+        return {name: value for name, value in sorted(values.items()) if name not in without}
 
 
 def import_factory(what: str, target: str) -> Factory:
@@ -101,9 +129,9 @@ def import_factory(what: str, target: str) -> Factory:
     module, _, name = target.partition(":")
     if module == "__main__":
         raise InvalidOptionError(
-            f"{what} {target!r}: worker processes cannot import from __main__",
-            "Move the function to a module, a .py file next to the script or on PYTHONPATH, and "
-            "use MODULE:FUNCTION.",
+            f"{what} {target!r}: worker processes run another program, which has no such function",
+            "Put the function into a module, a .py file beside the script or on PYTHONPATH, and "
+            "write MODULE:FUNCTION.",
         )
     try:
         loaded = import_module(module)
@@ -128,13 +156,13 @@ def bind_options(
 ) -> dict[str, Any]:
     """Return all options of a call of a factory, including defaults.
 
-    A value is text if the factory declares it as text; else it is parsed as JSON if possible.
-    Messages name `what` is made, such as `policy 'replay:full'`, and the options that are accepted
-    `also`, by something else.
+    A value is text where the factory declares text, else JSON (`3`, `0.5`, `true`, `null`) where it
+    parses as JSON. Invalid options raise `InvalidOptionError`; its message names `what` is made,
+    such as `policy 'replay:full'`, and lists options that something else takes, `also`.
     """
     signature, declared = signature_of(factory), _declared_types(factory)
     values: dict[str, Any] = {}
-    for name, text in _parse_options(what, options).items():
+    for name, text in _split_options(what, options).items():
         kinds = declared.get(name)
         value = text if kinds and str in kinds else _parse_json(text)
         if kinds and float in kinds and type(value) is int:
@@ -168,7 +196,7 @@ def signature_of(factory: Factory) -> inspect.Signature:
         return inspect.signature(lambda **options: None)
 
 
-def _parse_options(what: str, options: Iterable[str]) -> dict[str, str]:
+def _split_options(what: str, options: Iterable[str]) -> dict[str, str]:
     values: dict[str, str] = {}
     for option in options:
         name, equals, value = option.partition("=")

@@ -1,4 +1,4 @@
-"""Digests of model files, kept so that large ones are read once on a machine."""
+"""Digests of model files, cached so that large files are read once on a machine."""
 
 import hashlib
 from collections.abc import Sequence
@@ -10,10 +10,7 @@ from robomme_interference_data.storage.files import canonical_json, digest_folde
 
 
 def digest_weights(folder: Path, patterns: Sequence[str]) -> str:
-    """Return `digest_folder`, from the cache where no file has another size or time since.
-
-    A cache that cannot be written costs time only.
-    """
+    """Return `digest_folder`, from the cache if sizes and times of the files did not change."""
     paths = sorted({path for one in patterns for path in folder.rglob(one) if path.is_file()})
     stats = [(str(path.relative_to(folder)), path.stat()) for path in paths]
     state = [[name, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns] for name, stat in stats]

@@ -66,7 +66,7 @@ def test_retrieval_by_what_is_seen_under_a_shift(tmp_path: Path) -> None:
         kept(buffer_set, shift=s, **options) for s in ("none", "light:1", "clutter:3")
     )
     assert plain == same != black  # light:1 looks as always, clutter:3 is black
-    with pytest.raises(InvalidOptionError, match="the shift light:1 says nothing"):
+    with pytest.raises(InvalidOptionError, match="the shift light:1 has no effect"):
         ceiling(load_buffer_set(buffer_set), CeilingConfig(shift="light:1"))
 
 
@@ -82,7 +82,7 @@ def test_what_cannot_be_told(tiny_buffers: Path, monkeypatch: pytest.MonkeyPatch
         ceiling(buffer_set, CeilingConfig(retrieval="thumbnail", conditions=("no-history", "k0")))
     untold = SimpleNamespace(record=SimpleNamespace(evidence=None))
     monkeypatch.setattr(BufferSet, "query", lambda *_: untold)
-    with pytest.raises(InvalidOptionError, match="unknown which frames"):
+    with pytest.raises(InvalidOptionError, match="that show the answer are unknown"):
         ceiling(buffer_set, CeilingConfig())
 
 

@@ -38,7 +38,9 @@ from robomme_interference_data.evaluate.rollout.checks import (
 from robomme_interference_data.evaluate.rollout.worker import simulator_options
 from robomme_interference_data.evaluate.run.plan import plan_work
 from robomme_interference_data.evaluate.systems import name_system
+from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Serial
+from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.registry import SIMULATORS
 
 pytestmark = pytest.mark.usefixtures("world")
@@ -57,15 +59,15 @@ SAYS = {"policy": "python:support.own_policies:says"}
         ({"shift": "light:2"}, InvalidOptionError, "support.worlds:World does not support shifts"),
         ({"split": "tset"}, InvalidOptionError, "'tset' is none of train, val, test"),
         ({"conditions": ("k2",)}, UnknownNameError, "condition 'k2' is not in"),
-        ({"workers": 0}, InvalidOptionError, "workers 0; expected more than 0"),
-        ({"rollout_timeout": float("nan")}, InvalidOptionError, "rollout_timeout nan"),
+        ({"workers": 0}, InvalidOptionError, "workers 0; expected a number above 0"),
+        ({"rollout_timeout_s": float("nan")}, InvalidOptionError, "rollout_timeout_s nan"),
         ({"system": "pi05_baseline"}, InvalidOptionError, "pi05_baseline takes no history, so k0"),
         (
             {"system": "retrieval-framesamp-modul", "retrieval": "thumbnail"},
             InvalidOptionError,
             "has nothing to retrieve from under no-history",
         ),
-        ({"system": "retrieval-framesamp-modul"}, InvalidOptionError, "and none is given"),
+        ({"system": "retrieval-framesamp-modul"}, InvalidOptionError, "`retrieval` is None"),
         ({"retrieval_rule": "oracle"}, InvalidOptionError, "`retrieval_rule` has no effect"),
         ({"retrieval": "thumbnail", "retrieval_camera": "nose"}, UnknownNameError, "camera 'nose'"),
         ({"retrieval": "thumbnail"}, MissingFileError, "'thumbnail'"),
@@ -127,7 +129,7 @@ def test_by_default_all_conditions_that_apply_are_run(tmp_path: Path) -> None:
     assert conditions("baseline", system="pi05_baseline") == ["no-history"]
     still = "python:support.own_policies:Still"  # takes no history
     assert conditions("still", policy=still) == ["no-history"]
-    with pytest.raises(InvalidOptionError, match="takes no history, so k0 says nothing"):
+    with pytest.raises(InvalidOptionError, match="takes no history, so k0 has no effect"):
         run_one(tmp_path / "k0", policy=still, conditions=("k0",))
 
 
@@ -161,6 +163,21 @@ def test_the_simulator_is_made_before_the_folder_and_only_for_rollouts_that_are_
         run_one(tmp_path / "whole", conditions=("no-history", "k0"), **sample)
 
 
+def test_families_that_the_simulator_does_not_play(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Other(Simulator):
+        @classmethod
+        def episodes(cls) -> list[EpisodeId]:
+            return [EpisodeId("PatternLock", "test", 0)]
+
+    buffer_set = load_buffer_set(config().buffer_set)
+    monkeypatch.setitem(SIMULATORS, "sample", Other)
+    settings = config(simulator="sample", policy="noop")
+    plan = plan_work(buffer_set.episode_ids, conditions=("k0",))
+    with pytest.raises(InvalidOptionError, match="sample does not play the family") as raised:
+        check_plan(settings, name_system("noop"), buffer_set, plan, plan.items())
+    assert "It plays PatternLock." in (raised.value.hint or "")
+
+
 def test_only_what_somebody_looks_at_is_drawn() -> None:
     def options(name: str, *watched: str, **changes: Any) -> dict[str, Any]:
         return simulator_options(config(simulator=name, **changes), watched)
@@ -171,7 +188,7 @@ def test_only_what_somebody_looks_at_is_drawn() -> None:
     step = {"retrieval": "thumbnail", "retrieval_camera": "wrist"}
     assert options("tabletop", "front", **step)["cameras"] == ("front", "wrist")
     assert options("tabletop", videos=True)["cameras"] == ("front", "wrist")
-    assert options("robomme", "front", robomme_python="./py", simulator_timeout=100.0) == {
+    assert options("robomme", "front", robomme_python="./py", simulator_timeout_s=100.0) == {
         "python": "./py",
         "cameras": ("front",),
         "answer_s": 90.0,
@@ -260,7 +277,9 @@ def test_rows_are_named_after_policy_and_retrieval_step(
 def test_the_papers_retrieval_system_chooses_by_max(tiny_buffers: Path) -> None:
     served = {"policy": "websocket://h:1", "retrieval": "siglip"}
     check_name(tiny_buffers, "retrieval-framesamp-modul", **served)
-    with pytest.raises(InvalidOptionError, match="chooses by max, not by last"):
+    with pytest.raises(InvalidOptionError, match="the rule max, not last"):
         check_name(tiny_buffers, "retrieval-framesamp-modul", retrieval_rule="last/0.9", **served)
-    with pytest.raises(InvalidOptionError, match="has no retrieval step, and one is given"):
+    with pytest.raises(
+        InvalidOptionError, match="has no retrieval step, and `retrieval` is siglip"
+    ):
         check_name(tiny_buffers, "perceptual-framesamp-modul", **served)

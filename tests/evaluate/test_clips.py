@@ -11,7 +11,6 @@ from support.worlds import World
 
 from robomme_interference_data import Buffer, load_buffer
 from robomme_interference_data.evaluate.rollout.clips import history_picture
-from robomme_interference_data.evaluate.run.log import clip_name
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.schema.rollouts import Rollout
 from robomme_interference_data.storage.encode import VideoEncoder
@@ -86,7 +85,7 @@ def test_a_rollout_that_breaks_leaves_its_clip_too_unless_it_had_not_begun(
 
     (trouble / "MoveCube-0").write_text("raise")
     row = roll()
-    assert "the world fell apart" in str(row.error) and row.video == clip_name(K1)
+    assert "the world fell apart" in str(row.error) and row.video == K1.clip
     shown = frames(tmp_path / "run" / row.video)
     assert len(shown) == 1 + 4 + 10  # it broke in its fifth step
     assert banner(shown[-1]) == pytest.approx([0, 0, 0], abs=12)

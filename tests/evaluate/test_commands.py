@@ -20,6 +20,7 @@ APP = typer.Typer(rich_markup_mode="markdown", pretty_exceptions_enable=False)
 APP.command()(commands.evaluate)
 APP.command()(commands.merge)
 APP.command()(commands.ceiling)
+OWN = "python:support.own_policies:"
 USUAL = "--simulator support.worlds:World --system mine --episodes 0"
 
 
@@ -52,7 +53,8 @@ def test_ceiling_prints_a_table_or_json(tiny_buffers: Path) -> None:
 def test_evaluate_writes_the_rows_as_json(
     tmp_path: Path, tiny_buffers: Path, families: str
 ) -> None:
-    line = f"evaluate {tiny_buffers} --policy noop {USUAL} --families {families} --conditions no-history,k1 --json"
+    line = f"evaluate {tiny_buffers} --policy noop {USUAL} --families {families}"
+    line += " --conditions no-history,k1 --json"
     done = type_in(f"{line} --out {tmp_path / 'run'}")
     assert done.exit_code == 0, done.output
     assert [
@@ -66,7 +68,7 @@ def test_evaluate_writes_the_rows_as_json(
 
 
 def test_options_of_the_policy_are_typed(tmp_path: Path, tiny_buffers: Path) -> None:
-    line = f"evaluate {tiny_buffers} --policy python:support.own_policies:Still {USUAL} --families MoveCube"
+    line = f"evaluate {tiny_buffers} --policy {OWN}Still {USUAL} --families MoveCube"
     line += f" --out {tmp_path / 'run'} --policy-option gripper=-1"
     done = type_in(line)
     assert done.exit_code == 0, done.output
@@ -92,7 +94,7 @@ def test_what_broke_is_told_with_the_command_to_go_on(
 def test_a_full_disk_names_the_file_and_the_command_to_go_on(
     tmp_path: Path, tiny_buffers: Path
 ) -> None:
-    line = f"evaluate {tiny_buffers} --policy python:support.own_policies:Filler {USUAL} --families MoveCube"
+    line = f"evaluate {tiny_buffers} --policy {OWN}Filler {USUAL} --families MoveCube"
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         done = type_in(f"{line} --out {tmp_path / 'run'}")

@@ -11,7 +11,7 @@ from support.runs import header, run, run_one
 from robomme_interference_data.errors import RunError
 from robomme_interference_data.evaluate import RunConfig, merge_runs
 from robomme_interference_data.evaluate.policies.identity import policy_identity
-from robomme_interference_data.evaluate.policies.registry import pin_policy
+from robomme_interference_data.evaluate.policies.registry import POLICIES
 
 pytestmark = pytest.mark.usefixtures("world")
 
@@ -29,7 +29,7 @@ def test_every_setting_is_classed() -> None:
     plan = {"families", "episodes", "conditions", "shard"}
     may_differ = {
         *("out", "no_resume", "robomme_python", "workers", "videos", "check_lesson", "cache"),
-        *("rollout_timeout", "simulator_timeout", "history_chunk", "max_errors"),
+        *("rollout_timeout_s", "simulator_timeout_s", "history_chunk", "max_errors"),
         *("serve", "executor", "ray_address", "cpus_per_worker", "gpus_per_worker"),
     }
     fields = {field.name for field in dataclasses.fields(RunConfig)}
@@ -59,7 +59,7 @@ def test_another_run_is_refused_and_the_difference_named(
 
 def test_what_may_differ_goes_on_with_the_run(tmp_path: Path) -> None:
     run_one(tmp_path / "run", history_chunk=7)
-    run_one(tmp_path / "run", check_lesson=True, rollout_timeout=5.0, cache=True)
+    run_one(tmp_path / "run", check_lesson=True, rollout_timeout_s=5.0, cache=True)
     starts = header(tmp_path / "run")["starts"]
     assert [one["settings"]["history_chunk"] for one in starts] == [7, 64]
     assert [one["settings"]["check_lesson"] for one in starts] == [False, True]
@@ -115,7 +115,7 @@ def test_a_privileged_policy_is_on_record(tmp_path: Path, caplog: pytest.LogCapt
 
 def test_what_of_a_policy_can_change_a_result() -> None:
     # The default memory is the same, written or not.
-    assert [pin_policy(text) for text in ("replay", "replay:full")] == ["replay:full"] * 2
+    assert [POLICIES.pin(text) for text in ("replay", "replay:full")] == ["replay:full"] * 2
     assert policy_identity("replay:window", (), {})["policy"] == "replay:window"
     here = {"policy": "websocket", "server": "a:1", "server_metadata": {"model": "m"}}
     assert policy_identity("websocket://a:1,b:2", ("response_s=5", "checkpoint=7"), here) == {

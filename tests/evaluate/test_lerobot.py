@@ -18,7 +18,7 @@ from robomme_interference_data.errors import (
     PolicyError,
 )
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
-from robomme_interference_data.evaluate.policies.registry import make_policy, pin_policy
+from robomme_interference_data.evaluate.policies.registry import POLICIES, make_policy
 
 torch, _ = lazy("torch"), lazy("lerobot")
 lerobot = lazy("robomme_interference_data.evaluate.policies.lerobot")
@@ -154,7 +154,7 @@ def rename(config: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (rename, "wants observation.images.top (3, 256, 256), which the simulators do not give"),
+        (rename, "wants observation.images.top (3, 256, 256), which the simulators do not provide"),
         (
             lambda config: config["input_features"][FRONT].update(shape=[3, 96, 96]),
             "wants observation.images.front of shape (3, 96, 96)",
@@ -232,10 +232,10 @@ def test_a_model_of_the_hub_is_known_by_its_commit(
     monkeypatch.setattr("huggingface_hub.snapshot_download", download)
     assert lerobot.find_policy("me/act") == (snapshot, f"me/act@{commit}")
     # A run asks once what a branch or tag stands for; its workers then ask for the commit.
-    assert pin_policy("lerobot:me/act@v1") == f"lerobot:me/act@{commit}"
+    assert POLICIES.pin("lerobot:me/act@v1") == f"lerobot:me/act@{commit}"
     policy = make_policy(f"lerobot:me/act@{commit}", ["device=cpu"])
     assert policy.metadata()["source"] == f"me/act@{commit}"
-    assert pin_policy(f"lerobot:{act}") == f"lerobot:{act}"
+    assert POLICIES.pin(f"lerobot:{act}") == f"lerobot:{act}"
 
 
 def test_it_is_known_by_the_digest_of_weights_and_configuration(act: Path, tmp_path: Path) -> None:

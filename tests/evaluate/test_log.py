@@ -1,27 +1,19 @@
 """The files of a run, held against golden ones, and what is no record."""
 
 import json
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.evaluate.policies.identity import plain
-from robomme_interference_data.evaluate.run.kind import stored_count
-from robomme_interference_data.evaluate.run.log import (
-    open_log,
-    read_record,
-    read_run,
-    row_line,
-    row_of,
-)
+from robomme_interference_data.evaluate.run.identity import plain
+from robomme_interference_data.evaluate.run.kind import model_columns
+from robomme_interference_data.evaluate.run.log import open_log, read_record, read_run
 from robomme_interference_data.schema.codec import to_dict
-from robomme_interference_data.storage.files import canonical_json, parse_json
 from robomme_interference_data.storage.parquet import open_parquet
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "run"
@@ -57,19 +49,44 @@ def test_a_killed_run_stands_as_its_record_says(tmp_path: Path) -> None:
     assert header.counts == {"success": 1, "fail": 0, "timeout": 1, "error": 0}
 
 
-@given(
-    tokens=st.integers(),
-    metadata=st.recursive(
-        st.integers() | st.integers(10**300, 10**5000) | st.text() | st.floats(allow_nan=False),
-        lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
-    ),
+HOSTILE = st.recursive(
+    st.integers()
+    | st.integers(10**300, 10**5000)
+    | st.text(st.characters(codec=None))
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.binary(max_size=4),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
 )
-def test_numbers_from_outside_can_be_read_again(tokens: int, metadata: Any) -> None:
-    row = replace(ROWS[0], model_tokens=stored_count(tokens))
-    assert row_of(row_line(row)) == row
-    with suppress(ValueError):  # an infinity, which is refused before the run
-        stored = plain(metadata)
-        assert parse_json(canonical_json(stored).encode(), "it") == stored
+"""What policies, models and servers may report."""
+
+
+def nested(depth: int) -> Any:
+    return [nested(depth - 1)] if depth else "deep"
+
+
+@settings(max_examples=50)
+@given(tokens=st.lists(st.integers(), max_size=3), metadata=HOSTILE, text=st.text(max_size=99))
+@example(tokens=[10**30], metadata=nested(200), text="\ud800\x1b[2J")
+@example(tokens=[-1], metadata={"a": {"b": nested(90)}}, text="")
+def test_what_a_run_writes_it_can_read(
+    tmp_path_factory: pytest.TempPathFactory, tokens: list[int], metadata: Any, text: str
+) -> None:
+    out = tmp_path_factory.mktemp("hostile")
+    stored = plain({"metadata": metadata, text: text})
+    columns = model_columns(1, tokens, 0)
+    row = replace(ROWS[2], **columns, error=plain(text), finished_at=None)
+    with open_log(out, {"policy_metadata": stored}, "my-buffers") as log:
+        log.begin(replace(HEADER.starts[0], policy=stored))
+        log.append(row, text)
+        log.end(log.header)
+    header, rows = read_run(out)
+    assert header.identity == {"policy_metadata": stored} and [*rows.values()] == [row]
+    assert header.starts[0].policy == stored
+    stands = all(one >= 0 for one in tokens) and sum(tokens) < 1 << 63
+    assert (columns["model_tokens"], columns["model_faults"]) == (
+        sum(tokens) if tokens and stands else None,
+        int(not stands),
+    )
 
 
 @given(cut=st.integers(0, 2000))

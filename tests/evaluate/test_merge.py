@@ -101,7 +101,7 @@ def test_other_runs_and_taken_folders_are_refused(tmp_path: Path) -> None:
     run_one(tmp_path / "b", model_seed=1)
     with pytest.raises(RunError, match=r"b holds another run: model_seed is 1 there, 0 here"):
         merge_runs([tmp_path / "a", tmp_path / "b"], tmp_path / "merged")
-    with pytest.raises(RunError, match="b is there already"):
+    with pytest.raises(RunError, match="b already exists"):
         merge_runs([tmp_path / "a"], tmp_path / "b")
     (tmp_path / "empty").mkdir()
     with pytest.raises(RunError, match=r"empty holds no run: run\.json is missing"):

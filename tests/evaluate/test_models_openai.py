@@ -28,20 +28,12 @@ from support.chat_server import (
     ChatServer,
 )
 
-from robomme_interference_data.errors import (
-    InvalidOptionError,
-    ModelError,
-    UnknownNameError,
-)
+from robomme_interference_data.errors import InvalidOptionError, ModelError, UnknownNameError
 from robomme_interference_data.evaluate.models import bounded_http
 from robomme_interference_data.evaluate.models import openai as endpoint
 from robomme_interference_data.evaluate.models.images import within
 from robomme_interference_data.evaluate.models.model import Message, Video
-from robomme_interference_data.evaluate.models.registry import (
-    make_model,
-    model_identity,
-    parse_model,
-)
+from robomme_interference_data.evaluate.models.registry import MODELS, model_identity
 
 NOISE = np.random.default_rng(0).integers(0, 256, (20, 33, 21, 3), dtype=np.uint8)
 ASKED = [Message("system", ("be brief",)), Message("user", ("what is it? ", NOISE[0]))]
@@ -61,7 +53,7 @@ def server() -> Iterator[ChatServer]:
 
 
 def model_of(server: ChatServer, *options: str, name: str = "tiny") -> Any:
-    return make_model(f"openai:{server.url}#{name}", options)
+    return MODELS.make(f"openai:{server.url}#{name}", options)
 
 
 # --- what is sent --------------------------------------------------------------------------------
@@ -130,8 +122,8 @@ def test_what_fails_for_the_moment_is_asked_again(server: ChatServer, fault: str
     [
         (BUSY, "answers 429"),
         (BROKEN, "answers 500"),
-        (GARBAGE, "no chat completion"),
-        (EMPTY, "no chat completion"),
+        (GARBAGE, "without a chat completion"),
+        (EMPTY, "without a chat completion"),
         (CLOSED, "cannot be reached"),
     ],
 )
@@ -168,7 +160,7 @@ def test_a_refusal_is_an_answer_without_words(server: ChatServer) -> None:
 
 @pytest.mark.parametrize(
     ("fault", "words", "next_step"),
-    [(BUSY_FOR_AN_HOUR, "answers 429", "goes on"), (LOCKED, "answers 401", "OPENAI_API_KEY")],
+    [(BUSY_FOR_AN_HOUR, "answers 429", "resume"), (LOCKED, "answers 401", "OPENAI_API_KEY")],
 )
 def test_what_no_repetition_mends(
     server: ChatServer, fault: str, words: str, next_step: str
@@ -208,7 +200,7 @@ def test_nobody_there() -> None:
     with ChatServer() as server:
         url = server.url
     for call in ("metadata", "reply"):
-        model = make_model(f"openai:{url}#tiny", ["repeats=1"])
+        model = MODELS.make(f"openai:{url}#tiny", ["repeats=1"])
         with pytest.raises(ModelError, match="cannot be reached"):
             getattr(model, call)(*([ASKED] if call == "reply" else []))
 
@@ -226,12 +218,12 @@ def test_nobody_there() -> None:
 )
 def test_what_is_not_written_as_a_model(text: str) -> None:
     with pytest.raises(InvalidOptionError, match="expected"):
-        parse_model(text)
+        MODELS.parse(text)
 
 
 def test_an_unknown_kind_and_the_nearest_one() -> None:
     with pytest.raises(UnknownNameError, match="no model") as raised:
-        parse_model("opneai:http://h#m")
+        MODELS.parse("opneai:http://h#m")
     assert "openai" in str(raised.value.hint)
 
 

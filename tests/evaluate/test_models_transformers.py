@@ -12,12 +12,12 @@ from support.vision_language import save_tiny_adapter, save_tiny_model
 
 from robomme_interference_data.errors import InvalidOptionError, ModelError
 from robomme_interference_data.evaluate.models.model import Message, Video
-from robomme_interference_data.evaluate.models.registry import make_model, model_identity, pin_model
-from robomme_interference_data.storage import weights
+from robomme_interference_data.evaluate.models.registry import MODELS, model_identity
 
 pytest.importorskip("transformers", reason="needs the extra vlm")
 
 from robomme_interference_data.evaluate.models.transformers import TransformersModel
+from robomme_interference_data.storage import weights
 
 NOISE = np.random.default_rng(0).integers(0, 256, (6, 32, 24, 3), dtype=np.uint8)
 
@@ -32,7 +32,7 @@ def asked(number: int) -> list[Message]:
 
 
 def test_the_same_question_has_the_same_answer_and_another_image_another(tiny: Path) -> None:
-    model = make_model(f"transformers:{tiny}", ["max_tokens=12", "device=cpu"])
+    model = MODELS.make(f"transformers:{tiny}", ["max_tokens=12", "device=cpu"])
     first, again, other = (model.reply(asked(number)) for number in (0, 0, 1))
     assert first.text and first.text == again.text != other.text
     assert first.calls == 1 and first.seconds > 0
@@ -42,7 +42,7 @@ def test_the_same_question_has_the_same_answer_and_another_image_another(tiny: P
 
 
 def test_a_video_is_thinned_out(tiny: Path) -> None:
-    model = make_model(f"transformers:{tiny}", ["max_tokens=1", "images=3"])
+    model = MODELS.make(f"transformers:{tiny}", ["max_tokens=1", "images=3"])
     video = model.reply([Message("user", (Video(NOISE, 10.0),))])
     images = model.reply([Message("user", (NOISE[0], NOISE[2], NOISE[5]))])
     assert (video.text, video.tokens) == (images.text, images.tokens)
@@ -50,8 +50,8 @@ def test_a_video_is_thinned_out(tiny: Path) -> None:
 
 def test_an_adapter_is_another_model(tiny: Path, tmp_path: Path) -> None:
     adapter = save_tiny_adapter(tiny, tmp_path / "adapter")
-    plain = make_model(f"transformers:{tiny}", ["max_tokens=12"])
-    adapted = make_model(f"transformers:{tiny}", ["max_tokens=12", f"adapter={adapter}"])
+    plain = MODELS.make(f"transformers:{tiny}", ["max_tokens=12"])
+    adapted = MODELS.make(f"transformers:{tiny}", ["max_tokens=12", f"adapter={adapter}"])
     assert plain.reply(asked(0)).text != adapted.reply(asked(0)).text
     assert plain.metadata() == {"sha256": plain.metadata()["sha256"]}
     assert {*adapted.metadata()} == {"sha256", "adapter_sha256"}
@@ -61,7 +61,7 @@ def test_where_it_lies_is_no_part_of_it(tiny: Path, tmp_path: Path) -> None:
     (tmp_path / "moved").symlink_to(tiny)
     other = save_tiny_model(tmp_path / "other", seed=1)
     said = [
-        make_model(f"transformers:{path}").metadata() for path in (tiny, tmp_path / "moved", other)
+        MODELS.make(f"transformers:{path}").metadata() for path in (tiny, tmp_path / "moved", other)
     ]
     assert said[0] == said[1] != said[2]
     hub = said[0] | {"model": "someone/tiny", "revision": "0" * 40}
@@ -73,10 +73,10 @@ def test_where_it_lies_is_no_part_of_it(tiny: Path, tmp_path: Path) -> None:
 def test_its_identity_needs_neither_its_weights_nor_to_read_them_again(
     tiny: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    said = make_model(f"transformers:{tiny}").metadata()
+    said = MODELS.make(f"transformers:{tiny}").metadata()
     monkeypatch.setattr(TransformersModel, "_load", None)
     monkeypatch.setattr(weights, "digest_folder", None)
-    assert make_model(f"transformers:{tiny}").metadata() == said
+    assert MODELS.make(f"transformers:{tiny}").metadata() == said
 
 
 def test_digests_follow_the_files(tmp_path: Path) -> None:
@@ -98,19 +98,19 @@ def test_digests_follow_the_files(tmp_path: Path) -> None:
 def test_what_cannot_be_loaded(tiny: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(ModelError, match="cannot load the model"):
-        make_model(f"transformers:{tmp_path / 'empty'}")
+        MODELS.make(f"transformers:{tmp_path / 'empty'}")
     for file in tiny.glob("*.json"):
         shutil.copy(file, tmp_path / "empty")
     with pytest.raises(ModelError, match="it has no weights"):
-        make_model(f"transformers:{tmp_path / 'empty'}")
+        MODELS.make(f"transformers:{tmp_path / 'empty'}")
     with pytest.raises(InvalidOptionError, match="neither a folder"):
-        make_model("transformers:nowhere at all")
+        MODELS.make("transformers:nowhere at all")
     with pytest.raises(InvalidOptionError, match="device"):
-        make_model(f"transformers:{tiny}", ["device=cuda:77"])
+        MODELS.make(f"transformers:{tiny}", ["device=cuda:77"])
 
 
 def test_a_folder_stays_what_it_is(tiny: Path) -> None:
-    assert pin_model(f"transformers:{tiny}") == f"transformers:{tiny}"
+    assert MODELS.pin(f"transformers:{tiny}") == f"transformers:{tiny}"
 
 
 def test_questions_are_put_to_it(tiny: Path, tmp_path: Path) -> None:

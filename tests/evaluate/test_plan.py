@@ -47,15 +47,15 @@ def test_the_order_of_input_does_not_matter(known: list[EpisodeId], names: list[
         (
             {"episodes": "0,3-4"},
             UnknownNameError,
-            "MoveCube/test/3 and 1 more\nIt has episodes 0-2,5 of",
+            "MoveCube/test/3 and 1 more\nIts episodes of MoveCube/test are 0-2,5",
         ),
         (
             {"split": "val", "families": ["MoveCube"]},
             UnknownNameError,
-            "It has none of MoveCube/val",
+            "MoveCube/val are none",
         ),
         ({"families": ["MoveCub"]}, UnknownNameError, "Did you mean 'MoveCube'?"),
-        ({"split": "train"}, InvalidOptionError, "no train episode\nSet `split`"),
+        ({"split": "train"}, InvalidOptionError, "no train episode"),
         ({"episodes": "3-1"}, InvalidOptionError, "not a list of episode numbers"),
         ({"conditions": ["k0", "k64"]}, InvalidIdError, "'k64' is not a condition"),
         ({"conditions": ["k0", "k0"]}, InvalidOptionError, "each once"),

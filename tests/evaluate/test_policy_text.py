@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from robomme_interference_data import evaluate
 from robomme_interference_data.errors import (
     InvalidOptionError,
     MissingExtraError,
@@ -16,12 +17,12 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import (
-    PolicySpec,
+    POLICIES,
     make_policy,
-    parse_policy,
     policy_options,
+    server_addresses,
 )
-from robomme_interference_data.runtime.specs import bind_options
+from robomme_interference_data.runtime.specs import Spec, bind_options
 
 OWN = "python:support.own_policies:"
 
@@ -29,25 +30,25 @@ OWN = "python:support.own_policies:"
 @pytest.mark.parametrize(
     ("text", "spec", "servers"),
     [
-        ("oracle", PolicySpec("oracle"), ()),
-        ("replay:window", PolicySpec("replay", "window"), ()),
-        ("recall:framesamp", PolicySpec("recall", "framesamp"), ()),
-        ("lerobot:me/act", PolicySpec("lerobot", "me/act"), ()),
-        ("lerobot:out/last:1", PolicySpec("lerobot", "out/last:1"), ()),
-        ("python:my.policies:make", PolicySpec("python", "my.policies:make"), ()),
+        ("oracle", Spec("oracle"), ()),
+        ("replay:window", Spec("replay", "window"), ()),
+        ("recall:framesamp", Spec("recall", "framesamp"), ()),
+        ("lerobot:me/act", Spec("lerobot", "me/act"), ()),
+        ("lerobot:out/last:1", Spec("lerobot", "out/last:1"), ()),
+        ("python:my.policies:make", Spec("python", "my.policies:make"), ()),
         (
             "websocket://gpu-1.lab:8013,10.0.0.2:1,[::1]:65535",
-            PolicySpec("websocket", "//gpu-1.lab:8013,10.0.0.2:1,[::1]:65535"),
+            Spec("websocket", "//gpu-1.lab:8013,10.0.0.2:1,[::1]:65535"),
             (("gpu-1.lab", 8013), ("10.0.0.2", 1), ("::1", 65535)),
         ),
     ],
 )
-def test_what_is_read(text: str, spec: PolicySpec, servers: tuple[tuple[str, int], ...]) -> None:
-    assert parse_policy(text) == spec
+def test_what_is_read(text: str, spec: Spec, servers: tuple[tuple[str, int], ...]) -> None:
+    assert POLICIES.parse(text) == spec
     assert str(spec) == text
-    assert spec.servers == servers
-    assert str(parse_policy("replay")) == "replay:full"
-    assert str(parse_policy("recall")) == "recall:full"
+    assert server_addresses(text) == servers
+    assert str(POLICIES.parse("replay")) == "replay:full"
+    assert str(POLICIES.parse("recall")) == "recall:full"
 
 
 @pytest.mark.parametrize(
@@ -70,7 +71,7 @@ def test_what_is_read(text: str, spec: PolicySpec, servers: tuple[tuple[str, int
 )
 def test_what_is_refused(text: str, error: type[Exception], words: str) -> None:
     with pytest.raises(error) as raised:
-        parse_policy(text)
+        POLICIES.parse(text)
     assert words in str(raised.value)
     with pytest.raises(error):
         make_policy(text)
@@ -79,11 +80,11 @@ def test_what_is_refused(text: str, error: type[Exception], words: str) -> None:
 @given(st.text(max_size=20) | st.from_regex(r"(websocket:/?/?|python:|lerobot:)[a-z:,1.\[\]]*"))
 def test_any_text_is_a_policy_or_a_clear_error(text: str) -> None:
     try:
-        spec = parse_policy(text)
+        spec = POLICIES.parse(text)
     except (UnknownNameError, InvalidOptionError):
         return
     assert str(spec) == text
-    assert len(spec.servers) == (text.count(",") + 1 if spec.kind == "websocket" else 0)
+    assert len(server_addresses(text)) == (text.count(",") + 1 if spec.kind == "websocket" else 0)
 
 
 def test_each_worker_has_a_server() -> None:
@@ -164,6 +165,18 @@ def test_a_factory_that_is_none(
     with pytest.raises(error) as raised:
         make_policy(text)
     assert words in str(raised.value)
+
+
+def test_a_factory_that_raises_shows_its_own_traceback_alone() -> None:
+    with pytest.raises(PolicyError, match="its factory raised ZeroDivisionError") as raised:
+        make_policy(f"{OWN}raising")
+    hint = raised.value.hint or ""
+    assert "own_policies.py" in hint and "return 1 / 0" in hint and "registry.py" not in hint
+
+
+def test_authors_import_all_from_one_place() -> None:
+    for name in evaluate.__all__:
+        assert getattr(evaluate, name).__name__ == name or name == "Frames"
 
 
 def test_every_member_of_the_protocol_is_asked_for() -> None:

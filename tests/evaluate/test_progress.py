@@ -59,7 +59,7 @@ def test_without_a_terminal_a_line_is_written_for_each_cell(
         progress.row(row(plan[1], "success"))
         progress.row(row(plan[2], "error"))
     assert capsys.readouterr().err.splitlines() == [
-        "1 of 3 rollouts are done already",
+        "1 of 3 rollouts are already done",
         "MoveCube k0: 1/1 100%  (2 of 3)",
         r"MoveCube/test/0 under k1 broke: it \x1b[2Jbroke",
         "MoveCube k1: 1 broke  (3 of 3)",

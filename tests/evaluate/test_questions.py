@@ -26,15 +26,7 @@ from support.chat_server import (
 )
 from support.retrieval import make_index
 from support.runs import header
-from support.tabletop import (
-    LESSON,
-    NOBODY,
-    QUERIES,
-    TABLETOP,
-    copy_tabletop,
-    scene_of,
-    shown,
-)
+from support.tabletop import LESSON, NOBODY, QUERIES, TABLETOP, copy_tabletop, scene_of, shown
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.questions import write_questions
@@ -337,7 +329,7 @@ def test_every_setting_is_classed() -> None:
     }
     plan = {"families", "episodes", "conditions", "shard"}
     who = {"workers", "executor", "ray_address", "cpus_per_worker", "gpus_per_worker"}
-    may_differ = who | {"out", "no_resume", "cache", "rollout_timeout", "max_errors"}
+    may_differ = who | {"out", "no_resume", "cache", "rollout_timeout_s", "max_errors"}
     fields = {field.name for field in dataclasses.fields(AskConfig)}
     assert makes_the_run | plan | may_differ == fields
 
@@ -371,7 +363,7 @@ def test_another_run_is_refused_and_the_difference_named(
 def test_what_may_differ_goes_on_with_the_run(tmp_path: Path) -> None:
     with ChatServer(look) as server, ChatServer(look) as other:
         ask(tmp_path / "run", **behind(server, frames=3, families=("MoveCube",)))
-        moved = behind(other, frames=3, cache=True, rollout_timeout=9.0, max_errors=2)
+        moved = behind(other, frames=3, cache=True, rollout_timeout_s=9.0, max_errors=2)
         moved |= {"model_options": ("repeats=1", "response_s=9")}
         result = ask(tmp_path / "run", conditions=("k0", "k1"), **moved, **FOUR)
         assert len(server.seen) == 2 and len(other.seen) == 6
@@ -412,12 +404,12 @@ def test_other_questions_make_another_run(tmp_path: Path) -> None:
     [
         ({"frames": 1}, "frames 1"),
         ({"control": "blnk"}, "control 'blnk' is none of none, blank, text"),
-        ({"rollout_timeout": float("nan")}, "rollout_timeout nan"),
+        ({"rollout_timeout_s": float("nan")}, "rollout_timeout_s nan"),
         ({"control": "blank"}, "`control` has no effect on recall"),
         ({"model": "guess", "frames": 8}, "`frames` has no effect on guess"),
         ({"model": "recal"}, "there is no model 'recal'; expected recall, guess, openai:URL"),
         ({"model": "openai:h/v1#m", "system": "m"}, "expected openai:URL#MODEL"),
-        ({"model": "openai:http://h/v1#m", "system": "m", "prompt": "x"}, "no prompt 'x'"),
+        ({"model": "openai:http://h/v1#m", "system": "m", "prompt": "x"}, "no prompt or file 'x'"),
         ({"retrieval_rule": "last"}, "has no effect without a retrieval step"),
         ({"retrieval": "thumbnail", "conditions": ("no-history",)}, "nothing to retrieve from"),
         ({"retrieval": "thumbnail"}, "no embeddings of encoder 'thumbnail'"),
@@ -468,8 +460,8 @@ def test_stale_or_damaged_questions_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ({"system": "oracle"}, "oracle is a system that acts"),
-        ({"system": "questions-recall-full"}, "otherwise than recall"),
+        ({"system": "oracle"}, "oracle is the name of another system"),
+        ({"system": "questions-recall-full"}, "another system than recall"),
         ({"model": "openai:http://h/v1#m"}, "need a name"),
         # Sound names: what is refused is what comes after them.
         ({"system": "questions-recall-framesamp"}, "'Nothing'"),

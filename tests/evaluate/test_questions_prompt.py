@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from robomme_interference_data.data.questions import LETTERS, Question
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.evaluate.models.model import Video
-from robomme_interference_data.evaluate.models.prompts import told
+from robomme_interference_data.evaluate.models.prompts import as_text
 from robomme_interference_data.evaluate.questions.prompt import (
     PROMPTS,
     QuestionPrompt,
@@ -135,7 +135,7 @@ def test_what_a_model_is_asked() -> None:
     assert video is views["<history>"][0] and picture is IMAGE
     # Words of a goal stay words; an option without words is told by its letter.
     assert words == ": do <picture> {options} Which one?\nA: push it\nB: the one marked B"
-    assert told(user.parts) == (
+    assert as_text(user.parts) == (
         "before [video of 3 frames]; now [image]: do <picture> {options} Which one?\n"
         "A: push it\nB: the one marked B"
     )
@@ -165,7 +165,7 @@ def test_our_prompt_shows_all_and_asks_for_a_letter() -> None:
     )
     assert [type(part).__name__ for part in user.parts] == ["str", "Video", "str", "ndarray", "str"]
     assert str(user.parts[-1]).endswith("A: x\nB: y\nAnswer with one letter.")
-    assert not {"<", "{"} & {*told(user.parts)}
+    assert not {"<", "{"} & {*as_text(user.parts)}
 
 
 # --- files -------------------------------------------------------------------------------------

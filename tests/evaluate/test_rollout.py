@@ -1,5 +1,6 @@
 """One rollout: what the policy gets, when, and what is written of it."""
 
+import shutil
 import threading
 import time
 import warnings
@@ -9,6 +10,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,12 +20,11 @@ from support.worlds import Cheat, World
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.data.buffer import Buffer
-from robomme_interference_data.errors import (
-    InvalidOptionError,
-    PolicyError,
-)
+from robomme_interference_data.errors import InvalidOptionError, PolicyError
 from robomme_interference_data.evaluate.policies.builtin import Privileged
 from robomme_interference_data.evaluate.rollout.rollout import read_ahead
+from robomme_interference_data.evaluate.run.history import HistoryReader
+from robomme_interference_data.ids import EpisodeId
 
 pytestmark = pytest.mark.usefixtures("world")
 
@@ -234,3 +236,53 @@ def test_an_error_comes_where_its_item_would_have_come() -> None:
         assert [next(items), next(items)] == [0, 1]
         with pytest.raises(OSError, match="the disk is gone"):
             next(items)
+
+
+# --- damaged history ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("what", ["videos", "state"])
+def test_damaged_history_is_an_error_that_names_the_file(
+    tmp_path: Path, tiny_buffers: Path, what: str
+) -> None:
+    """Two lessons' videos exchanged, or one state changed; only its own rollouts break."""
+    root = shutil.copytree(tiny_buffers, tmp_path / "buffer_set")
+    dataset = load_buffer_set(root).datasets["demonstrations"]
+    places = [dataset.index_of(EpisodeId(name, "test", 0)) for name in ("MoveCube", "VideoRepick")]
+    data, video = dataset.files_of(places[0], ["front"])
+    if what == "videos":
+        other = dataset.files_of(places[1], ["front"])[1]
+        (root / "demonstrations" / video).rename(tmp_path / "kept")
+        (root / "demonstrations" / other).rename(root / "demonstrations" / video)
+        (tmp_path / "kept").rename(root / "demonstrations" / other)
+    else:
+        path = root / "demonstrations" / data
+        table = pq.read_table(path)
+        column = table.column_names.index("observation.state")
+        states = table["observation.state"].to_pylist()
+        states[5] = [value + 0.001 for value in states[5]]
+        values = pa.array(states, table.schema.field(column).type)
+        pq.write_table(table.set_column(column, table.schema.field(column), values), path)
+    rows = run(tmp_path / "run", buffer_set=root, conditions=("no-history", "k0", "k1")).rows
+    damaged = {"MoveCube", "VideoRepick"} if what == "videos" else {"MoveCube"}
+    for row in rows:
+        broken = row.family in damaged and row.condition != "no-history"
+        assert (row.status == "error") == broken, row.error
+    named = [row.error for row in rows if row.family == "MoveCube" and row.error]
+    expected = video if what == "videos" else data
+    assert len(named) == 2 and all(expected in error and "SHA-256" in error for error in named)
+
+
+@pytest.mark.parametrize("given", [range(144), range(40, 60), [0, 47, 48, 143]])
+@pytest.mark.parametrize("size", [10, 64])
+def test_the_reader_gives_the_frames_of_the_buffer(
+    tiny_buffers: Path, given: list[int], size: int
+) -> None:
+    buffer_set = load_buffer_set(tiny_buffers)
+    buffer, reader = buffer_set.load(EPISODE, "k3"), HistoryReader(buffer_set.datasets)
+    for _ in range(2):  # whole sessions at first, then the given frames alone
+        chunks = list(reader.stream(buffer, size, ("front",), given))
+        assert np.concatenate([one.indices for one in chunks]).tolist() == list(given)
+        frames = np.concatenate([one.frames["front"] for one in chunks])
+        assert np.array_equal(frames, buffer.frames("front")[list(given)])
+        assert all(0 < len(one) <= size for one in chunks)

@@ -85,7 +85,7 @@ def test_one_that_does_not_listen_is_told_with_its_last_words(tmp_path: Path) ->
     ("changes", "words"),
     [
         ({"policy": "websocket"}, "websocket with serve="),
-        ({"policy": "replay", "serve": "serve {port}"}, "has none to start"),
+        ({"policy": "replay", "serve": "serve {port}"}, "has no server to start"),
         ({"policy": "websocket:serve {port}"}, "websocket with serve="),
         ({"policy": "websocket", "serve": "serve 8000"}, "a command with {port}"),
         ({"policy": "websocket", "serve": "serve '{port}"}, "a command with {port}"),
@@ -103,7 +103,7 @@ def test_what_cannot_be_served_is_refused(
 
 
 def test_it_has_to_say_what_it_serves(tmp_path: Path) -> None:
-    with pytest.raises(InvalidOptionError, match="does not say which checkpoint"):
+    with pytest.raises(InvalidOptionError, match="does not report which checkpoint"):
         serve(tmp_path / "run", "--metadata", "{}")
     with pytest.raises(PolicyServerError, match="serves the checkpoint 'tiny/1', not 'mine'"):
         serve(tmp_path / "other", policy_options=("checkpoint=mine",))

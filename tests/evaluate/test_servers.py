@@ -18,7 +18,7 @@ from robomme_interference_data.errors import (
     RunError,
     ServerKeepaliveError,
 )
-from robomme_interference_data.evaluate.policies.identity import check_kind, hold_servers
+from robomme_interference_data.evaluate.policies.identity import check_servers_memory, lock_servers
 from robomme_interference_data.evaluate.systems import PAPER_SYSTEMS, name_system
 
 NAMED = ("checkpoint=a",)
@@ -32,7 +32,7 @@ def test_a_server_that_says_nothing_needs_a_checkpoint(
 ) -> None:
     for said in ({}, {"reset_pose": [0.0]}):
         server.metadata = said
-        with pytest.raises(InvalidOptionError, match="does not say which checkpoint") as raised:
+        with pytest.raises(InvalidOptionError, match="does not report which checkpoint") as raised:
             run_one(tmp_path / "run", policy=server.url)
         assert "checkpoint=TEXT" in (raised.value.hint or "")
     assert server.calls == [] and not (tmp_path / "run").exists()
@@ -77,14 +77,14 @@ def test_a_server_of_the_other_kind_is_refused(
             run(tmp_path / "wrong", policy=server.url, system=wrong, **asked)
         assert not (tmp_path / "wrong").exists()
         asked_before = len(server.calls)
-        check_kind(server.url, NAMED, name_system("mine"))  # of which nothing is known
+        check_servers_memory(server.url, NAMED, name_system("mine"))  # of which nothing is known
         assert len(server.calls) == asked_before
 
 
 def test_another_error_says_nothing_of_the_kind(server: PolicyServer) -> None:
     server.before = lambda message: "no key 'x'" if "prompt" in message else None
     with pytest.raises(PolicyServerError, match="reports: no key 'x'"):
-        check_kind(server.url, NAMED, name_system(FRAMES))
+        check_servers_memory(server.url, NAMED, name_system(FRAMES))
 
 
 def test_the_kinds_of_the_released_servers() -> None:
@@ -139,8 +139,8 @@ def test_such_a_rollout_is_begun_again_once(
 
 DRIVE = """
 import pathlib, sys, time
-from robomme_interference_data.evaluate.policies.identity import hold_servers
-with hold_servers(sys.argv[1], pathlib.Path(sys.argv[2])):
+from robomme_interference_data.evaluate.policies.identity import lock_servers
+with lock_servers(sys.argv[1], pathlib.Path(sys.argv[2])):
     print("driving", flush=True)
     time.sleep(600)
 """
@@ -178,6 +178,6 @@ def test_without_a_place_for_locks_a_run_goes_on(
 ) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    with hold_servers("websocket://gpu1:8013", tmp_path):
+    with lock_servers("websocket://gpu1:8013", tmp_path):
         pass
     assert "Nothing keeps other runs from the policy server gpu1:8013" in caplog.text

@@ -203,7 +203,10 @@ def test_our_prompts_show_history_and_present_and_read_their_own_examples(name: 
         ("system = 'a'\nfirst = 'b'\nthen = 'c'\npoint = '{y}'", "{x}"),
         ("system = ' '\nfirst = 'b'\nthen = 'c'", "system is empty"),
         ("system = 'a'\nfirst = '<histroy>'\nthen = 'c'", "Did you mean '<history>'?"),
-        ("system = 'a'\nfirst = 'b'\nthen = '{goals}'", "its then has {goals}"),
+        (
+            "system = 'a'\nfirst = 'b'\nthen = '{goals}'",
+            "its then has the unknown placeholder {goals}",
+        ),
         ("nonsense", "no prompt"),
         ("# " + "x" * (1 << 16), "at most"),
     ],
@@ -222,5 +225,5 @@ def test_words_that_only_look_like_places_stay() -> None:
 
 
 def test_no_such_prompt() -> None:
-    with pytest.raises(UnknownNameError, match="no prompt 'grouded'"):
+    with pytest.raises(UnknownNameError, match="no prompt or file 'grouded'"):
         load_prompt("grouded")

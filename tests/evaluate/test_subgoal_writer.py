@@ -12,6 +12,7 @@ from support.worlds import buffer_set_here
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.models.model import ChatModel, Message, Part, Reply, Video
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
+from robomme_interference_data.evaluate.run.history import HistoryReader
 from robomme_interference_data.evaluate.subgoals.model_writer import ModelWriter
 from robomme_interference_data.evaluate.subgoals.writer import History
 from robomme_interference_data.schema.subgoal import Subgoal
@@ -46,7 +47,9 @@ def begun(model: ChatModel, condition: str = "k0", prompt: str = "grounded", **o
     buffer = buffer_set_here().load("MoveCube/test/0", condition)
     writer = ModelWriter(model, prompt, **o)
     info = RolloutInfo("move it", len(buffer), 0)
-    writer.start(History(buffer, range(len(buffer))), info, None)  # type: ignore[arg-type]
+    writer.start(
+        History(buffer, range(len(buffer)), HistoryReader(buffer_set_here().datasets)), info, None
+    )  # type: ignore[arg-type]
     return writer
 
 

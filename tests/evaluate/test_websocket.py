@@ -13,7 +13,7 @@ from support.policy_server import PolicyServer
 from support.runs import run
 
 from robomme_interference_data.errors import PolicyServerError
-from robomme_interference_data.evaluate.policies.identity import plain
+from robomme_interference_data.evaluate.run.identity import plain
 
 
 @pytest.mark.parametrize(
@@ -120,7 +120,7 @@ def test_a_traceback_becomes_one_error_with_its_last_line(server: PolicyServer) 
         (PolicyServer.CLOSE, "closed the connection: "),
         ("", "reports: an empty text"),
         (b"\xc1", "1 bytes are not a message"),
-        (msgpack.packb([1]), "answers with a list, not a map"),
+        (msgpack.packb([1]), "answers with a list; expected a map"),
         (msgpack.packb({"a": 1, "b": 2}), "answers without '.*': a, b"),
         (msgpack.packb({"reset_finished": False}), "answers without"),
     ],

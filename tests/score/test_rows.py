@@ -166,7 +166,6 @@ BAD = {
     "too great": (f"my-memory,MoveCube,k0,{10**18},7,easy,fail,0,9", "expected a whole number"),
     "no episode": ("my-memory,MoveCube,k0,,7,easy,fail,0,9", "episode (empty); expected a whole"),
     "two difficulties": ("my-memory,MoveCube,k1,0,7,hard,fail,0,9", "difficulty 'hard' beside"),
-    "a slip": ("pi05-baseline,MoveCube,k0,0,7,easy,fail,0,9", "reads like the system 'pi05_bas"),
     "too short": ("my-memory,MoveCube,k0,1,7,easy,fail,0", "the line has 8 fields; expected 9"),
     "twice": (GOOD, "the same rollout as"),
     "blank": ("", "the line has 0 fields; expected 9"),

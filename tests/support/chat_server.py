@@ -1,7 +1,7 @@
 """A chat endpoint on loopback, as OpenAI has it: real HTTP, with a fault now and then.
 
     with ChatServer(answer=lambda seen: "A") as server:
-        model = make_model(f"openai:{server.url}#tiny")
+        model = MODELS.make(f"openai:{server.url}#tiny")
 
 `answer` gets what was asked, `Seen`: the words, and the images as they came. `faults` are used up
 one a question, in order, before it: `SLOW` (`slow_s` seconds), `BUSY` (429, `Retry-After: 0.01`),

@@ -9,11 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
-from lerobot.policies.factory import (
-    get_policy_class,
-    make_policy_config,
-    make_pre_post_processors,
-)
+from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
 
 from robomme_interference_data.constants import ACTION, FRONT, STATE, WRIST
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo

@@ -72,6 +72,10 @@ def changed(name: str, value: Any) -> Still:
     return policy
 
 
+def raising() -> float:
+    return 1 / 0
+
+
 NUMBER = 3
 
 

@@ -134,7 +134,7 @@ def test_the_command_may_be_killed_or_stopped_at_any_moment(
 def test_a_simulator_that_hangs_or_takes_its_process_along_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "VideoRepick-0").write_text("die")
     (tmp_path / "MoveCube-0").write_text("hang")
-    options = {"conditions": ("no-history",), "simulator_timeout": 2.0}
+    options = {"conditions": ("no-history",), "simulator_timeout_s": 2.0}
     died, hung = runs.run(tmp_path / "run", Processes(2), **options).rows
     assert (died.error, died.attempt) == ("the worker process died (exit code -9)", 2)
     assert (hung.error, hung.attempt) == ("the simulator's steps took more than 2 s", 2)
@@ -144,7 +144,7 @@ def test_a_simulator_that_hangs_or_takes_its_process_along_is_an_error(tmp_path:
     # Once only, it costs no rollout.
     (tmp_path / "VideoRepick-0").write_text("die once")
     (tmp_path / "MoveCube-0").write_text("hang once")
-    again = runs.run(tmp_path / "run", Processes(2), **options, rollout_timeout=60.0)
+    again = runs.run(tmp_path / "run", Processes(2), **options, rollout_timeout_s=60.0)
     assert [(row.status, row.attempt) for row in again.rows] == [("fail", 4), ("fail", 4)]
 
 

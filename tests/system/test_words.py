@@ -17,7 +17,7 @@ sys.path.insert(0, str(ROOT / "docs" / "_ext"))
 
 import reference_pages  # noqa: E402 - it lies beside the pages
 
-REPLACED = (
+REPLACED = (  # noqa: SIM905
     # names that have another one now
     "Material QueryMaterial Asked Answered Answerer Goods EpisodePlace FURTHER ExchangeFamily "
     "Obeying unusual_retrieval cannot_be_told go_on --grid --go-on --split-dir new-split my-split "

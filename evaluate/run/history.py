@@ -1,0 +1,84 @@
+"""Read history frames, and compare them with their recorded SHA-256 while they are decoded."""
+
+from collections.abc import Generator, Mapping, Sequence
+
+import numpy as np
+
+from robomme_interference_data.constants import STATE
+from robomme_interference_data.data.buffer import Buffer, Chunk
+from robomme_interference_data.data.dataset import Dataset, camera_feature
+from robomme_interference_data.errors import HashMismatchError
+from robomme_interference_data.schema.manifest import SessionEntry
+from robomme_interference_data.storage.arrays import FeatureDigests, combine
+
+
+class HistoryReader:
+    """Reads frames of buffers of a buffer set, given its datasets; compares each session once."""
+
+    def __init__(self, datasets: Mapping[str, Dataset]):
+        self._datasets = datasets
+        self._verified: set[tuple[str, str, int, int, int, tuple[str, ...]]] = set()
+
+    def stream(
+        self, buffer: Buffer, size: int, cameras: Sequence[str], given: Sequence[int]
+    ) -> Generator[Chunk]:
+        """Decode the given frames of a buffer in chunks of at most `size` frames.
+
+        Raises `HashMismatchError` if states or frames of a session are not the recorded ones. So
+        sessions that were not compared yet are decoded whole, even if only a few frames are given.
+        """
+        frames = np.asarray(given, np.int64)
+        new = {}
+        for session in buffer.sessions:
+            entry = session.entry
+            key = (
+                *(entry.dataset, entry.revision, entry.episode_index, entry.start, entry.stop),
+                tuple(sorted(cameras)),
+            )
+            read = ((frames >= session.start) & (frames < session.stop)).any()
+            if read and key not in self._verified:
+                new[key] = session, FeatureDigests()
+        decoded = [frames, *(np.arange(one.start, one.stop) for one, _ in new.values())]
+        for chunk in buffer.stream(size, cameras, np.unique(np.concatenate(decoded)).tolist()):
+            for key in [*new]:
+                session, digests = new[key]
+                inside = (chunk.indices >= session.start) & (chunk.indices < session.stop)
+                if not inside.any():
+                    continue
+                stored = inside & ((chunk.indices - session.start) % session.entry.repeat == 0)
+                digests.update(STATE, chunk.states[stored])
+                for camera in cameras:
+                    images = chunk.frames[camera]
+                    images = images if stored.all() else images[stored]
+                    digests.update(camera_feature(camera), images)
+                if chunk.indices[-1] >= session.stop - 1:
+                    self._compare(session.entry, digests.current())
+                    self._verified.add(key)
+                    del new[key]
+            keep = np.isin(chunk.indices, frames)
+            if keep.all():
+                yield chunk
+            elif keep.any():
+                kept = {name: values[keep] for name, values in chunk.frames.items()}
+                yield Chunk(
+                    chunk.indices[keep], kept, chunk.states[keep], chunk.session_index[keep]
+                )
+
+    def _compare(self, entry: SessionEntry, digests: dict[str, str]) -> None:
+        """Compare digests by feature with those that records and manifest have of a session."""
+        dataset, span = self._datasets[entry.dataset], (entry.start, entry.stop)
+        recorded = dataset.record(entry.episode_index).digests(*span)
+        if recorded is None:  # of a part that has no digests of its own
+            [recorded] = dataset.digests(entry.episode_index, [span])
+        wrong = [name for name, digest in digests.items() if recorded.get(name) != digest]
+        if not wrong and combine(recorded) == entry.sha256:
+            return
+        features = wrong or [*digests]
+        files = dataset.files_of(entry.episode_index, [one for one in features if one != STATE])
+        files = files if STATE in features else files[1:]  # the first one holds the vectors
+        raise HashMismatchError(
+            f"{', '.join(files)} in {dataset.files.describe()}: {', '.join(features)} of the "
+            f"{entry.role} {entry.source} differ from the SHA-256 that the buffer set records",
+            "The file is damaged: download or build it again.",
+            "verify BUFFER_SET",
+        )
