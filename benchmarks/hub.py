@@ -2,8 +2,8 @@
 
 The Hub is a server on the loopback interface (tests/support/hub_server.py), every answer of which
 takes longer by a latency; its client is the real one, in fresh processes, whose imports are left
-out, with empty caches. The buffer set of which a buffer is loaded has real videos; the whole one that is
-fetched and published is made up: the number of its files counts, not their size.
+out, with empty caches. A single buffer is loaded from real videos; the buffer set that is fetched
+and published whole is made up, as the number of its files counts, not their size.
 """
 
 import argparse
@@ -133,13 +133,13 @@ def metadata_table(made: Path, options: argparse.Namespace) -> str:
         for path in (folder / RECORDS_PATH, *sorted(folder.glob("meta/in*.json"))):
             rows.append([path.relative_to(made).as_posix(), _kilobytes(path.stat().st_size)])
     title = (
-        f"Metadata that a buffer needs of the made-up buffer set, {options.queries:,} demonstrations "
-        f"and {options.units:,} units."
+        f"Metadata that a buffer needs, of the made-up buffer set: {options.queries:,} "
+        f"demonstrations and {options.units:,} units."
     )
     return table(title, ("<file", ">kB"), rows)
 
 
-# --- a whole buffer set -------------------------------------------------------------------------------
+# --- a whole buffer set ---------------------------------------------------------------------
 
 
 def time_fetching(hub: Hub, options: argparse.Namespace) -> str:
@@ -165,8 +165,8 @@ def time_fetching(hub: Hub, options: argparse.Namespace) -> str:
         for name, run in runs.items()
     ]
     title = (
-        f"The made-up buffer set of {options.queries:,} queries × {len(CONDITIONS)} conditions, fetched "
-        f"whole into an empty cache; {_rounds(options)}."
+        f"The made-up buffer set of {options.queries:,} queries × {len(CONDITIONS)} conditions, "
+        f"fetched whole into an empty cache; {_rounds(options)}."
     )
     columns = ("<way", ">files of episodes", ">requests", ">MB", ">s", ">ratio", ">aim")
     return table(title, columns, rows)
@@ -212,7 +212,7 @@ def time_publishing(hub: Hub, made: Path, options: argparse.Namespace) -> str:
     ]
     files = 3 * (options.queries + options.units)
     title = (
-        f"The made-up buffer set published, {files:,} files of episodes, without the checks before; "
+        f"The made-up buffer set published, {files:,} files of episodes, without prior checks; "
         "each once."
     )
     columns = ("<way", ">large files", ">commits", ">requests", ">bytes sent", ">s", ">ratio")

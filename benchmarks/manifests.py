@@ -1,6 +1,6 @@
 """How fast buffers are planned and written: 10,000 queries under ten conditions.
 
-Episode tables are made up, in the columns of real datasets (docs/format.md); no video is needed.
+Episode tables are made up, with the columns of real datasets; no video is needed.
 Every run is a process of its own. The obvious alternative writes the same rows with a loop over
 dictionaries and `pyarrow.Table.from_pylist`, with the same draw.
 """

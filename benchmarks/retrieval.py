@@ -3,8 +3,8 @@
     python benchmarks/retrieval.py                  # SigLIP base with random weights; minutes
     python benchmarks/retrieval.py --model so400m   # the paper's architecture: wants a GPU
 
-Frames are those of a buffer set's distractor units. Weights are random, which costs the same time as
-trained ones. Histories that are graded are made-up embeddings: no video is needed.
+Frames are those of a buffer set's distractor units. Weights are random, which takes the same time
+as trained ones. Histories that are graded are made-up embeddings: no video is needed.
 """
 
 import argparse

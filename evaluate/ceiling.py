@@ -78,7 +78,7 @@ def ceiling(buffer_set: BufferSet, config: CeilingConfig) -> list[Ceiling]:
     if all(buffer_set.query(one).record.evidence is None for one in buffer_set.episode_ids):
         raise InvalidOptionError(
             f"the frames of {buffer_set.location} that show the answer are unknown",
-            "Build it from a source with evidence: see docs/sources.md.",
+            "Build it from a source with evidence: see docs/reference/sources.md.",
         )
     names = [one.name for one in in_order(config.conditions or buffer_set.conditions)]
     every = [

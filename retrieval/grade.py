@@ -224,4 +224,4 @@ def _share(cell: Cell, name: str) -> str | None:
     value, low, high = (getattr(cell, name + suffix) for suffix in ("", "_low", "_high"))
     if value is None:
         return None
-    return percent(value) + ("" if low is None else f" ({100 * low:.1f} to {100 * high:.1f})")
+    return percent(value) + ("" if low is None else f" [{100 * low:.0f}–{100 * high:.0f}]")

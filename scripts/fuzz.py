@@ -2,7 +2,8 @@
 
 Inputs are read in child processes, a batch in each: one that crashes or hangs, in this package or
 in a library under it, ends its child alone. It is kept in the folder given, named after what went
-wrong; the same seed gives the same inputs. `docs/security.md` says what was found.
+wrong; the same seed gives the same inputs. Findings so far:
+`docs/explanation/untrusted-data.md`.
 
     python scripts/fuzz.py buffers --inputs 1000000
     python scripts/fuzz.py all --seconds 60

@@ -202,7 +202,7 @@ class Recall(Privileged):
         if info.evidence is None:
             raise PolicyError(
                 "recall needs to know which frames show the answer, which is unknown here",
-                "Build the buffer set from a source with evidence: see docs/sources.md.",
+                "Build the buffer set from a source with evidence: see docs/reference/sources.md.",
             )
         self._known = known_parts(info.evidence, MEMORIES[self.memory](info.history_frames))
 

@@ -34,7 +34,7 @@ _ATTEMPT_S = 10.0
 _PAUSES_S = (0.2, 5.0)
 """The first pause between two attempts, which doubles, and the longest."""
 
-_GUIDE = "docs/systems.md describes how to start one."
+_GUIDE = "docs/how-to/policy-server.md describes how to start one."
 
 
 def _is_keepalive(error: Exception) -> bool:
@@ -130,7 +130,7 @@ class ServerConnection:
             raise PolicyServerError(
                 f"policy server {self.name} answers without {expected!r}: "
                 f"{', '.join(map(str, answer)) or 'an empty map'}",
-                "Is it an MME-VLA server? docs/systems.md has the order of calls.",
+                "Is it an MME-VLA server? docs/how-to/policy-server.md has the order of calls.",
             )
         return answer
 

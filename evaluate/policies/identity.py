@@ -135,8 +135,8 @@ def check_memory_kind(keeps: bool, server: str, system: System) -> None:
     raise PolicyServerError(
         f"the policy server {server} {actual}, and that of {system.name} {expected}: it serves "
         "another kind of model",
-        f"Start it with the checkpoint of {system.name} (docs/systems.md has a table) and the "
-        "history_config.txt beside it, or set `system` to a name of your own.",
+        f"Start it with the checkpoint of {system.name} (docs/how-to/paper-systems.md lists them) "
+        "and the history_config.txt beside it, or set `system` to a name of your own.",
     )
 
 

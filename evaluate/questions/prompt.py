@@ -71,4 +71,4 @@ def read_letter(text: str, letters: str) -> str | None:
 
 def load_prompt(name: str) -> tuple[QuestionPrompt, str]:
     """Read a prompt: `choice`, or a TOML file by its path; and the SHA-256 of its file."""
-    return read_prompt(QuestionPrompt, __package__, PROMPTS, name, "docs/questions.md")
+    return read_prompt(QuestionPrompt, __package__, PROMPTS, name, "docs/reference/prompts.md")

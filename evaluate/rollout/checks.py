@@ -50,7 +50,7 @@ def default_system(config: RunConfig) -> str:
         raise InvalidOptionError(
             f"the rows of {learned} need a name: its text does not identify a checkpoint",
             "Set `system`, such as perceptual-framesamp-modul, or a name of your own: see "
-            "docs/systems.md.",
+            "docs/how-to/paper-systems.md.",
         )
     name = "-".join(filter(None, (spec.kind, spec.target, config.subgoals)))
     if spec.kind == "replay":
@@ -107,7 +107,9 @@ def _check_name(config: RunConfig, system: System) -> None:
     elif retrieval and Rule.parse(config.retrieval_rule).method != "max":
         fault = f"the retrieval step of {system.name} has the rule max, not {config.retrieval_rule}"
     if fault is not None:
-        raise InvalidOptionError(fault, "Set `system` to a name of your own: see docs/systems.md.")
+        raise InvalidOptionError(
+            fault, "Set `system` to a name of your own: see docs/how-to/paper-systems.md."
+        )
 
 
 def _check_subgoals(config: RunConfig, system: System) -> None:
@@ -148,7 +150,8 @@ def check_plan(
             raise InvalidOptionError(
                 f"{config.policy} needs to know which frames show the answer, which is unknown "
                 f"for {episode}",
-                "Build the demonstrations from a source with evidence: see docs/sources.md.",
+                "Build the demonstrations from a source with evidence; see "
+                "docs/reference/sources.md.",
             )
         if ":" in config.simulator:  # a simulator of the user may play any episode
             continue

@@ -47,7 +47,7 @@ class WorkConfig(WorkersConfig, RetrievalConfig):
         "1/1", group=_EPISODES, help="Part of the plan to run, such as 2/8; see merge."
     )
     system: str | None = setting(
-        None, group=_EPISODES, help="Label of the rows; see docs/systems.md."
+        None, group=_EPISODES, help="Label of the rows; see docs/reference/policies.md."
     )
     model_seed: int = setting(0, group=_EXECUTION, help="Seed for all random draws.")
     rollout_timeout_s: float = setting(
@@ -84,7 +84,7 @@ class RunConfig(WorkConfig):
         whole=True,
         metavar="NAME=VALUE",
         group=_POLICY,
-        help="Options of the policy, such as device=cpu; see docs/systems.md.",
+        help="Options of the policy, such as device=cpu; see docs/reference/policies.md.",
     )
     simulator: str = setting(
         "tabletop", group=_SIMULATOR, help="tabletop, robomme or module:function."
@@ -105,7 +105,7 @@ class RunConfig(WorkConfig):
         None,
         metavar="NAME|FILE",
         group=_SUBGOALS,
-        help="Prompt of a model: simple, grounded, memer or a file; see docs/subgoals.md.",
+        help="Prompt of a model: simple, grounded, memer or a file; see docs/reference/prompts.md.",
         shown="as the system's",
     )
     subgoal_options: tuple[str, ...] = setting(

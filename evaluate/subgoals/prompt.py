@@ -195,4 +195,4 @@ def merge_near(frames: Sequence[int], distance: int) -> list[int]:
 
 def load_prompt(name: str) -> tuple[Prompt, str]:
     """Read one of `PROMPTS`, or a TOML file; return it with the SHA-256 of its file."""
-    return read_prompt(Prompt, __package__, PROMPTS, name, "docs/subgoals.md")
+    return read_prompt(Prompt, __package__, PROMPTS, name, "docs/reference/prompts.md")

@@ -1,7 +1,7 @@
 """Image features stored beside a dataset (its index), and the embeddings computed from them.
 
 `robomme-interference index` writes an index; reading one needs only numpy. An index depends on its
-dataset, encoder and camera. Every episode has its own file. `docs/format.md` lists the files.
+dataset, encoder and camera. Every episode has its own file (`docs/reference/file-layout.md`).
 Only this module turns features into embeddings, both of stored frames and of live images.
 """
 

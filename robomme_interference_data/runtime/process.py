@@ -114,7 +114,7 @@ class WorkerProcess:
             f"a worker process {problem}",
             "Worker processes import the script that starts them: it must be a file that makes "
             'the call under  if __name__ == "__main__":',
-        )
+        ) from None
 
 
 class ProcessScheduler(Scheduler[WorkerProcess]):

@@ -1,7 +1,7 @@
 """Records of manifests: sessions, buffers, and the header.
 
 The columns of `buffers.parquet` and the fields of `manifest.json` follow from these dataclasses
-(see `codec.py`); `docs/format.md` describes the files.
+(see `codec.py`); `docs/reference/file-layout.md` describes the files.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,7 @@
 """Records of datasets and their episodes.
 
 The columns of tables and the fields of headers follow from these dataclasses and from those in
-`manifest.py` and `rollouts.py` (see `codec.py`); `docs/format.md` describes the files.
+`manifest.py` and `rollouts.py` (see `codec.py`); files: `docs/reference/file-layout.md`.
 """
 
 from dataclasses import dataclass

@@ -79,7 +79,7 @@ def test_evidence_is_of_a_lesson(tmp_path: Path, kind: str) -> None:
 
 def test_evidence_outside_the_lesson_is_refused(tmp_path: Path) -> None:
     source = MadeUpSource({NAME: (40, 20)}, evidence=(EvidenceSpan(0, "lifts it", 5, 21),))
-    with pytest.raises(FormatError, match="of a lesson of 20"):
+    with pytest.raises(FormatError, match="its lesson has 20"):
         staged(tmp_path, source)
 
 

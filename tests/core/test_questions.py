@@ -186,7 +186,7 @@ def test_a_question_is_shown_in_words_and_as_a_picture(tmp_path: Path, run: Any)
         (("MoveCube/test/9",), "'MoveCube/test/9' is not in"),
         (("MoveCube",), "is not an episode id"),
         ((MOVE, "--out", "q.svg"), "a name that ends in .png"),
-        ((MOVE, "--out", TABLETOP / "manifests" / "q.png"), "whose files are a buffer set's"),
+        ((MOVE, "--out", TABLETOP / "manifests" / "q.png"), "a part of a buffer set"),
     ],
 )
 def test_what_cannot_be_shown(words: tuple[object, ...], message: str, run: Any) -> None:

@@ -52,7 +52,7 @@ def test_nobody_listens() -> None:
             policy.reset(info(0))
     assert f"policy server 127.0.0.1:{port} cannot be reached: " in raised.value.message
     assert raised.value.message.endswith("refused (for 0.5 s)")
-    assert "docs/systems.md" in (raised.value.hint or "")
+    assert "docs/how-to/policy-server.md" in (raised.value.hint or "")
 
 
 def test_a_port_that_never_answers_is_told_soon_and_given_up(

@@ -189,7 +189,7 @@ def test_what_is_no_prompt(tmp_path: Path, text: str, words: str) -> None:
     with pytest.raises(FormatError) as raised:
         load_prompt(str(path))
     assert words in raised.value.message and str(path) in raised.value.message
-    assert "docs/questions.md" in str(raised.value.hint)
+    assert "docs/reference/prompts.md" in str(raised.value.hint)
 
 
 def test_bytes_that_are_no_text(tmp_path: Path) -> None:

@@ -204,7 +204,7 @@ def test_two_do_not_make_one_index(own_buffers: Path) -> None:
 
 
 def test_the_files_are_the_golden_ones(own_buffers: Path) -> None:
-    """A change here is a change of the format: `docs/format.md`, and the format version."""
+    """A change here is a change of the format: raise its version."""
     build_index([own_buffers / "distractors"], TwoSums(), QUIET)
     written = own_buffers / "distractors" / "index"
     if os.environ.get("UPDATE_GOLDEN"):

@@ -62,5 +62,5 @@ def test_other_answers_occur_equally_often() -> None:
 
 
 def test_official_episodes_have_no_other_answer() -> None:
-    with pytest.raises(SourceError, match="scene and answer come together"):
+    with pytest.raises(SourceError, match="another answer"):
         SimulatorSource("robomme").contradict(SourceEpisode(EpisodeId("MoveCube", "test", 0)))

@@ -86,7 +86,7 @@ def test_help_shows_options_in_groups_and_examples_last(run: Run) -> None:
     out = run("build", "manifests", "--help")[1]
     assert "[OPTIONS] BUFFER_SET\n" in out
     out = run("index", "--help")[1]
-    order = ("\n  Embed", "Arguments:", "Options:", "Execution:", "--workers", "--json", "Example")
+    order = ("\n  Embed", "Arguments:", "Execution:", "--workers", "--json", "Example")
     assert [word for word in sorted(order, key=out.index)] == list(order)
 
 

@@ -107,7 +107,8 @@ import hashlib, json
 from importlib.util import find_spec
 from robomme_interference_data import load_buffer
 
-buffer = load_buffer("MoveCube/test/0", "k3", buffer_set="{buffer_set}", revision="data-1.0.0", verify=True)
+where = dict(buffer_set="{buffer_set}", revision="data-1.0.0")
+buffer = load_buffer("MoveCube/test/0", "k3", **where, verify=True)
 arrays = [buffer.frames("front"), buffer.frames("wrist"), buffer.states]
 print(json.dumps({{
     "arrays": [[a.shape, str(a.dtype), hashlib.sha256(a.tobytes()).hexdigest()] for a in arrays],

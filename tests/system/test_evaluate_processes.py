@@ -39,8 +39,8 @@ def _world(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 def start(
     out: Path, pause: float = 0.0, policy: str = runs.CHEAT, words: Sequence[str] = ()
 ) -> subprocess.Popen[str]:
-    usual = f"evaluate {os.environ[worlds.BUFFER_SET]} --policy {policy} --simulator {runs.WORLD} --system mine --workers 2"
-    usual += " --families VideoRepick,MoveCube --json"
+    usual = f"evaluate {os.environ[worlds.BUFFER_SET]} --policy {policy} --simulator {runs.WORLD}"
+    usual += " --system mine --workers 2 --families VideoRepick,MoveCube --json"
     called = [sys.executable, "-m", "robomme_interference_data.cli.main", *usual.split(), *words]
     return subprocess.Popen(
         [*called, "--out", str(out)],
@@ -254,7 +254,7 @@ def test_a_script_needs_its_guard(tmp_path: Path) -> None:
     assert done.stderr.splitlines()[-1].endswith(GUARD)
     assert read_record(tmp_path / "run") == {}
     stopped = json.loads((tmp_path / "run" / "run.json").read_text())["starts"][0]["stopped"]
-    assert "came upon the call that start" in stopped
+    assert "would start worker processes" in stopped
     done = script(tmp_path, f"{GUARD}\n    print({call}.counts)")
     assert done.stderr == ""
     assert done.stdout == "{'success': 1, 'fail': 0, 'timeout': 0, 'error': 0}\n"

@@ -53,8 +53,8 @@ def buffer_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_replay_retraces_the_lesson_with_one_worker_as_with_two(
     buffer_set: Path, tmp_path: Path
 ) -> None:
-    # The buffer set was built from the same simulator: the same bits. All that MoveCube and RouteStick
-    # ask for is in the arm's motion.
+    # The buffer set was built from the same simulator: the same bits. Retracing the arm's motion
+    # solves MoveCube and RouteStick.
     runs = [
         run_evaluation(
             RunConfig(

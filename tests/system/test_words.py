@@ -23,7 +23,7 @@ REPLACED = (  # noqa: SIM905
     "Obeying unusual_retrieval cannot_be_told go_on --grid --go-on --split-dir new-split my-split "
     "load_split SplitFolder "
     # habits of prose
-    "whatever anybody anybody's anyone's told tells mended mends afterwards"
+    "whatever anybody anybody's anyone's told tells mended mends"
 ).split()
 PHRASES = (
     *("is told of", "stands under", "stand under", "goes before", "at hand", "of itself"),

@@ -84,7 +84,7 @@ def _select(
     if missing := [name for name in _REQUIRED if name not in columns]:
         raise FormatError(
             f"{path} lacks the columns {', '.join(missing)}; it has {', '.join(header) or 'none'}",
-            "Expected the rows of a run, or of the released CSVs (docs/score.md).",
+            "Expected the rows of a run, or of the released CSVs (docs/reference/score-tables.md).",
         )
     if "system" not in columns and not has_system:
         raise FormatError(
