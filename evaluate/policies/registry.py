@@ -180,5 +180,5 @@ def _check_members(text: str, policy: Any) -> None:
     if wrong:
         raise PolicyError(
             f"policy {text!r}: {type(policy).__name__} has {'; '.join(wrong)}",
-            "Subclass robomme_interference_data.evaluate.Policy; see docs/how-to/your-own-policy.md.",
+            "Subclass robomme_interference_data.evaluate.Policy: docs/how-to/your-own-policy.md.",
         )

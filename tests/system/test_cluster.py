@@ -57,7 +57,8 @@ def ended(out: Path) -> list[dict[str, Any]]:
 def driver(out: Path, address: str) -> subprocess.Popen[str]:
     """The command, as a user runs it."""
     words = f"evaluate {GOLDEN} --policy {runs.CHEAT} --simulator {runs.WORLD} --system mine"
-    words += f" --workers 3 --families VideoRepick,MoveCube --executor ray --ray-address {address} --json"
+    words += " --workers 3 --families VideoRepick,MoveCube"
+    words += f" --executor ray --ray-address {address} --json"
     command = [sys.executable, "-m", "robomme_interference_data.cli.main", *words.split()]
     return subprocess.Popen(
         [*command, "--out", str(out)],
