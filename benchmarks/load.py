@@ -268,9 +268,7 @@ def stream_peak(
     buffer_set = load_buffer_set(folder)
     manifest = buffer_set.manifest(episode, condition)
     longer = dataclasses.replace(
-        manifest,
-        sessions=manifest.sessions * times,
-        history_frames=manifest.history_frames * times,
+        manifest, sessions=manifest.sessions * times, history_frames=manifest.history_frames * times
     )
     buffer = Buffer(longer, buffer_set.query(episode), buffer_set.datasets)
     before = peak_memory()

@@ -85,11 +85,7 @@ def main() -> None:
             f"and fed to the server that unpacks; medians of {options.rounds} rounds.",
             ("<decoding and feeding", ">ms", ">ratio"),
             [
-                [
-                    way,
-                    f"{decoding.median(way) * 1e3:.0f}",
-                    f"{decoding.ratio(way, IN_TURN):.2f}",
-                ]
+                [way, f"{decoding.median(way) * 1e3:.0f}", f"{decoding.ratio(way, IN_TURN):.2f}"]
                 for way in (IN_TURN, AHEAD)
             ],
         )
@@ -198,10 +194,7 @@ def run_servers(pipe: Connection) -> None:
     async def serve_both() -> None:
         started = [
             await serve(
-                lambda connection, reads=reads: answer(connection, reads),
-                "127.0.0.1",
-                0,
-                **OPTIONS,
+                lambda connection, reads=reads: answer(connection, reads), "127.0.0.1", 0, **OPTIONS
             )
             for reads in (False, True)
         ]

@@ -30,12 +30,7 @@ from robomme_interference_data.build_dataset.manifests import (
     plan_manifests,
     write_manifests,
 )
-from robomme_interference_data.constants import (
-    DEMONSTRATIONS,
-    DISTRACTORS,
-    INFO_PATH,
-    RECORDS_PATH,
-)
+from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, INFO_PATH, RECORDS_PATH
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.retrieval.encoders import Encoder, make_encoder
 from robomme_interference_data.retrieval.grade import cells, grade

@@ -94,10 +94,7 @@ def identity_of(
 
 
 def complete_dataset(
-    root: Path,
-    records: Sequence[EpisodeRecord],
-    identity: DatasetIdentity,
-    skipped: dict[str, str],
+    root: Path, records: Sequence[EpisodeRecord], identity: DatasetIdentity, skipped: dict[str, str]
 ) -> None:
     """Complete a dataset that LeRobot's writer has finished; fills in `sums` of the identity.
 

@@ -31,11 +31,7 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.data.buffer_set import pending_rows
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.query_sessions import QuerySessions, SessionSource
-from robomme_interference_data.errors import (
-    BuildError,
-    InvalidOptionError,
-    SourceError,
-)
+from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
 from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, Condition, in_order
 from robomme_interference_data.schema.manifest import (
@@ -210,10 +206,7 @@ def _write_rows(plan: ManifestPlan, path: Path) -> Generator[int, None, dict[str
     """Write all rows; yields the number of buffers of each batch, and returns the counts."""
     schema = arrow_schema(BufferManifest)
     buffers = sessions = 0
-    with (
-        writing(path) as file,
-        pq.ParquetWriter(file, schema, compression="zstd") as writer,
-    ):
+    with writing(path) as file, pq.ParquetWriter(file, schema, compression="zstd") as writer:
         for batch in batched(planned_buffers(plan), _BATCH):
             writer.write_table(to_table(batch, schema), row_group_size=_BATCH)
             buffers += len(batch)

@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 _GROUP = "Publishing"
 
 Private = Annotated[
-    bool,
-    typer.Option("--private", help="Make new repositories private.", rich_help_panel=_GROUP),
+    bool, typer.Option("--private", help="Make new repositories private.", rich_help_panel=_GROUP)
 ]
 To = Annotated[
     Path | None,
@@ -40,8 +39,7 @@ To = Annotated[
     ),
 ]
 DryRun = Annotated[
-    bool,
-    typer.Option("--dry-run", help="Only show what would be sent.", rich_help_panel=_GROUP),
+    bool, typer.Option("--dry-run", help="Only show what would be sent.", rich_help_panel=_GROUP)
 ]
 Yes = Annotated[
     bool, typer.Option("--yes", help="Do not ask for confirmation.", rich_help_panel=_GROUP)
@@ -59,8 +57,7 @@ def card(
     repo_id: Annotated[str, typer.Option(help="Repository, namespace/name.")] = "namespace/name",
     version: Annotated[str, typer.Option(help="Version, such as 1.0.0.")] = "1.0.0",
     license: Annotated[
-        str,
-        typer.Option(help="License, such as cc-by-4.0; other: the license of the recordings."),
+        str, typer.Option(help="License, such as cc-by-4.0; other: the license of the recordings.")
     ] = OTHER,
 ) -> None:
     """Print the card (README.md) of a buffer set, of demonstrations or of a run.

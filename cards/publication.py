@@ -109,10 +109,7 @@ class Publication:
 
     repo_id: str = setting(help="Repository, namespace/name.", group=_GROUP)
     version: str | None = setting(
-        None,
-        help="Version, such as 1.0.0.",
-        shown="the published one, or the first",
-        group=_GROUP,
+        None, help="Version, such as 1.0.0.", shown="the published one, or the first", group=_GROUP
     )
     license: str = setting(
         OTHER,

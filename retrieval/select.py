@@ -144,10 +144,7 @@ class Similarities:
 
 
 def measure(
-    buffer: Buffer,
-    encoder: str,
-    camera: str = "front",
-    query: NDArray[np.floating] | None = None,
+    buffer: Buffer, encoder: str, camera: str = "front", query: NDArray[np.floating] | None = None
 ) -> Similarities:
     """Return the similarities of a buffer from its stored embeddings.
 

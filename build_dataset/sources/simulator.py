@@ -89,10 +89,7 @@ class ShiftedSource(SimulatorSource):
 
 
 def _play(
-    simulator: Simulator,
-    lesson: Demonstration,
-    first: Observation,
-    act: Callable[[], Any] | None,
+    simulator: Simulator, lesson: Demonstration, first: Observation, act: Callable[[], Any] | None
 ) -> Generator[Frame]:
     recorded = len(lesson.actions) == len(lesson)
     for index in range(len(lesson)):

@@ -200,8 +200,7 @@ def read_run(folder: Path) -> tuple[RunHeader, dict[WorkItem, Rollout]]:
     for name in (RUN_HEADER, RUN_RECORD):
         if not (folder / name).is_file():
             raise RunError(
-                f"{folder} holds no run: {name} is missing",
-                "Give a complete folder of a run.",
+                f"{folder} holds no run: {name} is missing", "Give a complete folder of a run."
             )
     header, rows = read_header(folder / RUN_HEADER, RunHeader), read_record(folder)
     return header.standing(rows), rows

@@ -5,11 +5,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from robomme_interference_data.errors import (
-    InterferenceError,
-    InvalidOptionError,
-    NoRendererError,
-)
+from robomme_interference_data.errors import InterferenceError, InvalidOptionError, NoRendererError
 
 PROGRAM = "robomme-interference"
 

@@ -47,11 +47,7 @@ class WorkProgress:
     """
 
     def __init__(
-        self,
-        *,
-        unit: str = "frames",
-        quiet: bool = False,
-        above: Callable[[], str] | None = None,
+        self, *, unit: str = "frames", quiet: bool = False, above: Callable[[], str] | None = None
     ):
         self.console = Console(stderr=True, quiet=quiet)
         self._bars = _Bars(

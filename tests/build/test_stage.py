@@ -120,8 +120,7 @@ def test_an_episode_that_yields_nothing_is_remembered(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "change",
-    [{"cameras": ("front",)}, {"codec": "lerobot-default"}, {"kind": "distractors"}],
+    "change", [{"cameras": ("front",)}, {"codec": "lerobot-default"}, {"kind": "distractors"}]
 )
 def test_what_decides_the_content_decides_the_folder(change: dict[str, Any]) -> None:
     source = MadeUpSource({NAME: (300, 20)})

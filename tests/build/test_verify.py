@@ -358,11 +358,7 @@ def skipping(path: Path) -> None:
         (DATA, partial(edit, change=lambda t: t.append_column("x", t["index"])), "x is undeclared"),
         (ROWS, partial(edit, change=lambda t: t.append_column("x", t["seed"])), r"'x'\]"),
         (ROWS, partial(edit, change=lambda t: pa.concat_tables([t, t[:1]])), "2 rows of Video"),
-        (
-            ROWS,
-            partial(edit, change=lambda t: pa.concat_tables([t[:2], t[1:]])),
-            "2 rows of Video",
-        ),
+        (ROWS, partial(edit, change=lambda t: pa.concat_tables([t[:2], t[1:]])), "2 rows of Video"),
     ],
 )
 def test_what_only_the_meaning_shows(

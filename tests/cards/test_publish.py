@@ -165,8 +165,7 @@ def changed(tmp_path: Path, how: str) -> tuple[Path, dict[str, str]]:
 
 
 @pytest.mark.parametrize(
-    ("how", "following"),
-    [("card", "1.0.1"), ("added", "1.1.0"), ("drawn", "2.0.0")],
+    ("how", "following"), [("card", "1.0.1"), ("added", "1.1.0"), ("drawn", "2.0.0")]
 )
 def test_a_version_never_changes(hub: HubServer, tmp_path: Path, how: str, following: str) -> None:
     lessons, units = publish(GOLDEN)
@@ -288,8 +287,7 @@ def test_published_demonstrations_that_cannot_be_used(hub: HubServer, tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("who", "exists"),
-    [({"name": "stranger"}, False), ({"name": "someone", "write": False}, True)],
+    ("who", "exists"), [({"name": "stranger"}, False), ({"name": "someone", "write": False}, True)]
 )
 def test_a_token_without_rights(
     hub: HubServer, login: Login, who: dict[str, object], exists: bool

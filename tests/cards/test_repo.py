@@ -219,10 +219,7 @@ def test_a_base_is_a_commit_on_the_hub(location: object) -> None:
 
 def test_versions_are_tags() -> None:
     tags = {"v3.0": "a", "data-1.10.0": "b", "data-1.9.9": "c", "data-01.0.0": "d", "data-2": "e"}
-    assert list(versions_of(tags).items()) == [
-        (Version(1, 9, 9), "c"),
-        (Version(1, 10, 0), "b"),
-    ]
+    assert list(versions_of(tags).items()) == [(Version(1, 9, 9), "c"), (Version(1, 10, 0), "b")]
     texts = ("1.2", "1.2.3 ", "v1.2.3", "1.2.3")
     assert [Version.parse(text) for text in texts] == [None, None, None, Version(1, 2, 3)]
 

@@ -103,10 +103,7 @@ HOSTILE = (
 
 def test_hostile_goals_are_text(tmp_path: Path) -> None:
     buffer_set = made_up(tmp_path, query={"goals": (HOSTILE,), "difficulty": HOSTILE})
-    for text in (
-        buffer_set_text(buffer_set, OF_BUFFER_SET),
-        demonstrations_text(buffer_set),
-    ):
+    for text in (buffer_set_text(buffer_set, OF_BUFFER_SET), demonstrations_text(buffer_set)):
         assert "{{ about }} &#124; \\`x\\` &lt;script&gt;" in text
         assert "<script" not in text
         assert "http://b.c" not in text

@@ -49,11 +49,7 @@ def test_the_order_of_input_does_not_matter(known: list[EpisodeId], names: list[
             UnknownNameError,
             "MoveCube/test/3 and 1 more\nIts episodes of MoveCube/test are 0-2,5",
         ),
-        (
-            {"split": "val", "families": ["MoveCube"]},
-            UnknownNameError,
-            "MoveCube/val are none",
-        ),
+        ({"split": "val", "families": ["MoveCube"]}, UnknownNameError, "MoveCube/val are none"),
         ({"families": ["MoveCub"]}, UnknownNameError, "Did you mean 'MoveCube'?"),
         ({"split": "train"}, InvalidOptionError, "no train episode"),
         ({"episodes": "3-1"}, InvalidOptionError, "not a list of episode numbers"),

@@ -112,7 +112,7 @@ def test_options_reach_the_policy_with_the_declared_type() -> None:
 
     typed = ["a=7", "b=null", "c=null", "d=true", "e=x=y", "f=[1]"]
     assert bind_options("mine", make, {}, typed) == {
-        **{"a": "7", "b": "null", "c": None, "d": True, "e": "x=y", "f": [1]},
+        **{"a": "7", "b": "null", "c": None, "d": True, "e": "x=y", "f": [1]}
     }
 
 

@@ -479,11 +479,7 @@ def test_the_command_prints_results_and_how_to_resume(
     monkeypatch.setattr(evaluation, "make_executor", lambda config: Serial())
     with ChatServer(look, faults=[BROKEN] * 9) as server:
         usual = {"model": f"openai:{server.url}#tiny", "system": "tiny", "families": "MoveCube"}
-        usual |= {
-            "out": tmp_path / "run",
-            "conditions": "k0",
-            "max-errors": 1,
-        }
+        usual |= {"out": tmp_path / "run", "conditions": "k0", "max-errors": 1}
         usual |= {"model-option": "repeats=0"}
         line = [
             "ask",

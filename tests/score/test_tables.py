@@ -41,11 +41,7 @@ def of_paper() -> tuple[list[Table], Score]:
 
 @pytest.mark.parametrize("name", ["score", "score-kinds", "score-questions"])
 def test_tables_are_those_of_the_golden_files(
-    name: str,
-    kinds: Score,
-    questions: Score,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    name: str, kinds: Score, questions: Score, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)  # the note of a comparison holds the paths as they were given
     golden = {path.name: path.read_text(encoding="utf-8") for path in (GOLDEN / name).iterdir()}

@@ -32,11 +32,7 @@ def plain_cards(monkeypatch: pytest.MonkeyPatch) -> None:
     def card(_: Facts, about: Publication) -> dict[str, bytes]:
         text = f"---\nlicense: {about.license}\n---\n{about}\n"
         picture, machines = about.repo_id.encode(), b"{}"
-        return {
-            "README.md": text.encode(),
-            "README-strip.png": picture,
-            "croissant.json": machines,
-        }
+        return {"README.md": text.encode(), "README-strip.png": picture, "croissant.json": machines}
 
     monkeypatch.setattr(publish_module, "card_files", card)
 
@@ -47,10 +43,7 @@ def content_of(root: Path, repo_id: str = UNITS, **options: Any) -> BufferSetCon
 
 
 def plan(
-    root: Path,
-    repo_id: str = UNITS,
-    private: bool = False,
-    **options: Any,
+    root: Path, repo_id: str = UNITS, private: bool = False, **options: Any
 ) -> tuple[BufferSetContent, Publisher, list[RepoPlan]]:
     """Plan to publish a buffer set."""
     content = content_of(root, repo_id, **options)

@@ -61,10 +61,7 @@ def driver(out: Path, address: str) -> subprocess.Popen[str]:
     words += f" --executor ray --ray-address {address} --json"
     command = [sys.executable, "-m", "robomme_interference_data.cli.main", *words.split()]
     return subprocess.Popen(
-        [*command, "--out", str(out)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
+        [*command, "--out", str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
 
 

@@ -107,10 +107,7 @@ SPECS = {
         *_WITHIN,
     ),
     "matrix": TableSpec(
-        "All pairs of systems",
-        _EFFECT,
-        f"Complete cells within each condition. {_BOTH}",
-        *_WITHIN,
+        "All pairs of systems", _EFFECT, f"Complete cells within each condition. {_BOTH}", *_WITHIN
     ),
     "interaction": TableSpec(
         "Which system loses more",
