@@ -59,7 +59,7 @@ def _commands(name: str, command: Any, level: int) -> Iterator[str]:
     arguments = [one for one in command.params if not one.opts[0].startswith("-")]
     options = [one for one in command.params if one.opts[0].startswith("-")]
     usage = " ".join([name, *(_argument(one) for one in arguments), "[OPTIONS]"])
-    prose, _, examples = (command.help or "").partition("Example")
+    prose, _, examples = (command.help or "").partition("\nExample")
     yield f"{'#' * level} `{name.removeprefix('robomme-interference ')}`\n"
     yield f"```text\n{usage}\n```\n"
     yield _paragraphs(prose)
