@@ -61,11 +61,17 @@ class InterferenceError(Exception):
 
 
 class InvalidIdError(InterferenceError, ValueError):
-    """An episode id or condition that cannot be parsed."""
+    """An episode id or condition that cannot be parsed.
+
+    Fix: write `<Family>/<split>/<index>`, such as `VideoRepick/test/7`, and a condition such as `k3`.
+    """
 
 
 class UnknownNameError(InterferenceError, LookupError):
-    """An episode, family, condition or camera that the data does not hold."""
+    """An episode, family, condition or camera that the data does not hold.
+
+    Fix: use one of the names that the message offers; `list BUFFER_SET` prints all.
+    """
 
     @classmethod
     def among(cls, what: str, given: object, where: object, known: Iterable[object]) -> Self:
@@ -80,7 +86,10 @@ class UnknownNameError(InterferenceError, LookupError):
 
 
 class InvalidOptionError(InterferenceError, ValueError):
-    """An option or argument with a value that is not allowed."""
+    """An option or argument with a value that is not allowed.
+
+    Fix: use a value that the message names; `--help` of the command lists them.
+    """
 
     @classmethod
     def expected(cls, option: str, given: object, expected: str, hint: str | None = None) -> Self:
@@ -96,7 +105,10 @@ class InvalidOptionError(InterferenceError, ValueError):
 
 
 class MissingExtraError(InterferenceError, ImportError):
-    """A library of an optional extra is not installed."""
+    """A library of an optional extra is not installed.
+
+    Fix: install the extra that the message names.
+    """
 
     @classmethod
     def needs(cls, what: str, library: str, extra: str) -> Self:
@@ -108,11 +120,17 @@ class MissingExtraError(InterferenceError, ImportError):
 
 
 class MissingFileError(InterferenceError, FileNotFoundError):
-    """A dataset, buffer set or embedding index lacks a required file, or was made of other data."""
+    """A dataset, buffer set or embedding index lacks a required file, or was made of other data.
+
+    Fix: check the path; fetch or build the missing part, or run `index`.
+    """
 
 
 class FormatError(InterferenceError, ValueError):
-    """A file or message that is damaged, inconsistent, or of an unknown version."""
+    """A file or message that is damaged, inconsistent, or of an unknown version.
+
+    Fix: download or build the file again; `verify` lists everything that is damaged.
+    """
 
     @classmethod
     def damaged(cls, path: object, what: object) -> Self:
@@ -121,63 +139,108 @@ class FormatError(InterferenceError, ValueError):
 
 
 class HashMismatchError(InterferenceError, ValueError):
-    """Data whose SHA-256 differs from the recorded one."""
+    """Data whose SHA-256 differs from the recorded one.
+
+    Fix: download or build the data again; `verify` lists every mismatch.
+    """
 
 
 class HubError(InterferenceError, OSError):
-    """The Hub does not know a repository, denies access to it, or cannot be reached."""
+    """The Hub does not know a repository, denies access to it, or cannot be reached.
+
+    Fix: check the repository's name, log in with `hf auth login`, or try again later.
+    """
 
 
 class SourceError(InterferenceError, ValueError):
-    """Recorded episodes that cannot be used."""
+    """Recorded episodes that cannot be used.
+
+    Fix: correct the recording that the message names, or exclude it.
+    """
 
 
 class BuildError(InterferenceError, RuntimeError):
-    """A build that cannot continue, for example because the pool has too few units."""
+    """A build that cannot continue, for example because the pool has too few units.
+
+    Fix: provide more distractor units, or plan fewer sessions.
+    """
 
 
 class PublishError(InterferenceError, RuntimeError):
-    """Data or results that cannot be published, or not under the requested version."""
+    """Data or results that cannot be published, or not under the requested version.
+
+    Fix: run `verify`, or choose the version that the message suggests.
+    """
 
 
 class RunError(InterferenceError, RuntimeError):
-    """A run or rollout that cannot proceed: folder in use, other settings, simulator mismatch."""
+    """A run or rollout that cannot proceed: folder in use, other settings, simulator mismatch.
+
+    Fix: use another `--out`, or the settings of the existing run.
+    """
 
 
 class NoRendererError(InterferenceError, RuntimeError):
-    """No Vulkan device on this machine can render the simulator's cameras."""
+    """No Vulkan device on this machine can render the simulator's cameras.
+
+    Fix: install a Vulkan driver: `sudo make vulkan`; then `doctor`.
+    """
 
 
 class SimulatorCrashError(InterferenceError, RuntimeError):
-    """A simulator's process ended, timed out, or reported an internal error."""
+    """A simulator's process ended, timed out, or reported an internal error.
+
+    Fix: re-run the same command; see `errors.log` if it happens again.
+    """
 
 
 class PolicyError(InterferenceError, RuntimeError):
-    """A policy that does not fit, fails, is called out of order, or returns invalid actions."""
+    """A policy that does not fit, fails, is called out of order, or returns invalid actions.
+
+    Fix: correct the policy; its own traceback is in `errors.log`.
+    """
 
 
 class PolicyServerError(InterferenceError, ConnectionError):
-    """A policy server that cannot be reached, reports an error, or does not answer in time."""
+    """A policy server that cannot be reached, reports an error, or does not answer in time.
+
+    Fix: check that the server runs and is reachable; its log has the details.
+    """
 
 
 class ServerKeepaliveError(PolicyServerError):
-    """A policy server that closed its connection because one call blocked it for too long."""
+    """A policy server that closed its connection because one call blocked it for too long.
+
+    Fix: re-run the same command: a server that has compiled answers faster.
+    """
 
 
 class ServerDiedError(PolicyServerError):
-    """A policy server that a worker started and whose process ended."""
+    """A policy server that a worker started and whose process ended.
+
+    Fix: read the server's log in `RUN/servers`.
+    """
 
 
 class ModelError(InterferenceError, ConnectionError):
-    """A vision-language model that cannot be reached or gives no usable answer."""
+    """A vision-language model that cannot be reached or gives no usable answer.
+
+    Fix: check the endpoint and the model's name.
+    """
 
 
 class WorkerError(InterferenceError, RuntimeError):
-    """Workers that cannot be started, or a cluster that is missing or not set up as required."""
+    """Workers that cannot be started, or a cluster that is missing or not set up as required.
+
+    Fix: follow the message; with `--workers 1` a problem is easier to see.
+    """
 
 
 class WorkerRetiredError(InterferenceError, RuntimeError):
-    """A worker that can run no further task; the other workers take over its tasks."""
+    """A worker that can run no further task; the other workers take over its tasks.
+
+    Fix: nothing: it is handled inside a run.
+    """
 
 
 def nearest(given: str, known: Iterable[str], *, more: str = "Known: ") -> str:
