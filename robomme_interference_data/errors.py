@@ -63,7 +63,7 @@ class InterferenceError(Exception):
 class InvalidIdError(InterferenceError, ValueError):
     """An episode id or condition that cannot be parsed.
 
-    Fix: write `<Family>/<split>/<index>`, such as `VideoRepick/test/7`, and a condition such as `k3`.
+    Fix: write `<Family>/<split>/<index>`, such as `VideoRepick/test/7`; conditions such as `k3`.
     """
 
 
