@@ -4,7 +4,7 @@ from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.kind import Run
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.runtime.executor import Worker
-from robomme_interference_data.schema.rollouts import Rollout
+from robomme_interference_data.schema.rollouts import Rollout, Status
 
 
 class Nothing:
@@ -17,6 +17,7 @@ class Nothing:
         """Return its row."""
         return self._run.row(
             task,
-            **{"seed": 0, "difficulty": "easy", "goal": "", "status": "fail", "success": False},
-            **{"steps": 0, "history_frames": 0, "lesson_frames": 0, "lesson_share": None},
+            Status.FAIL,
+            **{"seed": 0, "difficulty": "easy", "goal": "", "steps": 0},
+            **{"history_frames": 0, "lesson_frames": 0, "lesson_share": None},
         )

@@ -132,7 +132,9 @@ def test_the_commands_of_the_pages_run(
         (tmp_path / name).write_text(prompt)
     with ChatServer(lambda seen: "A") as chat:
         for line in (*BEFORE.get(page.name, ()), *lines):
-            given = re.sub(r"--episodes [0-9-]+", "--episodes 0", line)
+            given = line
+            if not line.startswith("power"):
+                given = re.sub(r"--episodes [0-9-]+", "--episodes 0", given)
             given = re.sub(r"openai:\S+", f"openai:{chat.url}#tiny", given)
             if not asked:
                 given = given.replace("RouteStick", "PatternLock").replace("Unmask/", "Repick/")
