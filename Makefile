@@ -17,8 +17,7 @@ help:  ## Print this list.
 setup: install  ## Install what is missing: packages in .venv, a Vulkan driver, Chromium.
 	@scripts/system_packages.sh chromium
 
-# All but what only tests need.
-install:
+install:  ## Install all but what only tests need.
 	@scripts/setup.sh
 	@scripts/system_packages.sh vulkan
 

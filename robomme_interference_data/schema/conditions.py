@@ -137,7 +137,7 @@ _KINDS = (
         "raw",
         lambda p, k: (p.lesson(), *p.units(k, RAW_DISTRACTORS)),
         "lesson, the same n units at full rate: 256 frames, stride 1",
-        "whether the stride gives the border away",
+        "whether the change of frame rate reveals where the lesson ends",
         (RAW_DISTRACTORS,),
     ),
     Kind(

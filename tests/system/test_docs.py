@@ -18,6 +18,7 @@ from support.hub import push_buffer_set, running_hub
 from support.runs import run as evaluate_world
 from support.tabletop import copy_tabletop
 
+from robomme_interference_data import load_buffer
 from robomme_interference_data.evaluate.run import evaluation as run_module
 from robomme_interference_data.runtime.executor import Serial
 
@@ -208,6 +209,23 @@ def test_the_example_of_a_policy_runs(
     assert [(row.condition, row.status, row.steps) for row in result.rows] == [
         ("no-history", "fail", worlds.STEPS),
         ("k0", "success", 4),
+    ]
+
+
+def test_the_example_of_recordings_becomes_buffers(
+    tmp_path: Path, run: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = DOCS / "how-to" / "your-own-recordings.md"
+    monkeypatch.chdir(tmp_path)
+    exec(example(page, "frames"), {})
+    [line] = [one for one in command_lines(page) if "k0,k1" in one and one.startswith("build all")]
+    code, _, err = run(*shlex.split(line), "--workers", "1")
+    assert code == 0, err
+    buffer = load_buffer("OpenDrawer/test/0", "k1", buffer_set=tmp_path / "my-buffers", verify=True)
+    assert [len(buffer), *(one.family for one in buffer.sessions)] == [
+        72,
+        "OpenDrawer",
+        "StackCups",
     ]
 
 
