@@ -285,17 +285,12 @@ def test_views_under_shifts_are_of_the_queries(tmp_path: Path) -> None:
     ("changes", "plan", "error"),
     [
         ({"workers": 0}, {}, InvalidOptionError),
-        ({"codec": "h264"}, {}, InvalidOptionError),
-        ({"episodes": "3-1"}, {}, InvalidOptionError),
-        ({"time_limit_s": 0.0}, {}, InvalidOptionError),
         ({"time_limit_s": float("nan")}, {}, InvalidOptionError),
-        ({"columns": ("front",)}, {}, InvalidOptionError),
         ({"columns": ("front=a", "front=b")}, {}, InvalidOptionError),
         ({}, {"conditions": ("k0", "k0")}, InvalidOptionError),
         ({}, {"conditions": ("x3",)}, InvalidIdError),
         ({}, {"position_limit": "many"}, InvalidOptionError),
         ({}, {"conditions": ("k63",)}, BuildError),
-        ({"source": ("robomme",)}, {}, InvalidOptionError),
         ({"shifted": True}, {}, InvalidOptionError),  # the sample has no lamps
         ({"source": ("sample:MoveCube",)}, {}, BuildError),
     ],

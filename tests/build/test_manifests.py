@@ -9,7 +9,6 @@ from support.buffer_sets import CONDITIONS, GOLDEN, QUERIES, contents, copy_buff
 from support.made_up import record, write_metadata
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.build_dataset.config import AllConfig, PlanConfig, plan_all
 from robomme_interference_data.build_dataset.manifests import (
     in_folder,
     plan_manifests,
@@ -25,9 +24,7 @@ from robomme_interference_data.errors import (
     MissingFileError,
     SourceError,
 )
-from robomme_interference_data.schema.conditions import KINDS, Kind, parse_condition
-from robomme_interference_data.schema.draw import UnitPool
-from robomme_interference_data.storage.arrays import combine
+from robomme_interference_data.schema.conditions import parse_condition
 
 FAMILIES = ("MoveCube", "InsertPeg", "PatternLock", "Drawer")
 
@@ -57,40 +54,6 @@ def test_the_golden_manifests_come_out_again(tmp_path: Path, name: str) -> None:
         == 15
     )
     assert contents(root) == contents(GOLDEN)
-
-
-def test_what_buffers_hold(tmp_path: Path) -> None:
-    root = made_up(tmp_path)
-    plan = plan_manifests(in_folder(root), ("no-history", "k0", "k2", "k4"), seed=5)
-    found = {str(one): one for one in planned_buffers(plan)}
-    assert len(found) == 8 * 4
-    one = found["PatternLock/test/1 under k4"]
-    pool = UnitPool((unit.episode_id for unit in plan.datasets["distractors"].records()), 5)
-    drawn = pool.draw(one.episode_id, 4)
-    assert [session.source for session in one.sessions] == [one.episode_id, *drawn]
-    lesson, *units = one.sessions
-    query = plan.demonstrations.record(lesson.episode_index)
-    assert query.episode_id == one.episode_id
-    place = (lesson.role, lesson.dataset, lesson.start, lesson.stop, lesson.repeat)
-    assert place == ("lesson", "demonstrations", 0, 33, 1)
-    assert lesson.revision == plan.demonstrations.revision
-    assert lesson.sha256 == combine(query.feature_sha256)
-    for unit in units:
-        stored = plan.datasets["distractors"].record(unit.episode_index)
-        assert stored.episode_id == unit.source
-        place = (unit.role, unit.dataset, unit.start, unit.stop, unit.sha256)
-        sha256 = combine(stored.feature_sha256)
-        assert place == ("distractor", "distractors", 0, 32, sha256)
-    assert (one.k, one.lesson_frames, one.history_frames) == (4, 33, 33 + 4 * 32)
-    # An even 32-frame sample of 161 history frames and the live one: ⌊j·161/31⌋ < 33 for j ≤ 6.
-    assert one.lesson_share == 7 / 32
-    assert (one.query.dataset, one.query.frame) == ("demonstrations", 33)
-    # Nested, and paired over the conditions.
-    assert found["PatternLock/test/1 under k2"].sessions == one.sessions[:3]
-    assert found["PatternLock/test/1 under k0"].sessions == one.sessions[:1]
-    empty = found["PatternLock/test/1 under no-history"]
-    assert (empty.sessions, empty.history_frames, empty.lesson_share) == ((), 0, 0.0)
-    assert empty.query == one.query
 
 
 def test_what_buffers_beyond_the_paper_hold(tmp_path: Path) -> None:
@@ -167,24 +130,6 @@ def test_a_buffer_is_exact_where_all_of_it_is(tmp_path: Path) -> None:
     queries = [record("demonstrations", "MoveCube/test/0")]
     plan = plan_manifests(in_folder(made_up(tmp_path, queries=queries, units=units)), ("k0", "k3"))
     assert [one.exact for one in planned_buffers(plan)] == [True, False]
-
-
-def test_rules_ask_for_what_they_need(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a kind's k means is its rule's own affair: here it takes one unit more."""
-    more = Kind("more", lambda provider, k: tuple(provider.units(k + 1)))
-    monkeypatch.setitem(KINDS, "more", more)
-    root = made_up(tmp_path)
-    plan = plan_manifests(in_folder(root), ("k1", "more-k1", "more-k8"))
-    found = {one.condition: one.sessions for one in list(planned_buffers(plan))[:3]}
-    assert [len(sessions) for sessions in found.values()] == [2, 2, 9]
-    assert found["more-k1"] == found["more-k8"][:2]
-    with pytest.raises(BuildError, match="needs 10 distractor units"):
-        list(planned_buffers(plan_manifests(in_folder(root), ("more-k9",))))
-    buffer_set = tmp_path / "buffer_set"
-    asked = AllConfig(source=("sample:MoveCube,PatternLock",), buffer_set=buffer_set, split="test")
-    assert plan_all(asked, PlanConfig(conditions=("more-k1",)))
-    with pytest.raises(BuildError, match="needs 4 distractor units"):
-        plan_all(asked, PlanConfig(conditions=("more-k3",)))
 
 
 def test_a_pool_too_small(tmp_path: Path) -> None:

@@ -91,8 +91,8 @@ def test_a_clean_buffer_set() -> None:
 
 
 def test_what_people_put_beside_a_dataset_is_no_violation(own_buffers: Path) -> None:
-    (own_buffers / "distractors" / "README.md").write_text("mine")
-    (own_buffers / "distractors" / "LICENSE").write_text("mine")
+    for name in ("README.md", "README-strip.png", "croissant.json", "LICENSE"):
+        (own_buffers / "distractors" / name).write_text("mine")
     (own_buffers / "demonstrations" / ".gitattributes").write_text("")
     assert found(own_buffers) == []
 
@@ -154,29 +154,20 @@ def test_missing_and_cut_files(own_buffers: Path, path: str) -> None:
 
 @pytest.mark.parametrize(
     ("before", "after"),
-    [
-        ('"observation.state": {', '"state": {'),
-        ("/chunk-{chunk_index:03d}", "x" * 900),
-        ("/chunk-{chunk_index:03d}", "\\ud800"),
-    ],
+    [("/chunk-{chunk_index:03d}", "x" * 900), ("/chunk-{chunk_index:03d}", "\\ud800")],
 )
 def test_info_that_is_wrong(own_buffers: Path, before: str, after: str) -> None:
     info = own_buffers / "distractors" / "meta" / "info.json"
     assert before in info.read_text()
     info.write_text(info.read_text().replace(before, after))
-    expect(
-        own_buffers, "info.json: does not have", "observation.state|is too long|not a valid path"
-    )
+    expect(own_buffers, "info.json: does not have", "is too long|not a valid path")
 
 
 @pytest.mark.parametrize(
     ("path", "told"),
     [
-        *(
-            (f"distractors/{path}", "is not listed")
-            for path in ("data/x.parquet", "meta/more.json")
-        ),
-        *((f"distractors/{path}", "is not listed") for path in ("extra.bin", "more/README.md")),
+        ("distractors/data/x.parquet", "is not listed"),
+        ("distractors/more/README.md", "is not listed"),
         ("distractors/index/x.npy", "is not listed"),
         ("distractors/index/other", "index.json is missing"),
         ("manifests/x.parquet", "is not listed"),
@@ -216,24 +207,16 @@ def test_what_is_no_file_or_no_folder(own_buffers: Path) -> None:
     ("path", "change", "told"),
     [
         (DATA, first_changed("timestamp", 0.05), "timestamp of episode 3"),
-        (DATA, first_changed("timestamp", float("nan")), "timestamp of episode 3"),
         (DATA, as_text("timestamp"), "timestamp of episode 3 is of type string"),
         (DATA, first_changed("task_index", 0), "task_index of episode 3"),
-        (DATA, first_changed("index", 5), "index of episode 3"),
         (DATA, first_changed("frame_index", 1), "32 rows of episode 3"),
-        (DATA, first_changed("episode_index", 4), "episode 3"),
         (RECORDS, first_changed("dataset_from_index", 7), "dataset_from_index"),
-        (RECORDS, first_changed("dataset_to_index", 7), "dataset_to_index"),
         (RECORDS, first_changed(f"{FRONT}/to_timestamp", 1.0), "to_timestamp"),
-        (RECORDS, first_changed(f"{FRONT}/from_timestamp", 0.5), "from_timestamp"),
-        (RECORDS, first_changed(f"{FRONT}/file_index", 1), "is shared by"),
         (RECORDS, first_changed("data/file_index", 1), "is shared by episodes"),
         (RECORDS, first_changed("tasks", ["another"]), "tasks of"),
-        (RECORDS, first_changed("goals", ["another"]), "revision is"),
         (RECORDS, first_changed("length", 31), "holds 31 frames, not 32"),
         (RECORDS, first_changed("exec_start_idx", 7), "exec_start_idx is 7"),
         (RECORDS, first_changed("seed", 1), "revision is"),
-        (RECORDS, lambda t: t.drop_columns(["feature_sha256"]), "feature_sha256 is missing"),
         (RECORDS, lambda t: t.slice(1), "does not list the episodes"),
         (
             RECORDS,
@@ -241,8 +224,6 @@ def test_what_is_no_file_or_no_folder(own_buffers: Path) -> None:
             "dataset_from_index is missing",
         ),
         (EPISODES, first_changed("dataset_from_index", 7), "dataset_from_index differs"),
-        (EPISODES, first_changed("tasks", ["another"]), "tasks differs"),
-        (EPISODES, lambda t: t.slice(1), "does not list the episodes"),
         (
             "distractors/meta/tasks.parquet",
             lambda t: put(t, "task_index", list(reversed(range(len(t))))),
@@ -264,18 +245,11 @@ def test_tables_that_mean_something_else(
         ("stats", "action", None, "stats.json: action does not follow"),
         ("stats", "action", {"mean": [float("nan")]}, "NaN is not a finite number"),
         ("info", "total_frames", 1, "total_frames is 1"),
-        ("info", "total_episodes", 1, "does not list the episodes"),
-        ("info", "splits", {}, "splits is {}"),
-        ("info", "features", None, "features is None"),
         ("info", "fps", "10", "fps is '10'"),
         ("info", "video_path", "../../etc/{video_key}", "leads out of it"),
-        ("info", "video_path", "{video_key.__class__}", "cannot be filled in"),
         ("interference", "codec", "h264", "codec 'h264' is unknown"),
-        ("interference", "unit", None, "unit is None"),
         ("interference", "kind", "demonstrations", "kind is"),
-        ("interference", "exact", False, "exact is False"),
         ("interference", "sources", 3, "sources: 3"),
-        ("interference", "cameras", ["front"], "cameras is"),
         ("interference", "counts", {"episodes": 17, "frames": 1, "families": {}}, "counts is"),
     ],
 )
@@ -286,15 +260,6 @@ def test_json_that_means_something_else(
     path.write_text(json.dumps(json.loads(path.read_text()) | {field: value}))
     renew_sums(own_buffers / "distractors")
     expect(own_buffers, told)
-
-
-def test_goals_that_are_no_tasks(own_buffers: Path) -> None:
-    path = own_buffers / "distractors/meta/tasks.parquet"
-    name = next(one for one in pq.read_schema(path).names if one != "task_index")
-    edit(path, first_changed(name, "another"))
-    renew_sums(own_buffers / "distractors")
-    expect(own_buffers, "tasks.parquet: does not list the goals")
-    assert not any("-1" in one for one in found(own_buffers))
 
 
 def change_statistic(root: Path, feature: str) -> None:
@@ -338,7 +303,6 @@ def skipping(path: Path) -> None:
     ("path", "change", "told"),
     [
         ("distractors/meta/interference.json", as_bytes(told_again), "occurs twice"),
-        ("distractors/meta/build_report.json", as_bytes(told_again), "occurs twice"),
         ("distractors/meta/build_report.json", skipping, "has control characters"),
         (
             "distractors/meta/build_report.json",
@@ -350,15 +314,8 @@ def skipping(path: Path) -> None:
             partial(edit, change=lambda t: t.append_column("x", t["seed"])),
             "x is undeclared",
         ),
-        (
-            EPISODES,
-            partial(edit, change=lambda t: t.append_column("x", t["seed"])),
-            "x is undeclared",
-        ),
-        (DATA, partial(edit, change=lambda t: t.append_column("x", t["index"])), "x is undeclared"),
         (ROWS, partial(edit, change=lambda t: t.append_column("x", t["seed"])), r"'x'\]"),
         (ROWS, partial(edit, change=lambda t: pa.concat_tables([t, t[:1]])), "2 rows of Video"),
-        (ROWS, partial(edit, change=lambda t: pa.concat_tables([t[:2], t[1:]])), "2 rows of Video"),
     ],
 )
 def test_what_only_the_meaning_shows(
@@ -412,7 +369,6 @@ def renew_header(root: Path, **changes: Any) -> None:
         (first_changed("condition", "k9"), "under k9: should not be in"),
         (first_changed("lesson_share", 0.5), r"lesson_share is 0\.5; the rules give 0\.0"),
         (first_changed("goals", ["x"]), "goals is 'x' at 0; the rules give"),
-        (first_changed("history_frames", 5), "the sessions hold 0 frames"),
     ],
 )
 def test_rows_that_the_rules_do_not_give(
@@ -430,7 +386,6 @@ def test_rows_that_the_rules_do_not_give(
         ({"rule_version": 2}, "rule version 2; this package can check 1"),
         ({"counts": {}}, "counts are {}"),
         ({"conditions": ["k0"]}, "should not be in"),
-        ({"conditions": []}, "conditions"),
         ({"position_limit": 1400}, "under k3 needs 1444 positions"),
     ],
 )

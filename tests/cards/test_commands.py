@@ -53,8 +53,6 @@ def test_a_card_of_what_is_on_the_hub(
     [
         ((GOLDEN, "--license", "MIT License"), "--license 'MIT License'"),
         ((GOLDEN / "distractors",), "dataset of distractors"),
-        ((GOLDEN / "demonstrations" / "data",), "no buffer set"),
-        (("nowhere",), "neither a folder"),
         (("nobody/nothing",), "HF_HUB_OFFLINE"),
     ],
 )

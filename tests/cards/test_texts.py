@@ -21,7 +21,6 @@ from robomme_interference_data.cards.dataset_facts import (
     count_same_family,
     demonstrations_facts,
 )
-from robomme_interference_data.cards.facts import origin_limit
 from robomme_interference_data.cards.publication import Publication
 from robomme_interference_data.cards.render import card_files, card_text, croissant
 from robomme_interference_data.cards.results import results_facts
@@ -116,7 +115,6 @@ def test_hostile_goals_are_text(tmp_path: Path) -> None:
     "source",
     [
         {"kind": "```\n# x", "repo": "../../x", "revision": "main"},
-        {"kind": 7, "repo": ["a/b"], "revision": None},
         {"repo": "a/b", "revision": "javascript:x"},
     ],
 )
@@ -153,20 +151,6 @@ def test_conditions_and_limits_beyond_the_paper(tmp_path: Path) -> None:
     assert "seed 3" in text
     assert "| k0 | paper |" in text
     assert "| k2 | extension |" in text
-
-
-@pytest.mark.parametrize(
-    ("simulators", "told"),
-    [
-        ([], "name no simulator"),
-        (["robomme"], "official simulator"),
-        (["tabletop"], "is not RoboMME"),
-        (["sample"], "made-up pictures"),
-        (["<mine>"], "the simulator <mine>"),
-    ],
-)
-def test_where_episodes_come_from(simulators: list[str], told: str) -> None:
-    assert told in origin_limit(simulators)
 
 
 @pytest.mark.parametrize(

@@ -74,13 +74,6 @@ def test_centre_and_typical_cosine_are_of_the_units_alone(indexed: Path) -> None
     assert (other.center, other.header.typical_cosine) == (None, None)
 
 
-@pytest.mark.parametrize("name", ["demonstrations", "distractors"])
-def test_a_dataset_is_indexed_on_its_own(indexed: Path, own_buffers: Path, name: str) -> None:
-    build_index([own_buffers / name], Thumbnail(), QUIET)
-    both = files_of(indexed).items()
-    assert files_of(own_buffers) == {k: v for k, v in both if k.startswith(f"{name}/")}
-
-
 def test_a_live_frame_has_the_embedding_of_the_stored_one(indexed: Path) -> None:
     buffer = load_buffer(QUERIES[0], "k3", buffer_set=indexed)
     index, stored = buffer.index("thumbnail"), buffer.embeddings("thumbnail")
@@ -151,12 +144,9 @@ def test_an_interrupted_run_goes_on(indexed: Path, own_buffers: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "again"),
     [
-        ("distractors", [0, FRAMES[1]]),
         ("demonstrations", [FRAMES[0], 0]),
         ("distractors/index/thumbnail/chunk-000/episode-000003.npy", [0, FRAMES[1]]),
-        ("distractors/index/thumbnail/SHA256SUMS", [0, FRAMES[1]]),
         ("distractors/index/thumbnail/index.json", [0, FRAMES[1]]),
-        ("distractors/index/thumbnail/centre.npy", [0, FRAMES[1]]),
         ("demonstrations/index/thumbnail/stray.txt", [FRAMES[0], 0]),
     ],
 )

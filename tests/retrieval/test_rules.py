@@ -77,7 +77,6 @@ def test_the_cut_is_the_encoders_own_unless_given() -> None:
     assert str(Rule.parse("max")) == "max/adaptive"
     assert str(Rule.parse("mean/0.5", 0.923)) == "mean/0.5"
     assert str(Rule.parse("max/0.9234567")) == "max/0.9234567"  # not the same as max/0.923457
-    assert str(Rule.parse("max/-1")) == "max/-1"
     # 0.846 is what would give the paper's threshold.
     assert Rule("max", 0.923).threshold(0.1) == 0.923
     assert Rule("max", "adaptive").threshold(0.0) == 0.5
@@ -96,9 +95,7 @@ def test_all_rules() -> None:
     [
         ("maximum", UnknownNameError, "'maximum'"),
         ("max/high", InvalidOptionError, "'high'"),
-        ("max/", InvalidOptionError, "cut of max ''"),
         ("max/1.5", InvalidOptionError, r"1\.5"),
-        ("max/nan", InvalidOptionError, "nan"),
     ],
 )
 def test_rules_that_are_none(text: str, error: type[Exception], said: str) -> None:
@@ -162,10 +159,6 @@ def test_joined_takes_every_part_of_the_session() -> None:
     assert alone.spans == ((12, 16),)
     single = choose(embedded(np.stack([X, Y, Z]), Y), Rule("joined", 0.5))
     assert single.spans == ((1, 2),)
-
-
-def test_short_segments_count_if_there_are_no_others() -> None:
-    assert choose(embedded(np.stack([X, Y, Z]), Y), Rule("max", 0.5)).spans == ((1, 2),)
 
 
 def test_single_frames() -> None:
