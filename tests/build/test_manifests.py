@@ -1,4 +1,4 @@
-"""Manifests: what every buffer holds, the same bytes from the same inputs, and what is refused."""
+"""Manifests: contents of buffers, reproducible bytes, and invalid inputs."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -56,43 +56,7 @@ def test_the_golden_manifests_come_out_again(tmp_path: Path, name: str) -> None:
     assert contents(root) == contents(GOLDEN)
 
 
-def test_what_buffers_beyond_the_paper_hold(tmp_path: Path) -> None:
-    """The stored spans of each session; the draws are held by test_draw."""
-    root = made_up(tmp_path)
-    names = ("k2", "before-k2", "middle-k3", "held-k2", "same-k1", "parts-k2", "absent-k2")
-    plan = plan_manifests(in_folder(root), names)
-    found = {
-        one.condition: one
-        for one in planned_buffers(plan)
-        if str(one.episode_id) == "PatternLock/test/1"
-    }
-    lesson, *units = found["k2"].sessions
-    assert found["before-k2"].sessions == (*units, lesson)
-    assert found["absent-k2"].sessions == (*units,)
-    assert (found["absent-k2"].lesson_frames, found["absent-k2"].lesson_share) == (0, 0.0)
-    first, second, *rest = found["middle-k3"].sessions
-    assert [first, second] == units
-    assert [one.role for one in rest] == ["lesson", "distractor"]
-    start, *held = found["held-k2"].sessions
-    assert start == lesson
-    assert held[0] == held[1]
-    one = held[0]
-    assert (one.role, one.start, one.stop, one.repeat, one.sha256) == ("filler", 32, 33, 32, "l")
-    assert (one.source, one.dataset) == (lesson.source, "demonstrations")
-    assert (found["held-k2"].history_frames, found["held-k2"].lesson_frames) == (97, 33)
-    own = found["same-k1"].sessions[1]
-    assert (own.role, own.family, own.source.split) == ("distractor", "PatternLock", "train")
-    begin, *middle, end = found["parts-k2"].sessions
-    assert middle == units
-    assert [(one.role, one.start, one.stop) for one in (begin, end)] == [
-        ("lesson", 0, 16),
-        ("lesson", 16, 33),
-    ]
-    assert (begin.sha256, end.sha256) == ("1", "2")
-    assert found["parts-k2"].lesson_frames == 33
-
-
-def test_a_lesson_whose_parts_have_no_digests_is_refused(tmp_path: Path) -> None:
+def test_lesson_parts_without_digests_are_an_error(tmp_path: Path) -> None:
     queries = [record("demonstrations", "MoveCube/test/0", span_sha256=None)]
     root = made_up(tmp_path, queries=queries)
     assert len(list(planned_buffers(plan_manifests(in_folder(root), ("k1",))))) == 1
@@ -212,7 +176,7 @@ def test_a_buffer_is_planned_without_manifests() -> None:
         assert sessions.buffer(parse_condition(name)) == buffer_set.manifest(QUERIES[1], name)
 
 
-def test_earlier_manifests_are_replaced_and_strangers_kept(tmp_path: Path) -> None:
+def test_manifests_are_replaced_but_unknown_files_are_kept(tmp_path: Path) -> None:
     root = copy_buffer_set(tmp_path / "buffer_set")
     assert sum(write_manifests(plan_manifests(in_folder(root), ("k0",)), root)) == len(QUERIES)
     assert load_buffer_set(root).conditions == ("k0",)

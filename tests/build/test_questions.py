@@ -48,13 +48,13 @@ MANY = ("InsertPeg", "PatternLock", "RouteStick")
 
 
 def buffer_set_of(*episodes: EpisodeId, view: Any = GREY, **changes: Any) -> Any:
-    """What is asked of a buffer set, with episodes of the suite that nobody has recorded."""
+    """A stand-in for a buffer set, with episodes of the suite that were not recorded."""
 
     def query(episode: EpisodeId) -> Any:
         seed = seed_of(episode)
         known = {"simulator": "tabletop", "seed": seed, "difficulty": difficulty_of(seed)}
-        told = known | {"episode_id": episode, "frame": lambda: view} | changes
-        return SimpleNamespace(**told)
+        values = known | {"episode_id": episode, "frame": lambda: view} | changes
+        return SimpleNamespace(**values)
 
     demonstrations = SimpleNamespace(identity=SimpleNamespace(revision="r"))
     datasets = {DEMONSTRATIONS: demonstrations}
@@ -83,7 +83,7 @@ def of(made: Iterable[Made], family: str) -> list[Made]:
     return [one for one in made if one.question.episode_id.family == family]
 
 
-# --- what is asked -----------------------------------------------------------------------------
+# --- options --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -97,8 +97,8 @@ def test_the_right_option_is_the_scenes_answer_and_there_once(
         assert 3 <= len(set(choices)) == len(choices) <= 5
         assert choices[question.right] == scene.choice(answer)
         assert choices.count(scene.choice(answer)) == 1
-        told = list(zip(question.options, one.marks, strict=True))
-        assert len(set(told)) == len(told)  # whoever looks and reads can tell them apart
+        shown = list(zip(question.options, one.marks, strict=True))
+        assert len(set(shown)) == len(shown)  # text and marks distinguish the options
         assert question.text == scene.question and question.revision == "r"
         possible = {scene.choice(each) for each in scene.answers}
         assert len(choices) == (len(possible) if len(possible) <= 5 else 4)
@@ -115,7 +115,7 @@ def test_marks_and_their_letters_lie_inside_the_view_and_apart(made: list[Made])
                 assert math.dist(first, second) > 2 * 6.3 + 1
 
 
-# --- nothing gives the answer away -------------------------------------------------------------
+# --- no leaks -------------------------------------------------------------------------------------
 
 
 def excess(hits: Iterable[tuple[bool, float]]) -> float:
@@ -183,7 +183,7 @@ def test_who_sees_no_history_is_right_by_chance(made: list[Made], name: str) -> 
 def test_with_another_answer_only_the_right_place_is_another(
     family: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In one scene, whatever its answer is."""
+    """For every answer of the same scene."""
     for index in range(3):
         found = []
         episode = EpisodeId(family, "test", index)
@@ -213,7 +213,7 @@ def test_of_many_answers_the_others_are_drawn_alike(family: str) -> None:
     assert len(wrong) > min(count, wrong.total()) * 0.75
 
 
-# --- the same every time -----------------------------------------------------------------------
+# --- determinism and pictures ---------------------------------------------------------------------
 
 
 def bare(questions: Iterable[Question]) -> list[Question]:
@@ -231,7 +231,7 @@ def test_the_golden_questions_come_out_again() -> None:
         assert np.mean(np.abs(before.astype(int) - now)) < 1
 
 
-def test_whatever_the_hash_seed_the_same_bytes(tmp_path: Path) -> None:
+def test_same_bytes_for_any_hash_seed(tmp_path: Path) -> None:
     code = (
         "import sys\n"
         "from pathlib import Path\n"
@@ -254,9 +254,6 @@ def test_the_digest_is_of_all_that_is_asked() -> None:
     assert digest == digest_questions([second, first])
     for changes in ({"picture": b"x"}, {"right": (first.right + 1) % 3}, {"text": "What?"}):
         assert digest_questions([replace(first, **changes), second]) != digest  # type: ignore[arg-type]
-
-
-# --- pictures ----------------------------------------------------------------------------------
 
 
 def near(image: Any, point: tuple[int, int], way: int = 21) -> Any:
@@ -284,16 +281,13 @@ def test_a_thing_has_its_letter_over_it() -> None:
     assert (view == 200).all()
 
 
-# --- what is refused ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("changes", [{"simulator": "robomme"}, {"seed": -1}])
 def test_only_tabletops_episodes_have_questions(changes: dict[str, Any]) -> None:
     with pytest.raises(BuildError, match="MoveCube/test/0 .*does not list the possible answers"):
         list(make_questions(buffer_set_of(EpisodeId("MoveCube", "test", 0), **changes)))
 
 
-def test_views_of_another_size_are_refused() -> None:
+def test_views_of_another_size_are_an_error() -> None:
     wide = np.zeros((240, 320, 3), np.uint8)
     with pytest.raises(BuildError, match="320×240 pixels; expected 256×256"):
         list(make_questions(buffer_set_of(EpisodeId("MoveCube", "test", 0), view=wide)))

@@ -43,9 +43,6 @@ def test_block() -> None:
     assert (ids[345], ids[1599]) == ("VideoPlaceButton/train/45", "VideoUnmask/train/99")
 
 
-# --- the families file ---------------------------------------------------------------------------
-
-
 def test_a_csv_file_in_any_form(tmp_path: Path) -> None:
     lines = ["episode_index, family, split", "2,InsertPeg,val", "", "0,MoveCube,"]
     path = written(tmp_path, "\n".join([*lines, "3,MoveCube,train", "1,MoveCube,val"]))
@@ -103,8 +100,6 @@ def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
             ids_by_file(tmp_path / name, 1)
 
 
-# --- per-episode columns -------------------------------------------------------------------------
-
 ROWS: list[tuple[list[dict[str, Any]], list[str] | str]] = [
     (
         [{"episode_id": "MoveCube/val/3"}, {"episode_id": "A/test/0"}],
@@ -128,9 +123,6 @@ def test_columns(rows: list[dict[str, Any]], expected: list[str] | str) -> None:
         return
     with pytest.raises(SourceError, match=expected):
         ids_by_columns(rows, "here")
-
-
-# --- goals ---------------------------------------------------------------------------------------
 
 
 def test_every_goal_fits_its_families_and_no_others() -> None:

@@ -72,7 +72,7 @@ def test_the_example_in_the_docs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def refused(folder: Path) -> str:
-    """Return the refusal when all episodes are listed and read."""
+    """Return the error when all episodes are listed and read."""
     with pytest.raises(InterferenceError) as caught:
         source = FramesSource(folder)
         for episode in source.episodes():

@@ -40,9 +40,6 @@ def read(path: Path) -> Recording:
     return source.read(source.episodes()[0], None)
 
 
-# --- what is read --------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("fingers", [1, 2])
 def test_files_that_count_from_one(tmp_path: Path, fingers: int) -> None:
     write_h5(tmp_path, EPISODES, first=1, fingers=fingers)
@@ -81,10 +78,10 @@ def test_seed_difficulty_and_a_camera_may_be_missing(path: Path) -> None:
 
 def test_subgoals_of_the_demonstration_are_evidence(path: Path) -> None:
     assert read(path).evidence is None  # there are none
-    said = ["static", "pick up the peg", "pick up the peg", "hook it", "hook it", "hook it"]
+    subgoals = ["static", "pick up the peg", "pick up the peg", "hook it", "hook it", "hook it"]
     for name in ("grounded_subgoal", "simple_subgoal"):  # the second one counts
         with h5py.File(path, "r+") as file:
-            for step, text in enumerate(said):
+            for step, text in enumerate(subgoals):
                 file[f"episode_0/timestep_{step}/info/{name}"] = (
                     text if name[0] == "s" else f"{text} at <1, 2>"
                 )
@@ -92,9 +89,6 @@ def test_subgoals_of_the_demonstration_are_evidence(path: Path) -> None:
         EvidenceSpan(0, "pick up the peg", 1, 3),
         EvidenceSpan(1, "hook it", 3, 5),
     )
-
-
-# --- refusals ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -107,7 +101,7 @@ def test_subgoals_of_the_demonstration_are_evidence(path: Path) -> None:
         ("timestep_7/obs/joint_state", "text"),
     ],
 )
-def test_a_missing_or_wrong_piece(path: Path, place: str, value: Any) -> None:
+def test_missing_or_invalid_values(path: Path, place: str, value: Any) -> None:
     put(path, place, value)
     with pytest.raises(SourceError, match=r"is not a complete RoboMME recording") as raised:
         list(read(path).frames)
@@ -124,7 +118,7 @@ def test_a_missing_or_wrong_piece(path: Path, place: str, value: Any) -> None:
         ("timestep_8/info/is_video_demo", True, "is_video_demo in .*episode_0 is true in 6 frames"),
     ],
 )
-def test_what_cannot_be_used(path: Path, place: str, value: Any, message: str) -> None:
+def test_unusable_recordings(path: Path, place: str, value: Any, message: str) -> None:
     put(path, place, value)
     with pytest.raises(SourceError, match=message):
         read(path)
@@ -167,9 +161,6 @@ def test_no_family_and_no_h5py(path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(MissingExtraError, match=r"needs h5py(.|\n)*data\[build\]"):
         read(path.parent)
-
-
-# --- numbers, splits and seeds -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

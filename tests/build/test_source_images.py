@@ -78,7 +78,7 @@ def test_every_single_changed_byte_of_a_png_is_noticed() -> None:
         np.testing.assert_array_equal(image, FRAMES[2][:8, :8])
 
 
-def test_what_cannot_be_decoded() -> None:
+def test_invalid_images() -> None:
     deep = io.BytesIO()
     Image.fromarray(np.arange(64, dtype=np.uint16).reshape(8, 8)).save(deep, "PNG")
     for data, message in (

@@ -1,4 +1,4 @@
-"""LeRobot datasets as sources: what they say of an episode, by which names, and refusals."""
+"""LeRobot datasets as sources: episodes, families, column names, and invalid values."""
 
 import time
 from dataclasses import replace
@@ -40,9 +40,6 @@ def one(episode: Episode = FOUR) -> dict[str, Episode]:
 @pytest.fixture
 def v21(tmp_path: Path) -> Path:
     return write_lerobot(tmp_path / "v21", version="v2.1")
-
-
-# --- what is read --------------------------------------------------------------------------------
 
 
 def test_jpeg_is_not_exact(tmp_path: Path) -> None:
@@ -112,9 +109,6 @@ def test_families_that_are_not_told_or_do_not_fit(tmp_path: Path) -> None:
         read(root)
 
 
-# --- columns by other names ----------------------------------------------------------------------
-
-
 def test_columns_by_other_names(v21: Path) -> None:
     given = {"front": "wrist_image", "wrist": "image", "action": "state"}
     known = EPISODES[NAME]
@@ -175,9 +169,6 @@ def test_columns_that_do_not_fit(v21: Path, columns: Any, error: Any, message: s
         read(v21, columns=columns)
 
 
-# --- where demonstrations end --------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("columns", "lesson"),
     [
@@ -201,17 +192,14 @@ def test_marks(tmp_path: Path, columns: Any, lesson: int | str) -> None:
         read(root)
 
 
-# --- evidence ------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("column", ["simple_subgoal", "grounded_subgoal"])
 def test_subgoals_of_the_demonstration_are_evidence(tmp_path: Path, column: str) -> None:
     root = write_lerobot(tmp_path, one(make_episode(1, 6, MOVE, 4)))
     assert read(root).evidence is None
     edit_columns(root / DATA, **{column: [None, "hook it", "hook it", "put it", "put it", "done"]})
     assert read(root).evidence is None  # no column that info.json tells
-    told = {column: {"dtype": "string", "shape": [1]}}
-    edit_info(root, lambda info: info["features"].update(told))
+    declared = {column: {"dtype": "string", "shape": [1]}}
+    edit_info(root, lambda info: info["features"].update(declared))
     assert read(root).evidence == (
         EvidenceSpan(0, "hook it", 1, 3),
         EvidenceSpan(1, "put it", 3, 4),  # cut by the end of the lesson
@@ -231,7 +219,7 @@ def test_evidence_of_this_projects_datasets_goes_before_subgoals(tmp_path: Path)
         read(other)
 
 
-# --- refusals ------------------------------------------------------------------------------------
+# --- invalid values -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -47,9 +47,6 @@ def test_every_link_of_a_card_leads_somewhere(published: Path, name: str) -> Non
         assert (root / path).is_file(), path
 
 
-# --- front matter ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("tree", "name", "split", "file"),
     [

@@ -71,9 +71,6 @@ def test_the_reference_library_reads_the_rows(published: Path) -> None:
     assert episodes == pq.read_table(root / RECORDS_PATH)["episode_id"].to_pylist()
 
 
-# --- columns --------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("record", [BufferManifest, EpisodeRecord, Question, Rollout])
 def test_every_column_is_described(record: type) -> None:
     columns = columns_of(record)

@@ -1,4 +1,4 @@
-"""What a stranger wrote is shown as it is, whatever Markdown could make of it."""
+"""Untrusted text is shown literally in Markdown."""
 
 import ast
 import unicodedata

@@ -47,7 +47,7 @@ def _unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def writes(hub: HubServer) -> list[str]:
-    """Return what was asked of the Hub beside reading."""
+    """Return the requests that change the Hub."""
     return [one for one in hub.requests if not one.startswith(("GET", "HEAD"))]
 
 
@@ -222,9 +222,6 @@ def test_demonstrations_count_their_own_versions(
     assert header.location == f"{LESSONS}@{new.published}"
 
 
-# --- published demonstrations --------------------------------------------------------------------
-
-
 def placed(hub: HubServer, tmp_path: Path, commit: str | None = None) -> Path:
     """Return a buffer set whose manifests name demonstrations on the Hub."""
     commit = commit or hub.push("datasets/others/lessons", GOLDEN / "demonstrations")
@@ -259,7 +256,7 @@ def test_published_demonstrations_that_cannot_be_used(hub: HubServer, tmp_path: 
     assert UNITS not in str(hub.repositories)
 
 
-# --- who may, and what is there ------------------------------------------------------------------
+# --- permissions and existing repositories --------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -279,7 +276,7 @@ def test_a_token_without_rights(
 
 
 @pytest.mark.parametrize("token", ["hf_unknown", ""])
-def test_nobody_is_logged_in(
+def test_invalid_login(
     hub: HubServer, run: Run, monkeypatch: pytest.MonkeyPatch, token: str
 ) -> None:
     monkeypatch.setenv("HF_TOKEN", token)

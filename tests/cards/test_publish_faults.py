@@ -1,4 +1,4 @@
-"""Publishing when something goes wrong: nothing is half-published, and the same command goes on."""
+"""Failures while publishing: no partial version, and the same command resumes."""
 
 import os
 import signal
@@ -105,7 +105,7 @@ def test_publish_after_a_kill(hub: HubServer) -> None:
     assert published_set.revision == load_buffer_set(GOLDEN).revision
 
 
-def test_somebody_else_wrote_meanwhile(hub: HubServer) -> None:
+def test_concurrent_commit_by_another_user(hub: HubServer) -> None:
     other = {"README.md": b"to come", "notes.txt": b"other"}
     hub.fault("POST", "/tiny/commit/", call=lambda: hub.push(f"datasets/{UNITS}", other))
     with pytest.raises(HubError, match="somebody else wrote to someone/tiny") as caught:
@@ -137,9 +137,6 @@ def test_what_arrived_is_compared(hub: HubServer) -> None:
     assert tags(hub, UNITS) == {}
     publish(GOLDEN)
     assert whole(hub)
-
-
-# --- this machine --------------------------------------------------------------------------------
 
 
 def test_a_full_disk_while_versions_are_compared(hub: HubServer, tmp_path: Path) -> None:

@@ -64,13 +64,10 @@ def test_what_differs(expected: dict[str, bytes], existing: dict[str, bytes], la
     assert total_size(files, found.sent) == sum(map(len, sent.values()))
 
 
-def test_what_is_unmanaged_is_left_alone() -> None:
+def test_unmanaged_files_are_kept() -> None:
     unmanaged = (".gitattributes", "LICENSE", "LICENSE.txt", ".github/workflow.yml")
     existing = {path: remote(b"x") for path in (*unmanaged, "LICENSES/x", "data/.x", "NOTICE")}
     assert compare({}, existing).removed == ("LICENSES/x", "NOTICE", "data/.x")
-
-
-# --- what the repository of a buffer set holds ---------------------------------------------------
 
 
 def test_the_files_of_a_buffer_set(tmp_path: Path) -> None:
@@ -177,7 +174,7 @@ def test_a_full_disk_leaves_what_was_there(tmp_path: Path) -> None:
         *({"base": one} for one in ("people/demos", "people/demos@main", f"demos@{COMMIT}")),
     ],
 )
-def test_what_is_an_error(wrong: dict[str, Any]) -> None:
+def test_invalid_publications(wrong: dict[str, Any]) -> None:
     with pytest.raises(InvalidOptionError, match="expected") as caught:
         Publication(**{"repo_id": "people/tiny", **wrong})
     assert repr(next(iter(wrong.values())))[:6] in caught.value.message
@@ -190,7 +187,7 @@ def test_what_is_an_error(wrong: dict[str, Any]) -> None:
         ({"repo_id": "people/" + "a" * 90}, "demonstrations_id 'people/a*-demonstrations'"),
     ],
 )
-def test_settings_that_are_an_error(options: dict[str, str], words: str) -> None:
+def test_invalid_settings(options: dict[str, str], words: str) -> None:
     with pytest.raises(InvalidOptionError, match=words):
         PublishConfig(**{"repo_id": "people/tiny", **options})
 
@@ -201,9 +198,6 @@ def test_a_base_is_a_commit_on_the_hub(location: object) -> None:
     assert publication.base is None
     known = publication.made_for(f"people/demos@{COMMIT}")
     assert known.base == known.made_for(f"people/others@{COMMIT}").base == f"people/demos@{COMMIT}"
-
-
-# --- versions ------------------------------------------------------------------------------------
 
 
 def test_versions_are_tags() -> None:

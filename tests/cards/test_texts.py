@@ -1,4 +1,4 @@
-"""What cards say follows from the data: exactness, protocol, limits, and nobody else's words."""
+"""Cards follow from the data: exactness, protocol and limits; untrusted text stays text."""
 
 import json
 from dataclasses import replace
@@ -176,14 +176,6 @@ def test_nothing_unknown_is_asserted(
     assert ("- RoboMME" in tags) == ("robomme" in (query, unit))
 
 
-def test_what_yielded_nothing_is_counted(tmp_path: Path) -> None:
-    report = {"skipped": [{"episode_id": "MoveCube/train/9", "why": "short"}] * 3}
-    buffer_set = made_up(tmp_path, report=report)
-    assert "(3 recorded episodes yielded nothing" in buffer_set_text(buffer_set, OF_BUFFER_SET)
-    text = demonstrations_text(buffer_set)
-    assert "3 recorded episodes yielded no demonstration" in text
-
-
 def test_the_base_comes_from_the_manifests(tmp_path: Path) -> None:
     buffer_set = made_up(tmp_path)
     header = buffer_set.header
@@ -207,20 +199,12 @@ def test_a_buffer_set_without_buffers(tmp_path: Path, monkeypatch: pytest.Monkey
         buffer_set_facts(buffer_set)
 
 
-# --- results --------------------------------------------------------------------------------------
-
-
 def test_results_are_those_of_the_score(made: dict[str, dict[str, bytes]]) -> None:
     found = score(Settings(rows=(RUN,)))
     assert card_files(results_facts(found), OF_RESULTS) == made["results"]
-    text = results_text(found, OF_RESULTS)
-    [grid] = found.grids
-    assert grid.grid() in text
-    assert "0 of 5 cells are complete" in text
-    assert "1 success, 0 fail, 1 timeout, 1 error" in text
 
 
-def test_results_of_several_runs_are_refused(tmp_path: Path) -> None:
+def test_results_of_several_runs_are_an_error(tmp_path: Path) -> None:
     copy = tmp_path / "rollouts.jsonl"
     copy.write_bytes((RUN / "rollouts.jsonl").read_bytes().replace(b"replay-full", b"my-memory"))
     found = score(Settings(rows=(RUN, copy)))

@@ -1,4 +1,4 @@
-"""`index`, `retrieve`, `retrieval-score` and `calibrate`: what they print, write and refuse."""
+"""`index`, `retrieve`, `retrieval-score` and `calibrate`: output, files and errors."""
 
 import csv
 import json
@@ -123,7 +123,7 @@ def test_scores_as_json_and_the_same_every_time(run: Run, tmp_path: Path, indexe
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         ("index nowhere", "build all nowhere --source KIND:PATH"),
         ("index {bare} --encoder thumbnial", "Did you mean 'thumbnail'"),
@@ -136,11 +136,11 @@ def test_scores_as_json_and_the_same_every_time(run: Run, tmp_path: Path, indexe
         ("calibrate {buffer_set} --sweep 0.9 0.8", "sweep (0.9, 0.8)"),
     ],
 )
-def test_refusals(words: str, said: str, run: Run, indexed: Path, tiny_buffers: Path) -> None:
+def test_refusals(words: str, message: str, run: Run, indexed: Path, tiny_buffers: Path) -> None:
     places = {"buffer_set": indexed, "bare": tiny_buffers}
     code, out, err = run(*words.format(**places).split())
     assert (code, out) == (1, "")
-    assert said.format(**places) in err and "Traceback" not in err
+    assert message.format(**places) in err and "Traceback" not in err
     assert not list(tiny_buffers.glob("*/index"))
 
 
@@ -182,17 +182,17 @@ def test_why_is_the_reason_of_the_rule(rule: str, run: Run, indexed: Path) -> No
 
 
 def test_explanation_of_a_history_without_the_lesson(indexed: Path, tmp_path: Path) -> None:
-    said = "the history holds no lesson"
+    message = "the history holds no lesson"
     _, unit = load_buffer_set(indexed).manifest(EPISODE, "k1").sessions
     buffer = remade(indexed, [unit])
     rule = select.Rule("max", -1.0)
     measured = select.measure(buffer, "thumbnail")
     choice = select.choose(measured, rule)
     found = explain.explain(buffer, measured, choice, rule, "thumbnail", "front")
-    assert found.text().endswith(said)
+    assert found.text().endswith(message)
     live = buffer.query.frame()
     drawing.draw_retrieval(buffer, measured, choice, found, live, tmp_path / "why.svg")
-    assert said in (tmp_path / "why.svg").read_text()
+    assert message in (tmp_path / "why.svg").read_text()
 
 
 # --- calibrate ---------------------------------------------------------------------------------

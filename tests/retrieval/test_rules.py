@@ -21,8 +21,6 @@ MIXED = np.array([0.6, 0.8, 0], np.float16)  # cosine 0.6 with X, 0.8 with Y
 HISTORY = np.stack([X] * 4 + [Y] * 5 + [Z] * 2 + [MIXED] * 4)
 SPANS = ((0, 4), (4, 9), (9, 11), (11, 15))
 
-# --- cutting -----------------------------------------------------------------------------------
-
 
 def test_cosines() -> None:
     expected = [1, 1, 1, 0, 1, 1, 1, 1, 0, 1, 0, *[1] * 3]
@@ -63,9 +61,6 @@ def test_what_unrelated_frames_share() -> None:
     assert typical(HISTORY) == 0
 
 
-# --- rules -------------------------------------------------------------------------------------
-
-
 @given(st.sampled_from(sorted(METHODS)), st.one_of(st.just("adaptive"), st.floats(-1, 1)))
 def test_rules_are_read_as_they_are_written(method: str, cut: float) -> None:
     rule = Rule(method, cut)
@@ -91,19 +86,16 @@ def test_all_rules() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "error", "said"),
+    ("text", "error", "message"),
     [
         ("maximum", UnknownNameError, "'maximum'"),
         ("max/high", InvalidOptionError, "'high'"),
         ("max/1.5", InvalidOptionError, r"1\.5"),
     ],
 )
-def test_rules_that_are_none(text: str, error: type[Exception], said: str) -> None:
-    with pytest.raises(error, match=said):
+def test_rules_that_are_none(text: str, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
         Rule.parse(text)
-
-
-# --- choosing ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
