@@ -1,4 +1,4 @@
-"""Manifests: what every buffer holds, the same bytes from the same inputs, and what is refused."""
+"""Manifests: contents of buffers, reproducible bytes, and invalid inputs."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -9,7 +9,6 @@ from support.buffer_sets import CONDITIONS, GOLDEN, QUERIES, contents, copy_buff
 from support.made_up import record, write_metadata
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.build_dataset.config import AllConfig, PlanConfig, plan_all
 from robomme_interference_data.build_dataset.manifests import (
     in_folder,
     plan_manifests,
@@ -25,9 +24,7 @@ from robomme_interference_data.errors import (
     MissingFileError,
     SourceError,
 )
-from robomme_interference_data.schema.conditions import KINDS, Kind, parse_condition
-from robomme_interference_data.schema.draw import UnitPool
-from robomme_interference_data.storage.arrays import combine
+from robomme_interference_data.schema.conditions import parse_condition
 
 FAMILIES = ("MoveCube", "InsertPeg", "PatternLock", "Drawer")
 
@@ -59,77 +56,7 @@ def test_the_golden_manifests_come_out_again(tmp_path: Path, name: str) -> None:
     assert contents(root) == contents(GOLDEN)
 
 
-def test_what_buffers_hold(tmp_path: Path) -> None:
-    root = made_up(tmp_path)
-    plan = plan_manifests(in_folder(root), ("no-history", "k0", "k2", "k4"), seed=5)
-    found = {str(one): one for one in planned_buffers(plan)}
-    assert len(found) == 8 * 4
-    one = found["PatternLock/test/1 under k4"]
-    pool = UnitPool((unit.episode_id for unit in plan.datasets["distractors"].records()), 5)
-    drawn = pool.draw(one.episode_id, 4)
-    assert [session.source for session in one.sessions] == [one.episode_id, *drawn]
-    lesson, *units = one.sessions
-    query = plan.demonstrations.record(lesson.episode_index)
-    assert query.episode_id == one.episode_id
-    place = (lesson.role, lesson.dataset, lesson.start, lesson.stop, lesson.repeat)
-    assert place == ("lesson", "demonstrations", 0, 33, 1)
-    assert lesson.revision == plan.demonstrations.revision
-    assert lesson.sha256 == combine(query.feature_sha256)
-    for unit in units:
-        stored = plan.datasets["distractors"].record(unit.episode_index)
-        assert stored.episode_id == unit.source
-        place = (unit.role, unit.dataset, unit.start, unit.stop, unit.sha256)
-        sha256 = combine(stored.feature_sha256)
-        assert place == ("distractor", "distractors", 0, 32, sha256)
-    assert (one.k, one.lesson_frames, one.history_frames) == (4, 33, 33 + 4 * 32)
-    # An even 32-frame sample of 161 history frames and the live one: ⌊j·161/31⌋ < 33 for j ≤ 6.
-    assert one.lesson_share == 7 / 32
-    assert (one.query.dataset, one.query.frame) == ("demonstrations", 33)
-    # Nested, and paired over the conditions.
-    assert found["PatternLock/test/1 under k2"].sessions == one.sessions[:3]
-    assert found["PatternLock/test/1 under k0"].sessions == one.sessions[:1]
-    empty = found["PatternLock/test/1 under no-history"]
-    assert (empty.sessions, empty.history_frames, empty.lesson_share) == ((), 0, 0.0)
-    assert empty.query == one.query
-
-
-def test_what_buffers_beyond_the_paper_hold(tmp_path: Path) -> None:
-    """The stored spans of each session; the draws are held by test_draw."""
-    root = made_up(tmp_path)
-    names = ("k2", "before-k2", "middle-k3", "held-k2", "same-k1", "parts-k2", "absent-k2")
-    plan = plan_manifests(in_folder(root), names)
-    found = {
-        one.condition: one
-        for one in planned_buffers(plan)
-        if str(one.episode_id) == "PatternLock/test/1"
-    }
-    lesson, *units = found["k2"].sessions
-    assert found["before-k2"].sessions == (*units, lesson)
-    assert found["absent-k2"].sessions == (*units,)
-    assert (found["absent-k2"].lesson_frames, found["absent-k2"].lesson_share) == (0, 0.0)
-    first, second, *rest = found["middle-k3"].sessions
-    assert [first, second] == units
-    assert [one.role for one in rest] == ["lesson", "distractor"]
-    start, *held = found["held-k2"].sessions
-    assert start == lesson
-    assert held[0] == held[1]
-    one = held[0]
-    assert (one.role, one.start, one.stop, one.repeat, one.sha256) == ("filler", 32, 33, 32, "l")
-    assert (one.source, one.dataset) == (lesson.source, "demonstrations")
-    assert (found["held-k2"].history_frames, found["held-k2"].lesson_frames) == (97, 33)
-    own = found["same-k1"].sessions[1]
-    assert (own.role, own.family, own.source.split) == ("distractor", "PatternLock", "train")
-    begin, *middle, end = found["parts-k2"].sessions
-    assert middle == units
-    assert [(one.role, one.start, one.stop) for one in (begin, end)] == [
-        ("lesson", 0, 16),
-        ("lesson", 16, 33),
-    ]
-    assert (begin.sha256, end.sha256) == ("1", "2")
-    assert found["parts-k2"].lesson_frames == 33
-
-
-def test_a_lesson_whose_parts_have_no_digests_is_refused(tmp_path: Path) -> None:
+def test_lesson_parts_without_digests_are_an_error(tmp_path: Path) -> None:
     queries = [record("demonstrations", "MoveCube/test/0", span_sha256=None)]
     root = made_up(tmp_path, queries=queries)
     assert len(list(planned_buffers(plan_manifests(in_folder(root), ("k1",))))) == 1
@@ -167,24 +94,6 @@ def test_a_buffer_is_exact_where_all_of_it_is(tmp_path: Path) -> None:
     queries = [record("demonstrations", "MoveCube/test/0")]
     plan = plan_manifests(in_folder(made_up(tmp_path, queries=queries, units=units)), ("k0", "k3"))
     assert [one.exact for one in planned_buffers(plan)] == [True, False]
-
-
-def test_rules_ask_for_what_they_need(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a kind's k means is its rule's own affair: here it takes one unit more."""
-    more = Kind("more", lambda provider, k: tuple(provider.units(k + 1)))
-    monkeypatch.setitem(KINDS, "more", more)
-    root = made_up(tmp_path)
-    plan = plan_manifests(in_folder(root), ("k1", "more-k1", "more-k8"))
-    found = {one.condition: one.sessions for one in list(planned_buffers(plan))[:3]}
-    assert [len(sessions) for sessions in found.values()] == [2, 2, 9]
-    assert found["more-k1"] == found["more-k8"][:2]
-    with pytest.raises(BuildError, match="needs 10 distractor units"):
-        list(planned_buffers(plan_manifests(in_folder(root), ("more-k9",))))
-    buffer_set = tmp_path / "buffer_set"
-    asked = AllConfig(source=("sample:MoveCube,PatternLock",), buffer_set=buffer_set, split="test")
-    assert plan_all(asked, PlanConfig(conditions=("more-k1",)))
-    with pytest.raises(BuildError, match="needs 4 distractor units"):
-        plan_all(asked, PlanConfig(conditions=("more-k3",)))
 
 
 def test_a_pool_too_small(tmp_path: Path) -> None:
@@ -267,7 +176,7 @@ def test_a_buffer_is_planned_without_manifests() -> None:
         assert sessions.buffer(parse_condition(name)) == buffer_set.manifest(QUERIES[1], name)
 
 
-def test_earlier_manifests_are_replaced_and_strangers_kept(tmp_path: Path) -> None:
+def test_manifests_are_replaced_but_unknown_files_are_kept(tmp_path: Path) -> None:
     root = copy_buffer_set(tmp_path / "buffer_set")
     assert sum(write_manifests(plan_manifests(in_folder(root), ("k0",)), root)) == len(QUERIES)
     assert load_buffer_set(root).conditions == ("k0",)

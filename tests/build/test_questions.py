@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from support.buffer_sets import GOLDEN
 from support.machine import full_disk
 from support.tabletop import QUERIES, TABLETOP, copy_tabletop, scene_of
 
@@ -49,13 +48,13 @@ MANY = ("InsertPeg", "PatternLock", "RouteStick")
 
 
 def buffer_set_of(*episodes: EpisodeId, view: Any = GREY, **changes: Any) -> Any:
-    """What is asked of a buffer set, with episodes of the suite that nobody has recorded."""
+    """A stand-in for a buffer set, with episodes of the suite that were not recorded."""
 
     def query(episode: EpisodeId) -> Any:
         seed = seed_of(episode)
         known = {"simulator": "tabletop", "seed": seed, "difficulty": difficulty_of(seed)}
-        told = known | {"episode_id": episode, "frame": lambda: view} | changes
-        return SimpleNamespace(**told)
+        values = known | {"episode_id": episode, "frame": lambda: view} | changes
+        return SimpleNamespace(**values)
 
     demonstrations = SimpleNamespace(identity=SimpleNamespace(revision="r"))
     datasets = {DEMONSTRATIONS: demonstrations}
@@ -84,7 +83,7 @@ def of(made: Iterable[Made], family: str) -> list[Made]:
     return [one for one in made if one.question.episode_id.family == family]
 
 
-# --- what is asked -----------------------------------------------------------------------------
+# --- options --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -98,8 +97,8 @@ def test_the_right_option_is_the_scenes_answer_and_there_once(
         assert 3 <= len(set(choices)) == len(choices) <= 5
         assert choices[question.right] == scene.choice(answer)
         assert choices.count(scene.choice(answer)) == 1
-        told = list(zip(question.options, one.marks, strict=True))
-        assert len(set(told)) == len(told)  # whoever looks and reads can tell them apart
+        shown = list(zip(question.options, one.marks, strict=True))
+        assert len(set(shown)) == len(shown)  # text and marks distinguish the options
         assert question.text == scene.question and question.revision == "r"
         possible = {scene.choice(each) for each in scene.answers}
         assert len(choices) == (len(possible) if len(possible) <= 5 else 4)
@@ -116,7 +115,7 @@ def test_marks_and_their_letters_lie_inside_the_view_and_apart(made: list[Made])
                 assert math.dist(first, second) > 2 * 6.3 + 1
 
 
-# --- nothing gives the answer away -------------------------------------------------------------
+# --- no leaks -------------------------------------------------------------------------------------
 
 
 def excess(hits: Iterable[tuple[bool, float]]) -> float:
@@ -180,20 +179,11 @@ def test_who_sees_no_history_is_right_by_chance(made: list[Made], name: str) -> 
             assert not found or abs(excess(found)) < 3.6, (group, least)  # of 180 one in 18
 
 
-def test_letters_of_right_options_are_about_uniform(made: list[Made]) -> None:
-    for count in (3, 4, 5):
-        places = Counter(one.question.right for one in made if len(one.question.options) == count)
-        total = places.total()
-        assert total > 100 and len(places) == count
-        # Chi-squared with 2 to 4 degrees of freedom: 18.5 is exceeded in one of a thousand.
-        assert sum((n - total / count) ** 2 / (total / count) for n in places.values()) < 18.5
-
-
 @pytest.mark.parametrize("family", sorted({*FAMILIES} - {*MANY}))
 def test_with_another_answer_only_the_right_place_is_another(
     family: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In one scene, whatever its answer is."""
+    """For every answer of the same scene."""
     for index in range(3):
         found = []
         episode = EpisodeId(family, "test", index)
@@ -223,7 +213,7 @@ def test_of_many_answers_the_others_are_drawn_alike(family: str) -> None:
     assert len(wrong) > min(count, wrong.total()) * 0.75
 
 
-# --- the same every time -----------------------------------------------------------------------
+# --- determinism and pictures ---------------------------------------------------------------------
 
 
 def bare(questions: Iterable[Question]) -> list[Question]:
@@ -241,7 +231,7 @@ def test_the_golden_questions_come_out_again() -> None:
         assert np.mean(np.abs(before.astype(int) - now)) < 1
 
 
-def test_whatever_the_hash_seed_the_same_bytes(tmp_path: Path) -> None:
+def test_same_bytes_for_any_hash_seed(tmp_path: Path) -> None:
     code = (
         "import sys\n"
         "from pathlib import Path\n"
@@ -264,9 +254,6 @@ def test_the_digest_is_of_all_that_is_asked() -> None:
     assert digest == digest_questions([second, first])
     for changes in ({"picture": b"x"}, {"right": (first.right + 1) % 3}, {"text": "What?"}):
         assert digest_questions([replace(first, **changes), second]) != digest  # type: ignore[arg-type]
-
-
-# --- pictures ----------------------------------------------------------------------------------
 
 
 def near(image: Any, point: tuple[int, int], way: int = 21) -> Any:
@@ -294,54 +281,13 @@ def test_a_thing_has_its_letter_over_it() -> None:
     assert (view == 200).all()
 
 
-@pytest.mark.parametrize(("options", "shape"), [(2, (396, 792)), (3, (792, 792)), (4, (792, 792))])
-def test_paths_have_a_drawing_each(options: int, shape: tuple[int, int]) -> None:
-    # Points span 100 × 60 pixels: with 16 at either side 132, three times as large.
-    ways = [((100, 60), (100, 160)), ((160, 60), (160, 160))]
-    ways += [((100, 160), (100, 60)), ((100, 60), (160, 60), (160, 160))]
-    found = picture(GREY, ways[:options])
-    assert found.shape == (*shape, 3)
-    tiles = [found[y : y + 396, x : x + 396] for y in range(0, shape[0], 396) for x in (0, 396)]
-    # The window begins at (160 + 100 − 132) / 2 = 64 and (60 + 160 − 132) / 2 = 44.
-    upper, lower = (3 * (100 - 64), 3 * (110 - 44)), (3 * (160 - 64), 3 * (110 - 44))
-    yellow = [[tuple(tile[at]) == (255, 232, 0) for at in (upper, lower)] for tile in tiles]
-    assert yellow[:2] == [[True, False], [False, True]]
-    if options == 3:
-        assert (tiles[3] == 255).all()
-        # The arrow is where the way ends, so that its opposite is another drawing.
-        assert not np.array_equal(tiles[2][80:140], tiles[0][80:140])
-    if options == 4:
-        assert yellow[3] == [False, True]
-
-
-def test_a_picture_is_what_the_view_shows(made: list[Made]) -> None:
-    """The pixels beside marks and letters are the view's: here each family's first question."""
-    view = np.random.default_rng(0).integers(0, 256, GREY.shape, dtype=np.uint8)
-    for family in FAMILIES:
-        episode = EpisodeId(family, "test", 0)
-        [question] = make_questions(buffer_set_of(episode, view=view))
-        image = decode_image(question.picture)
-        assert 480 < max(image.shape) <= 2 * 480
-        [one] = [each for each in made if each.question.episode_id == episode]
-        if max(map(len, one.marks)) < 2:
-            times = 3 if one.marks[0] else 2
-            assert image.shape == (times * SIZE, times * SIZE, 3)
-            same = (image[::times, ::times] == view).all(2)
-            assert same.mean() > 0.97
-
-
-# --- what is refused ---------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "changes", [{"simulator": "robomme"}, {"simulator": None}, {"seed": -1}, {"difficulty": None}]
-)
+@pytest.mark.parametrize("changes", [{"simulator": "robomme"}, {"seed": -1}])
 def test_only_tabletops_episodes_have_questions(changes: dict[str, Any]) -> None:
     with pytest.raises(BuildError, match="MoveCube/test/0 .*does not list the possible answers"):
         list(make_questions(buffer_set_of(EpisodeId("MoveCube", "test", 0), **changes)))
 
 
-def test_views_of_another_size_are_refused() -> None:
+def test_views_of_another_size_are_an_error() -> None:
     wide = np.zeros((240, 320, 3), np.uint8)
     with pytest.raises(BuildError, match="320×240 pixels; expected 256×256"):
         list(make_questions(buffer_set_of(EpisodeId("MoveCube", "test", 0), view=wide)))
@@ -364,13 +310,6 @@ def test_the_command_makes_them(root: Path, run: Any) -> None:
     assert bare(read_questions(load_buffer_set(root)).values()) == bare(
         read_questions(load_buffer_set(TABLETOP)).values()
     )
-
-
-def test_other_demonstrations_are_refused(run: Any) -> None:
-    code, out, err = run("build", "questions", GOLDEN)
-    assert (code, out) == (1, "")
-    assert "the simulator 'sample'" in err and "Traceback" not in err
-    assert not (GOLDEN / QUESTIONS_PATH).exists()
 
 
 def test_where_there_is_no_folder(tmp_path: Path, run: Any) -> None:

@@ -43,9 +43,6 @@ def test_block() -> None:
     assert (ids[345], ids[1599]) == ("VideoPlaceButton/train/45", "VideoUnmask/train/99")
 
 
-# --- the families file ---------------------------------------------------------------------------
-
-
 def test_a_csv_file_in_any_form(tmp_path: Path) -> None:
     lines = ["episode_index, family, split", "2,InsertPeg,val", "", "0,MoveCube,"]
     path = written(tmp_path, "\n".join([*lines, "3,MoveCube,train", "1,MoveCube,val"]))
@@ -76,7 +73,6 @@ HEADER = "episode_index,family"
     [
         ("", "first line is ''(.|\n)*episode_index,family"),
         ("episode_index,famly\n0,A\n", "first line is 'episode_index,famly'"),
-        (f"{HEADER},family\n0,A,A\n", "first line is"),
         (f"{HEADER}\n0,A\n1\n", "line 3 has 1 values; expected 2"),
         (f"{HEADER}\n0,A\n-1,A\n", "line 3: episode_index is '-1'"),
         (f"{HEADER}\n0,A\n{'9' * 5000},A\n", "line 3: episode_index is '999"),
@@ -86,7 +82,6 @@ HEADER = "episode_index,family"
         (f"{HEADER}\n0,A\n1,9lives\n", "episode 1: '9lives' is not a family name"),
         (f"{HEADER},split\n0,A,train\n1,A,trian\n", "episode 1: 'trian' is not a split"),
         (f"{HEADER},index\n0,A,0\n1,A,0\n", "0 and 1 are both named A/train/0"),
-        (f"{HEADER},index\n0,A,0\n1,A,one\n", "line 3: index is 'one'"),
         (f"{HEADER},exec_start_idx\n0,A,-1\n", "line 2: exec_start_idx is '-1'"),
         (f"{HEADER}\n0,{'A' * 200_000}\n", "field larger than"),
     ],
@@ -105,8 +100,6 @@ def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
             ids_by_file(tmp_path / name, 1)
 
 
-# --- per-episode columns -------------------------------------------------------------------------
-
 ROWS: list[tuple[list[dict[str, Any]], list[str] | str]] = [
     (
         [{"episode_id": "MoveCube/val/3"}, {"episode_id": "A/test/0"}],
@@ -117,10 +110,8 @@ ROWS: list[tuple[list[dict[str, Any]], list[str] | str]] = [
     ([{"tasks": ["x"], "index": 3}], []),
     ([], []),
     ([{"episode_id": "MoveCube"}], "here, episode 0: 'MoveCube' is not"),
-    ([{"episode_id": None}], "episode 0: None is not an episode id"),
     ([{"family": "A", "index": "7"}], "episode 0: '7' is not an episode index"),
     ([{"family": "A"}, {"family": None}], "episode 1: None is not a family"),
-    ([{"family": ["A"]}], "is not a family"),
     ([{"episode_id": "A/val/1"}] * 2, "episodes 0 and 1 are both named A/val/1"),
 ]
 
@@ -132,9 +123,6 @@ def test_columns(rows: list[dict[str, Any]], expected: list[str] | str) -> None:
         return
     with pytest.raises(SourceError, match=expected):
         ids_by_columns(rows, "here")
-
-
-# --- goals ---------------------------------------------------------------------------------------
 
 
 def test_every_goal_fits_its_families_and_no_others() -> None:

@@ -40,9 +40,6 @@ def read(path: Path) -> Recording:
     return source.read(source.episodes()[0], None)
 
 
-# --- what is read --------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("fingers", [1, 2])
 def test_files_that_count_from_one(tmp_path: Path, fingers: int) -> None:
     write_h5(tmp_path, EPISODES, first=1, fingers=fingers)
@@ -81,10 +78,10 @@ def test_seed_difficulty_and_a_camera_may_be_missing(path: Path) -> None:
 
 def test_subgoals_of_the_demonstration_are_evidence(path: Path) -> None:
     assert read(path).evidence is None  # there are none
-    said = ["static", "pick up the peg", "pick up the peg", "hook it", "hook it", "hook it"]
+    subgoals = ["static", "pick up the peg", "pick up the peg", "hook it", "hook it", "hook it"]
     for name in ("grounded_subgoal", "simple_subgoal"):  # the second one counts
         with h5py.File(path, "r+") as file:
-            for step, text in enumerate(said):
+            for step, text in enumerate(subgoals):
                 file[f"episode_0/timestep_{step}/info/{name}"] = (
                     text if name[0] == "s" else f"{text} at <1, 2>"
                 )
@@ -94,32 +91,23 @@ def test_subgoals_of_the_demonstration_are_evidence(path: Path) -> None:
     )
 
 
-# --- refusals ------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("place", "value"),
     [
-        ("setup", None),
         ("setup/task_goal", None),
         ("setup/task_goal", np.bytes_(b"\xff\xfe")),
         ("setup/seed", "seven"),
-        ("timestep_0", 7),
         ("timestep_7/info/is_video_demo", None),
-        ("timestep_7/obs", 7),
-        ("timestep_7/obs/front_rgb", None),
-        ("timestep_7/obs/joint_state", None),
         ("timestep_7/obs/joint_state", "text"),
-        ("timestep_7/action/joint_action", None),
     ],
 )
-def test_a_missing_or_wrong_piece(path: Path, place: str, value: Any) -> None:
+def test_missing_or_invalid_values(path: Path, place: str, value: Any) -> None:
     put(path, place, value)
     with pytest.raises(SourceError, match=r"is not a complete RoboMME recording") as raised:
         list(read(path).frames)
     assert raised.value.message.startswith(str(path))
     assert "Record or download the file again" in str(raised.value.hint)
-    if "7/obs/" in place or "action/" in place:  # what is met while frames are read says where
+    if "7/obs/" in place:  # what is met while frames are read says where
         assert "episode_0/timestep_7 is not" in raised.value.message
 
 
@@ -127,18 +115,16 @@ def test_a_missing_or_wrong_piece(path: Path, place: str, value: Any) -> None:
     ("place", "value", "message"),
     [
         ("timestep_4", None, "episode_0 does not hold consecutive timestep_<T> groups"),
-        ("setup/task_goal", np.empty(0, "S4"), "goal is missing"),
-        ("setup/difficulty", "unknown", "difficulty is 'unknown'; expected one of easy"),
         ("timestep_8/info/is_video_demo", True, "is_video_demo in .*episode_0 is true in 6 frames"),
     ],
 )
-def test_what_cannot_be_used(path: Path, place: str, value: Any, message: str) -> None:
+def test_unusable_recordings(path: Path, place: str, value: Any, message: str) -> None:
     put(path, place, value)
     with pytest.raises(SourceError, match=message):
         read(path)
 
 
-@pytest.mark.parametrize("keep", [0, 9000, -90])
+@pytest.mark.parametrize("keep", [0, -90])
 def test_files_that_are_not_whole(path: Path, keep: int) -> None:
     path.write_bytes(path.read_bytes()[:keep])
     with pytest.raises(SourceError, match=r"\.h5 is not a complete RoboMME recording"):
@@ -177,27 +163,21 @@ def test_no_family_and_no_h5py(path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         read(path.parent)
 
 
-# --- numbers, splits and seeds -----------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("family", "seeds", "expected"),
     [
         # train: 1000 · code + 100 · index + attempt; MoveCube's code is 14
         ("MoveCube", {7: 14_799}, "train/7"),
-        ("MoveCube", {7: 14_699}, "train/6"),
         ("VideoUnmaskSwap", {3: 5301, 0: 5000}, "train/3 train/0"),
         ("RouteStick", {100: 25_900}, "train/99"),
         # test: 500,000 + 10,000 · code + 100 · index + attempt; PatternLock's code is 15
         ("PatternLock", {1: 650_000, 50: 654_902}, "test/0 test/49"),
         # val: 1,000,000 + 10,000 · code + 100 · index + attempt; a few are 100 higher
         ("RouteStick", {5: 1_160_500, 6: 1_160_700, 7: 1_160_700}, "val/5 val/6 val/7"),
-        ("RouteStick", {1: 1_160_100, 2: 1_160_100, 3: 1_160_200}, "val/0 val/1 val/2"),
         # one file with several splits
         ("MoveCube", {1: 14_000, 2: 640_100, 3: 1_140_200}, "train/0 test/1 val/2"),
         # no seeds, or a family that RoboMME does not have: numbering says it
         ("MoveCube", {1: None, 4: None}, "train/0 train/3"),
-        ("MoveCube", {4: None}, "train/4"),
         ("OpenDrawer", {1: 7, 2: 8}, "train/0 train/1"),
         # seeds of another rule contradict each other: numbering says it
         ("MoveCube", {1: 3, 2: 999}, "train/0 train/1"),

@@ -28,17 +28,13 @@ def info(codec: object, pix_fmt: str, crf: object = 30, **options: object) -> di
         (info("av1", "gbrp", None, **OURS), True),
         (info("av1", "gbrp", None, **{"aom-params": "lossless=0"}), False),
         (info("av1", "yuv420p"), False),
-        (info("av1", "yuv444p", None, **{"aom-params": "lossless=1"}), False),
         (info("hevc", "gbrp", **{"x265-params": "bframes=0:lossless=1:log-level=error"}), True),
         (info("hevc", "gbrp", crf=0), False),
         (info("vp9", "gbrp", lossless=1), True),
-        (info("h264", "gbrp", crf=0), True),
         (info("h264", "gbrp", crf=None, qp=0), True),
         (info("h264", "gbrp", crf=0, qp=4), False),
         (info("ffv1", "bgr0", None), True),
-        (info("ffv1", "yuv420p"), False),
         ({}, False),
-        ({"video.codec": ["av1"], "video.pix_fmt": "gbrp", "video.extra_options": 7}, False),
     ],
 )
 def test_info(described: dict[str, object], exact: bool) -> None:
@@ -50,8 +46,6 @@ def test_info(described: dict[str, object], exact: bool) -> None:
     [
         ("ffv1", "bgr0", ".mkv", True),
         ("huffyuv", "rgb24", ".avi", True),
-        ("png", "rgb24", ".mov", True),
-        ("rawvideo", "bgr24", ".avi", True),
         ("ffv1", "yuv444p", ".mkv", False),
         ("mpeg4", "yuv420p", ".mp4", False),
     ],
@@ -84,7 +78,7 @@ def test_every_single_changed_byte_of_a_png_is_noticed() -> None:
         np.testing.assert_array_equal(image, FRAMES[2][:8, :8])
 
 
-def test_what_cannot_be_decoded() -> None:
+def test_invalid_images() -> None:
     deep = io.BytesIO()
     Image.fromarray(np.arange(64, dtype=np.uint16).reshape(8, 8)).save(deep, "PNG")
     for data, message in (

@@ -1,4 +1,4 @@
-"""LeRobot datasets as sources: what they say of an episode, by which names, and refusals."""
+"""LeRobot datasets as sources: episodes, families, column names, and invalid values."""
 
 import time
 from dataclasses import replace
@@ -9,22 +9,13 @@ import pyarrow.parquet as pq
 import pytest
 from support.goal_texts import GOALS
 from support.lerobot_layouts import DATA, TABLE, edit_columns, edit_info, write_lerobot
-from support.recordings import (
-    EPISODES,
-    MOVE,
-    PEG,
-    Episode,
-    check_recording,
-    encode_image,
-    make_episode,
-)
+from support.recordings import EPISODES, MOVE, PEG, Episode, check_recording, make_episode
 
 from robomme_interference_data.build_dataset.config import BuildConfig, plan_build
 from robomme_interference_data.build_dataset.sources import Recording, Robot, open_source
 from robomme_interference_data.build_dataset.sources.robomme_families import BLOCKS
 from robomme_interference_data.errors import (
     FormatError,
-    InterferenceError,
     InvalidOptionError,
     MissingFileError,
     SourceError,
@@ -49,16 +40,6 @@ def one(episode: Episode = FOUR) -> dict[str, Episode]:
 @pytest.fixture
 def v21(tmp_path: Path) -> Path:
     return write_lerobot(tmp_path / "v21", version="v2.1")
-
-
-# --- what is read --------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("version", VERSIONS)
-def test_actions_marks_and_a_camera_may_be_missing(tmp_path: Path, version: str) -> None:
-    bare = make_episode(5, 4, MOVE, cameras=("front",), actions=False)
-    root = write_lerobot(tmp_path, one(bare), version=version, marked=False)
-    check_recording(read(root), bare, marked=False)
 
 
 def test_jpeg_is_not_exact(tmp_path: Path) -> None:
@@ -128,9 +109,6 @@ def test_families_that_are_not_told_or_do_not_fit(tmp_path: Path) -> None:
         read(root)
 
 
-# --- columns by other names ----------------------------------------------------------------------
-
-
 def test_columns_by_other_names(v21: Path) -> None:
     given = {"front": "wrist_image", "wrist": "image", "action": "state"}
     known = EPISODES[NAME]
@@ -181,9 +159,7 @@ def test_a_families_file_can_mark_the_demonstrations(tmp_path: Path, version: st
         ({"is_dem": "is_demo"}, SourceError, "'is_dem' needs images(.|\n)*'is_demo'"),
         ({"front": "imge"}, UnknownNameError, "'imge' is not in(.|\n)*'image'"),
         ({"front": "state"}, SourceError, "'state' holds float32 .*'front' needs images"),
-        ({"state": "image"}, SourceError, "'image' holds image .*needs a vector of floats"),
         ({"wrist": "depth"}, SourceError, r"of the shape \(48, 64, 1\).*three channels"),
-        ({"is_demo": "state"}, SourceError, "'state' holds float32 .*needs booleans"),
     ],
 )
 def test_columns_that_do_not_fit(v21: Path, columns: Any, error: Any, message: str) -> None:
@@ -193,17 +169,12 @@ def test_columns_that_do_not_fit(v21: Path, columns: Any, error: Any, message: s
         read(v21, columns=columns)
 
 
-# --- where demonstrations end --------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("columns", "lesson"),
     [
         ({"is_demo": [True, True, True, False], "exec_start_idx": [3] * 4}, 3),  # not as lists
-        ({"is_demo": [1, 1, 1, 0], "exec_start_idx": [3] * 4}, 3),
         ({"is_demo": [True, False, True, False]}, "true in 2 frames, not all of them at the"),
         ({"exec_start_idx": [2, 2, 3, 2]}, "'exec_start_idx' holds 2, 3; expected one number"),
-        ({"exec_start_idx": [5] * 4}, "holds 5; expected one number from 0 to 4"),
         ({"exec_start_idx": [3] * 4}, "not clear: 2 by is_demo and 3 by exec_start_idx"),
         ({"exec_start_idx": [2, None, 2, 2]}, "1 empty values"),
         ({"is_demo": ["yes"] * 4}, "column 'is_demo' is of type string"),
@@ -221,17 +192,14 @@ def test_marks(tmp_path: Path, columns: Any, lesson: int | str) -> None:
         read(root)
 
 
-# --- evidence ------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("column", ["simple_subgoal", "grounded_subgoal"])
 def test_subgoals_of_the_demonstration_are_evidence(tmp_path: Path, column: str) -> None:
     root = write_lerobot(tmp_path, one(make_episode(1, 6, MOVE, 4)))
     assert read(root).evidence is None
     edit_columns(root / DATA, **{column: [None, "hook it", "hook it", "put it", "put it", "done"]})
     assert read(root).evidence is None  # no column that info.json tells
-    told = {column: {"dtype": "string", "shape": [1]}}
-    edit_info(root, lambda info: info["features"].update(told))
+    declared = {column: {"dtype": "string", "shape": [1]}}
+    edit_info(root, lambda info: info["features"].update(declared))
     assert read(root).evidence == (
         EvidenceSpan(0, "hook it", 1, 3),
         EvidenceSpan(1, "put it", 3, 4),  # cut by the end of the lesson
@@ -251,28 +219,23 @@ def test_evidence_of_this_projects_datasets_goes_before_subgoals(tmp_path: Path)
         read(other)
 
 
-# --- refusals ------------------------------------------------------------------------------------
+# --- invalid values -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize(
     "columns",
     [
         {"seed": ["17"]},
         {"difficulty": [3]},
-        {"difficulty": ["hrd"]},
-        {"exact": ["yes"]},
         {"exec_start_idx": [2.5]},
         {"exec_start_idx": [3]},  # the rows say 2
         {"goals": [MOVE]},
-        {"goals": [[""]]},
         {"tasks": [["something else"]]},
-        {"tasks": [[]]},
         {"episode_id": [None]},
     ],
 )
-def test_values_that_are_wrong(tmp_path: Path, version: str, columns: dict[str, Any]) -> None:
-    root = write_lerobot(tmp_path, one(), version=version, **columns)
+def test_invalid_values(tmp_path: Path, columns: dict[str, Any]) -> None:
+    root = write_lerobot(tmp_path, one(), **columns)
     with pytest.raises((SourceError, FormatError)):
         read(root)
 
@@ -281,15 +244,9 @@ def test_images_that_are_wrong(tmp_path: Path) -> None:
     root = write_lerobot(tmp_path, one())
     column = "observation.images.front"
     cells = pq.read_table(root / DATA)[column].to_pylist()
-    jpeg = encode_image(FOUR.images["front"][2], "jpg")
-    for data, message in (
-        (cells[2]["bytes"][:60], "frame 2 of .* image is damaged"),
-        (jpeg, "frame 2 of .* a JPEG image, although"),
-        (b"", "expected PNG or JPEG"),
-    ):
-        wrong = [*cells[:2], {"bytes": data, "path": None}, cells[3]]
-        edit_columns(root / DATA, **{column: wrong})
-        frames = read(root).frames
-        assert [next(frames).is_demonstration for _ in range(2)] == [True, True]  # one by one
-        with pytest.raises(InterferenceError, match=message):
-            next(frames)
+    wrong = [*cells[:2], {"bytes": cells[2]["bytes"][:60], "path": None}, cells[3]]
+    edit_columns(root / DATA, **{column: wrong})
+    frames = read(root).frames
+    assert [next(frames).is_demonstration for _ in range(2)] == [True, True]  # read one by one
+    with pytest.raises(FormatError, match="frame 2 of .* image is damaged"):
+        next(frames)

@@ -16,7 +16,7 @@ from robomme_interference_data.simulators.tabletop import SUITE_VERSION
 
 @pytest.fixture
 def made(monkeypatch: pytest.MonkeyPatch) -> list[Double]:
-    """The simulators that are made; RoboMME's tells no actions."""
+    """The simulators that are made; RoboMME's provides no actions."""
     found: list[Double] = []
 
     def make(name: str, **options: Any) -> Double:
@@ -54,7 +54,7 @@ def test_an_episode_of_the_tabletop(made: list[Double]) -> None:
     assert made[0].executed == 3  # cut without a step
 
 
-def test_robomme_plays_demonstrations_only_and_tells_no_actions(made: list[Double]) -> None:
+def test_robomme_provides_demonstrations_without_actions(made: list[Double]) -> None:
     source = open_source("robomme", robomme_python="/opt/python")
     assert source.provenance == {"kind": "robomme"}
     assert (source.time_limit_s, source.whole) == (1800, False)

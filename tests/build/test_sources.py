@@ -1,10 +1,9 @@
-"""What every source of recordings does, whatever the layout; opening them; the made-up sample."""
+"""Properties of every source of recordings, opening sources, and the synthetic sample."""
 
 import os
 import pickle
 from collections.abc import Callable
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +12,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.lerobot_layouts import write_lerobot
-from support.recordings import EPISODES, SEEDS, check_recording, write_frames, write_h5
+from support.recordings import (
+    EPISODES,
+    SEEDS,
+    check_recording,
+    make_episode,
+    rows_of,
+    write_frames,
+    write_h5,
+    write_images,
+    write_table,
+)
 
 from robomme_interference_data.build_dataset.sources import SOURCES, Recording, Source, open_source
 from robomme_interference_data.build_dataset.sources.base import compose, demonstration_length
-from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import (
     InvalidIdError,
@@ -98,20 +106,28 @@ def test_files_that_are_gone_since_they_were_listed(source: Source, tmp_path: Pa
         list(source.read(episode, None).frames)
 
 
-# --- opening them ---------------------------------------------------------------------------------
+@pytest.mark.parametrize("layout", ["frames", "lerobot", "lerobot v2.1"])
+def test_actions_marks_and_a_camera_may_be_missing(tmp_path: Path, layout: str) -> None:
+    root, bare = tmp_path / "made", make_episode(5, 4, cameras=("front",), actions=False)
+    if layout == "frames":
+        write_table(root, rows_of("MoveCube/train/0", bare))
+        write_images(root / "images/front/MoveCube/train/0", bare.images["front"])
+    else:
+        version = "v2.1" if "v2.1" in layout else "v3.0"
+        write_lerobot(root, {"MoveCube/train/0": bare}, version=version, marked=False)
+    source = open_source(f"{layout.split(maxsplit=1)[0]}:{root}")
+    check_recording(source.read(source.episodes()[0], None), bare, marked=False)
 
 
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
         ("frames", "frames:FOLDER"),
-        ("frames:", "frames:FOLDER"),
         ("robome-h5:recordings", "'robomme-h5'"),
         ("tabletop:fast", "tabletop"),
-        ("recordings/", "sample"),
     ],
 )
-def test_what_is_no_source(text: str, expected: str) -> None:
+def test_unknown_source(text: str, expected: str) -> None:
     with pytest.raises((InvalidOptionError, UnknownNameError)) as caught:
         open_source(text)
     assert repr(text) in caught.value.message and expected in str(caught.value)
@@ -151,32 +167,6 @@ def test_recordings_check_themselves(values: dict[str, Any], message: str) -> No
     frames = compose({}, np.zeros((0, 1), np.float32), None, None)
     with pytest.raises(SourceError, match=message):
         Recording(**(known | values), exact=True, frames=frames)
-
-
-# --- the sample ----------------------------------------------------------------------------------
-
-FEW = ("VideoRepick", "Drawer")
-SAMPLE = SampleSource(",".join(FEW), size=32)
-
-
-def test_the_sample() -> None:
-    seen: set[bytes] = set()
-    lengths = {}
-    for episode in SAMPLE.episodes():
-        frames = list(SAMPLE.read(episode, None).frames)
-        shown = [frame.is_demonstration for frame in frames]
-        lengths[str(episode.id)] = (len(frames), shown.index(False))
-        for one, other in pairwise(frames):  # an action is the state that follows
-            assert one.action is not None
-            assert np.array_equal(one.action, other.state)
-        views = {frame.images[camera].tobytes() for frame in frames[::8] for camera in frame.images}
-        assert not views & seen, "two episodes have a frame in common"
-        seen |= views
-    by_number = {"train/0": (260, 48), "train/1": (260, 64), "train/2": (260, 48)}
-    by_number["test/0"] = (260, 48)
-    expected = {f"{family}/{n}": by_number[n] for family in FEW for n in by_number}
-    # Too short for a unit.
-    assert lengths == expected | {"VideoRepick/train/1": (200, 64)}
 
 
 def test_families_of_the_sample() -> None:

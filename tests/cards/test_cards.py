@@ -10,16 +10,8 @@ from support.buffer_sets import GOLDEN
 from support.cards import CARDS, OF_BUFFER_SET, without_version
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.build_dataset.verify import verify_buffer_set
 from robomme_interference_data.cards.dataset_facts import STRIP, buffer_set_facts
-from robomme_interference_data.cards.render import (
-    BIBTEX,
-    CROISSANT,
-    PAPER,
-    README,
-    card_files,
-    size_category,
-)
+from robomme_interference_data.cards.render import BIBTEX, CROISSANT, PAPER, README, card_files
 from robomme_interference_data.constants import RECORDS_PATH
 
 NAMES = ("demonstrations", "buffer_set", "results")
@@ -55,14 +47,10 @@ def test_every_link_of_a_card_leads_somewhere(published: Path, name: str) -> Non
         assert (root / path).is_file(), path
 
 
-# --- front matter ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("tree", "name", "split", "file"),
     [
         ("buffer_set", "buffers", "test", "manifests/buffers.parquet"),
-        ("buffer_set", "episodes", "train", RECORDS_PATH),
         ("demonstrations", "episodes", "test", RECORDS_PATH),
     ],
 )
@@ -82,26 +70,6 @@ def test_load_dataset_gives_rollouts(published: Path, tmp_path: Path) -> None:
     found = load_dataset(str(published / "results"), cache_dir=str(tmp_path))
     assert found.keys() == {"test"}
     assert found["test"]["status"] == ["success", "timeout", "error"]
-
-
-@pytest.mark.parametrize(
-    ("count", "category"),
-    [(0, "n<1K"), (999, "n<1K"), (1000, "1K<n<10K"), (768_897, "100K<n<1M"), (10**13, "n>1T")],
-)
-def test_size_categories(count: int, category: str) -> None:
-    assert size_category(count) == category
-
-
-# --- beside the data ------------------------------------------------------------------------------
-
-
-def test_a_card_beside_the_data_is_no_violation(
-    own_buffers: Path, made: dict[str, dict[str, bytes]]
-) -> None:
-    for name, files in (("demonstrations", "demonstrations"), ("distractors", "buffer_set")):
-        for path, content in made[files].items():
-            (own_buffers / name / path).write_bytes(content)
-    assert list(verify_buffer_set(load_buffer_set(own_buffers), decode=False)) == []
 
 
 def test_the_citation_is_the_project_s() -> None:

@@ -1,4 +1,4 @@
-"""What a stranger wrote is shown as it is, whatever Markdown could make of it."""
+"""Untrusted text is shown literally in Markdown."""
 
 import ast
 import unicodedata
@@ -76,11 +76,8 @@ def test_quoted_text_is_a_literal_in_a_block_of_code(text: str) -> None:
     [
         ("VideoRepick/test/7", "VideoRepick/test/7"),
         ("# a", "&#35; a"),
-        ("1. a", "&#49;. a"),
-        ("a - b", "a - b"),
         ("- b", "&#45; b"),
         ("a_b", "a\\_b"),
-        ("@x", "&#64;x"),
         (12, "12"),
         (Raw("**a**"), "**a**"),
     ],

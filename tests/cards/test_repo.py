@@ -64,13 +64,10 @@ def test_what_differs(expected: dict[str, bytes], existing: dict[str, bytes], la
     assert total_size(files, found.sent) == sum(map(len, sent.values()))
 
 
-def test_what_is_unmanaged_is_left_alone() -> None:
+def test_unmanaged_files_are_kept() -> None:
     unmanaged = (".gitattributes", "LICENSE", "LICENSE.txt", ".github/workflow.yml")
     existing = {path: remote(b"x") for path in (*unmanaged, "LICENSES/x", "data/.x", "NOTICE")}
     assert compare({}, existing).removed == ("LICENSES/x", "NOTICE", "data/.x")
-
-
-# --- what the repository of a buffer set holds ---------------------------------------------------
 
 
 def test_the_files_of_a_buffer_set(tmp_path: Path) -> None:
@@ -171,50 +168,36 @@ def test_a_full_disk_leaves_what_was_there(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "wrong",
     [
-        *({"repo_id": one} for one in ("tiny", "a/b/c", "a/b b", "a/b\n", "a/b.git", "", None)),
+        *({"repo_id": one} for one in ("tiny", "a/b/c", "a/b\n", "a/b.git", None)),
         *({"version": one} for one in ("1.0", "v1.0.0", "01.0.0", "1.0.0\n")),
         *({"license": one} for one in ("CC BY 4.0", "cc-by-4", "a: b", "")),
         *({"base": one} for one in ("people/demos", "people/demos@main", f"demos@{COMMIT}")),
     ],
 )
-def test_what_is_an_error(wrong: dict[str, Any]) -> None:
+def test_invalid_publications(wrong: dict[str, Any]) -> None:
     with pytest.raises(InvalidOptionError, match="expected") as caught:
         Publication(**{"repo_id": "people/tiny", **wrong})
     assert repr(next(iter(wrong.values())))[:6] in caught.value.message
 
 
-def test_licenses_are_those_of_the_hub() -> None:
-    for license in ("other", "mit", "cc-by-4.0", "openrail++"):
-        assert Publication("people/tiny", license=license).license == license
-    with pytest.raises(InvalidOptionError) as caught:
-        Publication("people/tiny", license="cc-by-4")
-    assert "'cc-by-4.0'" in str(caught.value.hint) and "licenses" in str(caught.value.hint)
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"repo_id": "tiny"}, "repo_id 'tiny'"),
-        ({"demonstrations_id": "a/b/c"}, "demonstrations_id 'a/b/c'"),
         ({"demonstrations_id": "people/tiny"}, "are both"),
         ({"repo_id": "people/" + "a" * 90}, "demonstrations_id 'people/a*-demonstrations'"),
-        ({"version": ""}, "version ''"),
     ],
 )
-def test_settings_that_are_an_error(options: dict[str, str], words: str) -> None:
+def test_invalid_settings(options: dict[str, str], words: str) -> None:
     with pytest.raises(InvalidOptionError, match=words):
         PublishConfig(**{"repo_id": "people/tiny", **options})
 
 
-@pytest.mark.parametrize("location", [None, ".", "demo/buffers", 7, f"demos@{COMMIT}"])
+@pytest.mark.parametrize("location", [None, ".", 7, f"demos@{COMMIT}"])
 def test_a_base_is_a_commit_on_the_hub(location: object) -> None:
     publication = Publication("people/tiny").made_for(location)
     assert publication.base is None
     known = publication.made_for(f"people/demos@{COMMIT}")
     assert known.base == known.made_for(f"people/others@{COMMIT}").base == f"people/demos@{COMMIT}"
-
-
-# --- versions ------------------------------------------------------------------------------------
 
 
 def test_versions_are_tags() -> None:

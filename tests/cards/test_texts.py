@@ -1,4 +1,4 @@
-"""What cards say follows from the data: exactness, protocol, limits, and nobody else's words."""
+"""Cards follow from the data: exactness, protocol and limits; untrusted text stays text."""
 
 import json
 from dataclasses import replace
@@ -21,7 +21,6 @@ from robomme_interference_data.cards.dataset_facts import (
     count_same_family,
     demonstrations_facts,
 )
-from robomme_interference_data.cards.facts import origin_limit
 from robomme_interference_data.cards.publication import Publication
 from robomme_interference_data.cards.render import card_files, card_text, croissant
 from robomme_interference_data.cards.results import results_facts
@@ -116,7 +115,6 @@ def test_hostile_goals_are_text(tmp_path: Path) -> None:
     "source",
     [
         {"kind": "```\n# x", "repo": "../../x", "revision": "main"},
-        {"kind": 7, "repo": ["a/b"], "revision": None},
         {"repo": "a/b", "revision": "javascript:x"},
     ],
 )
@@ -156,20 +154,6 @@ def test_conditions_and_limits_beyond_the_paper(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("simulators", "told"),
-    [
-        ([], "name no simulator"),
-        (["robomme"], "official simulator"),
-        (["tabletop"], "is not RoboMME"),
-        (["sample"], "made-up pictures"),
-        (["<mine>"], "the simulator <mine>"),
-    ],
-)
-def test_where_episodes_come_from(simulators: list[str], told: str) -> None:
-    assert told in origin_limit(simulators)
-
-
-@pytest.mark.parametrize(
     ("query", "unit", "synthetic", "simulated", "tabletop"),
     [
         (None, None, False, False, False),
@@ -190,14 +174,6 @@ def test_nothing_unknown_is_asserted(
     assert ("no people" in data["rai:dataSocialImpact"]) == simulated
     tags = card_text(facts, OF_BUFFER_SET).split("---\n")[1].splitlines()
     assert ("- RoboMME" in tags) == ("robomme" in (query, unit))
-
-
-def test_what_yielded_nothing_is_counted(tmp_path: Path) -> None:
-    report = {"skipped": [{"episode_id": "MoveCube/train/9", "why": "short"}] * 3}
-    buffer_set = made_up(tmp_path, report=report)
-    assert "(3 recorded episodes yielded nothing" in buffer_set_text(buffer_set, OF_BUFFER_SET)
-    text = demonstrations_text(buffer_set)
-    assert "3 recorded episodes yielded no demonstration" in text
 
 
 def test_the_base_comes_from_the_manifests(tmp_path: Path) -> None:
@@ -223,20 +199,12 @@ def test_a_buffer_set_without_buffers(tmp_path: Path, monkeypatch: pytest.Monkey
         buffer_set_facts(buffer_set)
 
 
-# --- results --------------------------------------------------------------------------------------
-
-
 def test_results_are_those_of_the_score(made: dict[str, dict[str, bytes]]) -> None:
     found = score(Settings(rows=(RUN,)))
     assert card_files(results_facts(found), OF_RESULTS) == made["results"]
-    text = results_text(found, OF_RESULTS)
-    [grid] = found.grids
-    assert grid.grid() in text
-    assert "0 of 5 cells are complete" in text
-    assert "1 success, 0 fail, 1 timeout, 1 error" in text
 
 
-def test_results_of_several_runs_are_refused(tmp_path: Path) -> None:
+def test_results_of_several_runs_are_an_error(tmp_path: Path) -> None:
     copy = tmp_path / "rollouts.jsonl"
     copy.write_bytes((RUN / "rollouts.jsonl").read_bytes().replace(b"replay-full", b"my-memory"))
     found = score(Settings(rows=(RUN, copy)))

@@ -1,9 +1,8 @@
-"""`index`, `retrieve`, `retrieval-score` and `calibrate`: what they print, write and refuse."""
+"""`index`, `retrieve`, `retrieval-score` and `calibrate`: output, files and errors."""
 
 import csv
 import json
 from collections.abc import Callable
-from itertools import pairwise
 from pathlib import Path
 
 import av
@@ -90,14 +89,6 @@ def test_rules_side_by_side(run: Run, tmp_path: Path, indexed: Path) -> None:
     graded = rows_of(tmp_path / "cells.csv")
     assert {row["passed"] for row in graded if row["rule"] == "oracle/adaptive"} == {"yes"}
     assert "oracle/adaptive: 12 of 12" in lines[-1]
-    # One segment, whatever comes: all of the lesson, and every other session.
-    whole = [row for row in rows_of(tmp_path / "cells.csv") if row["rule"] == "max/-1"]
-    assert {row["coverage"] for row in whole} == {"1.000000"}
-    for row in whole:
-        k = int(row["condition"].removeprefix("k"))
-        assert float(row["false_sessions"]) == k
-        assert (row["found_cuts"], row["false_cuts"]) == ("0", "0")
-        assert int(row["true_cuts"]) == k * int(row["queries"])
     found = {
         (r["rule"], r["episode_id"], r["condition"]): r for r in rows_of(tmp_path / "rows.csv")
     }
@@ -132,32 +123,24 @@ def test_scores_as_json_and_the_same_every_time(run: Run, tmp_path: Path, indexe
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         ("index nowhere", "build all nowhere --source KIND:PATH"),
         ("index {bare} --encoder thumbnial", "Did you mean 'thumbnail'"),
-        ("index {bare} --encoder thumbnail:x", "expected thumbnail"),
-        ("index {bare} --encoder siglip:", "siglip:ID"),
-        ("index {bare} --encoder siglip:/nonexistent", "'/nonexistent' is neither a folder"),
         ("index {bare} --camera side", "camera 'side'"),
         ("index {bare} --batch 0", "batch 0"),
-        ("index {bare} --threads 0", "threads 0"),
-        ("index {bare} --workers 0", "workers 0"),
         ("retrieval-score {bare}", "robomme-interference index {bare} --encoder thumbnail"),
         ("retrieval-score {buffer_set} --rules best", "there is no method 'best'"),
-        ("retrieval-score {buffer_set} --encoder clip", "there is no encoder 'clip'"),
-        (f"retrieve {{buffer_set}} {EPISODE} k2", "condition 'k2'"),
         (f"retrieve {{buffer_set}} {EPISODE} no-history", "the history is empty"),
-        ("retrieve {buffer_set} VideoRepick/test/9 k1", "VideoRepick/test/9"),
         (f"retrieve {{buffer_set}} {EPISODE} k1 --out why.gif", "ends in"),
         ("calibrate {buffer_set} --sweep 0.9 0.8", "sweep (0.9, 0.8)"),
     ],
 )
-def test_refusals(words: str, said: str, run: Run, indexed: Path, tiny_buffers: Path) -> None:
+def test_refusals(words: str, message: str, run: Run, indexed: Path, tiny_buffers: Path) -> None:
     places = {"buffer_set": indexed, "bare": tiny_buffers}
     code, out, err = run(*words.format(**places).split())
     assert (code, out) == (1, "")
-    assert said.format(**places) in err and "Traceback" not in err
+    assert message.format(**places) in err and "Traceback" not in err
     assert not list(tiny_buffers.glob("*/index"))
 
 
@@ -198,27 +181,18 @@ def test_why_is_the_reason_of_the_rule(rule: str, run: Run, indexed: Path) -> No
     assert (grade["start"], grade["stop"], grade["purity"]) == (0, 80, 0.6)  # 48 of 80
 
 
-@pytest.mark.parametrize(
-    ("order", "said"),
-    [
-        ([1, 0], "lesson is frames 32 to 79: purity 60.0%, coverage 100.0%, 1 false session"),
-        ([1], "the history holds no lesson"),
-    ],
-    ids=["second", "absent"],
-)
-def test_why_wherever_the_lesson_lies(
-    order: list[int], said: str, indexed: Path, tmp_path: Path
-) -> None:
-    planned = load_buffer_set(indexed).manifest(EPISODE, "k1").sessions
-    buffer = remade(indexed, [planned[number] for number in order])
+def test_explanation_of_a_history_without_the_lesson(indexed: Path, tmp_path: Path) -> None:
+    message = "the history holds no lesson"
+    _, unit = load_buffer_set(indexed).manifest(EPISODE, "k1").sessions
+    buffer = remade(indexed, [unit])
     rule = select.Rule("max", -1.0)
     measured = select.measure(buffer, "thumbnail")
     choice = select.choose(measured, rule)
     found = explain.explain(buffer, measured, choice, rule, "thumbnail", "front")
-    assert found.text().endswith(said)
+    assert found.text().endswith(message)
     live = buffer.query.frame()
     drawing.draw_retrieval(buffer, measured, choice, found, live, tmp_path / "why.svg")
-    assert said.rpartition(": ")[2] in (tmp_path / "why.svg").read_text()
+    assert message in (tmp_path / "why.svg").read_text()
 
 
 # --- calibrate ---------------------------------------------------------------------------------
@@ -241,9 +215,4 @@ def test_calibration(run: Run, tmp_path: Path, indexed: Path) -> None:
     assert found["threshold"] == pytest.approx(middle, abs=1e-5)
     swept = [round(0.8 + n / 100, 2) for n in range(20)]
     assert [trial["threshold"] for trial in found["sweep"][::4]] == swept
-    # Units return in many buffers, and cuts under several conditions: each counts once.
-    rows = list(load_buffer_set(indexed).manifests(condition="k7"))
-    pairs = {(a.source, b.source) for m in rows for a, b in pairwise(m.sessions)}
-    assert len(found["cuts"]) == len(pairs)
-    assert len(found["lowest"]) == len({s.source for m in rows for s in m.sessions})
     assert [one["family"] for one in found["held_out"]] == list(FAMILIES)

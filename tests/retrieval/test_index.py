@@ -1,4 +1,4 @@
-"""The index beside the data: what it holds, and how it is made and made again."""
+"""The embedding index: its contents, and how it is made and remade."""
 
 import os
 import shutil
@@ -27,9 +27,6 @@ GOLDEN = Path(__file__).parents[1] / "golden" / "index"
 
 def units_index(buffer_set: Path, camera: str = "front") -> EmbeddingIndex:
     return load_buffer_set(buffer_set).datasets["distractors"].index("thumbnail", camera)
-
-
-# --- what it holds -----------------------------------------------------------------------------
 
 
 def test_a_buffers_embeddings_are_those_of_its_frames(indexed: Path) -> None:
@@ -72,13 +69,6 @@ def test_centre_and_typical_cosine_are_of_the_units_alone(indexed: Path) -> None
     assert np.array_equal(index.span(3, 0, 32), features.reshape(UNITS, 32, -1)[3])
     other = datasets["demonstrations"].index("thumbnail")
     assert (other.center, other.header.typical_cosine) == (None, None)
-
-
-@pytest.mark.parametrize("name", ["demonstrations", "distractors"])
-def test_a_dataset_is_indexed_on_its_own(indexed: Path, own_buffers: Path, name: str) -> None:
-    build_index([own_buffers / name], Thumbnail(), QUIET)
-    both = files_of(indexed).items()
-    assert files_of(own_buffers) == {k: v for k, v in both if k.startswith(f"{name}/")}
 
 
 def test_a_live_frame_has_the_embedding_of_the_stored_one(indexed: Path) -> None:
@@ -127,9 +117,6 @@ def test_each_camera_has_an_index_of_its_own(indexed: Path, own_buffers: Path) -
     assert np.array_equal(measured.alike, measure(buffer, "thumbnail", "wrist", live).alike)
 
 
-# --- how it is made ----------------------------------------------------------------------------
-
-
 def test_an_index_is_the_same_bytes_every_time(indexed: Path, own_buffers: Path) -> None:
     assert make_index(own_buffers, threads=3) == FRAMES
     assert files_of(own_buffers) == files_of(indexed)
@@ -138,7 +125,7 @@ def test_an_index_is_the_same_bytes_every_time(indexed: Path, own_buffers: Path)
     assert files_of(own_buffers) == files_of(indexed)
 
 
-def test_an_interrupted_run_goes_on(indexed: Path, own_buffers: Path) -> None:
+def test_interrupted_index_resumes(indexed: Path, own_buffers: Path) -> None:
     # Three lessons of four batches each, then units of two: one is done, and half of the next.
     with pytest.raises(KeyboardInterrupt):
         make_index(own_buffers, Interrupted(after=15))
@@ -151,12 +138,9 @@ def test_an_interrupted_run_goes_on(indexed: Path, own_buffers: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "again"),
     [
-        ("distractors", [0, FRAMES[1]]),
         ("demonstrations", [FRAMES[0], 0]),
         ("distractors/index/thumbnail/chunk-000/episode-000003.npy", [0, FRAMES[1]]),
-        ("distractors/index/thumbnail/SHA256SUMS", [0, FRAMES[1]]),
         ("distractors/index/thumbnail/index.json", [0, FRAMES[1]]),
-        ("distractors/index/thumbnail/centre.npy", [0, FRAMES[1]]),
         ("demonstrations/index/thumbnail/stray.txt", [FRAMES[0], 0]),
     ],
 )
@@ -173,10 +157,7 @@ def test_what_is_missing_or_damaged_is_made_again(
     assert files_of(own_buffers) == files_of(indexed)
 
 
-# --- refusals ----------------------------------------------------------------------------------
-
-
-def test_what_cannot_be_embedded(own_buffers: Path) -> None:
+def test_frames_that_cannot_be_embedded(own_buffers: Path) -> None:
     class Holed(Thumbnail):
         def features(self, prepared: Any) -> Any:
             prepared[-1, 5] = 1e6  # more than float16 holds
@@ -193,14 +174,11 @@ def test_what_cannot_be_embedded(own_buffers: Path) -> None:
     assert not list(own_buffers.glob("*/index/thumbnail"))
 
 
-def test_two_do_not_make_one_index(own_buffers: Path) -> None:
+def test_concurrent_indexing_is_an_error(own_buffers: Path) -> None:
     folder = staging_path(own_buffers / "demonstrations" / "index" / "thumbnail")
     folder.mkdir(parents=True)
     with file_lock(folder / "lock", BuildError("busy")), pytest.raises(BuildError, match="another"):
         make_index(own_buffers)
-
-
-# --- the files ---------------------------------------------------------------------------------
 
 
 def test_the_files_are_the_golden_ones(own_buffers: Path) -> None:

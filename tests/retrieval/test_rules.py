@@ -21,8 +21,6 @@ MIXED = np.array([0.6, 0.8, 0], np.float16)  # cosine 0.6 with X, 0.8 with Y
 HISTORY = np.stack([X] * 4 + [Y] * 5 + [Z] * 2 + [MIXED] * 4)
 SPANS = ((0, 4), (4, 9), (9, 11), (11, 15))
 
-# --- cutting -----------------------------------------------------------------------------------
-
 
 def test_cosines() -> None:
     expected = [1, 1, 1, 0, 1, 1, 1, 1, 0, 1, 0, *[1] * 3]
@@ -63,9 +61,6 @@ def test_what_unrelated_frames_share() -> None:
     assert typical(HISTORY) == 0
 
 
-# --- rules -------------------------------------------------------------------------------------
-
-
 @given(st.sampled_from(sorted(METHODS)), st.one_of(st.just("adaptive"), st.floats(-1, 1)))
 def test_rules_are_read_as_they_are_written(method: str, cut: float) -> None:
     rule = Rule(method, cut)
@@ -77,7 +72,6 @@ def test_the_cut_is_the_encoders_own_unless_given() -> None:
     assert str(Rule.parse("max")) == "max/adaptive"
     assert str(Rule.parse("mean/0.5", 0.923)) == "mean/0.5"
     assert str(Rule.parse("max/0.9234567")) == "max/0.9234567"  # not the same as max/0.923457
-    assert str(Rule.parse("max/-1")) == "max/-1"
     # 0.846 is what would give the paper's threshold.
     assert Rule("max", 0.923).threshold(0.1) == 0.923
     assert Rule("max", "adaptive").threshold(0.0) == 0.5
@@ -92,21 +86,16 @@ def test_all_rules() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "error", "said"),
+    ("text", "error", "message"),
     [
         ("maximum", UnknownNameError, "'maximum'"),
         ("max/high", InvalidOptionError, "'high'"),
-        ("max/", InvalidOptionError, "cut of max ''"),
         ("max/1.5", InvalidOptionError, r"1\.5"),
-        ("max/nan", InvalidOptionError, "nan"),
     ],
 )
-def test_rules_that_are_none(text: str, error: type[Exception], said: str) -> None:
-    with pytest.raises(error, match=said):
+def test_rules_that_are_none(text: str, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
         Rule.parse(text)
-
-
-# --- choosing ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -162,10 +151,6 @@ def test_joined_takes_every_part_of_the_session() -> None:
     assert alone.spans == ((12, 16),)
     single = choose(embedded(np.stack([X, Y, Z]), Y), Rule("joined", 0.5))
     assert single.spans == ((1, 2),)
-
-
-def test_short_segments_count_if_there_are_no_others() -> None:
-    assert choose(embedded(np.stack([X, Y, Z]), Y), Rule("max", 0.5)).spans == ((1, 2),)
 
 
 def test_single_frames() -> None:

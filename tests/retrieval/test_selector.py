@@ -43,9 +43,6 @@ def test_what_it_cannot_choose_from(indexed: Path, tiny_buffers: Path) -> None:
     for image in (np.zeros((3, 32, 32), np.uint8), np.zeros((32, 32, 3), np.float32)):
         with pytest.raises(InvalidOptionError, match=r"\(H, W, 3\) uint8"):
             selector.select(buffer, image)  # type: ignore[arg-type]
-    empty = load_buffer(QUERIES[0], "no-history", buffer_set=indexed)
-    with pytest.raises(InvalidOptionError, match="the history is empty"):
-        selector.select(empty, empty.query.frame())
     bare = load_buffer(QUERIES[0], "k0", buffer_set=tiny_buffers)
     with pytest.raises(MissingFileError):
         selector.select(bare, bare.query.frame())

@@ -22,7 +22,7 @@ Run = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The golden buffer set with views under shifts beside it, indexed; read-only."""
+    """The golden buffer set with views under shifts, indexed; read-only."""
     folder = shutil.copytree(GOLDEN, tmp_path_factory.mktemp("seen") / "buffer_set")
     add_shifted(folder)
     make_index(folder, names=("demonstrations", "distractors", SHIFTED))
@@ -57,7 +57,7 @@ def test_the_query_frame_is_that_of_the_shift(run: Run, seen: Path) -> None:
     assert title.endswith("encoder thumbnail, camera front, shift camera:2, rule max/adaptive")
 
 
-def test_what_is_missing_or_does_not_fit_is_told(run: Run, seen: Path, own_buffers: Path) -> None:
+def test_missing_views_and_unknown_shifts(run: Run, seen: Path, own_buffers: Path) -> None:
     identity = own_buffers / "demonstrations" / IDENTITY_PATH
     write_json(identity, json.loads(identity.read_text()) | {"simulators": ["tabletop"]})
     code, _, err = run("retrieval-score", own_buffers, "--shift", "light:2")
@@ -66,16 +66,16 @@ def test_what_is_missing_or_does_not_fit_is_told(run: Run, seen: Path, own_buffe
 
 
 @pytest.mark.parametrize(
-    ("families", "kind", "told"),
+    ("families", "kind", "message"),
     [
         (("MoveCube",), "sample", "lacks VideoRepick/test/0"),
         ((), "other", "was built from .*'kind': 'other'"),
     ],
 )
-def test_views_of_other_scenes_are_refused(
-    own_buffers: Path, families: tuple[str, ...], kind: str, told: str
+def test_views_of_other_scenes_are_an_error(
+    own_buffers: Path, families: tuple[str, ...], kind: str, message: str
 ) -> None:
-    with pytest.raises(SourceError, match=told):
+    with pytest.raises(SourceError, match=message):
         add_shifted(own_buffers, *families, kind=kind)
 
 

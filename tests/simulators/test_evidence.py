@@ -51,11 +51,8 @@ def test_the_more_is_known_the_fewer_answers_agree(family: str) -> None:
         ("VideoRepick", 0, {0}, 1),
         ("VideoRepick", 2, {0}, 4),  # each of five cubes ends at another place
         ("VideoRepick", 2, {1, 2, 3}, 5),  # the swaps are known, but not which cube was lifted
-        ("VideoPlaceOrder", 0, {0, 1}, 1),  # of three targets one is left
         ("VideoPlaceButton", 1, {0}, 3),  # of four targets; the goal asks for the other visit
-        ("VideoUnmaskSwap", 1, {0}, 3),
         ("MoveCube", 0, set(), 3),
-        ("InsertPeg", 0, {0}, 4),
         ("InsertPeg", 0, {1, 2}, 2),
         ("RouteStick", 0, {1, 2}, 1),  # the first turn implies the start
     ],
@@ -68,15 +65,6 @@ def test_what_is_left_to_guess(family: str, index: int, known: set[int], left: i
             assert len(scene.agreeing(seen(scene, answer, known))) == left
 
 
-def test_a_path_continues_to_an_adjacent_button() -> None:
-    """A corner of the grid has three."""
-    scene = drawn("PatternLock", 0)
-    answer = next(one for one in scene.answers if one[:2] == (0, 1))
-    assert scene.parts(answer)[:2] == ("goes to button 0", "goes to button 1")
-    first = scene.agreeing(seen(scene, answer, {0}))
-    assert {one[1] for one in first} == {1, 4, 5} and {one[0] for one in first} == {0}
-
-
 def test_of_contradicting_parts_the_first_take_precedence() -> None:
     scene = drawn("InsertPeg", 0)  # (peg, end, side)
     one, other = (scene.parts(answer) for answer in ((0, 1, 1), (1, -1, -1)))
@@ -85,9 +73,6 @@ def test_of_contradicting_parts_the_first_take_precedence() -> None:
     apart = {0: "goes to button 0", 1: "goes to button 15"}  # no path has both
     assert {found[0] for found in path.agreeing(apart)} == {0}
     assert {found[1] for found in path.agreeing(dict(reversed(apart.items())))} == {15}
-
-
-# --- the ideal observer --------------------------------------------------------------------------
 
 
 def test_recall_draws_among_what_is_left() -> None:
@@ -125,9 +110,6 @@ def test_played_as_computed(blind: TabletopSimulator, family: str, index: int) -
         while status is Status.ONGOING:
             _, status = blind.step(blind.act("recall", known), observe=False)
         assert status is expected
-
-
-# --- what demonstrations show --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("index", [0, pytest.param(2, marks=pytest.mark.slow)])

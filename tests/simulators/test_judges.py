@@ -45,9 +45,6 @@ def play(env: TabletopEnv, script: Script, seen: Callable[[], None] = lambda: No
     return env.status
 
 
-# --- VideoUnmask: lifting a wrong container reveals nothing ------------------------------------
-
-
 def pixels_of(color: str, image: NDArray[np.uint8]) -> int:
     """Number of pixels in which one channel dominates."""
     channel = ("red", "green", "blue").index(color)
@@ -85,8 +82,6 @@ def test_no_cube_is_seen_under_a_wrong_container_before_the_failure(env: Tableto
     scene.shells[wrong].put(scene.under[wrong].home)  # at 0.02 m, where the cube becomes visible
     assert pixels_of(color, look()["front"]) > 0
 
-
-# --- MoveCube: the manner is judged all the time -----------------------------------------------
 
 PUSH, GRASP = 0, 1
 
@@ -143,9 +138,6 @@ def test_the_manner_is_what_moves_the_cube(
     assert play(env, way(env.arm, scene)) is status
     if way is drag_slowly:  # a wrong manner fails within millimeters
         assert np.linalg.norm(scene.cube.p - cube) < 0.004
-
-
-# --- the stick: touching buttons and hitting posts ------------------------------------------------
 
 
 @pytest.mark.parametrize(("height", "touches"), [(0.030, False), (0.015, False), (0.013, True)])

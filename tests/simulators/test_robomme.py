@@ -10,7 +10,6 @@ import textwrap
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -90,13 +89,6 @@ def test_a_step_executes_the_action(simulator: RoboMMESimulator) -> None:
     assert simulator.step(HOLD)[0].state.tolist() == [*HOLD[:7].tolist(), 0.0]
 
 
-def test_robommes_statuses(simulator: RoboMMESimulator) -> None:
-    for index, status in ((45, Status.SUCCESS), (46, Status.FAIL), (47, Status.TIMEOUT)):
-        simulator.reset(f"MoveCube/test/{index}")
-        statuses = [simulator.step(HOLD, observe=False)[1] for _ in range(3)]
-        assert statuses == [Status.ONGOING, Status.ONGOING, status]
-
-
 def play(simulator: RoboMMESimulator, episode: str) -> tuple[object, ...]:
     """Play an episode, and return all results."""
     lesson, first, info = simulator.reset(episode)
@@ -164,24 +156,7 @@ def test_a_process_plays_few_episodes_and_none_depends_on_it(simulator: RoboMMES
     assert simulator.reset("VideoRepick/test/0")[2].goals[-1] == "open environments: 1"
 
 
-def test_simulate_plays_the_demonstration(
-    run: Any, robomme_python: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    local = Path("python")  # there is another one on the path
-    local.write_text(f'#!/bin/sh\nexec "{robomme_python}" "$@"\n')
-    local.chmod(0o755)
-    words = "simulate --family MoveCube --episode 3 --json --simulator robomme"
-    code, out, err = run(*words.split(), "--robomme-python", "./python")
-    assert code == 0, err
-    found = json.loads(out)
-    assert (found["seed"], found["policy"], found["lesson_frames"]) == (640_003, "none", 5)
-
-
-# --- invalid input -----------------------------------------------------------------------------
-
-
-def test_what_robomme_does_not_have(simulator: RoboMMESimulator) -> None:
+def test_unknown_robomme_names(simulator: RoboMMESimulator) -> None:
     for episode, message in (
         ("MoveCube/test/50", "MoveCube has 50 test episodes"),
         ("MoveQube/test/0", "Did you mean 'MoveCube'"),
@@ -249,7 +224,7 @@ def test_an_exception_leaves_the_process_running(simulator: RoboMMESimulator) ->
     assert simulator.pid == pid
 
 
-def test_it_ends_with_us_even_in_a_long_call(robomme_python: Path) -> None:
+def test_process_ends_with_its_parent_during_a_call(robomme_python: Path) -> None:
     code = f"""
         import numpy as np
         from robomme_interference_data.simulators.robomme.simulator import RoboMMESimulator
@@ -282,7 +257,7 @@ def test_an_interpreter_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert find_python(None) == str(local)
 
 
-def test_an_interpreter_that_is_not_there(tmp_path: Path) -> None:
+def test_missing_interpreter(tmp_path: Path) -> None:
     with pytest.raises(InvalidOptionError, match="none is given") as caught:
         make_simulator("robomme")
     assert "robomme_python=PATH" in str(caught.value)
@@ -292,7 +267,7 @@ def test_an_interpreter_that_is_not_there(tmp_path: Path) -> None:
             find_python(path)
 
 
-def test_an_interpreter_that_will_not_do(
+def test_unusable_interpreter(
     bare_python: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refused(python: Path | str, error: type[Exception], message: str) -> None:
@@ -313,7 +288,7 @@ def test_an_interpreter_that_will_not_do(
     refused(sys.executable, MissingExtraError, f"numpy is {np.__version__}; RoboMME needs numpy")
 
 
-# --- another ManiSkill than RoboMME's fork of it ----------------------------------------------
+# --- other ManiSkill versions ---------------------------------------------------------------------
 
 
 def test_what_differs_from_the_fork_is_patched(
@@ -343,7 +318,7 @@ def test_what_differs_from_the_fork_is_patched(
     assert (folder / "meshes" / "camera.stl").read_text() == "solid\n"
 
 
-def test_what_cannot_be_patched_is_refused(
+def test_unsupported_maniskill_is_an_error(
     robomme_python: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("STAND_IN_MANI_SKILL", "strange")

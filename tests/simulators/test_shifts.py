@@ -8,11 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from support.families import families
 
-from robomme_interference_data.errors import (
-    InvalidOptionError,
-    SimulatorCrashError,
-    UnknownNameError,
-)
+from robomme_interference_data.errors import SimulatorCrashError, UnknownNameError
 from robomme_interference_data.schema.shifts import KINDS, SHIFTS, Shift
 from robomme_interference_data.simulators import Status
 
@@ -121,9 +117,7 @@ def test_clutter_is_out_of_the_way(blind: TabletopSimulator, family: str) -> Non
     assert status is Status.SUCCESS
 
 
-def test_shifts_are_asked_for_by_name(shifted: TabletopSimulator) -> None:
-    with pytest.raises(InvalidOptionError, match="shift 'fog:1'; expected none, or light"):
-        TabletopSimulator(shift="fog:1")
+def test_views_need_a_running_episode(shifted: TabletopSimulator) -> None:
     with pytest.raises(UnknownNameError):
         shifted.reset("MoveCube/test/99")
     with pytest.raises(SimulatorCrashError, match="no episode is running"):

@@ -138,7 +138,7 @@ def test_pictures_are_lit_by_the_scenes_own_lights(scene: TabletopEnv) -> None:
     assert np.abs(scene.observe(("front",)).images["front"][250, 5] - expected).max() < 1
 
 
-# --- fair --------------------------------------------------------------------------------------
+# --- fairness -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("index", [0, pytest.param(2, marks=pytest.mark.slow)])
@@ -219,9 +219,6 @@ def test_no_two_families_could_be_mistaken_for_one_another(scene: TabletopEnv) -
             assert (np.abs(on_a - on_b).max(axis=2)[there] > 40).mean() > 0.6, (one, other)
 
 
-# --- the arm -------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_the_cube_is_in_sight_all_through_a_lesson_in_pushing(tabletop: TabletopSimulator) -> None:
     tabletop.env.demonstrated = ("front", "wrist")
@@ -245,10 +242,7 @@ def test_motion_out_of_reach_is_an_error(scene: TabletopEnv) -> None:
         list(scene.arm.move((-0.3, 0.28, 0.02), -math.pi / 2))
 
 
-# --- invalid input -------------------------------------------------------------------------------
-
-
-def test_bad_input_is_refused(blind: TabletopSimulator) -> None:
+def test_invalid_input(blind: TabletopSimulator) -> None:
     blind.reset("PatternLock/test/0")
     with pytest.raises(UnknownNameError, match="Did you mean 'oracle'"):
         blind.act("orakle")

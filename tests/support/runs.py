@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import time
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ from support import worlds
 from robomme_interference_data.evaluate import RunConfig, RunResult, run_evaluation
 from robomme_interference_data.evaluate.rollout.rollout import run_rollout
 from robomme_interference_data.evaluate.run.kind import Run
+from robomme_interference_data.evaluate.run.log import read_record
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Executor, Serial
@@ -74,3 +77,16 @@ def untimed(rows: tuple[Rollout, ...]) -> list[dict[str, Any]]:
         {name: value for name, value in to_dict(row).items() if name not in TIMING_COLUMNS}
         for row in rows
     ]
+
+
+def finished_rows(out: Path) -> list[dict[str, Any]]:
+    """The recorded rows in canonical order, without what differs from run to run."""
+    rows = read_record(out)
+    return [row | {"attempt": 1} for row in untimed(tuple(rows[item] for item in sorted(rows)))]
+
+
+def wait_for_rows(out: Path, count: int, running: subprocess.Popen[str]) -> None:
+    log, end = out / "rollouts.jsonl", time.monotonic() + 200
+    while not log.exists() or log.read_bytes().count(b"\n") < count:
+        assert time.monotonic() < end and running.poll() is None, running.communicate()
+        time.sleep(0.02)

@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 from support.buffer_sets import contents
 from support.build_server import BuildServer
-from support.few import few
 
 from robomme_interference_data.build_dataset.stage import read_staged
 from robomme_interference_data.storage.staging import staging_path
@@ -20,6 +19,11 @@ from robomme_interference_data.storage.staging import staging_path
 pytestmark = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs /proc")
 
 HASH_SEED = "4711"
+SIGNALS = [
+    signal.SIGKILL,
+    pytest.param(signal.SIGINT, marks=pytest.mark.slow),
+    pytest.param(signal.SIGTERM, marks=pytest.mark.slow),
+]
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +65,7 @@ def staged(out: Path) -> dict[Path, int]:
 
 
 @pytest.mark.parametrize("times", [1, pytest.param(12, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("sent", few([signal.SIGKILL, signal.SIGINT, signal.SIGTERM], 1))
+@pytest.mark.parametrize("sent", SIGNALS)
 def test_stopped_at_random_moments(
     server: BuildServer,
     undisturbed: tuple[dict[str, bytes], float],
@@ -92,8 +96,10 @@ def test_stopped_at_random_moments(
         assert before.items() <= staged(out).items(), "finished episodes were made again"
         if finished.code > 0 and staged(out) != before:  # else it may not have begun yet
             assert "Stopped. " in finished.stderr, finished.stderr
-            told = finished.stderr.split("Stopped. ")[1]
-            assert told.startswith("Finished episodes are kept; resume with:\nrobomme-interference")
+            message = finished.stderr.split("Stopped. ")[1]
+            assert message.startswith(
+                "Finished episodes are kept; resume with:\nrobomme-interference"
+            )
     finished = server.run(*command(out))
     assert finished.code == 0, finished.stderr
     assert contents(out) == expected
@@ -106,17 +112,6 @@ def started(server: BuildServer, out: Path) -> int:
     while not staged(out) and time.monotonic() < end:
         time.sleep(0.01)
     return pid
-
-
-def test_a_terminated_build_prints_how_to_resume(server: BuildServer, tmp_path: Path) -> None:
-    pid = started(server, tmp_path / "distractors")
-    os.kill(pid, signal.SIGTERM)
-    finished = server.wait(pid)
-    assert finished.code == 143, finished.stderr
-    told = finished.stderr.split("resume with:\n")[1]
-    assert told.startswith(
-        f"robomme-interference build distractors {tmp_path} --source sample:MoveCube"
-    )
 
 
 def test_a_worker_that_is_killed_is_replaced(

@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -26,8 +25,6 @@ from robomme_interference_data.evaluate.run.log import read_record
 from robomme_interference_data.runtime.executor import Executor, Serial
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.runtime.ray_cluster import RayWorkers
-from robomme_interference_data.schema.codec import to_dict
-from robomme_interference_data.schema.rollouts import TIMING_COLUMNS
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 
@@ -44,14 +41,6 @@ def cluster() -> Iterator[Any]:
             patch.setenv(name, value)
         with running_cluster(3) as made:
             yield made
-
-
-def ended(out: Path) -> list[dict[str, Any]]:
-    rows, own = read_record(out), {*TIMING_COLUMNS, "attempt"}
-    return [
-        {name: value for name, value in to_dict(rows[item]).items() if name not in own}
-        for item in sorted(rows)
-    ]
 
 
 def driver(out: Path, address: str) -> subprocess.Popen[str]:
@@ -71,13 +60,6 @@ def raylets(node: Any) -> list[Any]:
     return found
 
 
-def wait_for_rows(out: Path, count: int, running: subprocess.Popen[str]) -> None:
-    log, end = out / "rollouts.jsonl", time.monotonic() + 200
-    while not log.exists() or log.read_bytes().count(b"\n") < count:
-        assert time.monotonic() < end and running.poll() is None, running.communicate()
-        time.sleep(0.02)
-
-
 def test_a_node_and_the_driver_are_killed_and_no_row_is_lost(
     cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -86,13 +68,13 @@ def test_a_node_and_the_driver_are_killed_and_no_row_is_lost(
     runs.run(tmp_path / "one", conditions=CONDITIONS, videos=True)
     out = tmp_path / "run"
     first = driver(out, cluster.address)
-    wait_for_rows(out, 1, first)
+    runs.wait_for_rows(out, 1, first)
     first.kill()
     first.communicate(timeout=60)
     before = read_record(out)
     assert 1 <= len(before) < ROLLOUTS
     second = driver(out, cluster.address)
-    wait_for_rows(out, len(before) + 1, second)
+    runs.wait_for_rows(out, len(before) + 1, second)
     cluster.remove_node(cluster.list_all_nodes()[1], allow_graceful=False)
     add_node(cluster)
     answer, err = second.communicate(timeout=300)
@@ -100,12 +82,13 @@ def test_a_node_and_the_driver_are_killed_and_no_row_is_lost(
     assert len(json.loads(answer)) == ROLLOUTS
     after = read_record(out)  # refuses a second row of a finished rollout
     assert all(after[item] == row for item, row in before.items())
-    assert [row | {"video": None} for row in ended(tmp_path / "one")] == ended(out)
+    expected = [row | {"video": None} for row in runs.finished_rows(tmp_path / "one")]
+    assert runs.finished_rows(out) == expected
 
 
 def test_ctrl_c_gives_all_workers_back(cluster: Any, tmp_path: Path) -> None:
     running = driver(tmp_path / "run", cluster.address)
-    wait_for_rows(tmp_path / "run", 1, running)
+    runs.wait_for_rows(tmp_path / "run", 1, running)
     nodes = [one.process.pid for each in cluster.list_all_nodes() for one in raylets(each)]
     hosts = [child for pid in nodes for child in psutil.Process(pid).children(recursive=True)]
     workers = [each.pid for each in hosts if "WorkerActor" in " ".join(each.cmdline())]

@@ -60,7 +60,6 @@ BAD = {"numpy": "1.26.4", "lerobot": "0.6.1", "datasets": "5.0.0"}
 @pytest.mark.parametrize(
     ("installed", "extra", "row"),
     [
-        (GOOD, "", (True, "numpy 2.2.6", None)),
         (GOOD, "build", (True, "lerobot 0.6.1, h5py 3.16.0", None)),
         (
             BAD,
@@ -107,13 +106,12 @@ def test_only_the_decoder_is_required(
     ("program", "ok", "detail"),
     [
         ("print('llvmpipe')", True, "drawn with llvmpipe"),
-        ("import sys; print('chatter', file=sys.stderr); sys.exit('no device')", None, "no device"),
         ("import os; os.abort()", None, "crashed (exit code -6)"),
         ("import time; time.sleep(60)", None, "did not answer within 1 s"),
     ],
-    ids=["draws", "refuses", "crashes", "hangs"],
+    ids=["draws", "crashes", "hangs"],
 )
-def test_the_renderer_is_asked_whatever_its_driver_does(
+def test_renderer_check_survives_its_driver(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, ok: bool | None, detail: str
 ) -> None:
     pytest.importorskip("sapien", reason="needs the extra sim")

@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -20,13 +19,10 @@ from support.worker_calls import wait_until_gone
 from robomme_interference_data.errors import WorkerRetiredError
 from robomme_interference_data.evaluate.run.log import read_record
 from robomme_interference_data.runtime.executor import Processes
-from robomme_interference_data.schema.codec import to_dict
-from robomme_interference_data.schema.rollouts import TIMING_COLUMNS
 
 TESTS = Path(__file__).parent.parent
 CONDITIONS = ("no-history", "k0", "k1", "k3", "k7")
 ROLLOUTS = 10  # two episodes, five conditions
-GUARD = 'if __name__ == "__main__":'
 
 
 @pytest.fixture(autouse=True)
@@ -70,29 +66,11 @@ def children(pid: int) -> list[int]:
     return found
 
 
-def ended(out: Path) -> list[dict[str, Any]]:
-    """What came out, in canonical order, without what differs from run to run."""
-    rows = read_record(out)
-    own = {*TIMING_COLUMNS, "attempt"}
-    return [
-        {name: value for name, value in to_dict(rows[item]).items() if name not in own}
-        for item in sorted(rows)
-    ]
-
-
-def wait_for_rows(out: Path, count: int, running: subprocess.Popen[str]) -> None:
-    log, end = out / "rollouts.jsonl", time.monotonic() + 120
-    while time.monotonic() < end and running.poll() is None:
-        if log.exists() and log.read_bytes().count(b"\n") >= count:
-            return
-        time.sleep(0.02)
-
-
 @pytest.fixture
 def undisturbed(tmp_path: Path) -> list[dict[str, Any]]:
     """What one process writes."""
     runs.run(tmp_path / "undisturbed", conditions=CONDITIONS)
-    return ended(tmp_path / "undisturbed")
+    return runs.finished_rows(tmp_path / "undisturbed")
 
 
 def test_the_command_may_be_killed_or_stopped_at_any_moment(
@@ -102,7 +80,7 @@ def test_the_command_may_be_killed_or_stopped_at_any_moment(
     before: dict[Any, Any] = {}
     for already, number in zip((1, 3), sent, strict=True):
         running = start(out, 0.02)
-        wait_for_rows(out, already, running)
+        runs.wait_for_rows(out, already, running)
         workers = children(running.pid)
         if number == signal.SIGKILL:
             running.kill()
@@ -127,7 +105,7 @@ def test_the_command_may_be_killed_or_stopped_at_any_moment(
     starts = json.loads((out / "run.json").read_text())["starts"]
     killed = [one == signal.SIGKILL for one in sent]
     assert [one["ended"] is None for one in starts] == [*killed, False]
-    assert ended(out) == undisturbed
+    assert runs.finished_rows(out) == undisturbed
 
 
 @pytest.mark.slow
@@ -159,9 +137,6 @@ def test_policies_are_closed_and_what_they_print_is_not_among_the_rows(
     assert (words.count("made"), words.count("reset"), words.count("closed")) == (3, 2, 3)
     pids = (tmp_path / "closed").read_text().split()
     assert len(set(pids)) == 3  # the command itself, and two workers
-
-
-# --- policy servers ----------------------------------------------------------------------------
 
 
 @contextmanager
@@ -213,7 +188,7 @@ def test_servers_that_workers_start_end_with_the_command(
 ) -> None:
     words = ["--serve", command("--pids", tmp_path / "pids")]
     running = start(tmp_path / "run", 0.05, policy="websocket", words=words)
-    wait_for_rows(tmp_path / "run", 2, running)
+    runs.wait_for_rows(tmp_path / "run", 2, running)
     pids = [int(line) for line in (tmp_path / "pids").read_text().split()]
     assert len(pids) == 2  # one beside each worker
     os.killpg(running.pid, sent)
@@ -221,40 +196,3 @@ def test_servers_that_workers_start_end_with_the_command(
     wait_until_gone(pids)
     numbers = {path.stem.rpartition("-")[2] for path in (tmp_path / "run" / "servers").iterdir()}
     assert {"0"} <= numbers <= {"0", "1"}
-
-
-# --- scripts -----------------------------------------------------------------------------------
-
-
-def script(tmp_path: Path, call: str) -> Any:
-    path = tmp_path / "script.py"
-    path.write_text(f"""
-from pathlib import Path
-from robomme_interference_data.evaluate import RunConfig, run_evaluation
-
-options = {{"simulator": {runs.WORLD!r}, "conditions": ("k0",), "families": ("MoveCube",)}}
-buffer_set, out = Path({os.environ[worlds.BUFFER_SET]!r}), Path("run")
-config = RunConfig({runs.CHEAT!r}, buffer_set, out, system="mine", **options)
-{call}
-""")
-    return subprocess.run(
-        [sys.executable, str(path)],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-
-
-def test_a_script_needs_its_guard(tmp_path: Path) -> None:
-    call = "run_evaluation(config)"
-    done = script(tmp_path, call)
-    assert done.returncode == 1 and done.stderr.count("Traceback") == 1
-    assert done.stderr.splitlines()[-1].endswith(GUARD)
-    assert read_record(tmp_path / "run") == {}
-    stopped = json.loads((tmp_path / "run" / "run.json").read_text())["starts"][0]["stopped"]
-    assert "would start worker processes" in stopped
-    done = script(tmp_path, f"{GUARD}\n    print({call}.counts)")
-    assert done.stderr == ""
-    assert done.stdout == "{'success': 1, 'fail': 0, 'timeout': 0, 'error': 0}\n"

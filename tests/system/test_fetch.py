@@ -47,8 +47,8 @@ def test_fetch_after_a_kill(hub: HubServer, run: Run, tmp_path: Path) -> None:
     came = in_cache()
     videos = [path for _, path in came if path.endswith(".mp4")]
     assert 24 - AT_ONCE < len(videos) < 24 + AT_ONCE and not out.exists()
-    code, told, _ = run(*words, "--dry-run", "--json")
-    missing = sum(one["missing_files"] for one in json.loads(told)["repositories"])
+    code, printed, _ = run(*words, "--dry-run", "--json")
+    missing = sum(one["missing_files"] for one in json.loads(printed)["repositories"])
     assert code == 0 and missing > 0
     before = len(hub.asked)
     assert run(*words)[0] == 0

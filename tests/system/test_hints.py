@@ -40,9 +40,7 @@ def test_settings_are_printed_as_options(error: InterferenceError, lines: list[s
     assert error_lines(error, EVALUATE) == lines
 
 
-def test_what_the_package_logs_is_printed_without_obeying_it(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_logged_control_characters_are_escaped(capsys: pytest.CaptureFixture[str]) -> None:
     log_to_stderr()
     logger = logging.getLogger("robomme_interference_data.storage.hub")
     logger.info("fetched %s", "\x1b[2Jname")
@@ -57,7 +55,7 @@ TO_OBEY = {"\x1b", "\x9b", "\x07"}
 @pytest.mark.parametrize(
     "error", [InterferenceError(HOSTILE, HOSTILE), OSError(1, HOSTILE, HOSTILE), KeyError(HOSTILE)]
 )
-def test_a_terminal_obeys_no_error_and_no_traceback(
+def test_control_characters_in_errors_are_escaped(
     error: Exception, run: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
@@ -68,7 +66,7 @@ def test_a_terminal_obeys_no_error_and_no_traceback(
     assert "[2J" in err and not TO_OBEY & {*err}
 
 
-def test_a_terminal_obeys_no_output(capsys: pytest.CaptureFixture[str]) -> None:
+def test_control_characters_in_output_are_escaped(capsys: pytest.CaptureFixture[str]) -> None:
     echo(f"a\n\t{HOSTILE}")
     print_json({"key": HOSTILE})
     first, *rest = capsys.readouterr().out.splitlines()

@@ -98,9 +98,6 @@ def test_a_dataset_of_lerobots_is_read_as_lerobot_does(
     assert row == len(theirs)
 
 
-# --- LeRobot over our datasets -------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", ["demonstrations", "distractors"])
 def test_lerobot_reads_what_we_do(lerobot: Any, name: str) -> None:
     theirs = lerobot.LeRobotDataset(f"tests/{name}", root=GOLDEN / name, video_backend="pyav")

@@ -8,7 +8,7 @@ import pytest
 from IPython.core.interactiveshell import InteractiveShell
 from support.buffer_sets import GOLDEN
 
-from robomme_interference_data import load_buffer, load_buffer_set
+from robomme_interference_data import load_buffer
 
 NOTEBOOK = Path(__file__).parents[2] / "examples" / "buffers.ipynb"
 
@@ -29,11 +29,6 @@ def test_the_example_runs(shell: InteractiveShell, monkeypatch: pytest.MonkeyPat
                 formats, _ = shell.display_formatter.format(result.result)
                 shown.append(sorted(formats))
     assert ["text/html", "text/plain"] in shown and ["image/png", "text/plain"] in shown
-
-
-def test_a_buffer_set_is_a_table(shell: InteractiveShell) -> None:
-    formats, _ = shell.display_formatter.format(load_buffer_set(GOLDEN))
-    assert "<td" in formats["text/html"] and "MoveCube" in formats["text/html"]
 
 
 def test_without_matplotlib_a_buffer_is_text(

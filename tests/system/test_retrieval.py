@@ -26,9 +26,6 @@ def test_worker_processes_give_the_same_bytes(tiny_buffers: Path, tmp_path: Path
     assert files_of(tmp_path / "a") == files_of(tmp_path / "b")
 
 
-# --- the first test episode of each of the nine families ------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def episodes(shared_data: Path) -> Features:
     """Features of the nine episodes by family; the last of each is the first live observation."""

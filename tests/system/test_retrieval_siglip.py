@@ -122,7 +122,7 @@ def test_other_weights_or_settings_are_another_encoder(model: str, tmp_path: Pat
     image = np.random.default_rng(0).integers(0, 256, (1, 32, 32, 3), np.uint8)
 
     def changed(path: Path) -> set[str]:
-        """What differs in the fingerprint; they are told apart because they see differently."""
+        """The keys of the fingerprint that differ, for models with different features."""
         one, other = (make_encoder(f"siglip:{place}", device="cpu") for place in (folder, path))
         rows = [encoder.features(encoder.prepare(image)) for encoder in (one, other)]
         assert not np.array_equal(*rows)
@@ -134,16 +134,14 @@ def test_other_weights_or_settings_are_another_encoder(model: str, tmp_path: Pat
         next(vision.parameters()).add_(0.01)
     vision.save_pretrained(weights)
     assert changed(weights) == {"weights_sha256"}
-    settings = {"num_attention_heads": 4, "hidden_act": "relu", "layer_norm_eps": 0.5}
-    for setting, value in settings.items():
-        path = shutil.copytree(folder, tmp_path / setting)
-        config = json.loads((path / "config.json").read_text())
-        config["vision_config"][setting] = value
-        (path / "config.json").write_text(json.dumps(config))
-        assert changed(path) == {"tower"}
+    path = shutil.copytree(folder, tmp_path / "settings")
+    config = json.loads((path / "config.json").read_text())
+    config["vision_config"]["hidden_act"] = "relu"
+    (path / "config.json").write_text(json.dumps(config))
+    assert changed(path) == {"tower"}
 
 
-def test_a_model_without_all_its_weights_is_refused(model: str, tmp_path: Path) -> None:
+def test_incomplete_model_is_an_error(model: str, tmp_path: Path) -> None:
     from safetensors.numpy import load_file, save_file
 
     folder = shutil.copytree(model.partition(":")[2], tmp_path / "part")
@@ -162,15 +160,9 @@ def test_a_model_without_all_its_weights_is_refused(model: str, tmp_path: Path) 
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(FormatError, match="cannot be loaded"):
         embed(folder)
-    save_file(tensors, path, metadata={"format": "pt"})
-    config = json.loads((folder / "config.json").read_text())
-    config["vision_config"]["intermediate_size"] = 48
-    (folder / "config.json").write_text(json.dumps(config))
-    with pytest.raises(FormatError, match="cannot be loaded"):
-        embed(folder)
 
 
-def test_weights_that_are_not_there(tmp_path: Path) -> None:
+def test_missing_weights(tmp_path: Path) -> None:
     pytest.importorskip("transformers")
     with pytest.raises(HubError, match="google/siglip-so400m-patch14-384") as caught:
         make_encoder("siglip")
@@ -184,6 +176,6 @@ def test_weights_that_are_not_there(tmp_path: Path) -> None:
         make_encoder(f"siglip:{tmp_path}")
 
 
-def test_a_device_that_is_not_there(model: str) -> None:
+def test_unknown_device(model: str) -> None:
     with pytest.raises(InvalidOptionError, match="device 'nowhere'"):
         make_encoder(model, device="nowhere")
