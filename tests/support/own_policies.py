@@ -139,9 +139,3 @@ class Served(WebsocketPolicy):
 
     def metadata(self) -> dict[str, Any]:
         return {name: value for name, value in super().metadata().items() if name != "server"}
-
-
-def from_checkpoint() -> Still:
-    """Return a policy that says which checkpoint CHECKPOINT names."""
-    said = {"policy": "still", "checkpoint": os.environ["CHECKPOINT"]}
-    return changed("metadata", lambda: said)
