@@ -187,7 +187,7 @@ def test_no_server_listens() -> None:
             call()
 
 
-# --- names and options of models ----------------------------------------------------------------------
+# --- names and options of models -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
