@@ -9,7 +9,7 @@ from support.asking import ask, behind, look, questions
 from support.chat_server import ChatServer
 from support.policy_server import PolicyServer
 from support.runs import header, run, run_one
-from support.tabletop import QUERIES, copy_tabletop
+from support.tabletop import copy_tabletop
 
 from robomme_interference_data.build_dataset.questions import write_questions
 from robomme_interference_data.data.questions import digest_questions
@@ -143,36 +143,11 @@ def test_another_run_of_questions_is_an_error_that_names_the_difference(tmp_path
                 ask(tmp_path / "run", **usual | changes)
 
 
-def test_other_settings_of_questions_may_change_between_starts(tmp_path: Path) -> None:
-    four = {"families": ("MoveCube", "PatternLock")}
-    with ChatServer(look) as server, ChatServer(look) as other:
-        ask(tmp_path / "run", **behind(server, frames=3, families=("MoveCube",)))
-        moved = behind(other, frames=3, cache=True, rollout_timeout_s=9.0, max_errors=2)
-        moved |= {"model_options": ("repeats=1", "response_s=9")}
-        result = ask(tmp_path / "run", conditions=("k0", "k1"), **moved, **four)
-        assert len(server.seen) == 2 and len(other.seen) == 6
-    assert result.planned == len(result.rows) == 8
-    starts = header(tmp_path / "run")["starts"]
-    assert [start["policy"]["model"] for start in starts] == [{"model": "tiny"}] * 2
-
-
 def test_other_questions_are_another_run(tmp_path: Path) -> None:
     root = copy_tabletop(tmp_path / "buffer_set")
     ask(tmp_path / "run", buffer_set=root)
-    turned = [
-        dataclasses.replace(
-            one,
-            options=one.options[::-1],
-            answers=one.answers[::-1],
-            right=len(one.options) - 1 - one.right,
-        )
-        for one in questions().values()
-    ]
-    write_questions(turned, root)
+    write_questions([dataclasses.replace(one, text="?") for one in questions().values()], root)
     with pytest.raises(RunError, match="questions is"):
         ask(tmp_path / "run", buffer_set=root)
     digest = header(tmp_path / "run")["identity"]["questions"]
     assert digest == digest_questions(questions().values())
-    # The ideal observer that has seen everything is right in any order of the options.
-    full = ask(tmp_path / "full", buffer_set=root, sampling="full")
-    assert full.counts["success"] == len(QUERIES)
