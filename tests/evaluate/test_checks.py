@@ -1,8 +1,8 @@
 """Checks before a run: settings, the simulator, and the names of systems."""
 
 import sys
-from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -47,6 +47,7 @@ from robomme_interference_data.simulators.registry import SIMULATORS
 
 pytestmark = pytest.mark.usefixtures("world")
 
+STEP: dict[str, Any] = {"retrieval": "thumbnail"}
 SAYS = {"policy": "python:support.own_policies:says"}
 
 
@@ -63,15 +64,11 @@ SAYS = {"policy": "python:support.own_policies:says"}
         ({"conditions": ("k2",)}, UnknownNameError, "condition 'k2' is not in"),
         ({"rollout_timeout_s": float("nan")}, InvalidOptionError, "rollout_timeout_s nan"),
         ({"system": "pi05_baseline"}, InvalidOptionError, "pi05_baseline takes no history, so k0"),
-        (
-            {"system": "retrieval-framesamp-modul", "retrieval": "thumbnail"},
-            InvalidOptionError,
-            "has nothing to retrieve from under no-history",
-        ),
+        (STEP | {"system": "retrieval-framesamp-modul"}, InvalidOptionError, "nothing to retrieve"),
         ({"system": "retrieval-framesamp-modul"}, InvalidOptionError, "`retrieval` is None"),
         ({"retrieval_rule": "oracle"}, InvalidOptionError, "`retrieval_rule` has no effect"),
-        ({"retrieval": "thumbnail", "retrieval_camera": "nose"}, UnknownNameError, "camera 'nose'"),
-        ({"retrieval": "thumbnail"}, MissingFileError, "'thumbnail'"),
+        (STEP | {"retrieval_camera": "nose"}, UnknownNameError, "camera 'nose'"),
+        (STEP, MissingFileError, "'thumbnail'"),
         (SAYS | {"policy_options": ("what=nan",)}, PolicyError, "holds nan"),
     ],
 )
@@ -92,7 +89,7 @@ def test_every_condition_needs_its_embeddings(tmp_path: Path) -> None:
     build_dataset(plan, buffer_set / CONTRADICTIONS, Serial(), QUIET)
     sum(write_manifests(plan_manifests(in_folder(buffer_set), ("k0", "stale-k0")), buffer_set))
     make_index(buffer_set)
-    settings = {"buffer_set": buffer_set, "retrieval": "thumbnail", "families": ("MoveCube",)}
+    settings = STEP | {"buffer_set": buffer_set, "families": ("MoveCube",)}
     with pytest.raises(MissingFileError, match=f"{CONTRADICTIONS} has no embeddings"):
         run(tmp_path / "run", **settings, conditions=("k0", "stale-k0"))
     assert not (tmp_path / "run").exists()
@@ -181,14 +178,11 @@ def test_only_cameras_in_use_are_rendered() -> None:
     assert options("tabletop") == {"cameras": (), "shift": "none"}
     assert options("tabletop", shift="light:2") == {"cameras": (), "shift": "light:2"}
     assert options("tabletop", "wrist")["cameras"] == ("wrist",)
-    step = {"retrieval": "thumbnail", "retrieval_camera": "wrist"}
+    step = STEP | {"retrieval_camera": "wrist"}
     assert options("tabletop", "front", **step)["cameras"] == ("front", "wrist")
     assert options("tabletop", videos=True)["cameras"] == ("front", "wrist")
     assert options("robomme", "front", robomme_python="./py", simulator_timeout_s=100.0) == {
-        "python": "./py",
-        "cameras": ("front",),
-        "answer_s": 90.0,
-        "subgoals": False,
+        **{"python": "./py", "cameras": ("front",), "answer_s": 90.0, "subgoals": False}
     }
     oracle = {"policy": "websocket://h:1", "robomme_python": "./py", "subgoals": "oracle"}
     assert options("robomme", "front", **oracle)["subgoals"] is True
@@ -196,11 +190,8 @@ def test_only_cameras_in_use_are_rendered() -> None:
 
 def test_recall_needs_evidence(tiny_buffers: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     buffer_set = load_buffer_set(tiny_buffers)
-    queries = {one: buffer_set.query(one) for one in buffer_set.episode_ids}
-    unknown = {
-        one: replace(q, record=replace(q.record, evidence=None)) for one, q in queries.items()
-    }
-    monkeypatch.setattr(buffer_set, "query", unknown.get)
+    unknown = SimpleNamespace(record=SimpleNamespace(evidence=None))
+    monkeypatch.setattr(buffer_set, "query", lambda _: unknown)
     settings = config(policy="recall:window")
     plan = plan_work(buffer_set.episode_ids, conditions=("k0",))
     with pytest.raises(InvalidOptionError, match=r"MoveCube/test/0|VideoRepick/test/0") as raised:
@@ -217,23 +208,22 @@ def check_name(tiny_buffers: Path, system: str, **changes: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "name"),
+    ("changes", "name", "other"),
     [
-        ({}, "replay-window"),
-        ({"policy_options": ("extrapolate=true",)}, "replay-window-extrapolate"),
+        ({}, "replay-window", "replay-full"),
+        ({"policy_options": ("extrapolate=true",)}, "replay-window-extrapolate", "replay-window"),
         (
             {"retrieval": "siglip", "retrieval_rule": "max/0.9", "retrieval_camera": "wrist"},
-            "retrieval-replay-window-max-0.9-wrist",
+            *("retrieval-replay-window-max-0.9-wrist", "retrieval-replay-window"),
         ),
     ],
 )
 def test_the_default_name_states_the_policy_and_the_retrieval_step(
-    tiny_buffers: Path, changes: dict[str, Any], name: str
+    tiny_buffers: Path, changes: dict[str, Any], name: str, other: str
 ) -> None:
     settings: dict[str, Any] = {"policy": "replay:window"} | changes
     assert default_system(config(**settings)) == name
     check_name(tiny_buffers, name, **settings)
-    other = "retrieval-replay-window" if "retrieval" in changes else "replay-full"
     with pytest.raises(InvalidOptionError, match="is not the control"):
         check_name(tiny_buffers, other, **settings)
     assert default_system(config(policy="python:my.module:make")) == "my.module-make"
@@ -269,7 +259,5 @@ def test_the_papers_retrieval_system_chooses_by_max(tiny_buffers: Path) -> None:
     check_name(tiny_buffers, "retrieval-framesamp-modul", **served)
     with pytest.raises(InvalidOptionError, match="the rule max, not last"):
         check_name(tiny_buffers, "retrieval-framesamp-modul", retrieval_rule="last/0.9", **served)
-    with pytest.raises(
-        InvalidOptionError, match="has no retrieval step, and `retrieval` is siglip"
-    ):
+    with pytest.raises(InvalidOptionError, match="no retrieval step, and `retrieval` is siglip"):
         check_name(tiny_buffers, "perceptual-framesamp-modul", **served)

@@ -251,11 +251,6 @@ def test_invalid_commands_are_errors(tmp_path: Path, changes: dict[str, Any], wo
     assert not (tmp_path / "run").exists()
 
 
-def test_a_started_server_must_report_its_checkpoint(tmp_path: Path) -> None:
-    with pytest.raises(InvalidOptionError, match="does not report which checkpoint"):
-        serve(tmp_path / "run", "--metadata", "{}")
-
-
 def test_a_worker_whose_server_reports_another_model_plays_no_rollout(tmp_path: Path) -> None:
     with pytest.raises(WorkerRetiredError, match="'other'"):
         serve(tmp_path / "run", "--differs", tmp_path / "asked", "--dies", tmp_path / "died")
