@@ -116,8 +116,6 @@ def test_a_run_of_questions(tiny: Path, tmp_path: Path) -> None:
     rows = ask(tmp_path / "run", **settings, model_options=("max_tokens=12",)).rows
     assert {row.status for row in rows} <= {"success", "fail"} and len(rows) == 2
     assert {row.model_calls for row in rows} == {1}
-    again = ask(tmp_path / "again", **settings, model_options=("max_tokens=12", "device=cpu")).rows
-    assert [row.answer for row in again] == [row.answer for row in rows]
     (tmp_path / "moved").symlink_to(tiny)  # the same weights: the same run, which is done
     moved = settings | {"model": f"transformers:{tmp_path / 'moved'}"}
     assert ask(tmp_path / "run", **moved, model_options=("max_tokens=12",)).rows == rows
