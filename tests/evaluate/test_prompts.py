@@ -281,6 +281,7 @@ SUBGOAL = "system = 'a'\nfirst = 'b'\nthen = 'c'"
         (subgoals.load_prompt, f"{SUBGOAL}\ngrid = -1", "grid"),
         (subgoals.load_prompt, f"{SUBGOAL}\nanswer = 'xml'", "answer"),
         (subgoals.load_prompt, f"{SUBGOAL}\npoint = '{{y}}'", "{x}"),
+        (subgoals.load_prompt, SUBGOAL.replace("'a'", "' '"), "system is empty"),
         (subgoals.load_prompt, SUBGOAL.replace("'b'", "'<histroy>'"), "mean '<history>'?"),
         (subgoals.load_prompt, SUBGOAL.replace("'c'", "'{goals}'"), "placeholder {goals}"),
         (subgoals.load_prompt, "nonsense", "no prompt"),

@@ -261,6 +261,7 @@ MODEL = {"subgoals": "openai:http://h/v1#m"}
     ("system", "changes", "words"),
     [
         ("symbolic-groundsg", MODEL, None),
+        ("symbolic-simplesg", MODEL, None),
         ("memer", MODEL, None),
         ("memer", {**MODEL, "subgoal_prompt": "memer"}, None),
         ("mine", {"subgoals": "oracle"}, None),
