@@ -1,4 +1,4 @@
-"""The world of the tests of rollouts: a simulator without physics over the tiny buffer set."""
+"""Fixtures of evaluations: a simulator without physics over the tiny buffer set, and servers."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,3 +28,14 @@ def server() -> Iterator[PolicyServer]:
     """A policy server in a thread of this process."""
     with PolicyServer().running() as running:
         yield running
+
+
+@pytest.fixture
+def fast_retries(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let clients of models retry without waiting, unless the server sends a delay."""
+    import openai
+
+    from robomme_interference_data.evaluate.models import openai as endpoint
+
+    monkeypatch.setattr(openai._base_client, "INITIAL_RETRY_DELAY", 0.001)
+    monkeypatch.setattr(endpoint, "_PAUSE_S", 0.001)

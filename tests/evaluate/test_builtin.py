@@ -1,4 +1,4 @@
-"""The policies without weights: what replay keeps, where it takes up, what it follows; ends."""
+"""The policies without weights: what replay keeps, where it starts, and how it moves."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def seen(shade: int, joint: float, opening: float = 0.04) -> Observation:
     return Observation({"front": np.full((32, 32, 3), shade, np.uint8)}, state(joint, opening))
 
 
-def test_what_memories_keep() -> None:
+def test_the_frames_that_a_memory_keeps() -> None:
     assert list(MEMORIES["full"](5)) == [0, 1, 2, 3, 4]
     assert list(MEMORIES["window"](100)) == list(range(69, 100))  # 32 with the live one
     assert list(MEMORIES["framesamp"](30)) == list(range(30))
@@ -46,28 +46,28 @@ def test_what_memories_keep() -> None:
 
 
 @given(st.sampled_from(sorted(MEMORIES)), st.integers(0, 5000))
-def test_a_memory_keeps_frames_that_were_there(name: str, live: int) -> None:
+def test_a_memory_keeps_existing_frames_in_order(name: str, live: int) -> None:
     kept = list(MEMORIES[name](live))
     assert kept == sorted(set(kept)) and set(kept) <= set(range(live))
     assert len(kept) == min(live, 31) or name == "full"
 
 
-def test_replay_goes_on_for_the_frames_that_it_knows_to_be_missing() -> None:
+def test_replay_extrapolates_over_the_frames_missing_at_the_end() -> None:
     """Of frames 0 to 309 the last one kept is 300; from 290 to it the joints moved by 0.1."""
     ends = {}
-    for goes_on in (False, True):
-        policy = ReplayPolicy("framesamp", extrapolate=goes_on)
+    for extend in (False, True):
+        policy = ReplayPolicy("framesamp", extrapolate=extend)
         policy.reset(RolloutInfo("goal", 310, 0))
         joints = np.arange(310) * np.float32(0.01)
         states = np.stack([state(joint) for joint in joints])
         policy.add_history({"front": np.zeros((310, 32, 32, 3), np.uint8)}, states, 310)
         plan = [policy.act(seen(0, 0.0), "")[-1] for _ in range(40)]
-        ends[goes_on] = plan[-1]
+        ends[extend] = plan[-1]
     np.testing.assert_allclose(ends[False][:7], 3.0, atol=1e-5)
     np.testing.assert_allclose(ends[True][:7], 3.09, atol=1e-5)
 
 
-def test_nothing_is_added_where_nothing_is_missing_or_known() -> None:
+def test_nothing_is_extrapolated_without_missing_frames_or_two_known_ones() -> None:
     two = np.stack([state(0.1), state(0.3, 0.02)])
     for kept, states, last in (([4, 6], two, 6), ([4], two[:1], 9), ([], two[:0], 9)):
         indices = np.array(kept, np.int64)
@@ -84,7 +84,6 @@ def test_nothing_is_added_where_nothing_is_missing_or_known() -> None:
 @pytest.mark.parametrize(
     ("kept", "joints", "plan"),
     [
-        ([0, 1, 2], [0.0, 0.02, 0.05], [0.0, 0.02, 0.05]),  # one a step
         ([0, 4], [0.0, 0.08], [0.0, 0.02, 0.04, 0.06, 0.08]),  # what is missing, between
         # 0.24 rad to the first frame: three steps of 0.08.
         ([7], [0.24], [0.08, 0.16, 0.24]),
@@ -96,7 +95,7 @@ def test_kept_frames_are_followed(kept: list[int], joints: list[float], plan: li
     assert (found[:, 7] == 1).all()
 
 
-def test_the_gripper_closes_and_opens_when_it_was_seen_to() -> None:
+def test_the_gripper_closes_and_opens_as_in_the_lesson() -> None:
     openings = [0.04, 0.04, 0.03, 0.02, 0.02, 0.03, 0.03]
     states = np.stack([state(0.0, opening) for opening in openings])
     plan = follow(states[0], np.arange(7), states)
@@ -113,7 +112,9 @@ def test_the_gripper_closes_and_opens_when_it_was_seen_to() -> None:
     st.lists(st.floats(-2, 2, width=32), min_size=1, max_size=8),
     st.lists(st.integers(1, 30), min_size=8, max_size=8),
 )
-def test_it_ends_where_it_should_and_never_jumps(joints: list[float], gaps: list[int]) -> None:
+def test_the_plan_ends_at_the_last_state_and_never_jumps(
+    joints: list[float], gaps: list[int]
+) -> None:
     states = np.stack([state(joint) for joint in joints])
     kept = np.cumsum(gaps)[: len(joints)]
     plan = follow(state(0.0), kept, states)
@@ -137,7 +138,7 @@ def fed(memory: str, shades: list[int], joints: list[float]) -> ReplayPolicy:
     return policy
 
 
-def test_it_takes_up_where_the_view_is_nearest_the_first_of_equals() -> None:
+def test_replay_starts_at_the_first_of_the_nearest_views() -> None:
     policy = fed("full", [10, 90, 50, 200], [0.0, 0.01, 0.02, 0.03])
     actions = policy.act(seen(88, 0.01), "goal")
     assert actions.shape == (16, 8) and actions.dtype == np.float32
@@ -149,7 +150,7 @@ def test_it_takes_up_where_the_view_is_nearest_the_first_of_equals() -> None:
     assert (policy.act(seen(200, 0.0), "goal")[:, 0] == 0).all()
 
 
-def test_it_goes_on_from_call_to_call_then_holds_and_a_reset_forgets() -> None:
+def test_replay_continues_over_calls_then_holds_until_a_reset() -> None:
     joints = [0.01 * step for step in range(20)]
     policy = fed("full", [0] * 20, joints)
     got = np.concatenate([policy.act(seen(0, 0.0), "goal") for _ in range(3)])[:, 0]
@@ -159,7 +160,7 @@ def test_it_goes_on_from_call_to_call_then_holds_and_a_reset_forgets() -> None:
     np.testing.assert_array_equal(held, np.tile([*[np.float32(0.2)] * 7, -1], (16, 1)))
 
 
-def test_hold_holds_and_a_script_needs_the_simulator() -> None:
+def test_noop_holds_and_a_privileged_policy_needs_the_simulator() -> None:
     held = Noop().act(seen(0, 0.2, 0.0), "goal")
     np.testing.assert_array_equal(held, np.tile([*[np.float32(0.2)] * 7, 1], (16, 1)))
     with pytest.raises(PolicyError, match="needs the simulator"):
@@ -169,11 +170,11 @@ def test_hold_holds_and_a_script_needs_the_simulator() -> None:
 # --- recall --------------------------------------------------------------------------------------
 
 
-class Asked:
-    """A simulator that keeps what it is asked."""
+class Recorder:
+    """A simulator that records the last call."""
 
     def act(self, policy: str, known: dict[int, str] | None = None) -> Vector:
-        self.asked = policy, known
+        self.call = policy, known
         return np.zeros(8, np.float32)
 
 
@@ -185,20 +186,22 @@ class Asked:
         ("window", {}),  # from 279 on
     ],
 )
-def test_recall_knows_what_its_memory_keeps(memory: str, known: dict[int, str]) -> None:
+def test_recall_knows_the_evidence_that_its_memory_keeps(
+    memory: str, known: dict[int, str]
+) -> None:
     entry = SessionEntry("lesson", "A", EpisodeId("A", "test", 0), "d", "r", 0, 0, 300, 1, "s")
     spans = EvidenceSpan(0, "takes peg 2", 11, 20), EvidenceSpan(1, "from the left", 20, 31)
     evidence = map_evidence(layout_sessions([entry]), lambda entry: spans)
-    simulator, policy = Asked(), Recall(memory)
+    simulator, policy = Recorder(), Recall(memory)
     policy.reset(RolloutInfo("goal", 310, 0, simulator, evidence))  # type: ignore[arg-type]
     assert policy.act(seen(0, 0), "goal").shape == (1, 8)
-    assert simulator.asked == ("recall", known)
+    assert simulator.call == ("recall", known)
     assert policy.metadata() == {"policy": "recall", "memory": memory}
     assert (policy.cameras, policy.history_cameras) == ((), ())  # it looks at nothing
 
 
-def test_recall_must_be_told_what_frames_show() -> None:
+def test_recall_needs_evidence() -> None:
     with pytest.raises(PolicyError, match="unknown"):
-        Recall().reset(RolloutInfo("goal", 0, 0, Asked(), None))  # type: ignore[arg-type]
+        Recall().reset(RolloutInfo("goal", 0, 0, Recorder(), None))  # type: ignore[arg-type]
     with pytest.raises(UnknownNameError, match="framesamp"):
         Recall("framesmap")

@@ -1,4 +1,4 @@
-"""What a memory leaves of the answer, counted by hand, without a simulator."""
+"""The evidence that a memory keeps, and the chance of the ideal observer, by hand."""
 
 import subprocess
 import sys
@@ -42,12 +42,11 @@ def test_evidence_kept_by_hand(tiny_buffers: Path) -> None:
     }
     # Of 272 frames every ninth: 0, 8, 17, 26, 35, 43.
     assert set(kept(tiny_buffers, conditions=("k7",)).values()) == {1}
-    assert set(kept(tiny_buffers, conditions=("no-history",)).values()) == {
-        None
-    }  # without a lesson
+    # Without a lesson nothing is known.
+    assert set(kept(tiny_buffers, conditions=("no-history",)).values()) == {None}
 
 
-def test_a_retrieval_step_in_front(tmp_path: Path) -> None:
+def test_a_retrieval_step(tmp_path: Path) -> None:
     buffer_set = copy_buffer_set(tmp_path / "buffer_set")
     make_index(buffer_set)
     found = kept(buffer_set, memory="window", retrieval="thumbnail", retrieval_rule="oracle")
@@ -57,7 +56,7 @@ def test_a_retrieval_step_in_front(tmp_path: Path) -> None:
     assert last["MoveCube", "k7"] == 0
 
 
-def test_retrieval_by_what_is_seen_under_a_shift(tmp_path: Path) -> None:
+def test_retrieval_under_a_shift(tmp_path: Path) -> None:
     buffer_set = copy_buffer_set(tmp_path / "buffer_set")
     add_shifted(buffer_set)
     make_index(buffer_set, names=("demonstrations", "distractors", "shifted"))
@@ -70,7 +69,7 @@ def test_retrieval_by_what_is_seen_under_a_shift(tmp_path: Path) -> None:
         ceiling(load_buffer_set(buffer_set), CeilingConfig(shift="light:1"))
 
 
-def test_what_cannot_be_told(tiny_buffers: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_settings_are_errors(tiny_buffers: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     buffer_set = load_buffer_set(tiny_buffers)
     with pytest.raises(UnknownNameError, match=r"'framesmap'(.|\n)*framesamp"):
         ceiling(buffer_set, CeilingConfig("framesmap"))
@@ -80,8 +79,8 @@ def test_what_cannot_be_told(tiny_buffers: Path, monkeypatch: pytest.MonkeyPatch
         ceiling(buffer_set, CeilingConfig(retrieval_rule="last"))
     with pytest.raises(InvalidOptionError, match="nothing to retrieve from under no-history"):
         ceiling(buffer_set, CeilingConfig(retrieval="thumbnail", conditions=("no-history", "k0")))
-    untold = SimpleNamespace(record=SimpleNamespace(evidence=None))
-    monkeypatch.setattr(BufferSet, "query", lambda *_: untold)
+    unknown = SimpleNamespace(record=SimpleNamespace(evidence=None))
+    monkeypatch.setattr(BufferSet, "query", lambda *_: unknown)
     with pytest.raises(InvalidOptionError, match="that show the answer are unknown"):
         ceiling(buffer_set, CeilingConfig())
 
@@ -95,8 +94,8 @@ def query(family: str, index: int, answer: int) -> tuple[Query, tuple[str, ...]]
     scene = draw_episode(family, seed, difficulty_of(seed))
     parts = scene.parts(scene.answers[answer])
     spans = tuple(EvidenceSpan(part, text, part, part + 1) for part, text in enumerate(parts))
-    told: dict[str, Any] = {"seed": seed, "difficulty": difficulty_of(seed), "evidence": spans}
-    known = record("demonstrations", f"{family}/test/{index}", simulator="tabletop", **told)
+    metadata: dict[str, Any] = {"seed": seed, "difficulty": difficulty_of(seed), "evidence": spans}
+    known = record("demonstrations", f"{family}/test/{index}", simulator="tabletop", **metadata)
     return Query(None, known), parts  # type: ignore[arg-type]
 
 
@@ -111,14 +110,14 @@ def query(family: str, index: int, answer: int) -> tuple[Query, tuple[str, ...]]
         ("PatternLock", 0, (), 1 / 1764),
     ],
 )
-def test_a_draw_among_what_is_left(
+def test_the_chance_among_the_remaining_answers(
     family: str, index: int, known: tuple[int, ...], expected: float
 ) -> None:
     asked, parts = query(family, index, 1)
     assert chance(asked, {part: parts[part] for part in known}) == expected
 
 
-def test_what_another_lesson_said_is_believed() -> None:
+def test_a_wrong_lesson_leaves_no_chance() -> None:
     asked, _ = query("MoveCube", 0, 0)
     _, wrong = query("MoveCube", 0, 1)
     assert chance(asked, dict(enumerate(wrong))) == 0
@@ -130,7 +129,7 @@ def test_no_chance_where_answers_are_unknown(unknown: str) -> None:
     assert chance(replace(asked, record=replace(asked.record, **{unknown: None})), {}) is None
 
 
-def test_it_needs_neither_simulator_nor_weights() -> None:
+def test_a_ceiling_needs_no_simulator_and_no_weights() -> None:
     code = (
         "import sys\n"
         "for name in ('sapien', 'mani_skill', 'torch', 'gymnasium', 'transformers'):\n"

@@ -1,14 +1,15 @@
-"""What is found out before a run: what cannot work, the simulator, the names of rows."""
+"""Checks before a run: settings, the simulator, and the names of systems."""
 
 import sys
-from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from support.buffer_sets import QUERIES, copy_buffer_set
 from support.retrieval import QUIET, make_index
 from support.runs import CHEAT, config, run, run_one
+from support.worlds import World
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.build import build_dataset
@@ -29,6 +30,7 @@ from robomme_interference_data.errors import (
     PolicyError,
     UnknownNameError,
 )
+from robomme_interference_data.evaluate import systems
 from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.rollout.checks import (
     check_plan,
@@ -45,6 +47,7 @@ from robomme_interference_data.simulators.registry import SIMULATORS
 
 pytestmark = pytest.mark.usefixtures("world")
 
+STEP: dict[str, Any] = {"retrieval": "thumbnail"}
 SAYS = {"policy": "python:support.own_policies:says"}
 
 
@@ -59,22 +62,17 @@ SAYS = {"policy": "python:support.own_policies:says"}
         ({"shift": "light:2"}, InvalidOptionError, "support.worlds:World does not support shifts"),
         ({"split": "tset"}, InvalidOptionError, "'tset' is none of train, val, test"),
         ({"conditions": ("k2",)}, UnknownNameError, "condition 'k2' is not in"),
-        ({"workers": 0}, InvalidOptionError, "workers 0; expected a number above 0"),
         ({"rollout_timeout_s": float("nan")}, InvalidOptionError, "rollout_timeout_s nan"),
         ({"system": "pi05_baseline"}, InvalidOptionError, "pi05_baseline takes no history, so k0"),
-        (
-            {"system": "retrieval-framesamp-modul", "retrieval": "thumbnail"},
-            InvalidOptionError,
-            "has nothing to retrieve from under no-history",
-        ),
+        (STEP | {"system": "retrieval-framesamp-modul"}, InvalidOptionError, "nothing to retrieve"),
         ({"system": "retrieval-framesamp-modul"}, InvalidOptionError, "`retrieval` is None"),
         ({"retrieval_rule": "oracle"}, InvalidOptionError, "`retrieval_rule` has no effect"),
-        ({"retrieval": "thumbnail", "retrieval_camera": "nose"}, UnknownNameError, "camera 'nose'"),
-        ({"retrieval": "thumbnail"}, MissingFileError, "'thumbnail'"),
+        (STEP | {"retrieval_camera": "nose"}, UnknownNameError, "camera 'nose'"),
+        (STEP, MissingFileError, "'thumbnail'"),
         (SAYS | {"policy_options": ("what=nan",)}, PolicyError, "holds nan"),
     ],
 )
-def test_what_cannot_work_is_refused_before_anything_is_written(
+def test_invalid_settings_are_errors_before_anything_is_written(
     tmp_path: Path, changes: dict[str, Any], error: type[InterferenceError], words: str
 ) -> None:
     with pytest.raises(error) as raised:
@@ -83,7 +81,7 @@ def test_what_cannot_work_is_refused_before_anything_is_written(
     assert not (tmp_path / "run").exists()
 
 
-def test_every_condition_must_have_its_indexes(tmp_path: Path) -> None:
+def test_every_condition_needs_its_embeddings(tmp_path: Path) -> None:
     buffer_set, source = copy_buffer_set(tmp_path / "buffer_set"), SampleSource(size=32)
     listed = list_episodes((source,), split="test", families=[one.split("/")[0] for one in QUERIES])
     tasks = tuple((number, source.contradict(one)) for number, one in listed)
@@ -91,36 +89,33 @@ def test_every_condition_must_have_its_indexes(tmp_path: Path) -> None:
     build_dataset(plan, buffer_set / CONTRADICTIONS, Serial(), QUIET)
     sum(write_manifests(plan_manifests(in_folder(buffer_set), ("k0", "stale-k0")), buffer_set))
     make_index(buffer_set)
-    asked = {"buffer_set": buffer_set, "retrieval": "thumbnail", "families": ("MoveCube",)}
+    settings = STEP | {"buffer_set": buffer_set, "families": ("MoveCube",)}
     with pytest.raises(MissingFileError, match=f"{CONTRADICTIONS} has no embeddings"):
-        run(tmp_path / "run", **asked, conditions=("k0", "stale-k0"))
+        run(tmp_path / "run", **settings, conditions=("k0", "stale-k0"))
     assert not (tmp_path / "run").exists()
-    assert run(tmp_path / "run", **asked, conditions=("k0",)).counts["error"] == 0
+    assert run(tmp_path / "run", **settings, conditions=("k0",)).counts["error"] == 0
 
 
-def test_videos_without_pillow_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_videos_need_pillow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "PIL", None)
     with pytest.raises(MissingExtraError, match="`videos` needs pillow"):
         run_one(tmp_path / "run", videos=True)
     assert not (tmp_path / "run").exists()
 
 
-def test_conditions_beyond_a_systems_positions_are_refused_one_by_one(
+def test_conditions_beyond_a_systems_positions_are_errors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # 4096 positions, of which 3952 are for the rollout here: 144 frames are left.
-    from robomme_interference_data.evaluate import systems
-
+    # Of 4096 positions the rollout takes 3952: 144 remain for the history.
     monkeypatch.setattr(systems, "MAX_STEPS", 3952)
     limited = {"system": "perceptual-framesamp-modul"}
     run(tmp_path / "run", conditions=("k0", "k3"), **limited)  # 48 + 3 · 32
-    with pytest.raises(InvalidOptionError, match="a history of 272 frames under k7\n"):
-        run(tmp_path / "run", conditions=("k3", "k7"), **limited)
-    with pytest.raises(InvalidOptionError, match="272 frames under k7"):
-        run(tmp_path / "run", conditions=(), **limited)
+    for conditions in (("k3", "k7"), ()):
+        with pytest.raises(InvalidOptionError, match="a history of 272 frames under k7\n"):
+            run(tmp_path / "run", conditions=conditions, **limited)
 
 
-def test_by_default_all_conditions_that_apply_are_run(tmp_path: Path) -> None:
+def test_the_default_is_all_conditions_that_apply(tmp_path: Path) -> None:
     def conditions(name: str, **changes: Any) -> list[str]:
         result = run_one(tmp_path / name, conditions=(), **changes)
         return [row.condition for row in result.rows]
@@ -136,11 +131,9 @@ def test_by_default_all_conditions_that_apply_are_run(tmp_path: Path) -> None:
 # --- the simulator -----------------------------------------------------------------------------
 
 
-def test_the_simulator_is_made_before_the_folder_and_only_for_rollouts_that_are_left(
+def test_the_simulator_is_made_before_the_folder_and_only_for_remaining_rollouts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from support.worlds import World
-
     made: list[dict[str, Any]] = []
 
     def make(**options: Any) -> Any:
@@ -163,7 +156,7 @@ def test_the_simulator_is_made_before_the_folder_and_only_for_rollouts_that_are_
         run_one(tmp_path / "whole", conditions=("no-history", "k0"), **sample)
 
 
-def test_families_that_the_simulator_does_not_play(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_families_that_the_simulator_lacks_are_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     class Other(Simulator):
         @classmethod
         def episodes(cls) -> list[EpisodeId]:
@@ -178,21 +171,18 @@ def test_families_that_the_simulator_does_not_play(monkeypatch: pytest.MonkeyPat
     assert "It plays PatternLock." in (raised.value.hint or "")
 
 
-def test_only_what_somebody_looks_at_is_drawn() -> None:
+def test_only_cameras_in_use_are_rendered() -> None:
     def options(name: str, *watched: str, **changes: Any) -> dict[str, Any]:
         return simulator_options(config(simulator=name, **changes), watched)
 
     assert options("tabletop") == {"cameras": (), "shift": "none"}
     assert options("tabletop", shift="light:2") == {"cameras": (), "shift": "light:2"}
     assert options("tabletop", "wrist")["cameras"] == ("wrist",)
-    step = {"retrieval": "thumbnail", "retrieval_camera": "wrist"}
+    step = STEP | {"retrieval_camera": "wrist"}
     assert options("tabletop", "front", **step)["cameras"] == ("front", "wrist")
     assert options("tabletop", videos=True)["cameras"] == ("front", "wrist")
     assert options("robomme", "front", robomme_python="./py", simulator_timeout_s=100.0) == {
-        "python": "./py",
-        "cameras": ("front",),
-        "answer_s": 90.0,
-        "subgoals": False,
+        **{"python": "./py", "cameras": ("front",), "answer_s": 90.0, "subgoals": False}
     }
     oracle = {"policy": "websocket://h:1", "robomme_python": "./py", "subgoals": "oracle"}
     assert options("robomme", "front", **oracle)["subgoals"] is True
@@ -200,9 +190,8 @@ def test_only_what_somebody_looks_at_is_drawn() -> None:
 
 def test_recall_needs_evidence(tiny_buffers: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     buffer_set = load_buffer_set(tiny_buffers)
-    queries = {one: buffer_set.query(one) for one in buffer_set.episode_ids}
-    known = {one: replace(q, record=replace(q.record, evidence=None)) for one, q in queries.items()}
-    monkeypatch.setattr(buffer_set, "query", lambda episode: known[episode])
+    unknown = SimpleNamespace(record=SimpleNamespace(evidence=None))
+    monkeypatch.setattr(buffer_set, "query", lambda _: unknown)
     settings = config(policy="recall:window")
     plan = plan_work(buffer_set.episode_ids, conditions=("k0",))
     with pytest.raises(InvalidOptionError, match=r"MoveCube/test/0|VideoRepick/test/0") as raised:
@@ -218,14 +207,26 @@ def check_name(tiny_buffers: Path, system: str, **changes: Any) -> None:
     check_settings(settings, system, load_buffer_set(tiny_buffers), make_policy("noop"))
 
 
-def test_replay_that_goes_on_is_a_system_of_its_own(tiny_buffers: Path) -> None:
-    going = {"policy": "replay:framesamp", "policy_options": ("extrapolate=true",)}
-    assert default_system(config(**going)) == "replay-framesamp-extrapolate"
-    step = going | {"retrieval": "thumbnail"}
-    assert default_system(config(**step)) == "retrieval-replay-framesamp-extrapolate"
-    check_name(tiny_buffers, "replay-framesamp-extrapolate", **going)
-    with pytest.raises(InvalidOptionError, match="is not the control replay-framesamp"):
-        check_name(tiny_buffers, "replay-framesamp", **going)
+@pytest.mark.parametrize(
+    ("changes", "name", "other"),
+    [
+        ({}, "replay-window", "replay-full"),
+        ({"policy_options": ("extrapolate=true",)}, "replay-window-extrapolate", "replay-window"),
+        (
+            {"retrieval": "siglip", "retrieval_rule": "max/0.9", "retrieval_camera": "wrist"},
+            *("retrieval-replay-window-max-0.9-wrist", "retrieval-replay-window"),
+        ),
+    ],
+)
+def test_the_default_name_states_the_policy_and_the_retrieval_step(
+    tiny_buffers: Path, changes: dict[str, Any], name: str, other: str
+) -> None:
+    settings: dict[str, Any] = {"policy": "replay:window"} | changes
+    assert default_system(config(**settings)) == name
+    check_name(tiny_buffers, name, **settings)
+    with pytest.raises(InvalidOptionError, match="is not the control"):
+        check_name(tiny_buffers, other, **settings)
+    assert default_system(config(policy="python:my.module:make")) == "my.module-make"
 
 
 @pytest.mark.parametrize(
@@ -242,7 +243,7 @@ def test_replay_that_goes_on_is_a_system_of_its_own(tiny_buffers: Path) -> None:
         (CHEAT, "memer", None),
     ],
 )
-def test_a_name_of_the_table_is_for_the_policy_that_it_stands_for(
+def test_a_name_of_the_table_needs_its_policy(
     tiny_buffers: Path, policy: str, system: str, words: str | None
 ) -> None:
     if words is None:
@@ -253,33 +254,10 @@ def test_a_name_of_the_table_is_for_the_policy_that_it_stands_for(
     assert raised.value.hint is not None and "name of your own" in raised.value.hint
 
 
-@pytest.mark.parametrize(
-    ("step", "name"),
-    [
-        ({}, "replay-window"),
-        (
-            {"retrieval": "siglip", "retrieval_rule": "max/0.9", "retrieval_camera": "wrist"},
-            "retrieval-replay-window-max-0.9-wrist",
-        ),
-    ],
-)
-def test_rows_are_named_after_policy_and_retrieval_step(
-    tiny_buffers: Path, step: dict[str, str], name: str
-) -> None:
-    assert default_system(config(policy="replay:window", **step)) == name
-    check_name(tiny_buffers, name, policy="replay:window", **step)
-    if "retrieval_rule" in step:
-        with pytest.raises(InvalidOptionError, match="not the control"):
-            check_name(tiny_buffers, "retrieval-replay-window", policy="replay:window", **step)
-    assert default_system(config(policy="python:my.module:make")) == "my.module-make"
-
-
 def test_the_papers_retrieval_system_chooses_by_max(tiny_buffers: Path) -> None:
     served = {"policy": "websocket://h:1", "retrieval": "siglip"}
     check_name(tiny_buffers, "retrieval-framesamp-modul", **served)
     with pytest.raises(InvalidOptionError, match="the rule max, not last"):
         check_name(tiny_buffers, "retrieval-framesamp-modul", retrieval_rule="last/0.9", **served)
-    with pytest.raises(
-        InvalidOptionError, match="has no retrieval step, and `retrieval` is siglip"
-    ):
+    with pytest.raises(InvalidOptionError, match="no retrieval step, and `retrieval` is siglip"):
         check_name(tiny_buffers, "perceptual-framesamp-modul", **served)

@@ -1,4 +1,4 @@
-"""The commands `evaluate` and `merge`: what is typed, what is printed, and how one goes on."""
+"""The commands `evaluate`, `merge` and `ceiling`: arguments, output, progress, how to resume."""
 
 import json
 import resource
@@ -10,9 +10,15 @@ import typer
 from support.runs import run_one
 from typer.testing import CliRunner
 
+from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate import commands
 from robomme_interference_data.evaluate.run import evaluation as run_module
+from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.evaluate.run.progress import RunProgress, rate_table
+from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Serial
+from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS
+from robomme_interference_data.schema.rollouts import Rollout
 
 pytestmark = pytest.mark.usefixtures("trouble", "_serial")
 
@@ -49,25 +55,20 @@ def test_ceiling_prints_a_table_or_json(tiny_buffers: Path) -> None:
     }
 
 
-@pytest.mark.parametrize("families", ["MoveCube --families VideoRepick", "MoveCube,VideoRepick"])
-def test_evaluate_writes_the_rows_as_json(
-    tmp_path: Path, tiny_buffers: Path, families: str
-) -> None:
-    line = f"evaluate {tiny_buffers} --policy noop {USUAL} --families {families}"
-    line += " --conditions no-history,k1 --json"
+def test_evaluate_writes_the_rows_as_json(tmp_path: Path, tiny_buffers: Path) -> None:
+    line = f"evaluate {tiny_buffers} --policy noop {USUAL} --families MoveCube"
+    line += " --families VideoRepick --conditions no-history,k1 --json"
     done = type_in(f"{line} --out {tmp_path / 'run'}")
     assert done.exit_code == 0, done.output
-    assert [
-        (row["family"], row["condition"], row["status"]) for row in json.loads(done.stdout)
-    ] == [
-        ("VideoRepick", "no-history", "fail"),
-        ("VideoRepick", "k1", "fail"),
-        ("MoveCube", "no-history", "fail"),
-        ("MoveCube", "k1", "fail"),
+    rows = json.loads(done.stdout)
+    assert [(row["family"], row["condition"], row["status"]) for row in rows] == [
+        (family, condition, "fail")
+        for family in ("VideoRepick", "MoveCube")
+        for condition in ("no-history", "k1")
     ]
 
 
-def test_options_of_the_policy_are_typed(tmp_path: Path, tiny_buffers: Path) -> None:
+def test_options_of_the_policy_have_types(tmp_path: Path, tiny_buffers: Path) -> None:
     line = f"evaluate {tiny_buffers} --policy {OWN}Still {USUAL} --families MoveCube"
     line += f" --out {tmp_path / 'run'} --policy-option gripper=-1"
     done = type_in(line)
@@ -77,21 +78,19 @@ def test_options_of_the_policy_are_typed(tmp_path: Path, tiny_buffers: Path) -> 
     assert header["identity"]["policy_options"] == {"gripper": -1}
 
 
-def test_what_broke_is_told_with_the_command_to_go_on(
+def test_errors_are_printed_with_the_command_to_resume(
     tmp_path: Path, trouble: Path, tiny_buffers: Path
 ) -> None:
     (trouble / "MoveCube-0").write_text("raise")
-    line = (
-        f"evaluate {tiny_buffers} --policy noop {USUAL} --families MoveCube --conditions no-history"
-    )
-    done = type_in(f"{line} --out {tmp_path / 'run'} --max-errors 1")
+    line = f"evaluate {tiny_buffers} --policy noop {USUAL} --families MoveCube"
+    done = type_in(f"{line} --conditions no-history --out {tmp_path / 'run'} --max-errors 1")
     assert done.exit_code == 1
     assert "1 rollouts broke (see" in done.stderr
     assert "Stopped: 1 in a row broke" in done.stderr
     assert done.stderr.rstrip().splitlines()[-1].startswith("robomme-interference")
 
 
-def test_a_full_disk_names_the_file_and_the_command_to_go_on(
+def test_a_full_disk_names_the_file_and_the_command_to_resume(
     tmp_path: Path, tiny_buffers: Path
 ) -> None:
     line = f"evaluate {tiny_buffers} --policy {OWN}Filler {USUAL} --families MoveCube"
@@ -107,7 +106,7 @@ def test_a_full_disk_names_the_file_and_the_command_to_go_on(
 
 
 @pytest.mark.parametrize("begun", [True, False])
-def test_a_stop_tells_of_rollouts_only_where_there_are_some(
+def test_an_interruption_mentions_finished_rollouts_if_there_are_any(
     begun: bool, tmp_path: Path, tiny_buffers: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def stop(*_: object, **__: object) -> None:
@@ -120,7 +119,7 @@ def test_a_stop_tells_of_rollouts_only_where_there_are_some(
     assert (f"Finished rollouts are in {tmp_path / 'run'}" in done.stderr) == begun
 
 
-def test_merge_tells_what_is_missing_and_double(tmp_path: Path) -> None:
+def test_merge_prints_missing_and_duplicate_rollouts(tmp_path: Path) -> None:
     run_one(tmp_path / "a", shard="1/1", conditions=("no-history", "k0"))
     log = tmp_path / "a" / "rollouts.jsonl"
     log.write_text("".join(log.read_text().splitlines(keepends=True)[:1]))
@@ -130,7 +129,65 @@ def test_merge_tells_what_is_missing_and_double(tmp_path: Path) -> None:
     assert "1 missing: MoveCube/test/0 under" in done.stderr
     assert "1 in more than one run, the first one kept: MoveCube/test/0" in done.stderr
     assert "1 of 2 rollouts in " in done.stdout
-    told = json.loads(type_in(f"{line} {tmp_path / 'again'} --json").stdout)
-    assert (told["planned"], told["rows"], len(told["missing"])) == (2, 1, 1)
-    assert told["missing"][0]["episode"] == "MoveCube/test/0"
-    assert told["conflicts"] == told["broken"] == []
+    summary = json.loads(type_in(f"{line} {tmp_path / 'again'} --json").stdout)
+    assert (summary["planned"], summary["rows"], len(summary["missing"])) == (2, 1, 1)
+    assert summary["missing"][0]["episode"] == "MoveCube/test/0"
+    assert summary["conflicts"] == summary["broken"] == []
+
+
+# --- progress ----------------------------------------------------------------------------------
+
+
+PLAN = [
+    WorkItem(condition, EpisodeId(family, "test", index))
+    for family in FAMILIES
+    for index in range(50)
+    for condition in DEFAULT_CONDITIONS
+]
+
+
+def row(item: WorkItem, status: str) -> Rollout:
+    success = None if status == "error" else status == "success"
+    return Rollout(
+        *("mine", "world", "buffer_set", "r", item.episode.family, item.condition, "test"),
+        *(item.episode.index, "none", 0, 1, 7, "easy", "a goal", status, success, 0, 0, 0, None),
+        error="it \x1b[2Jbroke" if status == "error" else None,
+    )
+
+
+def test_nine_families_and_five_conditions_fit_in_80_columns() -> None:
+    progress = RunProgress(quiet=True)
+    progress.start(PLAN, [row(item, "success") for item in PLAN])
+    lines = progress.rates().splitlines()
+    assert max(map(len, lines)) <= 80
+    for family in FAMILIES:
+        (line,) = [line for line in lines if line.startswith(f"{family} ")]
+        assert line.split()[1:] == ["50/50", "100%"] * 5
+
+
+def test_errors_are_listed_beside_the_rate() -> None:
+    items = [item for item in PLAN if item.condition == "k0"][:7]
+    ends = ("success", "fail", "success", "timeout", "success", "error")
+    rows = [row(item, end) for item, end in zip(items, ends, strict=False)]
+    other = WorkItem("no-history", EpisodeId("MoveCube", "test", 0))
+    table = rate_table([*rows, row(other, "error")])
+    assert [column.name for column in table.columns] == ["family", "no-history", "k0"]
+    assert table.rows == (
+        ("VideoRepick", "", "3/5 60%, 1 broke"),
+        ("MoveCube", "1 broke", ""),
+        ("all", "1 broke", "3/5 60%, 1 broke"),
+    )
+
+
+def test_without_a_terminal_each_cell_prints_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    plan = [WorkItem(c, EpisodeId("MoveCube", "test", 0)) for c in ("no-history", "k0", "k1")]
+    with RunProgress() as progress:
+        progress.start(plan, [row(plan[0], "fail")])
+        progress.row(row(plan[1], "success"))
+        progress.row(row(plan[2], "error"))
+    assert capsys.readouterr().err.splitlines() == [
+        "1 of 3 rollouts are already done",
+        "MoveCube k0: 1/1 100%  (2 of 3)",
+        r"MoveCube/test/0 under k1 broke: it \x1b[2Jbroke",
+        "MoveCube k1: 1 broke  (3 of 3)",
+    ]

@@ -1,39 +1,64 @@
-"""What makes a run the one that it is, and what may differ from start to start."""
+"""Which settings identify a run, so that resuming with others is an error, and which may change."""
 
 import dataclasses
 from pathlib import Path
 from typing import Any
 
 import pytest
+from support.asking import ask, behind, look, questions
+from support.chat_server import ChatServer
 from support.policy_server import PolicyServer
 from support.runs import header, run, run_one
+from support.tabletop import copy_tabletop
 
+from robomme_interference_data.build_dataset.questions import write_questions
+from robomme_interference_data.data.questions import digest_questions
 from robomme_interference_data.errors import RunError
 from robomme_interference_data.evaluate import RunConfig, merge_runs
-from robomme_interference_data.evaluate.policies.identity import policy_identity
-from robomme_interference_data.evaluate.policies.registry import POLICIES
+from robomme_interference_data.evaluate.run.config import AskConfig, WorkConfig
 
 pytestmark = pytest.mark.usefixtures("world")
 
-STILL = "python:support.own_policies:Still"
+OWN = "python:support.own_policies:"
+STILL = f"{OWN}Still"
+
+# Every setting is in one of these sets: the author of a new one decides which.
+IDENTITY = {
+    WorkConfig: {
+        *("retrieval", "retrieval_rule", "retrieval_camera"),  # in Selector.identity
+        *("system", "split", "model_seed"),
+    },
+    RunConfig: {
+        *("policy", "policy_options"),  # in policy_identity
+        *("subgoals", "subgoal_prompt", "subgoal_options"),  # in subgoals_identity
+        *("simulator", "buffer_set", "shift"),
+    },
+    AskConfig: {
+        *("model", "model_options", "prompt"),  # in model_identity, and the prompt's digest
+        *("frames", "sampling", "control", "buffer_set"),
+    },
+}
+FREE = {
+    WorkConfig: {
+        *("families", "episodes", "conditions", "shard"),  # the plan, which may grow
+        *("workers", "executor", "ray_address", "cpus_per_worker", "gpus_per_worker"),
+        *("no_resume", "cache", "rollout_timeout_s", "max_errors"),
+    },
+    RunConfig: {
+        *("out", "robomme_python", "videos", "check_lesson", "simulator_timeout_s"),
+        *("history_chunk", "serve"),
+    },
+    AskConfig: {"out"},
+}
 
 
-def test_every_setting_is_classed() -> None:
-    """A new setting either makes another run of it, or does not: somebody has to say which."""
-    makes_the_run = {
-        *("policy", "policy_options"),  # by policy_identity
-        *("retrieval", "retrieval_rule", "retrieval_camera"),  # by Selector.identity
-        *("subgoals", "subgoal_prompt", "subgoal_options"),  # by subgoals_identity
-        *("system", "simulator", "buffer_set", "split", "shift", "model_seed"),
-    }
-    plan = {"families", "episodes", "conditions", "shard"}
-    may_differ = {
-        *("out", "no_resume", "robomme_python", "workers", "videos", "check_lesson", "cache"),
-        *("rollout_timeout_s", "simulator_timeout_s", "history_chunk", "max_errors"),
-        *("serve", "executor", "ray_address", "cpus_per_worker", "gpus_per_worker"),
-    }
-    fields = {field.name for field in dataclasses.fields(RunConfig)}
-    assert makes_the_run | plan | may_differ == fields
+@pytest.mark.parametrize("config", [RunConfig, AskConfig])
+def test_every_setting_is_classified(config: type) -> None:
+    classified = [one[kind] for one in (IDENTITY, FREE) for kind in (WorkConfig, config)]
+    assert set().union(*classified) == {field.name for field in dataclasses.fields(config)}
+
+
+# --- rollouts ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -45,7 +70,7 @@ def test_every_setting_is_classed() -> None:
         ({"policy_options": ("gripper=1",)}, "policy_options.gripper is -1.0 there, 1.0 here"),
     ],
 )
-def test_another_run_is_refused_and_the_difference_named(
+def test_another_run_is_an_error_that_names_the_difference(
     tmp_path: Path, changes: dict[str, Any], message: str
 ) -> None:
     usual: dict[str, Any] = {"policy": STILL, "policy_options": ("gripper=-1",)}
@@ -57,7 +82,7 @@ def test_another_run_is_refused_and_the_difference_named(
     assert (tmp_path / "run" / "run.json").read_bytes() == before
 
 
-def test_what_may_differ_goes_on_with_the_run(tmp_path: Path) -> None:
+def test_other_settings_may_change_between_starts(tmp_path: Path) -> None:
     run_one(tmp_path / "run", history_chunk=7)
     run_one(tmp_path / "run", check_lesson=True, rollout_timeout_s=5.0, cache=True)
     starts = header(tmp_path / "run")["starts"]
@@ -65,69 +90,64 @@ def test_what_may_differ_goes_on_with_the_run(tmp_path: Path) -> None:
     assert [one["settings"]["check_lesson"] for one in starts] == [False, True]
 
 
-def test_another_checkpoint_behind_the_same_words_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    policy = "python:support.own_policies:from_checkpoint"
-    for name in ("a", "b"):
-        monkeypatch.setenv("CHECKPOINT", name)
-        run_one(tmp_path / name, policy=policy)
-    difference = r"policy_metadata\.checkpoint is '{}' there, '{}' here"
-    with pytest.raises(RunError, match=difference.format("b", "a")):
-        merge_runs([tmp_path / "a", tmp_path / "b"], tmp_path / "merged")
-    with pytest.raises(RunError, match=difference.format("a", "b")):
-        run_one(tmp_path / "a", policy=policy)
-
-
-def test_where_a_server_listens_makes_no_other_run(tmp_path: Path) -> None:
-    def serve(out: str, server: PolicyServer, **changes: Any) -> Any:
+def test_the_address_of_a_server_may_change_but_not_its_model(tmp_path: Path) -> None:
+    def served(out: str, server: PolicyServer, **changes: Any) -> Any:
         return run(tmp_path / out, policy=server.url, conditions=("k0",), **changes)
 
     with PolicyServer().running() as first, PolicyServer().running() as second:
         first.metadata = second.metadata = {"checkpoint": "a"}
-        serve("one", first, shard="1/2")
-        serve("two", second, shard="2/2")
+        served("one", first, shard="1/2")
+        served("two", second, shard="2/2")
         merged = merge_runs([tmp_path / "one", tmp_path / "two"], tmp_path / "merged")
         assert merged.missing == merged.duplicates == ()
-        again = serve("merged", second, policy_options=("response_s=30",))
+        again = served("merged", second, policy_options=("response_s=30",))
         assert again.counts["fail"] == 2
         addresses = {start["policy"]["server"] for start in header(tmp_path / "merged")["starts"]}
         assert addresses == {f"127.0.0.1:{first.port}", f"127.0.0.1:{second.port}"}
         first.metadata = {"checkpoint": "b"}
         difference = r"server_metadata\.checkpoint is 'a' there, 'b' here"
         with pytest.raises(RunError, match=difference):
-            serve("one", first, shard="1/2")
+            served("one", first, shard="1/2")
 
 
-def test_a_privileged_policy_is_on_record(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    insider = {"policy_options": ("name=privileged", "value=true")}
-    run_one(tmp_path / "run", policy="python:support.own_policies:changed", **insider)
-    said = header(tmp_path / "run")["starts"][0]["policy"]
-    assert said == {"policy": "still", "privileged": True}
+def test_a_privileged_policy_is_recorded(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    privileged = {"policy_options": ("name=privileged", "value=true")}
+    run_one(tmp_path / "run", policy=f"{OWN}changed", **privileged)
+    metadata = header(tmp_path / "run")["starts"][0]["policy"]
+    assert metadata == {"policy": "still", "privileged": True}
     assert "own_policies:changed is privileged: it gets the simulator" in caplog.text
     caplog.clear()
-    says = "python:support.own_policies:says"
-    run_one(tmp_path / "other", policy=says, policy_options=("what=array",))
-    said = header(tmp_path / "other")["starts"][0]["policy"]
-    assert said == {"policy": "still", "sizes": [0, 1, 2], "4": 5.0}
+    run_one(tmp_path / "other", policy=f"{OWN}says", policy_options=("what=array",))
+    metadata = header(tmp_path / "other")["starts"][0]["policy"]
+    assert metadata == {"policy": "still", "sizes": [0, 1, 2], "4": 5.0}
     assert "privileged" not in caplog.text
 
 
-def test_what_of_a_policy_can_change_a_result() -> None:
-    # The default memory is the same, written or not.
-    assert [POLICIES.pin(text) for text in ("replay", "replay:full")] == ["replay:full"] * 2
-    assert policy_identity("replay:window", (), {})["policy"] == "replay:window"
-    here = {"policy": "websocket", "server": "a:1", "server_metadata": {"model": "m"}}
-    assert policy_identity("websocket://a:1,b:2", ("response_s=5", "checkpoint=7"), here) == {
-        "policy": "websocket",
-        "policy_options": {"checkpoint": "7", "chunk_frames": 16},
-        "policy_metadata": {"policy": "websocket", "server_metadata": {"model": "m"}},
-    }
-    assert policy_identity(STILL, ("gripper=1",), {}) == policy_identity(STILL, (), {})
-    assert policy_identity(STILL, ("gripper=0.5",), {"device": "cuda"}) == {
-        "policy": STILL,
-        "policy_options": {"gripper": 0.5},
-        "policy_metadata": {"device": "cuda"},
-    }
-    objects = policy_identity("python:support.own_policies:with_object", (), {})
-    assert objects["policy_options"] == {"name": "x"}  # what JSON cannot hold is left out
+# --- questions ---------------------------------------------------------------------------------
+
+
+def test_another_run_of_questions_is_an_error_that_names_the_difference(tmp_path: Path) -> None:
+    prompt = tmp_path / "mine.toml"
+    prompt.write_text('system = "s"\nquestion = "<history><picture>{goal}{question}{options}"\n')
+    with ChatServer(look) as server:
+        usual = behind(server, frames=3, families=("MoveCube",), episodes="0")
+        ask(tmp_path / "run", **usual)
+        for changes, message in (
+            ({"frames": 5}, "frames is 3 there, 5 here"),
+            ({"control": "blank"}, "control is 'none' there, 'blank' here"),
+            ({"model_options": ("max_tokens=9",)}, "max_tokens is 256 there, 9 here"),
+            ({"model": "guess", "frames": 32}, "model.model is 'tiny' there, 'guess' here"),
+            ({"prompt": str(prompt)}, "model.prompt_sha256 is"),
+        ):
+            with pytest.raises(RunError, match=message):
+                ask(tmp_path / "run", **usual | changes)
+
+
+def test_other_questions_are_another_run(tmp_path: Path) -> None:
+    root = copy_tabletop(tmp_path / "buffer_set")
+    ask(tmp_path / "run", buffer_set=root)
+    write_questions([dataclasses.replace(one, text="?") for one in questions().values()], root)
+    with pytest.raises(RunError, match="questions is"):
+        ask(tmp_path / "run", buffer_set=root)
+    digest = header(tmp_path / "run")["identity"]["questions"]
+    assert digest == digest_questions(questions().values())

@@ -22,7 +22,7 @@ def shards(tmp_path: Path, count: int = 2) -> list[Path]:
     return folders
 
 
-def test_shards_make_the_run(tmp_path: Path) -> None:
+def test_merged_shards_equal_the_whole_run(tmp_path: Path) -> None:
     whole = run(tmp_path / "whole")
     folders = shards(tmp_path, 3)
     # Two episodes under two conditions: the third shard has nothing to do.
@@ -44,7 +44,7 @@ def test_shards_make_the_run(tmp_path: Path) -> None:
         assert (tmp_path / "merged" / name).exists()
 
 
-def test_what_is_missing_is_told_and_run_by_going_on(tmp_path: Path) -> None:
+def test_missing_rollouts_are_listed_and_run_on_resume(tmp_path: Path) -> None:
     first, second = shards(tmp_path)
     merged = merge_runs([first], tmp_path / "merged")
     assert merged.missing == tuple(sorted(read_record(second)))
@@ -53,7 +53,7 @@ def test_what_is_missing_is_told_and_run_by_going_on(tmp_path: Path) -> None:
     assert len(run(tmp_path / "merged").rows) == 4
 
 
-def test_a_finished_row_stands_before_an_error(tmp_path: Path, trouble: Path) -> None:
+def test_a_finished_row_takes_precedence_over_an_error(tmp_path: Path, trouble: Path) -> None:
     (trouble / "MoveCube-0").write_text("raise")
     run(tmp_path / "broken")
     (trouble / "MoveCube-0").unlink()
@@ -69,7 +69,7 @@ def test_a_finished_row_stands_before_an_error(tmp_path: Path, trouble: Path) ->
     assert only.broken == (WorkItem("no-history", EpisodeId("MoveCube", "test", 0)),)
 
 
-def test_double_rollouts_that_differ_are_told_apart(tmp_path: Path) -> None:
+def test_duplicates_that_differ_are_conflicts(tmp_path: Path) -> None:
     a, b = (run(tmp_path / name) for name in "ab")
     log = b.folder / "rollouts.jsonl"
     first, *others = log.read_text().splitlines(keepends=True)
@@ -83,7 +83,7 @@ def test_double_rollouts_that_differ_are_told_apart(tmp_path: Path) -> None:
     assert merged.rows == a.rows
 
 
-def test_videos_come_along(tmp_path: Path) -> None:
+def test_videos_are_copied(tmp_path: Path) -> None:
     run_one(tmp_path / "a", conditions=("k0",), videos=True)
     (row,) = merge_runs([tmp_path / "a"], tmp_path / "merged").rows
     assert row.video is not None
@@ -96,7 +96,7 @@ def test_videos_come_along(tmp_path: Path) -> None:
     assert not (tmp_path / "other").exists()
 
 
-def test_other_runs_and_taken_folders_are_refused(tmp_path: Path) -> None:
+def test_other_runs_and_existing_folders_are_errors(tmp_path: Path) -> None:
     run_one(tmp_path / "a")
     run_one(tmp_path / "b", model_seed=1)
     with pytest.raises(RunError, match=r"b holds another run: model_seed is 1 there, 0 here"):

@@ -7,7 +7,6 @@ from typing import Any
 
 import av
 import numpy as np
-import openai
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -30,20 +29,14 @@ from support.chat_server import (
 
 from robomme_interference_data.errors import InvalidOptionError, ModelError, UnknownNameError
 from robomme_interference_data.evaluate.models import bounded_http
-from robomme_interference_data.evaluate.models import openai as endpoint
 from robomme_interference_data.evaluate.models.images import within
 from robomme_interference_data.evaluate.models.model import Message, Video
 from robomme_interference_data.evaluate.models.registry import MODELS, model_identity
 
+pytestmark = pytest.mark.usefixtures("fast_retries")
+
 NOISE = np.random.default_rng(0).integers(0, 256, (20, 33, 21, 3), dtype=np.uint8)
 ASKED = [Message("system", ("be brief",)), Message("user", ("what is it? ", NOISE[0]))]
-
-
-@pytest.fixture(autouse=True)
-def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the client repeat without waiting, unless the server says for how long."""
-    monkeypatch.setattr(openai._base_client, "INITIAL_RETRY_DELAY", 0.001)
-    monkeypatch.setattr(endpoint, "_PAUSE_S", 0.001)
 
 
 @pytest.fixture
@@ -59,7 +52,7 @@ def model_of(server: ChatServer, *options: str, name: str = "tiny") -> Any:
 # --- what is sent --------------------------------------------------------------------------------
 
 
-def test_words_and_images_arrive_as_they_are(server: ChatServer) -> None:
+def test_text_and_images_arrive_unchanged(server: ChatServer) -> None:
     reply = model_of(server, "max_tokens=7").reply(ASKED)
     assert (reply.text, reply.tokens, reply.calls) == ("1 images", 105, 1)
     [seen] = server.seen
@@ -99,18 +92,16 @@ def test_budgets(lengths: list[int], single: int, images: int) -> None:
     videos = [Video(np.repeat(frame[None], length, 0), 10.0) for length in lengths]
     [message] = within([Message("user", (*videos, *[frame] * single))], images)
     assert all(isinstance(part, np.ndarray) for part in message.parts)
-    whole = sum(lengths) + single
-    assert len(message.parts) <= max(images, single)
-    assert (
-        len(message.parts) == whole or len(message.parts) > max(images, single) - len(lengths) - 1
-    )
+    count, most = len(message.parts), max(images, single)
+    assert count <= most
+    assert count == sum(lengths) + single or count > most - len(lengths) - 1
 
 
 # --- faults --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("fault", [BUSY, BUSY_SOME_TIME, BROKEN, GARBAGE, EMPTY, CLOSED])
-def test_what_fails_for_the_moment_is_asked_again(server: ChatServer, fault: str) -> None:
+def test_temporary_failures_are_retried(server: ChatServer, fault: str) -> None:
     server.faults = [fault, fault]
     reply = model_of(server).reply(ASKED)
     assert (reply.text, reply.calls) == ("1 images", 3)
@@ -119,15 +110,11 @@ def test_what_fails_for_the_moment_is_asked_again(server: ChatServer, fault: str
 
 @pytest.mark.parametrize(
     ("fault", "words"),
-    [
-        (BUSY, "answers 429"),
-        (BROKEN, "answers 500"),
-        (GARBAGE, "without a chat completion"),
-        (EMPTY, "without a chat completion"),
-        (CLOSED, "cannot be reached"),
-    ],
+    [(BROKEN, "answers 500"), (EMPTY, "without a chat completion"), (CLOSED, "cannot be reached")],
 )
-def test_what_goes_on_failing_is_one_error(server: ChatServer, fault: str, words: str) -> None:
+def test_a_failure_after_all_retries_is_one_error(
+    server: ChatServer, fault: str, words: str
+) -> None:
     server.faults = [fault] * 9
     with pytest.raises(ModelError, match=words):
         model_of(server, "repeats=2").reply(ASKED)
@@ -152,7 +139,7 @@ def test_an_answer_without_end(server: ChatServer, monkeypatch: pytest.MonkeyPat
     assert model_of(server).reply(ASKED).text == "1 images"
 
 
-def test_a_refusal_is_an_answer_without_words(server: ChatServer) -> None:
+def test_a_refusal_is_an_empty_answer(server: ChatServer) -> None:
     server.faults = [REFUSED]
     reply = model_of(server).reply(ASKED)
     assert (reply.text, reply.calls) == ("", 1)
@@ -162,7 +149,7 @@ def test_a_refusal_is_an_answer_without_words(server: ChatServer) -> None:
     ("fault", "words", "next_step"),
     [(BUSY_FOR_AN_HOUR, "answers 429", "resume"), (LOCKED, "answers 401", "OPENAI_API_KEY")],
 )
-def test_what_no_repetition_mends(
+def test_failures_that_no_retry_solves(
     server: ChatServer, fault: str, words: str, next_step: str
 ) -> None:
     server.faults = [fault]
@@ -172,15 +159,8 @@ def test_what_no_repetition_mends(
     assert len(server.seen) == 1
 
 
-def test_a_wrong_model_is_told_with_those_that_are_served(server: ChatServer) -> None:
-    with pytest.raises(ModelError, match="serves no model 'small'") as raised:
-        model_of(server, name="small").reply(ASKED)
-    assert "tiny" in str(raised.value.hint)
-    assert len(server.seen) == 1
-
-
 @pytest.mark.parametrize("key", ["one\ntwo", "schlüssel"])
-def test_a_key_that_is_none_is_refused_and_not_told(
+def test_an_invalid_key_is_an_error_that_does_not_show_it(
     server: ChatServer, key: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("OPENAI_API_KEY", key)
@@ -189,23 +169,25 @@ def test_a_key_that_is_none_is_refused_and_not_told(
     assert key not in str(raised.value)
 
 
-def test_a_wrong_model_is_told_before_the_first_question(server: ChatServer) -> None:
-    with pytest.raises(ModelError, match="serves no model 'small'") as raised:
-        model_of(server, name="small").metadata()
-    assert "tiny" in str(raised.value.hint)
+def test_a_missing_model_is_an_error_that_lists_those_served(server: ChatServer) -> None:
+    model = model_of(server, name="small")
+    for call in (model.metadata, lambda: model.reply(ASKED)):
+        with pytest.raises(ModelError, match="serves no model 'small'") as raised:
+            call()
+        assert "tiny" in str(raised.value.hint)
+    assert len(server.seen) == 1
     assert model_of(server).metadata() == {"model": "tiny"}
 
 
-def test_nobody_there() -> None:
+def test_no_server_listens() -> None:
     with ChatServer() as server:
-        url = server.url
-    for call in ("metadata", "reply"):
-        model = MODELS.make(f"openai:{url}#tiny", ["repeats=1"])
+        model = model_of(server, "repeats=1")
+    for call in (model.metadata, lambda: model.reply(ASKED)):
         with pytest.raises(ModelError, match="cannot be reached"):
-            getattr(model, call)(*([ASKED] if call == "reply" else []))
+            call()
 
 
-# --- how models are written ----------------------------------------------------------------------
+# --- names and options of models -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -216,12 +198,12 @@ def test_nobody_there() -> None:
         *("openai:http:///v1#m", "openai:http://me:key@h#m"),
     ],
 )
-def test_what_is_not_written_as_a_model(text: str) -> None:
+def test_invalid_names_are_errors(text: str) -> None:
     with pytest.raises(InvalidOptionError, match="expected"):
         MODELS.parse(text)
 
 
-def test_an_unknown_kind_and_the_nearest_one() -> None:
+def test_an_unknown_kind_is_an_error_with_the_nearest_one() -> None:
     with pytest.raises(UnknownNameError, match="no model") as raised:
         MODELS.parse("opneai:http://h#m")
     assert "openai" in str(raised.value.hint)
@@ -239,7 +221,7 @@ def test_options_out_of_range(server: ChatServer, option: str) -> None:
         model_of(server, option)
 
 
-def test_what_makes_a_model_the_one_that_it_is() -> None:
+def test_what_identifies_a_model() -> None:
     said = {"model": "m"}
     here = model_identity("openai:http://h/v1#m", ["images=9", "response_s=3"], said)
     assert here == model_identity("openai:http://other/v1#m", ["images=9", "repeats=1"], said)

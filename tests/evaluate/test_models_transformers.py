@@ -1,4 +1,4 @@
-"""Models in this process: a tiny one with random weights, saved and loaded as real ones are."""
+"""Models in this process: a tiny one with random weights, saved and loaded like a real one."""
 
 import os
 import shutil
@@ -31,7 +31,7 @@ def asked(number: int) -> list[Message]:
     return [Message("system", ("be brief",)), Message("user", (NOISE[number], "what is it?"))]
 
 
-def test_the_same_question_has_the_same_answer_and_another_image_another(tiny: Path) -> None:
+def test_answers_are_deterministic_and_depend_on_the_image(tiny: Path) -> None:
     model = MODELS.make(f"transformers:{tiny}", ["max_tokens=12", "device=cpu"])
     first, again, other = (model.reply(asked(number)) for number in (0, 0, 1))
     assert first.text and first.text == again.text != other.text
@@ -57,7 +57,7 @@ def test_an_adapter_is_another_model(tiny: Path, tmp_path: Path) -> None:
     assert {*adapted.metadata()} == {"sha256", "adapter_sha256"}
 
 
-def test_where_it_lies_is_no_part_of_it(tiny: Path, tmp_path: Path) -> None:
+def test_the_folder_is_not_part_of_the_identity(tiny: Path, tmp_path: Path) -> None:
     (tmp_path / "moved").symlink_to(tiny)
     other = save_tiny_model(tmp_path / "other", seed=1)
     said = [
@@ -70,13 +70,14 @@ def test_where_it_lies_is_no_part_of_it(tiny: Path, tmp_path: Path) -> None:
     )
 
 
-def test_its_identity_needs_neither_its_weights_nor_to_read_them_again(
+def test_the_identity_needs_no_loaded_weights_and_is_cached(
     tiny: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    said = MODELS.make(f"transformers:{tiny}").metadata()
+    metadata = MODELS.make(f"transformers:{tiny}").metadata()
+    assert MODELS.pin(f"transformers:{tiny}") == f"transformers:{tiny}"
     monkeypatch.setattr(TransformersModel, "_load", None)
     monkeypatch.setattr(weights, "digest_folder", None)
-    assert MODELS.make(f"transformers:{tiny}").metadata() == said
+    assert MODELS.make(f"transformers:{tiny}").metadata() == metadata
 
 
 def test_digests_follow_the_files(tmp_path: Path) -> None:
@@ -95,7 +96,7 @@ def test_digests_follow_the_files(tmp_path: Path) -> None:
     assert weights.digest_weights(file.parent, ["*.safetensors"]) in digests
 
 
-def test_what_cannot_be_loaded(tiny: Path, tmp_path: Path) -> None:
+def test_models_that_cannot_be_loaded(tiny: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(ModelError, match="cannot load the model"):
         MODELS.make(f"transformers:{tmp_path / 'empty'}")
@@ -109,18 +110,12 @@ def test_what_cannot_be_loaded(tiny: Path, tmp_path: Path) -> None:
         MODELS.make(f"transformers:{tiny}", ["device=cuda:77"])
 
 
-def test_a_folder_stays_what_it_is(tiny: Path) -> None:
-    assert MODELS.pin(f"transformers:{tiny}") == f"transformers:{tiny}"
-
-
-def test_questions_are_put_to_it(tiny: Path, tmp_path: Path) -> None:
-    told: dict[str, Any] = {"model": f"transformers:{tiny}", "system": "tiny", "frames": 2}
-    told["families"] = ("MoveCube",)
-    rows = ask(tmp_path / "run", **told, model_options=("max_tokens=12",)).rows
+def test_a_run_of_questions(tiny: Path, tmp_path: Path) -> None:
+    settings: dict[str, Any] = {"model": f"transformers:{tiny}", "system": "tiny", "frames": 2}
+    settings["families"] = ("MoveCube",)
+    rows = ask(tmp_path / "run", **settings, model_options=("max_tokens=12",)).rows
     assert {row.status for row in rows} <= {"success", "fail"} and len(rows) == 2
     assert {row.model_calls for row in rows} == {1}
-    again = ask(tmp_path / "again", **told, model_options=("max_tokens=12", "device=cpu")).rows
-    assert [row.answer for row in again] == [row.answer for row in rows]
     (tmp_path / "moved").symlink_to(tiny)  # the same weights: the same run, which is done
-    moved = told | {"model": f"transformers:{tmp_path / 'moved'}"}
+    moved = settings | {"model": f"transformers:{tmp_path / 'moved'}"}
     assert ask(tmp_path / "run", **moved, model_options=("max_tokens=12",)).rows == rows

@@ -1,4 +1,4 @@
-"""The table of systems: the paper's grid, its conditions, and names that do not pretend."""
+"""The table of systems, their conditions, and valid names."""
 
 import pytest
 
@@ -16,14 +16,14 @@ CONDITIONS = ("no-history", "k0", "k1", "k3", "k7")
 
 
 @pytest.mark.parametrize("name", [*SYSTEMS, "my-memory"])
-def test_conditions(name: str) -> None:
+def test_conditions_of_a_system(name: str) -> None:
     expected = {"pi05_baseline": ["no-history"]}.get(name, list(CONDITIONS))
     if name.startswith("retrieval-"):
         expected = ["k0", "k1", "k3", "k7"]
     assert [one for one in CONDITIONS if name_system(name).applies(one)] == expected
 
 
-def test_a_retrieval_system_has_one_without() -> None:
+def test_the_base_of_a_retrieval_system() -> None:
     assert base_of("retrieval-framesamp-modul") == "perceptual-framesamp-modul"
     assert base_of("retrieval-replay-window") == "replay-window"
     assert base_of("replay-window") is base_of("my-memory") is None
@@ -31,19 +31,17 @@ def test_a_retrieval_system_has_one_without() -> None:
 
 
 @pytest.mark.parametrize("step", ["mean", "joined", "last", "top32", "max-0.9-wrist", "oracle"])
-def test_a_control_behind_another_step_is_that_control(step: str) -> None:
+def test_a_control_behind_another_retrieval_step(step: str) -> None:
     system = name_system(f"retrieval-recall-framesamp-{step}")
-    assert (system.display, system.sampling) == (
-        f"Retrieval-Recall-FrameSamp ({step})",
-        "framesamp",
-    )
+    assert system.display == f"Retrieval-Recall-FrameSamp ({step})"
+    assert system.sampling == "framesamp"
     assert not system.applies("no-history") and system.applies("k0")
     assert is_bound(system.name) and not is_bound(f"retrieval-replay-window-{step}")
     assert base_of(system.name) == "recall-framesamp"
     assert display_name(system.name) == system.display
 
 
-def test_position_limits_are_told_condition_by_condition() -> None:
+def test_position_limits_name_the_conditions() -> None:
     limited = {name for name, system in SYSTEMS.items() if system.position_limit is not None}
     assert limited == {
         name for name in SYSTEMS if name.startswith(("perceptual-", "recurrent-"))
@@ -58,7 +56,7 @@ def test_position_limits_are_told_condition_by_condition() -> None:
             check_history(system, longest)
 
 
-def test_own_names() -> None:
+def test_names_outside_the_table() -> None:
     own = name_system("my-memory.v2")
     assert (own.name, own.display, own.paper) == ("my-memory.v2", "my-memory.v2", False)
     assert name_system("memer") is SYSTEMS["memer"]
@@ -66,7 +64,7 @@ def test_own_names() -> None:
 
 
 @pytest.mark.parametrize("sampling", ["full", "framesamp", "window"])
-def test_who_answers_without_a_model_is_a_bound(sampling: str) -> None:
+def test_recall_and_guess_of_questions_are_bounds(sampling: str) -> None:
     for name in ("questions-guess", f"questions-recall-{sampling}"):
         for known in (name, f"retrieval-{name}", f"retrieval-{name}-joined"):
             assert name_system(known).name == known and is_bound(known)
@@ -74,6 +72,6 @@ def test_who_answers_without_a_model_is_a_bound(sampling: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["", " ", "-x", "a b", "a/b", "x" * 65, "π"])
-def test_what_is_no_name(name: str) -> None:
+def test_invalid_names_are_errors(name: str) -> None:
     with pytest.raises(InvalidIdError, match="is not the name of a system"):
         name_system(name)

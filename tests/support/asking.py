@@ -50,8 +50,3 @@ def look(seen: Seen) -> str:
         if part and number < len(QUERIES):
             return f"The answer is {right_letter(QUERIES[number])}."
     return "I cannot tell."
-
-
-def pixels(seen: Seen) -> list[tuple[int, ...]]:
-    """The first pixel of each image of the history that was sent."""
-    return [tuple(map(int, image[0, 0])) for image in seen.images[:-1]]

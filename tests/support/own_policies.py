@@ -80,11 +80,9 @@ NUMBER = 3
 
 
 SAID: dict[str, Any] = {
-    "huge": {"checkpoint": 10**5000},
     "array": {"policy": "still", "sizes": np.arange(3), 4: np.float32(5)},
     "text": "still",
     "nan": {"policy": "still", "scales": [1.0, np.float32("nan")]},
-    "surrogate": {"policy": "still", "checkpoint": "caf\udce9"},
 }
 
 
@@ -139,9 +137,3 @@ class Served(WebsocketPolicy):
 
     def metadata(self) -> dict[str, Any]:
         return {name: value for name, value in super().metadata().items() if name != "server"}
-
-
-def from_checkpoint() -> Still:
-    """Return a policy that says which checkpoint CHECKPOINT names."""
-    said = {"policy": "still", "checkpoint": os.environ["CHECKPOINT"]}
-    return changed("metadata", lambda: said)

@@ -1,4 +1,4 @@
-"""Policies from text: what is read, what is refused before any episode, and what is made."""
+"""Policies from text: parsing, errors before any episode, options, and user-defined policies."""
 
 import sys
 from pathlib import Path
@@ -15,6 +15,7 @@ from robomme_interference_data.errors import (
     PolicyError,
     UnknownNameError,
 )
+from robomme_interference_data.evaluate.policies.identity import policy_identity
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import (
     POLICIES,
@@ -25,39 +26,23 @@ from robomme_interference_data.evaluate.policies.registry import (
 from robomme_interference_data.runtime.specs import Spec, bind_options
 
 OWN = "python:support.own_policies:"
+STILL = f"{OWN}Still"
 
 
-@pytest.mark.parametrize(
-    ("text", "spec", "servers"),
-    [
-        ("oracle", Spec("oracle"), ()),
-        ("replay:window", Spec("replay", "window"), ()),
-        ("recall:framesamp", Spec("recall", "framesamp"), ()),
-        ("lerobot:me/act", Spec("lerobot", "me/act"), ()),
-        ("lerobot:out/last:1", Spec("lerobot", "out/last:1"), ()),
-        ("python:my.policies:make", Spec("python", "my.policies:make"), ()),
-        (
-            "websocket://gpu-1.lab:8013,10.0.0.2:1,[::1]:65535",
-            Spec("websocket", "//gpu-1.lab:8013,10.0.0.2:1,[::1]:65535"),
-            (("gpu-1.lab", 8013), ("10.0.0.2", 1), ("::1", 65535)),
-        ),
-    ],
-)
-def test_what_is_read(text: str, spec: Spec, servers: tuple[tuple[str, int], ...]) -> None:
-    assert POLICIES.parse(text) == spec
-    assert str(spec) == text
-    assert server_addresses(text) == servers
-    assert str(POLICIES.parse("replay")) == "replay:full"
-    assert str(POLICIES.parse("recall")) == "recall:full"
+def test_a_policy_is_parsed() -> None:
+    assert POLICIES.parse("lerobot:out/last:1") == Spec("lerobot", "out/last:1")
+    assert [str(POLICIES.parse(text)) for text in ("replay", "recall")] == [
+        *("replay:full", "recall:full")
+    ]
+    addresses = ("gpu-1.lab", 8013), ("10.0.0.2", 1), ("::1", 65535)
+    assert server_addresses("websocket://gpu-1.lab:8013,10.0.0.2:1,[::1]:65535") == addresses
 
 
 @pytest.mark.parametrize(
     ("text", "error", "words"),
     [
-        ("orcale", UnknownNameError, "Did you mean 'oracle'"),
         ("websockets://a:1", UnknownNameError, "Did you mean 'websocket'?"),
         ("zzz", UnknownNameError, "expected replay, replay:framesamp or replay:window, recall,"),
-        ("", UnknownNameError, "there is no policy ''"),
         *(
             (text, InvalidOptionError, f"policy '{text}'; expected {text.partition(':')[0]}")
             for text in (
@@ -69,12 +54,10 @@ def test_what_is_read(text: str, spec: Spec, servers: tuple[tuple[str, int], ...
         ),
     ],
 )
-def test_what_is_refused(text: str, error: type[Exception], words: str) -> None:
+def test_invalid_policies_are_errors(text: str, error: type[Exception], words: str) -> None:
     with pytest.raises(error) as raised:
         POLICIES.parse(text)
     assert words in str(raised.value)
-    with pytest.raises(error):
-        make_policy(text)
 
 
 @given(st.text(max_size=20) | st.from_regex(r"(websocket:/?/?|python:|lerobot:)[a-z:,1.\[\]]*"))
@@ -95,116 +78,6 @@ def test_each_worker_has_a_server() -> None:
     make_policy("replay", worker=50)
 
 
-# --- options -----------------------------------------------------------------------------------
-
-
-def test_options_reach_the_policy_with_the_declared_type() -> None:
-    policy: Any = make_policy(f"{OWN}Still", ["gripper=-1"], worker=3)
-    assert (policy.action[0, 7], policy.worker) == (-1, 3)  # it asks for its worker
-    assert policy_options("websocket://a:1", ["response_s=5"]) == {
-        "checkpoint": None,
-        "chunk_frames": 16,
-        "connect_s": 600.0,
-        "response_s": 5.0,
-    }
-
-    def make(a: str, b: str | None, c: int | None, d: bool, e, f: list[int]) -> None: ...  # type: ignore[no-untyped-def]
-
-    typed = ["a=7", "b=null", "c=null", "d=true", "e=x=y", "f=[1]"]
-    assert bind_options("mine", make, {}, typed) == {
-        **{"a": "7", "b": "null", "c": None, "d": True, "e": "x=y", "f": [1]}
-    }
-
-
-@pytest.mark.parametrize("texts", [["gripper"], ["=1"], ["two words=1"], ["a=1", "b=1", "a=2"]])
-def test_what_is_no_option(texts: list[str]) -> None:
-    with pytest.raises(InvalidOptionError, match="policy 'noop': option"):
-        policy_options("noop", texts)
-
-
-@pytest.mark.parametrize(
-    ("text", "option", "words"),
-    [
-        ("websocket://a:1", "chunk_frames=2.5", "chunk_frames is 2.5; expected a whole number"),
-        ("websocket://a:1", "chunk_frames=true", "is True; expected a whole number"),
-        ("websocket://a:1", "connect_s=soon", "connect_s is 'soon'; expected a number"),
-        ("websocket://a:1", "memory=full", "Its options: checkpoint, chunk_frames, "),
-        ("websocket://a:1", "port=2", "port"),
-        ("websocket://a:1", "connect_s=-1", "expected positive numbers"),
-        (f"{OWN}still", "gripper=null", "gripper is None; expected a number"),
-        ("noop", "speed=1", "Its options: none."),
-    ],
-)
-def test_options_that_do_not_fit(text: str, option: str, words: str) -> None:
-    with pytest.raises(InvalidOptionError) as raised:
-        make_policy(text, [option])
-    assert words in str(raised.value)
-    with pytest.raises(InvalidOptionError, match="missing a required argument: 'gripper'"):
-        make_policy(f"{OWN}still")
-
-
-# --- policies of one's own ---------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("text", "error", "words"),
-    [
-        ("python:no_such_module:make", InvalidOptionError, "PYTHONPATH"),
-        (f"{OWN}stil", UnknownNameError, "Did you mean 'still'"),
-        (f"{OWN}NUMBER", UnknownNameError, "function 'NUMBER'"),
-        ("python:builtins:dict", PolicyError, "dict has cameras None; expected a tuple of 'front'"),
-        ("python:builtins:dict", PolicyError, "no method reset(); no method add_history()"),
-        ("python:broken_policy:make", InvalidOptionError, "No module named 'not_installed_here'"),
-    ],
-)
-def test_a_factory_that_is_none(
-    text: str, error: type[Exception], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "broken_policy.py").write_text("import not_installed_here\n", encoding="utf-8")
-    monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(error) as raised:
-        make_policy(text)
-    assert words in str(raised.value)
-
-
-def test_a_factory_that_raises_shows_its_own_traceback_alone() -> None:
-    with pytest.raises(PolicyError, match="its factory raised ZeroDivisionError") as raised:
-        make_policy(f"{OWN}raising")
-    hint = raised.value.hint or ""
-    assert "own_policies.py" in hint and "return 1 / 0" in hint and "registry.py" not in hint
-
-
-def test_authors_import_all_from_one_place() -> None:
-    for name in evaluate.__all__:
-        assert getattr(evaluate, name).__name__ == name or name == "Frames"
-
-
-def test_every_member_of_the_protocol_is_asked_for() -> None:
-    members = [name for name in vars(Policy) if not name.startswith("_")]
-    assert len(members) == 11
-    for name in members:
-        with pytest.raises(PolicyError, match=rf"Lacking has (no method )?{name}\b"):
-            make_policy(f"{OWN}lacking", [f"name={name}"])
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "words"),
-    [
-        ("history_cameras", "null", "history_cameras None"),
-        ("history_cameras", '["top"]', "a tuple of 'front' and 'wrist'"),
-        ("cameras", '"front"', "cameras 'front'"),
-        ("wants_history", "no", "wants_history 'no'; expected True or False"),
-        ("every_frame", "1", "every_frame 1"),
-        ("act", "3", r"no method act()"),
-    ],
-)
-def test_a_member_of_another_kind(name: str, value: str, words: str) -> None:
-    with pytest.raises(PolicyError) as raised:
-        make_policy(f"{OWN}changed", [f"name={name}", f"value={value}"])
-    assert words in str(raised.value)
-    make_policy(f"{OWN}changed", ["name=cameras", 'value=["wrist"]'])  # a list will do
-
-
 @pytest.mark.parametrize("library", ["websockets", "msgpack"])
 def test_a_missing_library_names_the_extra(library: str, monkeypatch: pytest.MonkeyPatch) -> None:
     package = "robomme_interference_data.evaluate.policies"
@@ -215,3 +88,119 @@ def test_a_missing_library_names_the_extra(library: str, monkeypatch: pytest.Mon
     with pytest.raises(MissingExtraError, match=f"needs {library}") as raised:
         make_policy("websocket://a:1")
     assert "robomme-interference-data[evaluate]" in str(raised.value.hint)
+
+
+# --- options -----------------------------------------------------------------------------------
+
+
+def test_options_reach_the_policy_with_the_declared_type() -> None:
+    policy: Any = make_policy(STILL, ["gripper=-1"], worker=3)
+    assert (policy.action[0, 7], policy.worker) == (-1, 3)  # it has a parameter `worker`
+
+    def make(a: str, b: str | None, c: int | None, d: bool, e, f: list[int]) -> None: ...  # type: ignore[no-untyped-def]
+
+    typed = ["a=7", "b=null", "c=null", "d=true", "e=x=y", "f=[1]"]
+    assert bind_options("mine", make, {}, typed) == {
+        **{"a": "7", "b": "null", "c": None, "d": True, "e": "x=y", "f": [1]}
+    }
+
+
+@pytest.mark.parametrize("texts", [["gripper"], ["=1"], ["two words=1"], ["a=1", "b=1", "a=2"]])
+def test_malformed_or_repeated_options_are_errors(texts: list[str]) -> None:
+    with pytest.raises(InvalidOptionError, match="policy 'noop': option"):
+        policy_options("noop", texts)
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "words"),
+    [
+        ("websocket://a:1", ["chunk_frames=true"], "chunk_frames is True; expected a whole number"),
+        ("websocket://a:1", ["connect_s=soon"], "connect_s is 'soon'; expected a number"),
+        ("websocket://a:1", ["memory=full"], "Its options: checkpoint, chunk_frames, "),
+        ("websocket://a:1", ["port=2"], "port"),
+        ("websocket://a:1", ["connect_s=-1"], "expected positive numbers"),
+        ("noop", ["speed=1"], "Its options: none."),
+        (f"{OWN}still", [], "missing a required argument: 'gripper'"),
+    ],
+)
+def test_options_that_do_not_fit(text: str, options: list[str], words: str) -> None:
+    with pytest.raises(InvalidOptionError) as raised:
+        make_policy(text, options)
+    assert words in str(raised.value)
+
+
+def test_the_part_of_a_policy_that_can_change_a_result() -> None:
+    # The default memory may be left out.
+    assert [POLICIES.pin(text) for text in ("replay", "replay:full")] == ["replay:full"] * 2
+    metadata = {"policy": "websocket", "server": "a:1", "server_metadata": {"model": "m"}}
+    assert policy_identity("websocket://a:1,b:2", ("response_s=5", "checkpoint=7"), metadata) == {
+        "policy": "websocket",
+        "policy_options": {"checkpoint": "7", "chunk_frames": 16},
+        "policy_metadata": {"policy": "websocket", "server_metadata": {"model": "m"}},
+    }
+    assert policy_identity(STILL, ("gripper=1",), {}) == policy_identity(STILL, (), {})
+    assert policy_identity(STILL, ("gripper=0.5",), {"device": "cuda"}) == {
+        "policy": STILL,
+        "policy_options": {"gripper": 0.5},
+        "policy_metadata": {"device": "cuda"},
+    }
+    objects = policy_identity("python:support.own_policies:with_object", (), {})
+    assert objects["policy_options"] == {"name": "x"}  # values that JSON lacks are left out
+
+
+# --- user-defined policies ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "words"),
+    [
+        ("python:no_such_module:make", InvalidOptionError, "PYTHONPATH"),
+        (f"{OWN}stil", UnknownNameError, "Did you mean 'still'"),
+        (f"{OWN}NUMBER", UnknownNameError, "function 'NUMBER'"),
+        ("python:broken_policy:make", InvalidOptionError, "No module named 'not_installed_here'"),
+    ],
+)
+def test_invalid_factories_are_errors(
+    text: str, error: type[Exception], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "broken_policy.py").write_text("import not_installed_here\n", encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(error) as raised:
+        make_policy(text)
+    assert words in str(raised.value)
+
+
+def test_a_factory_that_raises_shows_only_its_own_traceback() -> None:
+    with pytest.raises(PolicyError, match="its factory raised ZeroDivisionError") as raised:
+        make_policy(f"{OWN}raising")
+    hint = raised.value.hint or ""
+    assert "own_policies.py" in hint and "return 1 / 0" in hint and "registry.py" not in hint
+
+
+def test_users_import_everything_from_one_place() -> None:
+    for name in evaluate.__all__:
+        assert getattr(evaluate, name).__name__ == name or name == "Frames"
+
+
+def test_every_member_of_the_protocol_is_required() -> None:
+    members = [name for name in vars(Policy) if not name.startswith("_")]
+    assert len(members) == 11
+    for name in members:
+        with pytest.raises(PolicyError, match=rf"Lacking has (no method )?{name}\b"):
+            make_policy(f"{OWN}lacking", [f"name={name}"])
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("history_cameras", '["top"]', "a tuple of 'front' and 'wrist'"),
+        ("cameras", '"front"', "cameras 'front'"),
+        ("every_frame", "1", "every_frame 1; expected True or False"),
+        ("act", "3", r"no method act()"),
+    ],
+)
+def test_members_of_another_type_are_errors(name: str, value: str, words: str) -> None:
+    with pytest.raises(PolicyError) as raised:
+        make_policy(f"{OWN}changed", [f"name={name}", f"value={value}"])
+    assert words in str(raised.value)
+    make_policy(f"{OWN}changed", ["name=cameras", 'value=["wrist"]'])  # a list is accepted

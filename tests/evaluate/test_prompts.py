@@ -1,0 +1,310 @@
+"""Prompts of questions and subgoals, their files, and how answers are parsed."""
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robomme_interference_data.data.questions import LETTERS, Question
+from robomme_interference_data.errors import FormatError, InvalidOptionError, UnknownNameError
+from robomme_interference_data.evaluate.models.model import Video
+from robomme_interference_data.evaluate.models.prompts import as_text
+from robomme_interference_data.evaluate.questions import prompt as questions
+from robomme_interference_data.evaluate.questions.prompt import QuestionPrompt, read_letter
+from robomme_interference_data.evaluate.subgoals import prompt as subgoals
+from robomme_interference_data.evaluate.subgoals.prompt import Prompt, merge_near
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.schema.subgoal import Subgoal
+
+SIZE = (256, 256)
+BOXES = "<|box_start|>({y},{x})<|box_end|>"
+IMAGE = np.zeros((2, 2, 3), np.uint8)
+NO_IMAGES: dict[str, Any] = {"<history>": [], "<picture>": []}
+
+
+def question(*options: str) -> Question:
+    episode, answers = EpisodeId("MoveCube", "test", 0), tuple(range(len(options)))
+    return Question(episode, "r", "Which one?", options, answers, 0, b"")
+
+
+def prompt(**changes: object) -> Prompt:
+    usual = {"system": "s", "first": "<history>{goal}<image>", "then": "{subgoals}"}
+    return Prompt(**usual | changes)  # type: ignore[arg-type]
+
+
+# --- answers to questions ----------------------------------------------------------------------
+
+NO_LETTERS = st.text(st.characters(exclude_categories=("L", "M", "N"), exclude_characters="_"))
+
+
+@given(st.integers(2, 8), st.sampled_from(LETTERS), NO_LETTERS, NO_LETTERS)
+def test_a_single_letter_counts_in_any_punctuation(
+    count: int, letter: str, before: str, after: str
+) -> None:
+    letters = LETTERS[:count]
+    for text in (letter, letter.lower()):
+        expected = letter if letter in letters else None
+        assert read_letter(f"{before}{text}{after}", letters) == expected
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        "the correct answer is: **@**",
+        '{"answer": "@", "why": "A or B"}',
+        "The answer is option @, as the cube moved.",
+        "@: the one marked @",
+        "**@**\n\nBecause # was never touched.",
+        "@, because option # is wrong",
+        "I choose option @.",
+        "A robot lifted @.",
+        "\\boxed{@}",
+        "Not sure. #: no. @: yes. Answer: @",
+        "Answer: #. Wait. Answer: @",
+        "<think>The answer is #. Option #!</think>\n\n@",
+    ],
+)
+@pytest.mark.parametrize(("letter", "other"), [("B", "D"), ("C", "A"), ("D", "C")])
+def test_forms_of_answers(form: str, letter: str, other: str) -> None:
+    """With the letter of the answer for @, and that of another option for #."""
+    assert read_letter(form.replace("@", letter).replace("#", other), "ABCD") == letter
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", None),
+        ("A or B", None),
+        ("A, B, C", None),
+        ("A: no\nB: no", None),
+        ("The answer is a blue cube.", None),
+        ("The answer is a blue cube, marked C", "C"),
+        ("It's A's neighbour.", None),
+        ("answer: a\nbecause it moved", "A"),
+        ("The answer is A because it moved.", "A"),
+    ],
+)
+def test_answers_by_hand(text: str, expected: str | None) -> None:
+    assert read_letter(text, "ABCD") == expected
+
+
+@given(st.text(), st.integers(2, 8))
+def test_any_text_names_an_option_or_none(text: str, count: int) -> None:
+    letters = LETTERS[:count]
+    assert read_letter(text, letters) in (None, *letters)
+
+
+@pytest.mark.parametrize("piece", ["x ", "A ", "answer ", "answer is ", "\n ", "* \n", "option\n"])
+def test_long_answers_are_parsed_in_linear_time(piece: str) -> None:
+    began = time.perf_counter()
+    read_letter(piece * 50_000, "ABCD")
+    assert time.perf_counter() - began < 2
+
+
+# --- answers with subgoals ---------------------------------------------------------------------
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 255), st.integers(0, 255)), max_size=3),
+    st.sampled_from([0, 256, 1000]),
+    st.sampled_from(["<{y}, {x}>", "({x},{y})", BOXES, "[{y} {x}]"]),
+)
+def test_points_are_parsed_as_the_same_pixels(
+    points: list[tuple[int, int]], grid: int, form: str
+) -> None:
+    subgoal = Subgoal("put it" + " at <point>" * len(points), tuple(points))
+    written = prompt(grid=grid, point=form)
+    assert written.read(written.write(subgoal, SIZE), SIZE).subgoal == subgoal
+
+
+@pytest.mark.parametrize(
+    ("changes", "text", "expected"),
+    [
+        # The end of the grid is the last pixel; 3 · 256 / 1000 = 0.77, 4 · 256 / 1000 = 1.02.
+        ({}, "go <500, 1000> <3,  4>", Subgoal("go <point> <point>", ((128, 255), (0, 1)))),
+        (
+            {"grid": 0, "box": "[{x0}, {y0}, {x1}, {y1}]", "point": "({x}, {y})"},
+            "pick up [10, 20, 30, 60], not (1, 2)",  # the center of a box counts
+            Subgoal("pick up <point>, not <point>", ((40, 20), (2, 1))),
+        ),
+        # Special tokens may be missing.
+        ({"point": BOXES}, "at (500, 250) now", Subgoal("at <point> now", ((128, 64),))),
+        # The first line counts, without quotes.
+        ({}, "\n  pick it up \nbecause", Subgoal("pick it up")),
+        ({}, '**"pick it up"**', Subgoal("pick it up")),
+    ],
+)
+def test_subgoals_by_hand(changes: dict[str, Any], text: str, expected: Subgoal) -> None:
+    assert prompt(**changes).read(text, SIZE).subgoal == expected
+
+
+def test_json_may_have_text_around_it() -> None:
+    parsed = prompt(answer="json", subgoal_key="task", keyframes_key="keep")
+    text = '```json\n{"task": "press it at <0, 500>", "keep": [1, 3]}\n```'
+    answer = parsed.read(text, SIZE, shown=3)
+    assert answer.subgoal == Subgoal("press it at <point>", ((0, 128),))
+    assert answer.keyframes == (0, 2)
+    assert parsed.read('{"task": "go"}', SIZE).keyframes == ()
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        *(({}, text) for text in ("", " \n ", "x" * 301, "<1, 2>", "go <0, 1001>")),
+        ({"grid": 0}, "go <256, 0>"),
+        *(
+            ({"answer": "json"}, text)
+            for text in (
+                *("go on", "{", "[1]", '{"subgoal": 3}', "[" * 10_000),
+                *('{"subgoal": "go", "keyframes": [0]}', '{"subgoal": "go", "keyframes": [4]}'),
+                '{"subgoal": "go", "keyframes": [true]}',
+            )
+        ),
+    ],
+)
+def test_texts_without_a_subgoal_are_errors(changes: dict[str, Any], text: str) -> None:
+    with pytest.raises(InvalidOptionError):
+        prompt(**changes).read(text, SIZE, shown=3)
+
+
+@given(st.text())
+def test_any_text_is_a_subgoal_or_a_clear_error(text: str) -> None:
+    for kind in ("text", "json"):
+        try:
+            answer = prompt(answer=kind, box="[{y0},{x0},{y1},{x1}]").read(text, SIZE)
+        except InvalidOptionError:
+            continue
+        assert all(0 <= side < 256 for point in answer.subgoal.points for side in point)
+
+
+def test_near_key_frames_become_their_median() -> None:
+    assert [merge_near(frames, 8) for frames in ([0, 8], [0, 9])] == [[8], [0, 9]]  # the upper one
+    # 2, 10 and 18 are one group; 18 to 30 is too far.
+    assert merge_near([30, 2, 10, 18, 40], 8) == [10, 30, 40]
+
+
+@given(st.lists(st.integers(0, 300)), st.integers(0, 20))
+def test_kept_frames_are_some_of_the_given_in_order(frames: list[int], near: int) -> None:
+    kept = merge_near(frames, near)
+    assert set(kept) <= set(frames)
+    assert kept == sorted(set(kept))
+    assert bool(kept) == bool(frames)
+
+
+# --- filled prompts ----------------------------------------------------------------------------
+
+
+def test_a_question_is_filled_in_order() -> None:
+    filled = QuestionPrompt(
+        "be brief", "see <history>; now <picture>: {goal} {question}\n{options}"
+    )
+    views = {"<history>": [Video(np.stack([IMAGE] * 3), 10.0)], "<picture>": [IMAGE]}
+    system, user = filled.fill("do <picture> {options}", question("push it", ""), views)
+    assert (system.role, system.parts) == ("system", ("be brief",))
+    assert user.parts[1] is views["<history>"][0] and user.parts[3] is IMAGE
+    # Placeholders in the goal stay text; an option without text is named by its letter.
+    assert as_text(user.parts) == (
+        "see [video of 3 frames]; now [image]: do <picture> {options} Which one?\n"
+        "A: push it\nB: the one marked B"
+    )
+    _, user = filled.fill("g", question("x", "y"), NO_IMAGES)
+    assert user.parts == ("see none; now none: g Which one?\nA: x\nB: y",)
+
+
+def test_a_subgoal_prompt_is_filled_in_order() -> None:
+    history, now = np.zeros((1, 1, 3), np.uint8), np.ones((1, 1, 3), np.uint8)
+    views = {"<history>": [history], "<image>": [now]}
+    filled = prompt(
+        first="before <history> the goal: {goal} <image>{goal} {other}",
+        then="so far: {subgoals}; kept: <keyframes>",
+        point=BOXES,
+    )
+    parts = filled.fill("go to <image>", [], SIZE, views)
+    assert parts[1] is history and parts[3] is now
+    assert parts[::2] == ("before ", " the goal: go to <image> ", "go to <image> {other}")
+    earlier = [Subgoal("pick up <point>", ((128, 0),)), Subgoal("wait")]
+    [text] = filled.fill("g", earlier, SIZE, {"<keyframes>": []})
+    assert text == "so far: 1. pick up <|box_start|>(500,0)<|box_end|>; 2. wait; kept: none"
+
+
+# --- files -------------------------------------------------------------------------------------
+
+
+def test_the_questions_prompt_of_the_package() -> None:
+    [name] = questions.PROMPTS
+    loaded, digest = questions.load_prompt(name)
+    assert len(digest) == 64 and "letter" in loaded.system
+    views: Any = {"<history>": [Video(IMAGE[None], 10.0)], "<picture>": [IMAGE]}
+    _, user = loaded.fill("g", question("x", "y"), views)
+    assert [type(part).__name__ for part in user.parts] == ["str", "Video", "str", "ndarray", "str"]
+    assert str(user.parts[-1]).endswith("A: x\nB: y\nAnswer with one letter.")
+    assert not {"<", "{"} & {*as_text(user.parts)}
+
+
+@pytest.mark.parametrize("name", subgoals.PROMPTS)
+def test_subgoal_prompts_of_the_package_parse_their_own_examples(name: str) -> None:
+    loaded, digest = subgoals.load_prompt(name)
+    assert len(digest) == 64
+    now = "<recent>" if name == "memer" else "<image>"
+    for text in (loaded.first, loaded.then):
+        assert "<history>" in text and now in text and "{goal}" in text
+    assert loaded.watches is (name == "memer")
+    example = "pick it up" if name == "simple" else "pick it up at <420, 615>"
+    answer = json.dumps({"subgoal": example, "keyframes": []}) if name == "memer" else example
+    points = () if name == "simple" else ((107, 157),)
+    assert loaded.read(answer, SIZE).subgoal.points == points
+
+
+QUESTION = "system = 's'\nquestion = '<history><picture>{question}{options}'"
+SUBGOAL = "system = 'a'\nfirst = 'b'\nthen = 'c'"
+
+
+@pytest.mark.parametrize(
+    ("load", "text", "words"),
+    [
+        (questions.load_prompt, "system = 's'", "lacks question"),
+        (questions.load_prompt, QUESTION.replace("<history>", ""), "lacks <history>"),
+        (questions.load_prompt, QUESTION.replace("<picture>", ""), "lacks <picture>"),
+        (questions.load_prompt, QUESTION.replace("{question}", ""), "lacks {question}"),
+        (questions.load_prompt, QUESTION.replace("{options}", ""), "lacks {options}"),
+        (questions.load_prompt, QUESTION.replace("'s'", "' '"), "system is empty"),
+        (questions.load_prompt, "a = " + "[" * 5000, "no prompt"),
+        (subgoals.load_prompt, f"{SUBGOAL}\ncolor = 'red'", "'color'"),
+        (subgoals.load_prompt, "system = 'a'\nfirst = 'b'\nthen = 3", "then is 3"),
+        (subgoals.load_prompt, f"{SUBGOAL}\ngrid = true", "grid is True"),
+        (subgoals.load_prompt, f"{SUBGOAL}\ngrid = -1", "grid"),
+        (subgoals.load_prompt, f"{SUBGOAL}\nanswer = 'xml'", "answer"),
+        (subgoals.load_prompt, f"{SUBGOAL}\npoint = '{{y}}'", "{x}"),
+        (subgoals.load_prompt, SUBGOAL.replace("'a'", "' '"), "system is empty"),
+        (subgoals.load_prompt, SUBGOAL.replace("'b'", "'<histroy>'"), "mean '<history>'?"),
+        (subgoals.load_prompt, SUBGOAL.replace("'c'", "'{goals}'"), "placeholder {goals}"),
+        (subgoals.load_prompt, "nonsense", "no prompt"),
+        (subgoals.load_prompt, "\udcff\udcfe", "no prompt"),  # no UTF-8
+        (subgoals.load_prompt, "# " + "x" * (1 << 16), "at most"),
+    ],
+)
+def test_invalid_files_are_errors(
+    tmp_path: Path, load: Callable[[str], Any], text: str, words: str
+) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(text, errors="surrogateescape")
+    with pytest.raises(FormatError) as raised:
+        load(str(path))
+    assert words in raised.value.message and str(path) in raised.value.message
+    assert "docs/reference/prompts.md" in str(raised.value.hint)
+
+
+def test_special_tokens_of_models_are_no_placeholders() -> None:
+    text = "<think> at <|box_start|>({y},{x}) <box>: {goal} <image>"
+    assert prompt(first=text).first == text
+
+
+def test_no_such_prompt() -> None:
+    with pytest.raises(UnknownNameError, match="no prompt or file 'grouded'"):
+        subgoals.load_prompt("grouded")
