@@ -1,5 +1,6 @@
 """A progress bar on stderr, with the rate and the time left."""
 
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Self
@@ -49,7 +50,9 @@ class WorkProgress:
     def __init__(
         self, *, unit: str = "frames", quiet: bool = False, above: Callable[[], str] | None = None
     ):
-        self.console = Console(stderr=True, quiet=quiet)
+        # Notebooks set FORCE_COLOR for their commands, whose output no bar can overwrite.
+        terminal = sys.stderr.isatty()
+        self.console = Console(stderr=True, quiet=quiet, force_terminal=terminal)
         self._bars = _Bars(
             TextColumn("{task.description}"),
             BarColumn(),
