@@ -78,7 +78,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     tables = [
         *(cells.rate_table(found, name) for name in ("main", "family", "difficulty")),
         chance.chance_table(outcomes, found),
-        ranks.rank_table(every, draws),
+        ranks.rank_table(every),
         *(comparison_table(name, [*compared, *by_family]) for name in SPECS),
         families.families_table(every, compared),
         evidence_kept.evidence_table(every),
@@ -127,7 +127,7 @@ def _compared(
             found, decay = effects.effects_of(outcomes, system, **beside, draws=draws)
             compared += found
             decays += decay
-        compared += ranks.systems_of(outcomes) + ranks.interactions_of(outcomes)
+        compared += ranks.systems_of(outcomes) + ranks.interactions_of(outcomes, draws)
     return compared, decays, notes
 
 

@@ -74,14 +74,14 @@ def bootstrap(values: Floats, key: str, draws: int = DRAWS) -> list[Interval]:
     """
     if not values.size:
         return [Interval(math.nan)] * values.shape[1]
-    drawn = drawn_means(values, key, draws)
+    drawn = _drawn_means(values, key, draws)
     return [
         _interval(column[~np.isnan(column)], means[np.isfinite(means)])
         for column, means in zip(values.T, drawn.T, strict=True)
     ]
 
 
-def drawn_means(values: Floats, key: str, draws: int = DRAWS) -> Floats:
+def _drawn_means(values: Floats, key: str, draws: int = DRAWS) -> Floats:
     """Return the column means in the draws of `bootstrap`, `(draws, K)`; NaN without values.
 
     They are rounded, so that equal means are equal on any machine.
@@ -90,14 +90,17 @@ def drawn_means(values: Floats, key: str, draws: int = DRAWS) -> Floats:
     # Most columns lack the same episodes: each mask is summed once.
     masks, place = np.unique(known, axis=1, return_inverse=True)
     columns = np.concatenate([np.where(known, values, 0.0), masks], axis=1)
-    drawn = drawn_counts(key, len(values), draws)
-    step = max(1, _CHUNK // len(values))
-    sums = np.concatenate(
-        [drawn[at : at + step].astype(float) @ columns for at in range(0, draws, step)]
-    )
+    sums = summed(drawn_counts(key, len(values), draws), columns)
     count = values.shape[1]
     with np.errstate(invalid="ignore"):
         return np.asarray((sums[:, :count] / sums[:, count:][:, place]).round(12))
+
+
+def summed(drawn: NDArray[np.uint8], columns: Floats) -> Floats:
+    """Return the sums of the columns, `(E, K)`, in draws of episodes, `(draws, E)`."""
+    step = max(1, _CHUNK // len(columns))
+    parts = range(0, len(drawn), step)
+    return np.concatenate([drawn[at : at + step].astype(float) @ columns for at in parts])
 
 
 def _interval(values: Floats, drawn: Floats) -> Interval:

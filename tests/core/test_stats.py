@@ -26,6 +26,7 @@ from robomme_interference_data.stats.significance import (
     sign_flip,
     two_proportions,
 )
+from robomme_interference_data.stats.signs import sign_flips
 
 COUNTS = st.tuples(*[st.integers(0, 300)] * 4).filter(any)
 
@@ -146,6 +147,34 @@ def test_sign_flips_of_five_repeats_are_exact_where_one_broke() -> None:
     # of which the four of 0 are as far exactly.
     found = sign_flip(np.array([4 / 5, -3 / 5, -1 / 5, 3 / 4]))
     assert found == pytest.approx((12 / 16, 10 / 16))
+
+
+def test_random_sign_flips_and_their_interval_by_hand() -> None:
+    # Of the draws of four ones, two in sixteen leave one part empty: the sum is as far from 0.
+    column = np.array([[1.0, 0.0]] * 4 + [[np.nan, 0.0]] * 2)
+    one, nothing = sign_flips(column, "key", 20_000)
+    assert one.value == 1 and one.p == pytest.approx(2 / 16, abs=0.01)
+    assert math.isnan(one.at().low)  # fewer than ten episodes differ
+    assert (nothing.value, nothing.p) == (0, 1)
+    # Of a normal sample the interval is Student's, and the p-value that of its test.
+    values = np.random.default_rng(4).normal(0.3, 1, (60, 3))
+    for found, own in zip(sign_flips(values, "key", 20_000), values.T, strict=True):
+        test = scipy.stats.ttest_1samp(own, 0)
+        assert found.p == pytest.approx(test.pvalue, abs=0.01)
+        bounds = test.confidence_interval(0.95)
+        assert found.at()[1:] == pytest.approx((bounds.low, bounds.high), abs=0.02)
+
+
+@given(st.lists(st.integers(-2, 2), min_size=20, max_size=40), st.sampled_from([0.9, 0.95]))
+def test_the_interval_of_sign_flips_agrees_with_its_test(values: list[int], level: float) -> None:
+    (found,) = sign_flips(np.array(values, float)[:, None], "key", 400)
+    interval = found.at(level)
+    if not math.isnan(interval.low):
+        assert interval.low <= interval.value <= interval.high
+        assert (interval.low <= 0 <= interval.high) == (found.p > 1 - level + 1e-9)
+    # A shift of all values shifts the interval.
+    (moved,) = sign_flips(np.array(values, float)[:, None] + 5, "key", 400)
+    assert moved.at(level)[1:] == pytest.approx([b + 5 for b in interval[1:]], nan_ok=True)
 
 
 @given(st.integers(0, 200), st.integers(0, 200), st.integers(0, 50))

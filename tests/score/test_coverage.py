@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.evaluate.score.comparisons.effects import retained
 from robomme_interference_data.evaluate.score.comparisons.pairs import pair
-from robomme_interference_data.evaluate.score.comparisons.ranks import changes
 from robomme_interference_data.evaluate.score.outcomes import rate_of, success
 
 pytestmark = pytest.mark.slow
@@ -61,19 +60,6 @@ def test_rates_with_repeats(n: int, shared: float, rate: float) -> None:
         return rate_of(status[0]).interval
 
     assert covers(bounds, rate, n, (rate,), shared, 3) >= 0.92
-
-
-@pytest.mark.parametrize("rates", [(0.45, 0.2, 0.35, 0.3), (0.2, 0.2, 0.2, 0.2)])
-@pytest.mark.parametrize(("n", "shared"), CELLS)
-def test_differences_of_differences(
-    n: int, shared: float, rates: tuple[float, float, float, float]
-) -> None:
-    def bounds(status: NDArray[np.int8]) -> tuple[float, float]:
-        change = changes(status[:2], status[2:]).change
-        return change.low, change.high
-
-    true = rates[3] - rates[2] - (rates[1] - rates[0])
-    assert covers(bounds, true, n, rates, shared, 1) >= 0.92
 
 
 @pytest.mark.parametrize("rates", [(0.18, 0.45, 0.19), (0.18, 0.45, 0.45), (0.18, 0.45, 0.3)])

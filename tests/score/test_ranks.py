@@ -1,9 +1,7 @@
 """Systems against each other: the best, all pairs, ranks, and which of them falls more."""
 
-import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -11,8 +9,8 @@ from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, cells, record, records
 
 from robomme_interference_data.evaluate.score.comparisons.tables import corrected
-from robomme_interference_data.stats.intervals import mover_interval, newcombe, newcombe_paired
-from robomme_interference_data.stats.significance import holm, mcnemar, sign_flip, two_proportions
+from robomme_interference_data.stats.intervals import newcombe, newcombe_paired
+from robomme_interference_data.stats.significance import holm, two_proportions
 
 
 def scored(tmp_path: Path, outcomes: dict[tuple[str, str], str]) -> made.Score:
@@ -46,50 +44,49 @@ def test_systems_of_other_histories_are_not_paired(tmp_path: Path) -> None:
     assert [r["best"] for r in records(found, "main")] == [True, False]
 
 
-def test_ranks_have_the_interval_of_the_draws(tmp_path: Path) -> None:
-    # The first is never below the second, whatever is drawn; both always above the third.
-    given = {("a", "k0"): "s" * 30, ("b", "k0"): first(27, 30), ("c", "k0"): first(2, 30)}
-    found = scored(tmp_path, given)
+def test_ranks_follow_from_the_significant_pairs(tmp_path: Path) -> None:
+    rates = {"one": 12, "two": 11, "three": 6, "four": 2}
+    found = scored(tmp_path, {(name, "k0"): first(won) for name, won in rates.items()})
     ranks = {
         r["system"]: (r["rank"], r["rank_low"], r["rank_high"]) for r in records(found, "ranks")
     }
-    # The second ties with the first where none of its three failures is drawn: 0.9³⁰ = 4%.
-    assert ranks == {"a": (1, 1, 1), "b": (2, 1, 2), "c": (3, 3, 3)}
+    # As in test_cells: one and two are better than four, and no other pair differs.
+    assert ranks == {"one": (1, 1, 3), "two": (2, 1, 3), "three": (3, 1, 4), "four": (4, 3, 4)}
+    # Against the best, p is corrected over all six pairs too, and the intervals for all six.
+    row = record(found, "systems", system="four")
+    assert row["p_holm"] == 6 * 2 / 2**10
+    bounds = newcombe_paired(2, 10, 0, 12, 1 - 0.05 / 6)
+    assert (row["joint_low"], row["joint_high"]) == pytest.approx((-bounds[1], -bounds[0]))
 
 
-def test_which_system_falls_more(tmp_path: Path) -> None:
-    given = {
-        (BASE, "k0"): first(10, 20),
-        (BASE, "k7"): first(2, 20),
-        (RETRIEVAL, "k0"): "f" + first(10, 19),
-        (RETRIEVAL, "k7"): "f" + first(9, 19),
-        (OWN, "k0"): first(12, 20),
-        (OWN, "k1"): first(12, 20),
-        (OWN, "k7"): first(11, 20),
+def test_which_system_falls_faster(tmp_path: Path) -> None:
+    rates = {
+        (BASE, "k0"): 30,
+        (BASE, "k7"): 14,
+        (RETRIEVAL, "k0"): 30,
+        (RETRIEVAL, "k7"): 28,
+        (OWN, "k0"): 12,
+        (OWN, "k1"): 12,
+        (OWN, "k7"): 11,
+        ("oracle", "k0"): 30,
+        ("oracle", "k7"): 30,
     }
+    given = {cell: first(won, 30) for cell, won in rates.items()}
     found = scored(tmp_path, given)
-    against = {(r["system"], r["against_system"]) for r in records(found, "interaction")}
-    # The best at k0 is one's own; retrieval is also set against the system without.
-    assert against == {(BASE, OWN), (RETRIEVAL, OWN), (RETRIEVAL, BASE)}
-    row = record(found, "interaction", system=RETRIEVAL, against_system=BASE)
-    assert (row["condition"], row["n"], row["change"], row["against_change"]) == (
-        "k7",
-        20,
-        -0.05,
-        -0.4,
-    )
-    # The base loses 2 to 9, retrieval 10 alone: eight are higher, one is lower.
-    assert (row["difference"], row["gained"], row["lost"]) == (0.35, 8, 1)
-    assert (
-        (row["p"], row["p_mid"])
-        == mcnemar(8, 1)
-        == sign_flip(np.array([1.0] * 8 + [-1.0] + [0.0] * 11))
-    )
-    changes = newcombe_paired(9, 0, 1, 10), newcombe_paired(2, 0, 8, 10)
-    # Of the changes: mean product 0, means −0.05 and −0.4.
-    phi = -0.05 * 0.4 / math.sqrt(0.05 * 0.95 * 0.4 * 0.6)
-    expected = mover_interval(-0.05, changes[0], -0.4, changes[1], phi, limit=2)
-    assert (row["low"], row["high"]) == pytest.approx(expected)
+    against = [(r["system"], r["against_system"]) for r in records(found, "interaction")]
+    # Each pair once, and no reference.
+    assert against == [(BASE, RETRIEVAL), (BASE, OWN), (RETRIEVAL, OWN)]
+    row = record(found, "interaction", system=BASE, against_system=RETRIEVAL)
+    # From k0 to k7 the sessions double three times: slopes of −16/30/3 and −2/30/3.
+    assert (row["conditions"], row["n"], row["slope"]) == ("k0 k7", 30, pytest.approx(-16 / 90))
+    assert row["difference"] == pytest.approx(-14 / 90)
+    # Fourteen fall with the base alone: 2/2¹⁴, and no draw of 2,000 but the observed one.
+    assert (row["gained"], row["lost"]) == (0, 14)
+    assert row["p"] <= 3 / 2001 and row["p_holm"] == pytest.approx(3 * row["p"])
+    assert row["low"] < row["difference"] < row["high"] < 0
+    assert row["joint_low"] < row["low"] and row["high"] < row["joint_high"]
+    own = record(found, "interaction", system=RETRIEVAL, against_system=OWN)
+    assert own["conditions"] == "k0 k7" and own["low"] is None  # three episodes differ
 
 
 @given(st.lists(st.tuples(st.floats(0, 1), st.sampled_from("abc")), max_size=9))

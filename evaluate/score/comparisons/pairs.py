@@ -1,8 +1,9 @@
 """Two sides of a comparison, paired over the episodes that count on both."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -27,21 +28,30 @@ WITHIN = 0.90
 """Level of the interval that equivalence uses: two one-sided tests at 5%."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pairs:
     """Two sides of a comparison, paired over the episodes that count on both."""
 
     n: int  # episodes that count on both sides; of unpaired sides the fewer
     first: float  # mean success over them on the first side
     second: float
-    change: Interval  # second − first, with its 95% interval
-    within: Interval  # the same with its 90% interval
-    interval: str  # `newcombe`, with repeats `clusters`, or `unpaired`; empty without an episode
+    at: Callable[[float], Interval]  # second − first, with its interval of any level
+    interval: str  # its method: `newcombe`, with repeats `clusters`, `unpaired`, or `sign-flip`
     pairs: int  # pairs of rollouts, one per episode: of the lowest shared model seed
     gained: int  # pairs that succeed on the second side alone
     lost: int  # pairs that succeed on the first side alone
-    p: float  # two-sided: McNemar's or sign-flip, exact; unpaired, of two proportions
-    p_mid: float  # its mid-p; NaN of unpaired sides
+    p: float  # two-sided: McNemar's or sign-flip; unpaired, of two proportions
+    p_mid: float  # its mid-p, of exact tests
+
+    @cached_property
+    def change(self) -> Interval:
+        """The difference second − first, with its 95% interval."""
+        return self.at(LEVEL)
+
+    @cached_property
+    def within(self) -> Interval:
+        """The difference second − first, with its 90% interval."""
+        return self.at(WITHIN)
 
     @property
     def paired(self) -> bool:
@@ -55,8 +65,7 @@ class Pairs:
 
 
 NO_PAIRS = Pairs(
-    *(0, math.nan, math.nan, Interval(math.nan), Interval(math.nan), "", 0, 0, 0),
-    *(math.nan, math.nan),
+    *(0, math.nan, math.nan, lambda level: Interval(math.nan), "", 0, 0, 0, math.nan, math.nan)
 )
 """The comparison over no episode."""
 
@@ -75,7 +84,7 @@ def pair(
     n = len(before)
     if n == counting(first).sum() == counting(second).sum():
         return _of_single(before, after)
-    change, within = (_clusters(first, second, level) for level in (LEVEL, WITHIN))
+    at = partial(_clusters, first, second)
     tests = sign_flip(after - before)
     rate, other_rate = float(before.mean()), float(after.mean())
     if matched is not None:
@@ -87,7 +96,7 @@ def pair(
     old, new = (side[episodes, seed] == 0 for side in (first, second))
     gained, lost = int((new & ~old).sum()), int((old & ~new).sum())
     counts = (len(episodes), gained, lost)
-    return Pairs(n, rate, other_rate, change, within, "clusters", *counts, *tests)
+    return Pairs(n, rate, other_rate, at, "clusters", *counts, *tests)
 
 
 def _of_single(before: Floats, after: Floats) -> Pairs:
@@ -98,14 +107,12 @@ def _of_single(before: Floats, after: Floats) -> Pairs:
     one, other, both = (int(part) for part in (before.sum(), after.sum(), before @ after))
     gained, lost = other - both, one - both
     gap, neither = round((other - one) / n, 12), n - both - gained - lost
-    change, within = (
-        Interval(gap, *newcombe_paired(both, gained, lost, neither, level))
-        for level in (LEVEL, WITHIN)
-    )
+
+    def at(level: float) -> Interval:
+        return Interval(gap, *newcombe_paired(both, gained, lost, neither, level))
+
     counts = (n, gained, lost)
-    return Pairs(
-        *(n, one / n, other / n), change, within, "newcombe", *counts, *mcnemar(gained, lost)
-    )
+    return Pairs(n, one / n, other / n, at, "newcombe", *counts, *mcnemar(gained, lost))
 
 
 def _clusters(first: Statuses, second: Statuses, level: float) -> Interval:
@@ -124,6 +131,9 @@ def compare_unpaired(first: Rate, second: Rate) -> Pairs:
     won = second.value * second.trials, first.value * first.trials
     counts = (won[0], second.trials, won[1], first.trials)
     gap, p = round(second.value - first.value, 12), two_proportions(*counts)
-    change, within = (Interval(gap, *newcombe(*counts, level)) for level in (LEVEL, WITHIN))
+
+    def at(level: float) -> Interval:
+        return Interval(gap, *newcombe(*counts, level))
+
     n, rates = min(first.n, second.n), (first.value, second.value)
-    return Pairs(n, *rates, change, within, "unpaired", 0, 0, 0, p, math.nan)
+    return Pairs(n, *rates, at, "unpaired", 0, 0, 0, p, math.nan)

@@ -1,27 +1,21 @@
-"""Systems compared: difference to the best, ranks, all pairs, and who loses more from k0 on."""
+"""Systems compared: all pairs, the best ones, ranks, and which of them falls faster over k."""
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from robomme_interference_data.evaluate.score.outcomes import (
-    Flags,
-    Outcomes,
-    Statuses,
-    rate_of,
-    success,
-)
-from robomme_interference_data.evaluate.systems import base_of, is_bound
+from robomme_interference_data.evaluate.score.outcomes import Flags, Outcomes, rate_of, success
+from robomme_interference_data.evaluate.systems import is_bound
 from robomme_interference_data.schema.conditions import parse_condition
-from robomme_interference_data.stats.bootstrap import DRAWS, Floats, Interval, drawn_means
-from robomme_interference_data.stats.intervals import mover_interval
-from robomme_interference_data.stats.significance import ALPHA, holm, sign_flip
+from robomme_interference_data.stats.bootstrap import DRAWS, slope_weights
+from robomme_interference_data.stats.significance import ALPHA, holm
+from robomme_interference_data.stats.signs import sign_flips
 from robomme_interference_data.viz.tables import Table
 
-from .contrast import START, Contrast
-from .pairs import NO_PAIRS, Pairs, compare_unpaired, pair
+from .contrast import Contrast
+from .pairs import Pairs, compare_unpaired, pair
 
 
 def against(outcomes: Outcomes, condition: str, one: str, other: str, here: Flags) -> Pairs:
@@ -32,22 +26,38 @@ def against(outcomes: Outcomes, condition: str, one: str, other: str, here: Flag
     return compare_unpaired(*map(rate_of, sides))
 
 
-def to_best(
+def all_pairs(
     outcomes: Outcomes, condition: str, systems: Sequence[str], here: Flags
-) -> tuple[str, dict[str, Pairs]]:
-    """Return the first system of the highest rate, and the comparisons of the others with it."""
-    cells = [outcomes.status[outcomes.cell(one, condition)][here] for one in systems]
-    rates = [rate_of(cell).value for cell in cells]
-    best = systems[rates.index(max(rates))]
-    others = [system for system in systems if system != best]
-    return best, {one: against(outcomes, condition, one, best, here) for one in others}
+) -> dict[tuple[str, str], Pairs]:
+    """Compare each pair of systems, the first with the second, over some episodes."""
+    two = combinations(systems, 2)
+    return {both: against(outcomes, condition, *both, here) for both in two}
 
 
-def tied_with_best(best: str, others: Mapping[str, Pairs]) -> set[str]:
-    """Return the best and the systems not distinguishable from it; empty for a single system."""
-    ps = holm([pairs.p for pairs in others.values()])
-    tied = {system for system, p in zip(others, ps, strict=True) if not p < ALPHA}
-    return tied | {best} if others else set()
+def rank_bounds(
+    systems: Sequence[str], compared: Mapping[tuple[str, str], Pairs]
+) -> dict[str, tuple[int, int]]:
+    """Return the ranks that each system can have, from its comparisons with all others.
+
+    The first rank is 1 + the number of systems that are significantly better, the last the number
+    of systems less those that are significantly worse, by p after Holm's correction over all pairs.
+    With 95% confidence, all true ranks are within their bounds.
+    """
+    better = dict.fromkeys(systems, 0)
+    worse = dict.fromkeys(systems, 0)
+    ps = holm([pairs.p for pairs in compared.values()])
+    for ((one, other), pairs), p in zip(compared.items(), ps, strict=True):
+        if p < ALPHA:
+            above, below = (one, other) if pairs.change.value > 0 else (other, one)
+            better[below] += 1
+            worse[above] += 1
+    return {name: (1 + better[name], len(systems) - worse[name]) for name in systems}
+
+
+def tied_with_best(systems: Sequence[str], compared: Mapping[tuple[str, str], Pairs]) -> set[str]:
+    """Return the systems that no other one is significantly better than; empty for one system."""
+    bounds = rank_bounds(systems, compared) if len(systems) > 1 else {}
+    return {name for name, (first, _) in bounds.items() if first == 1}
 
 
 def ranked(outcomes: Outcomes) -> Iterator[tuple[str, list[str]]]:
@@ -58,40 +68,46 @@ def ranked(outcomes: Outcomes) -> Iterator[tuple[str, list[str]]]:
 
 
 def systems_of(outcomes: Outcomes) -> list[Contrast]:
-    """Compare the ranked systems of each condition with the best (`systems`), and all pairs."""
+    """Compare the ranked systems of each condition: each with the highest rate, and all pairs.
+
+    Both are corrected over all pairs, since the highest rate is chosen from the same data.
+    """
     every: Flags = np.ones(len(outcomes.episodes), bool)
     found = {"systems": list[Contrast](), "matrix": list[Contrast]()}
     for condition, systems in ranked(outcomes):
         if len(systems) < 2:
             continue
-        best, compared = to_best(outcomes, condition, systems, every)
-        rows = [("systems", system, best, pairs) for system, pairs in compared.items()]
-        for two in combinations(systems, 2):
-            rows.append(("matrix", *two, against(outcomes, condition, *two, every)))
-        for table, system, other, pairs in rows:
-            names = (outcomes.simulator, system, condition, (other, condition))
-            found[table].append(Contrast(*names, table, pairs, complete=True))
+        compared = all_pairs(outcomes, condition, systems, every)
+        ps = zip(compared, holm([pairs.p for pairs in compared.values()]), strict=True)
+        corrected = {frozenset(both): p for both, p in ps}
+        rates = [rate_of(outcomes.status[outcomes.cell(one, condition)]).value for one in systems]
+        best = systems[rates.index(max(rates))]
+        rows = [("matrix", *both, pairs) for both, pairs in compared.items()]
+        for one in systems:
+            if one != best:
+                rows.append(("systems", one, best, against(outcomes, condition, one, best, every)))
+        for table, one, other, pairs in rows:
+            more = {"p_holm": corrected[frozenset((one, other))], "tests": len(compared)}
+            names = (outcomes.simulator, one, condition, (other, condition), table)
+            found[table].append(Contrast(*names, pairs, complete=True, more=more))
     return [*found["systems"], *found["matrix"]]
 
 
-def rank_table(every: Iterable[Outcomes], draws: int = DRAWS) -> Table:
-    """Return the rank of each ranked system with its bootstrap interval over episodes."""
+def rank_table(every: Iterable[Outcomes]) -> Table:
+    """Return the rank of each ranked system, and the ranks that it can have."""
     rows = []
     for outcomes in every:
+        here: Flags = np.ones(len(outcomes.episodes), bool)
         for condition, systems in ranked(outcomes):
             if len(systems) < 2:
                 continue
-            sides = [
-                outcomes.status[outcomes.cell(s, condition)][outcomes.expected] for s in systems
-            ]
-            means = drawn_means(np.stack([*map(success, sides)], axis=1), outcomes.simulator, draws)
-            rates = np.array([rate_of(side).value for side in sides])
-            bounds = np.quantile(_ranks(means), (0.025, 0.975), axis=0, method="nearest").T
+            bounds = rank_bounds(systems, all_pairs(outcomes, condition, systems, here))
+            cells = [outcomes.status[outcomes.cell(one, condition)] for one in systems]
+            rates = {name: rate_of(cell).value for name, cell in zip(systems, cells, strict=True)}
             rows += [
-                (outcomes.simulator, condition, system, float(rate), int(rank), int(low), int(high))
-                for system, rate, rank, (low, high) in zip(
-                    systems, rates, _ranks(rates[None])[0], bounds, strict=True
-                )
+                (outcomes.simulator, condition, name, rate, rank, *bounds[name])
+                for name, rate in rates.items()
+                for rank in [1 + sum(other > rate for other in rates.values())]
             ]
     return Table.make(
         "ranks",
@@ -99,75 +115,50 @@ def rank_table(every: Iterable[Outcomes], draws: int = DRAWS) -> Table:
         "simulator condition system rate:rate rank:count rank_low:count rank_high:count",
         rows,
         "Complete cells only; rank 1 is the highest rate, and equal rates share a rank. rank_low "
-        f"to rank_high: the middle 95% of a system's ranks in {draws:,} bootstrap draws of "
-        "episodes, the same draws for all systems.",
+        "to rank_high: the ranks that the system can have, from the significant differences of the "
+        "table matrix (p_holm below 0.05): 1 + the systems that are better, to the number of "
+        "systems less those that are worse. All of a condition hold at once with 95% confidence.",
     )
 
 
-def _ranks(rates: Floats) -> NDArray[np.int64]:
-    """Return 1 + the number of systems with a higher rate, `(D, S)`."""
-    return 1 + np.stack([(rates > column[:, None]).sum(axis=1) for column in rates.T], axis=1)
+# --- differences of slopes ---------------------------------------------------------------------
 
 
-# --- differences of changes --------------------------------------------------------------------
+def interactions_of(outcomes: Outcomes, draws: int = DRAWS) -> list[Contrast]:
+    """Compare how fast each pair of systems falls over all `k<n>` that both have.
 
-
-def interactions_of(outcomes: Outcomes) -> list[Contrast]:
-    """Compare each system's change from k0 with that of the best at k0, and of its base.
-
-    The change is to the most sessions under which both have rows. Systems whose histories may
-    differ are left out, and so are references.
+    Each pair is tested once. Systems whose histories may differ are left out, and so are
+    references.
     """
-    leader, contrasts = None, []
-    if systems := dict(ranked(outcomes)).get(START):
-        leader, _ = to_best(outcomes, START, systems, np.ones(len(outcomes.episodes), bool))
-    for system in outcomes.systems:
-        if is_bound(system):
+    values = success(outcomes.status)
+    systems = [name for name in outcomes.systems if not is_bound(name)]
+    pairs, slopes = list[tuple[str, str, list[str]]](), []
+    for one, other in combinations(systems, 2):
+        conditions = [c for c in outcomes.ran(one) if c in outcomes.ran(other)]
+        conditions = [c for c in conditions if parse_condition(c).kind.name == "k"]
+        if len(conditions) < 2 or not outcomes.pairable(one, other):
             continue
-        others = dict.fromkeys(one for one in (leader, base_of(system)) if one and one != system)
-        for other in others:
-            if other in outcomes.systems and outcomes.pairable(system, other):
-                contrasts += _contrasts(outcomes, system, other)
-    return contrasts
-
-
-def _contrasts(outcomes: Outcomes, system: str, other: str) -> list[Contrast]:
-    common = [parse_condition(c) for c in outcomes.ran(system) if c in outcomes.ran(other)]
-    ks = {one.k: one.name for one in common if one.kind.name == "k"}
-    if len(ks) < 2 or 0 not in ks:
+        weights = slope_weights([parse_condition(c).k for c in conditions])
+        cells = [[outcomes.cell(name, c) for c in conditions] for name in (other, one)]
+        sides = np.stack([weights @ [values[cell] for cell in side] for side in cells])
+        pairs.append((one, other, conditions))
+        slopes.append(sides)
+    if not pairs:
         return []
-    last = ks[max(ks)]
-    places = [outcomes.cell(name, c) for name in (other, system) for c in (START, last)]
-    sides = np.stack([outcomes.status[place] for place in places])
-    complete = all(bool(outcomes.complete[place]) for place in places)
-    names = (outcomes.simulator, system, last, (other, last), "interaction")
-    return [Contrast(*names, changes(sides[:2], sides[2:]), complete)]
-
-
-def changes(first: Statuses, second: Statuses) -> Pairs:
-    """Compare two changes over the episodes that count in all four cells.
-
-    Each side is its outcomes before and after, `(2, E, M) int8`. The interval combines those of
-    both changes and their correlation (`mover_interval`); the test is the exact sign-flip test of
-    the episodes' differences of differences. `first` and `second` of the result are the changes,
-    `pairs` episodes, gained and lost those whose change is higher or lower on the second side.
-    """
-    values = success(np.stack([*first, *second]))
-    known = ~np.isnan(values).any(axis=0)
-    n = int(known.sum())
-    one, other = (pair(*(part[known] for part in side)) for side in (first, second))
-    if not n:
-        return NO_PAIRS
-    old, new = values[1, known] - values[0, known], values[3, known] - values[2, known]
-    spread = float(old.std() * new.std())
-    phi = float(((old - old.mean()) * (new - new.mean())).mean()) / spread if spread else 0.0
-    gap = round(other.change.value - one.change.value, 12)
-    change, within = (
-        Interval(gap, *mover_interval(b.value, (b.low, b.high), a.value, (a.low, a.high), phi, 2.0))
-        for a, b in ((one.change, other.change), (one.within, other.within))
-    )
-    steps = (new - old).round(12)
-    counts = (n, int((steps > 0).sum()), int((steps < 0).sum()))
-    kind = other.interval if one.interval == other.interval else "clusters"
-    sides = (one.change.value, other.change.value)
-    return Pairs(n, *sides, change, within, kind, *counts, *sign_flip(steps))
+    changes = np.stack([(after - before).round(12) for before, after in slopes], axis=1)
+    found = []
+    for (one, other, conditions), sides, step, test in zip(
+        pairs, slopes, changes.T, sign_flips(changes, outcomes.simulator, draws), strict=True
+    ):
+        known = ~np.isnan(step)
+        n = int(known.sum())
+        old, new = (float(side[known].mean()) if n else math.nan for side in sides)
+        counts = (n, int((step > 0).sum()), int((step < 0).sum()))
+        kind = "sign-flip" if n else ""
+        cells = [outcomes.cell(name, c) for name in (one, other) for c in conditions]
+        compared = Pairs(n, old, new, test.at, kind, *counts, test.p, math.nan)
+        names = (outcomes.simulator, one, conditions[-1], (other, conditions[-1]), "interaction")
+        complete = all(bool(outcomes.complete[cell]) for cell in cells)
+        more = {"conditions": " ".join(conditions)}
+        found.append(Contrast(*names, compared, complete, more=more))
+    return found

@@ -1,6 +1,7 @@
 """Tables of comparisons: one specification each; one function makes rows, Holm's p and notes."""
 
 import math
+from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -10,9 +11,10 @@ from typing import Any
 from robomme_interference_data.evaluate.score import power
 from robomme_interference_data.stats.intervals import cohens_h
 from robomme_interference_data.stats.significance import ALPHA, holm
+from robomme_interference_data.stats.signs import simultaneous
 from robomme_interference_data.viz.tables import Provisional, Table
 
-from .contrast import START, Contrast
+from .contrast import Contrast
 
 
 def _count(name: str, one: Contrast) -> Any:
@@ -47,7 +49,9 @@ _VALUES: dict[str, tuple[str, Callable[[Contrast], Any]]] = {
 """Column to its kind (see `viz.tables.Column`) and its value for a comparison."""
 
 CELLS = "simulator system condition against_system against_condition"
-TEST = "low high interval pairs gained lost flips p p_mid p_holm:p"
+TEST = (
+    "low high interval pairs gained lost flips p p_mid p_holm:p joint_low:points joint_high:points"
+)
 _BOTH = "Over the n episodes that count on both sides. {how}"
 
 
@@ -56,9 +60,10 @@ class TableSpec:
     """A table of comparisons.
 
     `columns` names entries of `_VALUES`; `name=value` renames one, and `name:kind` shows an entry
-    of `Contrast.more`, or `p_holm`, which is p after Holm's correction. In the note, `{how}` is the
-    explanation of intervals and tests. Comparisons with equal `group` are corrected together;
-    `among` describes them. With `power` the note ends with what so many episodes can detect.
+    of `Contrast.more`, or `p_holm`, p after Holm's correction, or `joint_low` and `joint_high`, the
+    interval that holds with all others of the group. In the note, `{how}` is the explanation of
+    intervals and tests. Comparisons with equal `group` are corrected together; `among` describes
+    them. With `power` the note ends with what so many episodes can detect.
     """
 
     title: str
@@ -103,25 +108,25 @@ SPECS = {
         "Difference to the best system",
         _EFFECT,
         "Within each condition, each complete cell against the one with the highest rate (the "
-        f"first of equal ones). {_BOTH}",
+        "first of equal ones). Since that one is chosen by its rate, p_holm and joint intervals "
+        f"are corrected over all pairs of systems, as in the table matrix. {_BOTH}",
         *_WITHIN,
     ),
     "matrix": TableSpec(
         "All pairs of systems", _EFFECT, f"Complete cells within each condition. {_BOTH}", *_WITHIN
     ),
     "interaction": TableSpec(
-        "Which system loses more",
-        "simulator system condition against_system n change:points=rate "
-        f"against_change:points=against_rate difference {TEST} complete",
-        f"change: rate under the condition − rate at {START}; difference: between the two changes, "
-        "positive if the system loses less than the other one, which is the best at k0 or the "
-        "system without retrieval. Choosing the best at k0 by its rate overstates its loss if "
-        "others are about as good. Systems whose histories may differ are left out. Over the n "
-        "episodes that count in all four cells; pairs are episodes, gained and lost those whose "
-        "change is higher or lower than the other system's. 95% intervals combine those of both "
-        "changes and their correlation. p: exact sign-flip test of the episodes' differences; "
-        "p_mid: its mid-p; p_holm: p after Holm's correction among the tests of this table in one "
-        "simulator.",
+        "Which system falls faster",
+        "simulator system against_system conditions:text n slope:points=rate "
+        "against_slope:points=against_rate difference low high gained lost p p_holm:p "
+        "joint_low:points joint_high:points complete",
+        "slope: change of the success rate per doubling of the sessions (least-squares line over "
+        "log2(k + 1) of all conditions listed); difference: between the two slopes, positive if "
+        "the system falls more slowly than the other one. Each pair of systems once; those whose "
+        "histories may differ are left out. Over the n episodes that count in all cells; gained "
+        "and lost: episodes whose own slope is higher or lower than the other system's. p: "
+        "sign-flip test of the episodes' differences; low to high: the 95% interval of all "
+        "differences that this test does not reject, if at least ten episodes differ. {correct}",
         power=False,
     ),
     "family_effects": TableSpec(
@@ -143,11 +148,16 @@ def comparison_table(
     found = [one for one in contrasts if one.table == name]
     columns = [_column(text) for text in spec.columns.split()]
     holms = corrected([one.pairs.p for one in found], [spec.group(one) for one in found])
+    groups = Counter(spec.group(one) for one in found)
     rows = []
     for one, p_holm in zip(found, holms, strict=True):
+        tests = one.more.get("tests", groups[spec.group(one)])
+        joint = one.pairs.at(simultaneous(tests))
         more = {"p_holm": provisional(p_holm, one.complete), **one.more}
+        more |= {"joint_low": joint.low, "joint_high": joint.high}
         rows.append(tuple(more[key] if key in more else _VALUES[key][1](one) for _, key in columns))
-    note = spec.note.format(how=_how_to_read(found, spec.among))
+    correct = _CORRECT.format(among=spec.among)
+    note = spec.note.format(how=_how_to_read(found, correct), correct=correct)
     if spec.power:
         pairs = [one.pairs for one in found if not one.family]
         note += power.note((one.pairs, one.gained, one.lost) for one in pairs)
@@ -177,14 +187,20 @@ def corrected(p_values: Sequence[float], groups: Sequence[Hashable]) -> list[flo
     return adjusted
 
 
-def _how_to_read(found: Sequence[Contrast], among: str) -> str:
+_CORRECT = (
+    "p_holm: p after Holm's correction among {among}; joint_low to joint_high: intervals that hold "
+    "for all of these at once with 95% (Bonferroni)."
+)
+
+
+def _how_to_read(found: Sequence[Contrast], correct: str) -> str:
     """Explain the intervals and tests of some comparisons."""
     kinds = {one.pairs.interval for one in found}
     note = (
         "95% confidence intervals; interval names the method: newcombe is Newcombe's paired score "
-        "interval. p: McNemar's exact test; p_mid: its less conservative mid-p; p_holm: p after "
-        f"Holm's correction among {among}. pairs: one per episode; gained and lost: pairs whose "
-        "outcome changes; flips: their share."
+        "interval. p: McNemar's exact test, which is conservative: where an interval excludes 0 "
+        f"and p is not below 0.05, see p_mid, its mid-p. {correct} pairs: one per episode; gained and "
+        "lost: pairs whose outcome changes; flips: their share."
     )
     if "clusters" in kinds:
         note += (

@@ -9,15 +9,18 @@ from robomme_interference_data.evaluate.score.tables.cells import Cell
 from robomme_interference_data.evaluate.score.tables.equivalence import BEYOND, EQUIVALENT, OPEN
 from robomme_interference_data.evaluate.systems import base_of, display_name, is_bound
 from robomme_interference_data.schema.conditions import NO_HISTORY, parse_condition
-from robomme_interference_data.stats.significance import holm
+from robomme_interference_data.stats.intervals import wilson
+from robomme_interference_data.stats.significance import ALPHA, holm
+from robomme_interference_data.stats.signs import simultaneous
 from robomme_interference_data.viz.tables import percent, points
 
 
 def headline(score: Score, simulator: str) -> str:
     """Return the main finding of one simulator's rows.
 
-    Only complete cells are compared. Of equal rates the first in the order of tables leads, and the
-    others are named. A reference leads only if there is no other system.
+    Only complete cells are compared. The leader has the highest rate at k0; systems that are not
+    distinguishable from the best are named, and intervals and p-values are corrected for the choice
+    of the leader. A reference leads only if there is no other system.
     """
     found = [one for one in score.cells if one.simulator == simulator and not one.part]
     cells = [cell for cell in found if not is_bound(cell.system)] or found
@@ -32,38 +35,51 @@ def headline(score: Score, simulator: str) -> str:
 def _leading(score: Score, complete: Sequence[Cell]) -> list[str]:
     """State the best rate at k0 and how far it falls, or else the best rate."""
     best = _best(complete, START) or _best(complete, _best(complete)[0].condition)
-    leader, others = best[0], best[1:]
+    leader = best[0]
     key = ("effects", leader.simulator, leader.system, (leader.system, START))
     falls = [
         c
         for c in score.contrasts
         if (c.table, c.simulator, c.system, c.against) == key and c.pairs.n
     ]
+    rate = (
+        f"In {leader.simulator}, {display_name(leader.system)} succeeds in {percent(leader.rate)} "
+        f"of {leader.n} episodes "
+    )
+    interval = _chosen_interval(leader, complete)
     if leader.condition != START or not falls:
-        first = (
-            f"In {leader.simulator}, {display_name(leader.system)} succeeds in "
-            f"{percent(leader.rate)} of {leader.n} episodes under {_named(leader.condition)} "
-            f"(95% interval {_interval(leader)})."
-        )
-        return [first, *_alike(others), *_hurting(score, leader)]
+        first = f"{rate}under {_named(leader.condition)} ({interval})."
+        return [first, *_tied(complete, leader), *_hurting(score, leader)]
     fall = max(falls, key=lambda one: parse_condition(one.condition).k)
-    sentences = [_from_start(leader, fall, _corrected(score, fall)), *_alike(others)]
+    first = f"{rate}if the history holds only the lesson ({START}, {interval}), "
+    sentences = [first + _from_start(score, fall), *_tied(complete, leader)]
     if fall.complete:
-        best = _best(complete, fall.condition)
-        if all(cell.system != leader.system for cell in best):
-            rate = percent(best[0].rate)
-            sentences.append(f"The highest rate at {fall.condition} is {rate}, of {_listed(best)}.")
-        else:
-            sentences += _alike([cell for cell in best if cell.system != leader.system])
+        highest = _best(complete, fall.condition)[0]
+        if highest.system != leader.system:
+            named = f"{percent(highest.rate)}, of {display_name(highest.system)}"
+            sentences.append(f"The highest rate at {fall.condition} is {named}.")
+        sentences += _tied(complete, highest)
     sentences += _equal(score, fall) + _beside_base(score, fall)
     return sentences + _hurting(score, leader)
 
 
-def _alike(others: Sequence[Cell]) -> list[str]:
-    if not others:
+def _chosen_interval(leader: Cell, complete: Sequence[Cell]) -> str:
+    """Return the interval of the leader's rate, corrected for its choice among all systems."""
+    among = sum(cell.condition == leader.condition for cell in complete)
+    level = simultaneous(among)
+    low, high = wilson(leader.rate * leader.trials, leader.trials, level)
+    chosen = f", corrected for the choice among {among} systems" * (among > 1)
+    return f"95% interval {100 * low:.1f} to {100 * high:.1f}{chosen}"
+
+
+def _tied(complete: Sequence[Cell], first: Cell) -> list[str]:
+    """Name the other systems that are not distinguishable from the best of a condition."""
+    cells = [c for c in complete if c.best and c.condition == first.condition and c is not first]
+    if not cells:
         return []
-    have = "has" if len(others) == 1 else "have"
-    return [f"Under {_named(others[0].condition)}, {_listed(others)} {have} the same rate."]
+    be = "is" if len(cells) == 1 else "are"
+    names = f"{_listed(cells)} {be} not distinguishable from the best"
+    return [f"Under {_named(first.condition)}, {names}."]
 
 
 def _listed(cells: Sequence[Cell]) -> str:
@@ -84,11 +100,8 @@ def _nothing_complete(cells: Sequence[Cell]) -> str:
     )
 
 
-def _corrected(score: Score, fall: Contrast) -> str:
-    """Return the p of the leader's fall, corrected over all systems' falls.
-
-    Choosing the leader by its rate at k0 overstates its fall, so it is tested among all falls.
-    """
+def _from_start(score: Score, fall: Contrast) -> str:
+    """State the leader's rate under a condition, and its fall among the falls of all systems."""
     key = (fall.simulator, fall.condition, "effects")
     falls = [
         one
@@ -98,45 +111,42 @@ def _corrected(score: Score, fall: Contrast) -> str:
         and (one is fall or one.complete)
         and not (is_bound(one.system) and one is not fall)
     ]
-    p = holm([one.pairs.p for one in falls])[falls.index(fall)]
-    among = f", corrected for the falls of {len(falls)} systems" * (len(falls) > 1)
-    return f"{_test(fall)} p = {_p(p)}{among}{'' if fall.complete else ', provisional'}"
+    k, pairs = parse_condition(fall.condition).k, fall.pairs
+    sessions = "distractor session" + ("s" if k > 1 else "")
+    over = "" if fall.complete else f", incomplete, over its {pairs.n} episodes"
+    counts = f"{pairs.gained} episodes gained, {pairs.lost} lost"
+    return (
+        f"and in {percent(pairs.second)} with {k} {sessions} after it ({fall.condition}{over}): "
+        f"{_shown(fall, falls, 'the falls of {} systems', counts)}."
+    )
 
 
-def _test(contrast: Contrast) -> str:
-    return "McNemar" if contrast.pairs.interval == "newcombe" else "sign-flip"
+def _shown(one: Contrast, among: Sequence[Contrast], correction: str, counts: str = "") -> str:
+    """State a difference that was chosen among some, with interval and p corrected for all."""
+    change = one.pairs.at(simultaneous(len(among)))
+    p = holm([other.pairs.p for other in among])[among.index(one)]
+    name = "McNemar" if one.pairs.interval == "newcombe" else "sign-flip"
+    text = f"{points(change.value)} points ({points(change.low)} to {points(change.high)}; "
+    text += f"{counts}, " * bool(counts) + f"{name} p = {_p(p)}"
+    if p >= ALPHA and (change.low > 0 or change.high < 0):
+        text += f", not significant although the interval excludes 0: mid-p = {_p(one.pairs.p_mid)}"
+    several = f", corrected for {correction.format(len(among))}" * (len(among) > 1)
+    return f"{text}{several}{'' if one.complete else ', provisional'})"
 
 
 def _hurting(score: Score, leader: Cell) -> list[str]:
-    """Name the kind of condition beyond the paper that lowers the leader's rate most."""
+    """Name the largest loss of the leader under conditions beyond the paper's."""
     key = ("interference", leader.simulator, leader.system)
     found = [c for c in score.contrasts if (c.table, c.simulator, c.system) == key and c.complete]
     worst = min(found, key=lambda one: one.pairs.change.value, default=None)
     if worst is None or worst.pairs.change.value >= 0:
         return []
-    change = worst.pairs.change
     p = holm([one.pairs.p for one in found])[found.index(worst)]
-    among = f", corrected for {len(found)} comparisons" * (len(found) > 1)
+    loss = "largest loss is by" if p < ALPHA else "largest loss, which is not significant, is by"
     return [
-        f"Of the conditions beyond the paper's, {worst.asks} costs it most: {worst.condition} "
-        f"minus {_named(worst.against[1])} is {points(change.value)} points "
-        f"({points(change.low)} to {points(change.high)}; {_test(worst)} p = {_p(p)}{among})."
+        f"Under the conditions beyond the paper's, its {loss} {worst.asks}: {worst.condition} "
+        f"minus {_named(worst.against[1])} is {_shown(worst, found, '{} comparisons')}."
     ]
-
-
-def _from_start(leader: Cell, contrast: Contrast, tested: str) -> str:
-    k = parse_condition(contrast.condition).k
-    sessions = "distractor session" + ("s" if k > 1 else "")
-    pairs, change = contrast.pairs, contrast.pairs.change
-    over = "" if contrast.complete else f", incomplete, over its {pairs.n} episodes"
-    return (
-        f"In {leader.simulator}, {display_name(leader.system)} succeeds in {percent(leader.rate)} "
-        f"of {leader.n} episodes if the history holds only the lesson ({START}, 95% interval "
-        f"{_interval(leader)}), and in {percent(pairs.second)} with {k} {sessions} after it "
-        f"({contrast.condition}{over}): {points(change.value)} points "
-        f"({points(change.low)} to {points(change.high)}; {pairs.gained} episodes gained, "
-        f"{pairs.lost} lost, {tested})."
-    )
 
 
 def _equal(score: Score, fall: Contrast) -> list[str]:
@@ -180,11 +190,6 @@ def _best(cells: Sequence[Cell], condition: str | None = None) -> list[Cell]:
     found = [cell for cell in cells if condition in (None, cell.condition)]
     highest = max((cell.rate for cell in found), default=math.nan)
     return [cell for cell in found if cell.rate == highest]
-
-
-def _interval(cell: Cell) -> str:
-    low, high = cell.interval
-    return f"{100 * low:.1f} to {100 * high:.1f}"
 
 
 def _named(condition: str) -> str:

@@ -9,7 +9,7 @@ from itertools import groupby
 import numpy as np
 
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
-from robomme_interference_data.evaluate.score.comparisons.ranks import tied_with_best, to_best
+from robomme_interference_data.evaluate.score.comparisons.ranks import all_pairs, tied_with_best
 from robomme_interference_data.evaluate.score.outcomes import (
     STATUSES,
     Flags,
@@ -30,8 +30,8 @@ _NOTE = (
     "cell without any rollout is missing."
 )
 _BEST = (
-    " Best (bold): above zero and not distinguishable from the highest rate; the p against it, "
-    "after Holm's correction over the others, is 0.05 or more."
+    " Best (bold): above zero, and no other system is significantly better, by p after Holm's "
+    "correction over all pairs of systems."
 )
 
 
@@ -54,7 +54,7 @@ class Cell:
     broken: Sequence[EpisodeId] = ()  # with an error
     other: Sequence[EpisodeId] = ()  # count without being expected
     rank: int | None = None  # among complete cells, 1 for the highest rate; None for references
-    best: bool = False  # one of several, and not distinguishable from the highest rate
+    best: bool = False  # one of several, and no other one is significantly better
 
     @property
     def as_rate(self) -> Rate:
@@ -118,7 +118,7 @@ def _ranked(outcomes: Outcomes, cells: list[Cell], parts: Mapping[str, Flags]) -
     for (condition, part), places in groups.items():
         group = [cells[place] for place in places]
         systems = [cell.system for cell in group]
-        best = tied_with_best(*to_best(outcomes, condition, systems, parts[part]))
+        best = tied_with_best(systems, all_pairs(outcomes, condition, systems, parts[part]))
         for place, cell in zip(places, group, strict=True):
             rank = 1 + sum(other.rate > cell.rate for other in group)
             cells[place] = replace(cell, rank=rank, best=cell.system in best and cell.rate > 0)

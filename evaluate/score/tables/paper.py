@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from importlib import resources
+from itertools import combinations
 from typing import Any
 
 from robomme_interference_data.evaluate.score.comparisons.pairs import compare_unpaired
@@ -21,8 +22,8 @@ _NOTE = (
     "2026), Tables 3 and 4. complete: over the benchmark's 450 episodes, like the published rates. "
     "95% intervals: Wilson for rates; Newcombe's hybrid score for differences, with both sides as "
     "independent samples, because the paper's rows are not available for pairing. published_best: "
-    "not distinguishable from the highest published rate of its condition, by the test of two "
-    "proportions after Holm's correction over the others (p of 0.05 or more). A system that is not "
+    "no other published rate of its condition is significantly higher, by the test of two "
+    "proportions after Holm's correction over all pairs. A system that is not "
     "in the paper is listed beside all of them if its cell is complete; this is not a ranking."
 )
 _FAMILIES_NOTE = (
@@ -56,10 +57,13 @@ def published() -> tuple[Cell, ...]:
 
 
 def _best(cells: Sequence[Cell]) -> set[tuple[str, str]]:
-    """Return system and condition of the published cells not distinguishable from the best."""
-    best = max(cells, key=lambda cell: cell.rate)
-    others = {c.system: compare_unpaired(best.as_rate, c.as_rate) for c in cells if c is not best}
-    return {(system, best.condition) for system in tied_with_best(best.system, others)}
+    """Return system and condition of the published cells that no other one is better than."""
+    pairs = {
+        (one.system, other.system): compare_unpaired(other.as_rate, one.as_rate)
+        for one, other in combinations(cells, 2)
+    }
+    best = tied_with_best([cell.system for cell in cells], pairs)
+    return {(cell.system, cell.condition) for cell in cells if cell.system in best}
 
 
 @cache
