@@ -13,20 +13,26 @@ def test_a_sample_of_families_is_less_sure_than_these() -> None:
     # All of one family are gained, none of the other: within them nothing varies, but of two drawn
     # families both are the first, or the second, in a quarter of the draws each.
     values = np.array([1.0] * 12 + [0.0] * 12)[:, None]
-    ((alike, *bounds, p),) = over_families(values, np.repeat([3, 5], 12), "key")
-    assert (alike, *bounds) == (0.5, 0.5, 0.5, 0.0, 1.0)
-    assert p == 1 / 2001  # no draw deals them out like that again
+    ((alike, *bounds, spread, p),) = over_families(values, np.repeat([3, 5], 12), "key")
+    # Without either family, the mean is that of the other; their variance is 1/2.
+    assert (alike, *bounds) == (0.5, 0.5, 0.5, 0.0, 1.0, 0.0, 1.0)
+    assert spread == pytest.approx(np.sqrt(0.5))
+    assert p == 1 / 2001  # nothing varies within families
 
 
 def test_whether_families_differ_by_hand() -> None:
-    # Of the six ways to deal two gained episodes out to two families of two, two reach 2² / 2.
-    values = np.array([1.0, 1.0, 0.0, 0.0])[:, None]
-    ((*_, p),) = over_families(values, np.array([0, 0, 1, 1]), "key")
-    assert p == pytest.approx(1 / 3, abs=0.04)
-    # One of ten that count is gained, in the family of four: it falls there in 4 of 10 draws.
-    gained = np.array([0.0, 1.0, np.nan, 0.0, 0.0, np.nan] + [0.0] * 6)[:, None]
-    ((*_, p),) = over_families(gained, np.repeat([0, 1], 6), "key")
-    assert p == pytest.approx(0.4, abs=0.04)
+    # Means 1/2 and 0, residuals ±1/2, with n / (n − 1) ±√½. Sums of the flipped residuals are 0 in
+    # half of the draws, and ±√2 in the others: as far as 1, which was observed.
+    values = np.array([1.0, 0.0, 0.0, 0.0])[:, None]
+    ((*_, low, high, spread, p),) = over_families(values, np.array([0, 0, 1, 1]), "key")
+    assert p == pytest.approx(1 / 2, abs=0.04)
+    # The variance of the means is 1/8, their noise on average 1/2 / 2 / 2 = 1/8.
+    assert (low, high, spread) == (0, 0.5, 0)
+    # Episodes that do not count change nothing.
+    more = np.array([np.nan, 1.0, 0.0, 0.0, np.nan, 0.0])[:, None]
+    assert over_families(more, np.repeat([0, 1], 3), "key") == over_families(
+        values, np.array([0, 0, 1, 1]), "key"
+    )
     # Where families are alike, every draw is as far apart.
     ((*_, p),) = over_families(np.ones((4, 1)), np.array([0, 1, 0, 1]), "key")
     assert p == 1.0

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +23,7 @@ from .pairs import pair
 from .tables import CELLS, TableSpec, comparison_table, corrected, provisional
 
 DRAWS = 2000
-"""Permutations, and draws of families and episodes."""
-
-_CHUNK = 2**18  # numbers that are permuted at a time
+"""Random signs, and draws of families and episodes."""
 
 _TABLES = ("lift", "effects", "interference")
 
@@ -46,17 +45,25 @@ def family_effects(outcomes: Outcomes, contrasts: Sequence[Contrast]) -> Iterato
 _SPEC = TableSpec(
     "Effects over families",
     f"{CELLS} n families:count difference alike:points alike_low:points alike_high:points "
-    "sample_low:points sample_high:points p_families:p p_families_holm:p complete",
+    "without_low:points without_high:points spread:points sample_low:points sample_high:points "
+    "p_families:p p_families_holm:p complete",
     "difference: over all episodes, as in the other tables. alike: the mean of the families' own "
     "differences. alike_low to alike_high: its 95% bootstrap interval for these families, with "
-    "episodes drawn within each. sample_low to sample_high: the same with families drawn too, as a "
-    "sample of such families: for tasks beyond these, much wider, and with so few families still "
+    "episodes drawn within each. without_low to without_high: the lowest and the highest mean if "
+    "one family is left out. spread: the standard deviation of the true differences of families, "
+    "estimated without the noise of their episodes. sample_low to sample_high: as alike_low and "
+    "alike_high, with families drawn too, as a sample of such families: for tasks beyond these, "
+    "much wider, and with so few families still "
     f"too narrow. Both from {DRAWS:,} draws, if at least {MIN_EPISODES} episodes differ. "
-    "p_families: a permutation test of whether the difference varies between families, with "
-    f"{DRAWS:,} permutations; p_families_holm: after Holm's correction within a simulator.",
+    "p_families: a test of whether the difference varies between families, by "
+    f"{DRAWS:,} random sign flips of the differences from their family's mean; p_families_holm: "
+    "after Holm's correction within a simulator.",
     power=False,
 )
-_COLUMNS = ("alike", "alike_low", "alike_high", "sample_low", "sample_high", "p_families")
+_COLUMNS = (
+    *("alike", "alike_low", "alike_high", "sample_low", "sample_high"),
+    *("without_low", "without_high", "spread", "p_families"),
+)
 
 
 def families_table(every: Iterable[Outcomes], contrasts: Sequence[Contrast]) -> Table:
@@ -95,17 +102,24 @@ def over_families(
 ) -> list[tuple[float, ...]]:
     """Return, for each comparison, how its difference varies over families.
 
-    These are the mean of the families' means, its 95% interval for these families, the one for a
-    sample of such families (NaN if fewer than ten episodes differ), and p. `values` are second −
-    first of each episode, NaN where not both count, `(E, K)`; `labels` are the families, `(E,)`;
-    `key` seeds the draws. Unknown families and episodes take no part in any draw.
+    In the order of `_COLUMNS`: the mean of the families' means, its 95% interval for these
+    families, the one for a sample of such families (NaN if fewer than ten episodes differ), the
+    lowest and the highest mean without one of the families, the standard deviation between
+    families, and p. `values` are second − first of each episode, NaN where not both count, `(E,
+    K)`; `labels` are the families, `(E,)`; `key` seeds the draws. Unknown families and episodes
+    take no part in any draw.
 
-    The permutation test: with the sum Sᶠ of a family's nᶠ differences, Σ Sᶠ² / nᶠ grows with the
-    differences between families; p is the share of permutations of the episodes over the families
-    that reach the observed value, which counts as one of them.
+    With the mean mᶠ and the variance sᶠ² of a family's nᶠ differences, the standard deviation
+    between families is that of the means less their noise: √max(0, var(mᶠ) − mean(sᶠ² / nᶠ)).
 
-    Source: Davison and Hinkley (1997), Bootstrap Methods and their Application, sections 3.8 (draws
-    of clusters, then within them) and 4.3 (permutations).
+    The test: Σ nᶠ mᶠ² − (Σ nᶠ mᶠ)² / n grows with the differences between families. Its
+    distribution without any comes from random signs of the residuals (d − mᶠ) √(nᶠ / (nᶠ − 1)), so
+    that families may differ in how often their outcomes flip; the observed value counts as one of
+    the draws.
+
+    Source: Davison and Hinkley (1997), Bootstrap Methods and their Application, section 3.8 (draws
+    of clusters, then within them); Wu (1986), Annals of Statistics 14, 1261–1295 (signs of
+    residuals); the deviation between groups: Searle (1971), Linear Models, chapter 9.
     """
     masks, place = np.unique(~np.isnan(values), axis=1, return_inverse=True)
     found: list[tuple[float, ...]] = [()] * values.shape[1]
@@ -128,19 +142,25 @@ def _over(
     sizes = np.diff(starts, append=len(labels))[:, None]
     generator = generator_of(f"{key}, families")
 
-    def variation(deals: NDArray[np.int64]) -> Floats:
-        sums = np.add.reduceat(values[deals], starts, axis=1)
-        return np.asarray((sums * sums / sizes).sum(axis=1).round(9))
+    means = np.add.reduceat(values, starts, axis=0) / sizes
+    residuals = values - means.repeat(sizes[:, 0], axis=0)
+    noise = np.add.reduceat(residuals**2, starts, axis=0) / np.maximum(1, sizes - 1) / sizes
+    count, spread = len(starts), np.sqrt(np.maximum(0, means.var(axis=0, ddof=1) - noise.mean(0)))
 
-    every = np.arange(len(values))[None]
-    observed, step = variation(every), max(1, _CHUNK // values.size)
-    reached = sum(
-        (variation(generator.permuted(every.repeat(size, 0), axis=1)) >= observed).sum(axis=0)
-        for size in (min(step, draws - at) for at in range(0, draws, step))
-    )
-    p = (1 + np.asarray(reached)) / (1 + draws)
+    def variation(sums: Floats) -> Floats:
+        """Return the variation between families of their sums, `(…, F, K)`."""
+        whole = sums.sum(axis=-2) ** 2 / len(values)
+        return np.asarray(((sums * sums / sizes).sum(axis=-2) - whole).round(9))
 
-    alike = (np.add.reduceat(values, starts, axis=0) / sizes).mean(axis=0)
+    residuals *= np.sqrt(sizes / np.maximum(1, sizes - 1)).repeat(sizes[:, 0], axis=0)
+    signs = 1.0 - 2 * generator.integers(0, 2, (draws, len(values)), np.uint8)
+    ends = [*starts.tolist(), len(values)]
+    sums = np.stack([signs[:, a:b] @ residuals[a:b] for a, b in pairwise(ends)], axis=1)
+    reached = (variation(sums) >= variation(means * sizes)).sum(axis=0)
+    p = (1 + reached) / (1 + draws)
+
+    alike = means.mean(axis=0)
+    without = (means.sum(axis=0) - means) / (count - 1)
     taken = generator.multinomial(len(starts), np.full(len(starts), 1 / len(starts)), draws)
     parts, intervals = np.split(values, starts[1:]), []
     for often in (np.ones_like(taken), taken):
@@ -151,6 +171,8 @@ def _over(
         yield (
             float(alike[n]),
             *(bounds if varies_enough(column) else [math.nan] * len(bounds)),
+            *(float(bound) for bound in (without[:, n].min(), without[:, n].max())),
+            float(spread[n]),
             float(p[n]),
         )
 

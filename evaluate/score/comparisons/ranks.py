@@ -155,10 +155,10 @@ def interactions_of(outcomes: Outcomes, draws: int = DRAWS) -> list[Contrast]:
         old, new = (float(side[known].mean()) if n else math.nan for side in sides)
         counts = (n, int((step > 0).sum()), int((step < 0).sum()))
         kind = "sign-flip" if n else ""
-        cells = [outcomes.cell(name, c) for name in (one, other) for c in conditions]
+        every = [outcomes.cell(name, c) for name in (one, other) for c in conditions]
         compared = Pairs(n, old, new, test.at, kind, *counts, test.p, math.nan)
         names = (outcomes.simulator, one, conditions[-1], (other, conditions[-1]), "interaction")
-        complete = all(bool(outcomes.complete[cell]) for cell in cells)
+        complete = all(bool(outcomes.complete[cell]) for cell in every)
         more = {"conditions": " ".join(conditions)}
         found.append(Contrast(*names, compared, complete, more=more))
     return found

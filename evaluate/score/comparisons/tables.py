@@ -199,8 +199,8 @@ def _how_to_read(found: Sequence[Contrast], correct: str) -> str:
     note = (
         "95% confidence intervals; interval names the method: newcombe is Newcombe's paired score "
         "interval. p: McNemar's exact test, which is conservative: where an interval excludes 0 "
-        f"and p is not below 0.05, see p_mid, its mid-p. {correct} pairs: one per episode; gained and "
-        "lost: pairs whose outcome changes; flips: their share."
+        f"and p is not below 0.05, see p_mid, its mid-p. {correct} pairs: one per episode; gained "
+        "and lost: pairs whose outcome changes; flips: their share."
     )
     if "clusters" in kinds:
         note += (

@@ -21,6 +21,7 @@ from robomme_interference_data.evaluate.systems import display_name, is_bound
 from robomme_interference_data.ids import EpisodeId, format_numbers
 from robomme_interference_data.schema.conditions import in_order
 from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.stats.intervals import stratified_n, wilson
 from robomme_interference_data.viz.tables import Table, percent
 
 _ERROR = STATUSES.index(Status.ERROR)
@@ -32,6 +33,10 @@ _NOTE = (
 _BEST = (
     " Best (bold): above zero, and no other system is significantly better, by p after Holm's "
     "correction over all pairs of systems."
+)
+_FIXED = (
+    " fixed_low to fixed_high: Wilson's interval for other episodes of the same families in the "
+    "same numbers, narrower because the families' rates differ."
 )
 
 
@@ -47,6 +52,7 @@ class Cell:
     rate: float  # mean over them of the success of their repeats; NaN if n is 0
     interval: tuple[float, float]  # 95% Wilson; (0, 1) if n is 0
     trials: float  # effective number of independent trials: n, and more with repeats
+    fixed: tuple[float, float] = (math.nan, math.nan)  # interval for just these families
     counts: tuple[int, ...] = (0,) * len(STATUSES)  # rollouts by status
     chance: float = math.nan  # mean success of guessing; NaN unless all episodes are questions
     expected: int = 0  # number of expected episodes
@@ -99,6 +105,7 @@ def _cells(outcomes: Outcomes) -> list[Cell]:
             cells.append(
                 Cell(
                     *(*names, rate.n, rate.value, rate.interval, rate.trials),
+                    fixed=(math.nan, math.nan) if name else _fixed(outcomes, s, c, rate),
                     counts=tuple(counts[here].sum(axis=0).tolist()),
                     chance=float(outcomes.chance[counted].mean()) if rate.n else math.nan,
                     expected=int((due & outcomes.expected).sum()),
@@ -108,6 +115,18 @@ def _cells(outcomes: Outcomes) -> list[Cell]:
                 )
             )
     return _ranked(outcomes, cells, {name: here for name, (here, _) in parts.items()})
+
+
+def _fixed(outcomes: Outcomes, system: int, condition: int, rate: Rate) -> tuple[float, float]:
+    """Return the interval of a rate for its families as fixed strata; none for one family."""
+    status = outcomes.status[system, condition]
+    parts = [rate_of(status[here]) for name in FAMILIES if (here := outcomes.of_family(name)).any()]
+    parts = [part for part in parts if part.n]
+    if len(parts) < 2:
+        return math.nan, math.nan
+    trials = stratified_n([p.value * p.n for p in parts], [p.n for p in parts])
+    trials *= rate.trials / rate.n
+    return wilson(rate.value * trials, trials)
 
 
 def _ranked(outcomes: Outcomes, cells: list[Cell], parts: Mapping[str, Flags]) -> list[Cell]:
@@ -135,16 +154,17 @@ def rate_table(cells: Sequence[Cell], name: str) -> Table:
         if cell.part in (parts or ("",)) and not (parts and key not in ran):
             key += (cell.part,) if parts else ()
             bounds = cell.interval if cell.n else (math.nan, math.nan)
+            fixed = () if parts else cell.fixed
             more = (cell.complete, len(cell.missing), cell.rank, cell.best)
-            rows.append((*key, cell.n, cell.rate, *bounds, *cell.counts, *more))
+            rows.append((*key, cell.n, cell.rate, *bounds, *fixed, *cell.counts, *more))
     return Table.make(
         name,
         f"Success by {name if parts else 'system and condition'}",
         f"simulator system condition {name if parts else ''} n:count rate:rate low:rate high:rate "
-        "successes:count fails:count timeouts:count errors:count complete:flag missing:count "
-        "rank:count best:flag",
+        f"{'' if parts else 'fixed_low:rate fixed_high:rate '}successes:count fails:count "
+        "timeouts:count errors:count complete:flag missing:count rank:count best:flag",
         rows,
-        _NOTE + _BEST,
+        _NOTE + _BEST + _FIXED * (not parts),
     )
 
 
