@@ -181,7 +181,10 @@ def base_of(name: str) -> str | None:
     if known is None or not known.retrieval:
         return None
     plain = name.removeprefix("retrieval-")
-    return next((one for one in SYSTEMS if plain.startswith(one)), f"perceptual-{plain}")
+    base = next((one for one in SYSTEMS if plain.startswith(one)), f"perceptual-{plain}")
+    # An option of the policy, which it has without retrieval too.
+    option = "-extrapolate"
+    return base + option * plain.startswith(base + option)
 
 
 def is_bound(name: str) -> bool:

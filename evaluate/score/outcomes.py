@@ -58,9 +58,9 @@ class Outcomes:
         return [condition for condition, has in zip(self.conditions, has_rows, strict=True) if has]
 
     def pairable(self, one: str, other: str) -> bool:
-        """Whether two systems had the same histories: both or neither name a revision."""
-        same = self.unpinned[[self.systems.index(name) for name in (one, other)]]
-        return bool(same[0] == same[1])
+        """Whether two systems had the same histories: both name a revision, or they are one."""
+        names = [self.systems.index(name) for name in (one, other)]
+        return one == other or not bool(self.unpinned[names].any())
 
     def of_family(self, family: str) -> Flags:
         """Whether each episode is of a family, `(E,) bool`."""

@@ -134,8 +134,11 @@ def _compared(
 def _unpaired(rows: Rows, outcomes: Outcomes, system: str, other: str) -> str:
     """Return why two systems cannot be paired; empty if they can."""
     if not outcomes.pairable(system, other):
-        (lone,) = (one for one in (system, other) if (outcomes.simulator, one) in rows.unpinned)
-        return f"the rows of {lone} name no revision of a buffer set, so their histories may differ"
+        lone = [one for one in (system, other) if (outcomes.simulator, one) in rows.unpinned]
+        whose = " and ".join(lone)
+        return (
+            f"the rows of {whose} name no revision of a buffer set, so their histories may differ"
+        )
     steps = [rows.retrieval.get((outcomes.simulator, one)) for one in (system, other)]
     if None not in steps and steps[0] != steps[1]:
         return f"their retrieval steps differ: {' and '.join(map(str, steps))}"

@@ -26,6 +26,8 @@ def test_conditions_of_a_system(name: str) -> None:
 def test_the_base_of_a_retrieval_system() -> None:
     assert base_of("retrieval-framesamp-modul") == "perceptual-framesamp-modul"
     assert base_of("retrieval-replay-window") == "replay-window"
+    for step in ("", "-joined"):
+        assert base_of(f"retrieval-replay-full-extrapolate{step}") == "replay-full-extrapolate"
     assert base_of("replay-window") is base_of("my-memory") is None
     assert all((base_of(name) in SYSTEMS) == one.retrieval for name, one in SYSTEMS.items())
 

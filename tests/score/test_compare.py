@@ -43,6 +43,7 @@ def test_model_seeds_are_matched(tmp_path: Path) -> None:
     found = compared(tmp_path, own(3, k0="ffff") + own(7, k0="sf"), own(7, k0="fsss"))
     overall = found.table.records()[0]
     assert (overall["n"], overall["pairs"], overall["gained"], overall["lost"]) == (4, 2, 1, 1)
+    assert "with partly other model seeds" in found.notes[0]
 
 
 def test_runs_over_other_histories_show_no_noise_floor(tmp_path: Path) -> None:
@@ -56,6 +57,9 @@ def test_runs_over_other_histories_show_no_noise_floor(tmp_path: Path) -> None:
     both = made.write_csv(tmp_path / "b.csv", made.changed(own(k0="ss"), simulator="robomme"))
     (note,) = compare(both, released).notes
     assert "different buffer sets (revisions abab" in note
+    again = tmp_path / "d.csv"
+    again.write_text(released.read_text())
+    assert "name no revision of a buffer set" in compare(released, again).notes[0]
 
 
 def test_two_conditions_of_one_run_are_compared(tmp_path: Path) -> None:

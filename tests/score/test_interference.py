@@ -59,6 +59,7 @@ def test_whatever_is_compared_differs_in_kind_alone(names: set[str], floor: bool
         ("replay-framesamp", "recall-framesamp"),
         ("replay-full", "recall-full"),
         ("retrieval-replay-window-joined", "retrieval-recall-window-joined"),
+        ("retrieval-replay-full-extrapolate-joined", "retrieval-recall-full-joined"),
         ("retrieval-framesamp-modul", "retrieval-recall-framesamp"),
         ("perceptual-tokendrop-modul", None),  # it keeps parts of frames
         ("oracle", None),

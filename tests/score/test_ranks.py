@@ -44,6 +44,19 @@ def test_systems_of_other_histories_are_not_paired(tmp_path: Path) -> None:
     assert [r["best"] for r in records(found, "main")] == [True, False]
 
 
+def test_two_systems_without_a_revision_are_not_paired(tmp_path: Path) -> None:
+    lines = [
+        f"{name},MoveCube,{k},{e},{e},easy,{'success' if e < won else 'fail'},{int(e < won)},9"
+        for name, won in (("one", 9), ("two", 2))
+        for k in ("k0", "k7")
+        for e in range(10)
+    ]
+    found = made.score(made.released(tmp_path / "a.csv", lines))
+    assert {r["interval"] for r in records(found, "matrix")} == {"unpaired"}
+    # The conditions of one system have the same demonstrations, and are paired.
+    assert {r["interval"] for r in records(found, "effects")} == {"newcombe"}
+
+
 def test_ranks_follow_from_the_significant_pairs(tmp_path: Path) -> None:
     rates = {"one": 12, "two": 11, "three": 6, "four": 2}
     found = scored(tmp_path, {(name, "k0"): first(won) for name, won in rates.items()})

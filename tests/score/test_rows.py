@@ -210,6 +210,14 @@ def test_bad_rows_of_runs_are_refused(tmp_path: Path, change: dict[str, Any], re
     assert (found.refused, len(found)) == (1, 106)
 
 
+def test_leniently_the_most_frequent_revision_is_kept(tmp_path: Path) -> None:
+    rows = made.rows()
+    rows[0] = replace(rows[0], revision="cd" * 32)
+    found = read_rows([made.write_csv(tmp_path / "a.csv", rows)], lenient=True)
+    assert found.refused == 1 and found.revisions == {"tabletop": made.REVISION}
+    assert "line 2: revision 'cdcd" in found.refusals[0]
+
+
 def test_lines_are_right_after_quoted_line_breaks(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     path.write_text(

@@ -221,10 +221,14 @@ def _differing(one: Rows, other: Rows, matched: Iterable[tuple[_Side, _Side]]) -
                 "is the effect of the shift."
             )
         revisions = [rows.revisions.get(name) for rows, name in zip((one, other), two, strict=True)]
-        if revisions[0] != revisions[1]:
+        if one is not other and revisions == [None, None]:
+            yield (
+                f"The rows of {two[0]} name no revision of a buffer set: the histories may differ."
+            )
+        elif revisions[0] != revisions[1]:
             yield (
                 f"The rows of {two[0]} are of different buffer sets (revisions "
-                f"{' and '.join(one or 'unknown' for one in revisions)}): the histories may "
+                f"{' and '.join(rev or 'unknown' for rev in revisions)}): the histories may "
                 "differ."
             )
 
@@ -239,9 +243,10 @@ def _noise(a: _Side, b: _Side, pairs: Mapping[str, Pairs]) -> list[str]:
                 f"{condition} {percent(compared.flips)} of {compared.pairs} "
                 f"(95% interval {100 * low:.1f} to {100 * high:.1f})"
             )
-    disjoint = set(a.outcomes.model_seeds).isdisjoint(b.outcomes.model_seeds)
+    seeds, others = {*a.outcomes.model_seeds}, {*b.outcomes.model_seeds}
+    which = "the same" if seeds == others else "partly other" if seeds & others else "other"
     note = (
-        f"{a.system} ran in both, with {'other' if disjoint else 'the same'} model seeds, in "
+        f"{a.system} ran in both, with {which} model seeds, in "
         f"{a.outcomes.simulator}. If nothing else differs, this share of episodes flips by chance "
         f"(the noise floor): {', '.join(shares)}."
     )

@@ -1,6 +1,6 @@
 """Rows of rollouts, checked: each by itself, and against those of the same episode or rollout."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -147,14 +147,18 @@ class _Checks:
         return f"{path}, {'row' if path.suffix.lower() == '.parquet' else 'line'} {row[1]}"
 
     def check_alike(self, name: str, group: Sequence[str], why: str) -> None:
-        """Refuse rows whose value differs from that of the first row of the same group."""
+        """Refuse rows whose value differs from the most frequent one of the same group."""
         rows = self.sound.values()
-        keys, values = map(attrgetter(*group), rows), map(attrgetter(name), rows)
-        first: dict[Any, Any] = {}
+        keys, values = [*map(attrgetter(*group), rows)], [*map(attrgetter(name), rows)]
+        counts = defaultdict[Any, Counter[Any]](Counter)
+        for key, value in zip(keys, values, strict=True):
+            if value is not None:
+                counts[key][value] += 1
+        usual = {key: count.most_common(1)[0][0] for key, count in counts.items()}
         self._refuse(
-            (at, f"{name} {value!r} beside {first[key]!r}: {why}")
+            (at, f"{name} {value!r} beside {usual[key]!r}: {why}")
             for at, key, value in zip(self.sound, keys, values, strict=True)
-            if value is not None and value != first.setdefault(key, value)
+            if value is not None and value != usual[key]
         )
 
     def check_repeats(self) -> None:

@@ -14,8 +14,8 @@ def ceiling_of(system: str) -> str | None:
     known = known_system(system)
     if known is None or known.sampling is None or known.bound:
         return None
-    name = f"{'retrieval-' * known.retrieval}recall-{known.sampling}{'-' * bool(known.step)}"
-    return name + known.step
+    step = known.step.removeprefix("extrapolate").removeprefix("-")  # not of the memory
+    return f"{'retrieval-' * known.retrieval}recall-{known.sampling}{'-' * bool(step)}{step}"
 
 
 def evidence_table(every: Iterable[Outcomes]) -> Table:

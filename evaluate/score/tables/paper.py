@@ -29,7 +29,8 @@ _NOTE = (
 _FAMILIES_NOTE = (
     "The paper reports no rates by family. These are from its public repository "
     "(SoumilRathi/robomme-interference, CC BY 4.0), an earlier version, where they add up to the "
-    "paper's rate over all families. A system that is not in the paper is listed beside all of "
+    "paper's rate over all families; those of Retrieval-FrameSamp-Modul are counted from its "
+    "released rows. A system that is not in the paper is listed beside all of "
     "them, with any number of episodes (n). Families differ in difficulty: this is not a ranking."
 )
 _SIDES = (
