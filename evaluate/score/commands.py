@@ -1,5 +1,6 @@
 """The commands `score`, `compare` and `power`."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -15,6 +16,7 @@ from robomme_interference_data.cli.console import (
     print_status,
 )
 from robomme_interference_data.cli.options import AsJson, split_commas, with_settings
+from robomme_interference_data.errors import InvalidOptionError
 
 from .config import Settings
 
@@ -114,6 +116,14 @@ def compare(
     lenient: Annotated[
         bool, typer.Option("--lenient", help="Leave out bad rows and count them.")
     ] = False,
+    looks: Annotated[
+        str,
+        typer.Option(
+            help="Number of this look at the data, and of all that are planned, equally spaced: "
+            "stricter intervals and levels, so that looking at incomplete runs is allowed.",
+            metavar="LOOK/OF",
+        ),
+    ] = "1/1",
     as_json: AsJson = False,
 ) -> None:
     """Compare two runs, or two conditions of one run, paired over shared episodes.
@@ -123,13 +133,14 @@ def compare(
     Examples:
     ```
     robomme-interference compare my-run my-run-with-retrieval
-    robomme-interference compare my-run --conditions k0,k7
+    robomme-interference compare my-run --conditions k0,k7 --looks 2/5
     robomme-interference compare my-run rollouts.csv --system-b retrieval-framesamp-modul
     ```
     """
     from .comparisons.compare import compare as compute
 
-    found = compute(run_a, run_b, (system_a, system_b), lenient, conditions or ())
+    look = _look(looks)
+    found = compute(run_a, run_b, (system_a, system_b), lenient, conditions or (), look)
     _print_notes(found.runs, found.notes)
     if as_json:
         bad = [rows.refused for rows in found.runs]
@@ -144,21 +155,29 @@ def power(
     flips: Annotated[
         float, typer.Option(help="Share of the episodes that flips between two equal systems.")
     ] = 0.06,
+    tests: Annotated[
+        int, typer.Option(help="Number of tests that are corrected together, such as 66 pairs.")
+    ] = 1,
+    looks: Annotated[
+        int, typer.Option(help="Number of planned looks at the data, equally spaced.")
+    ] = 1,
     as_json: AsJson = False,
 ) -> None:
     """Compute which differences a number of episodes can detect.
 
     The share that flips by chance is in the table noise of a score, and in the output of compare
-    for two runs of one system.
+    for two runs of one system. Two different systems differ in far more episodes than two runs of
+    one: for them, take flips of the table matrix.
 
     Examples:
     ```
     robomme-interference power --margin 5 --episodes 450 --flips 0.06
+    robomme-interference power --margin 10 --flips 0.3 --tests 66 --looks 5
     ```
     """
     from .power import plan
 
-    found = plan(margin / 100, episodes, flips)
+    found = plan(margin / 100, episodes, flips, tests, looks)
     if as_json:
         print_json(asdict(found))
         return
@@ -170,10 +189,22 @@ def power(
         f"episodes that find {margin:g} points with 80% power": f"{found.needed:,}",
         "smallest margin of equivalence with 80% power": f"±{100 * found.equal:.1f} points",
     }
-    echo(f"{episodes:,} episodes, of which {100 * flips:g}% flip by chance\n")
+    for look, level in enumerate(found.looks, start=1):
+        at = round(episodes * look / looks)
+        lines[f"look {look} after {at:,} episodes: significant if p_holm is below"] = f"{level:.2g}"
+    corrected = f", corrected for {tests:,} tests" * (tests > 1)
+    echo(f"{episodes:,} episodes, of which {100 * flips:g}% flip by chance{corrected}\n")
     width = max(map(len, lines))
     for name, value in lines.items():
         echo(f"{name:{width}}  {value}")
+
+
+def _look(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([0-9]{1,2})/([0-9]{1,2})", text)
+    look, of = map(int, match.groups()) if match else (0, 0)
+    if not 1 <= look <= of <= 20:
+        raise InvalidOptionError.expected("looks", text, "LOOK/OF, such as 2/5, of at most 20")
+    return look, of
 
 
 def _print_notes(found: "Sequence[Rows]", notes: Sequence[str]) -> None:

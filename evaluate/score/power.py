@@ -6,7 +6,7 @@ other way round.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from statistics import median
@@ -15,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.stats.intervals import z_of
-from robomme_interference_data.stats.significance import ALPHA
+from robomme_interference_data.stats.bootstrap import generator_of
+from robomme_interference_data.stats.intervals import newcombe_paired, z_of
+from robomme_interference_data.stats.sequential import MOST_LOOKS, look_levels
+from robomme_interference_data.stats.significance import ALPHA, mcnemar
 from robomme_interference_data.viz.tables import percent
 
 POWER = 0.8
@@ -35,11 +37,14 @@ class Plan:
         flips: Share of them that flips by chance.
         margin: A difference of interest.
         noise: 95% range of the difference between two equal systems: z √(f / n), at most 1.
-        power: Probability that McNemar's exact test at 5% finds a difference of `margin`.
+        power: Probability that McNemar's exact test at 5% / `tests` finds a difference of `margin`.
         smallest: Smallest difference found with 80% power; None if none is.
         needed: Episodes that find a difference of `margin` with 80% power.
-        equal: Smallest margin of an equivalence test at 5% with 80% power for two equal systems:
-            (z(95%) + z(90%)) √(f / n) with one-sided quantiles, at most 1.
+        equal: Smallest margin of an equivalence test at 5% with 80% power for two equal systems
+            with rates around 50%.
+        tests: Number of tests that Holm's correction is over; the levels are for the first.
+        looks: Level of each planned look, see `look_levels`; with several, `power` is that of
+            finding the difference at any look, and the other values are those of one look.
     """
 
     episodes: int
@@ -50,10 +55,15 @@ class Plan:
     smallest: float | None
     needed: int
     equal: float
+    tests: int = 1
+    looks: tuple[float, ...] = ()
 
 
-def plan(margin: float, episodes: int, flips: float) -> Plan:
+def plan(margin: float, episodes: int, flips: float, tests: int = 1, looks: int = 1) -> Plan:
     """Return what episodes can detect; the margin is a fraction."""
+    for name, value, most in (("tests", tests, 10_000), ("looks", looks, MOST_LOOKS)):
+        if not 1 <= value <= most:
+            raise InvalidOptionError.expected(name, value, f"a number from 1 to {most:,}")
     if not 0 < margin <= 1:
         expected = "points, more than 0 up to 100"
         raise InvalidOptionError.expected("margin", float(f"{100 * margin:g}"), expected)
@@ -66,20 +76,50 @@ def plan(margin: float, episodes: int, flips: float) -> Plan:
             f"{100 * margin:g} points and flips {flips} are more than all episodes",
             "A difference adds flips: margin and flips must sum to at most 100%.",
         )
-    noise = math.sqrt(flips / episodes)
+    alpha = ALPHA / tests
+    levels = look_levels(looks) if looks > 1 else ()
+    found = power(margin, episodes, flips, alpha)
+    if levels:
+        found = _sequential(margin, episodes, flips, [level / tests for level in levels])
+    noise = min(1.0, z_of(0.95) * math.sqrt(flips / episodes))
     return Plan(
-        *(episodes, flips, margin, min(1.0, z_of(0.95) * noise), power(margin, episodes, flips)),
-        smallest=smallest(episodes, flips),
-        needed=needed(margin, flips),
-        equal=min(1.0, (z_of(1 - 2 * ALPHA) + z_of(POWER)) * noise),
+        *(episodes, flips, margin, noise, found),
+        smallest=smallest(episodes, flips, alpha),
+        needed=needed(margin, flips, alpha),
+        equal=_equal(episodes, flips),
+        tests=tests,
+        looks=levels,
     )
 
 
-def power(margin: float, episodes: int, flips: float) -> float:
+def _equal(episodes: int, flips: float) -> float:
+    """Return the margin that 80% of the 90% intervals of two equal systems are within."""
+    numbers = generator_of("equivalence").multinomial(episodes, [flips / 2] * 2 + [1 - flips], 500)
+    found = [
+        max(map(abs, newcombe_paired(rest // 2, gained, lost, rest - rest // 2, 1 - 2 * ALPHA)))
+        for gained, lost, rest in numbers.tolist()
+    ]
+    return float(np.quantile(found, POWER))
+
+
+def _sequential(margin: float, episodes: int, flips: float, levels: Sequence[float]) -> float:
+    """Return the share of 5,000 made-up studies that find a difference at any of the looks."""
+    ends = [round(episodes * look / len(levels)) for look in range(len(levels) + 1)]
+    chances = [flips / 2 + margin, flips / 2, max(0.0, 1 - flips - margin)]
+    sizes = np.diff(ends)[None].repeat(5000, axis=0)
+    steps = generator_of("looks").multinomial(sizes, np.array(chances) / sum(chances))
+    counts = steps[..., :2].cumsum(axis=1)
+    pairs, place = np.unique(counts.reshape(-1, 2), axis=0, return_inverse=True)
+    ps = np.array([mcnemar(*both)[0] for both in pairs.tolist()])[place].reshape(counts.shape[:2])
+    return float((ps <= levels).any(axis=1).mean())
+
+
+def power(margin: float, episodes: int, flips: float, alpha: float = ALPHA) -> float:
     """Return the probability that McNemar's exact test finds a true difference.
 
     Flips are d of n with Binomial(n, f + δ), and of these Binomial(d, (f / 2) / (f + δ)) go
-    against the difference; the test finds it where p is at most 0.05. Summed over all d that occur.
+    against the difference; the test finds it where p is at most alpha. Summed over all d that
+    occur.
     """
     both = flips + margin
     reach = 8 * math.sqrt(episodes * both) + 8
@@ -91,7 +131,7 @@ def power(margin: float, episodes: int, flips: float) -> float:
     ways = np.where(rest >= 0, logs[d][:, None] - logs[x] - logs[np.maximum(rest, 0)], -np.inf)
     fair = np.exp(ways - d[:, None] * math.log(2))
     # Both tails are alike: x against the difference, and as many for it.
-    rare = 2 * fair.cumsum(axis=1) <= ALPHA
+    rare = 2 * fair.cumsum(axis=1) <= alpha
     against = _powers(flips / 2 / both, x) + _powers(1 - flips / 2 / both, rest)
     in_favour = _powers(flips / 2 / both, rest) + _powers(1 - flips / 2 / both, x)
     found = (np.exp(ways + against) + np.exp(ways + in_favour)) * (rare & (2 * x < d[:, None]))
@@ -100,7 +140,7 @@ def power(margin: float, episodes: int, flips: float) -> float:
     return float(np.exp(flipping) @ found.sum(axis=1))
 
 
-def needed(margin: float, flips: float) -> int:
+def needed(margin: float, flips: float, alpha: float = ALPHA) -> int:
     """Return how many episodes find a difference with 80% power; one fewer would not.
 
     Where they are more than `MOST` it is the normal approximation with a continuity correction,
@@ -110,11 +150,13 @@ def needed(margin: float, flips: float) -> int:
     design, Biometrics 43, 207–211; the correction: Edwards (1948), Psychometrika 13, 185–187.
     """
     both = flips + margin
-    wide = z_of(1 - ALPHA) * math.sqrt(both) + z_of(2 * POWER - 1) * math.sqrt(both - margin**2)
+    wide = z_of(1 - alpha) * math.sqrt(both) + z_of(2 * POWER - 1) * math.sqrt(both - margin**2)
     low, high = 0, math.ceil(((wide + math.sqrt(wide**2 + 4 * margin)) / 2 / margin) ** 2)
     while high <= MOST and high - low > 1:
         middle = (low + high) // 2
-        low, high = (low, middle) if power(margin, middle, flips) >= POWER else (middle, high)
+        low, high = (
+            (low, middle) if power(margin, middle, flips, alpha) >= POWER else (middle, high)
+        )
     return high
 
 
@@ -126,31 +168,44 @@ def _powers(base: float, exponents: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 @lru_cache(maxsize=64)
-def smallest(episodes: int, flips: float) -> float | None:
+def smallest(episodes: int, flips: float, alpha: float = ALPHA) -> float | None:
     """Return the smallest difference that is found with 80% power, to 0.01 points, or None."""
-    low, high = 0.0, 1 - flips
-    if high <= 0 or power(high, episodes, flips) < POWER:
+    return _smallest(1 - flips, lambda margin: power(margin, episodes, flips, alpha))
+
+
+@lru_cache(maxsize=64)
+def _smallest_among(episodes: int, differing: float, alpha: float) -> float | None:
+    """Return the same if a share of the episodes differs, those of the difference among them."""
+    return _smallest(
+        differing, lambda margin: power(margin, episodes, max(0.0, differing - margin), alpha)
+    )
+
+
+def _smallest(high: float, power_of: Callable[[float], float]) -> float | None:
+    low = 0.0
+    if high <= 0 or power_of(high) < POWER:
         return None
     while high - low > 1e-4:
         middle = (low + high) / 2
-        low, high = (low, middle) if power(middle, episodes, flips) >= POWER else (middle, high)
+        low, high = (low, middle) if power_of(middle) >= POWER else (middle, high)
     return high
 
 
-def note(counts: Iterable[tuple[int, int, int]]) -> str:
+def note(counts: Iterable[tuple[int, int, int]], tests: int) -> str:
     """Return a sentence on what comparisons with these pairs, gained and lost can detect.
 
-    It uses the most episodes, and the median of the flips that go both ways: twice the smaller of
-    gained and lost. Empty without pairs.
+    It uses the most episodes, and the median of the shares that differ. The correction is that of
+    the first of `tests` by Holm. Empty without pairs.
     """
     found = [one for one in counts if one[0]]
     if not found:
         return ""
     n = min(MOST, max(pairs for pairs, _, _ in found))
-    flips = round(median(2 * min(gained, lost) / pairs for pairs, gained, lost in found), 3)
-    least = smallest(n, flips)
+    differing = round(median((gained + lost) / pairs for pairs, gained, lost in found), 3)
+    least = _smallest_among(n, differing, ALPHA / tests)
     shown = "no difference" if least is None else f"a difference of {100 * least:.1f} points"
+    corrected = f" after correction for {tests} tests" * (tests > 1)
     return (
-        f" With {n:,} episode{'s' * (n > 1)}, of which {percent(flips)} flip both ways (the median "
-        f"here), {shown} can be detected with 80% power."
+        f" With {n:,} episode{'s' * (n > 1)}, of which {percent(differing)} differ (the median "
+        f"here), {shown} can be detected with 80% power{corrected}."
     )

@@ -84,6 +84,6 @@ def _flips(key: str, episodes: int, draws: int) -> NDArray[np.uint8]:
     return generator_of(f"{key}, signs").integers(0, 2, (draws, episodes), np.uint8)
 
 
-def simultaneous(tests: int) -> float:
-    """Return the level at which `tests` intervals hold all at once with 95% (Bonferroni)."""
-    return 1 - (1 - LEVEL) / max(1, tests)
+def simultaneous(tests: int, alpha: float = 1 - LEVEL) -> float:
+    """Return the level at which `tests` intervals hold all at once with 1 − alpha (Bonferroni)."""
+    return 1 - alpha / max(1, tests)

@@ -6,12 +6,14 @@ from typing import Any
 
 import pytest
 from support import scoring as made
-from support.scoring import BASE, OWN, cells
+from support.scoring import BASE, OWN, cells, run
 
 from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.evaluate.run.plan import Plan
 from robomme_interference_data.evaluate.score.comparisons.compare import RunComparison, compare
 from robomme_interference_data.schema.rollouts import Rollout
-from robomme_interference_data.stats.intervals import wilson
+from robomme_interference_data.stats.intervals import newcombe_paired, wilson
+from robomme_interference_data.stats.sequential import look_levels
 
 
 def compared(tmp_path: Path, a: Sequence[Rollout], b: Sequence[Rollout]) -> RunComparison:
@@ -107,3 +109,35 @@ def test_what_cannot_be_paired_is_not_compared(
         a, message = [*a, *cells({(BASE, "k0"): "s"})], "no system is in both"
     with pytest.raises(InvalidOptionError, match=message):
         compared(tmp_path, a, b)
+
+
+def test_a_run_that_was_stopped_is_marked(tmp_path: Path) -> None:
+    plan = Plan({"MoveCube/test": "0-9"}, ("k0", "k7"))
+    both = own(k0="ssssss", k7="sfffff")
+    stopped = made.write_run(tmp_path / "stopped", both, plans=(plan,), status="incomplete")
+    found = compare(stopped, conditions=("k0", "k7"))
+    overall = found.table.records()[0]
+    assert not overall["complete"] and "0.062†" in found.table.markdown()
+    (note,) = found.notes
+    assert "a was stopped early" in note and "k0 (4 of 10); my-memory in tabletop, k7" in note
+    whole = made.write_run(tmp_path / "whole", own(k0="s" * 10, k7="s" * 10), plans=(plan,))
+    found = compare(whole, conditions=("k0", "k7"))
+    assert found.notes == () and found.table.records()[0]["complete"]
+    assert "Without the record of a run" not in found.table.note
+    # Nothing is known of the plan of a file by itself.
+    alone = made.write_csv(tmp_path / "a.csv", both)
+    assert "Without the record of a run" in compare(alone, conditions=("k0", "k7")).table.note
+
+
+def test_a_planned_look_has_a_level_and_intervals_of_its_own(tmp_path: Path) -> None:
+    path = made.write_csv(tmp_path / "a.csv", own(k0="s" * 30, k7="s" * 18 + "f" * 12))
+    (overall, _) = compare(path, conditions=("k0", "k7"), look=(2, 5)).table.records()
+    level = look_levels(5)[1]
+    bounds = newcombe_paired(18, 0, 12, 0, 1 - level)
+    assert (overall["low"], overall["high"]) == bounds
+    assert (overall["joint_low"], overall["joint_high"]) == bounds  # one row of all families
+    done = run("compare", path, "--conditions", "k0,k7", "--looks", "2/5")
+    text = " ".join(done.stdout.split())
+    assert "Look 2 of 5" in text and f"p_holm is below {level:.2g}" in text
+    wrong = run("compare", path, "--conditions", "k0,k7", "--looks", "6/5")
+    assert isinstance(wrong.exception, InvalidOptionError) and "6/5" in str(wrong.exception)

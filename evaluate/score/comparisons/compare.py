@@ -1,6 +1,7 @@
 """Compare two runs, or two conditions of one, paired over shared episodes."""
 
 import shlex
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +15,8 @@ from robomme_interference_data.evaluate.score.rows.values import unshifted
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.stats.intervals import wilson
+from robomme_interference_data.stats.sequential import look_levels
+from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.viz.tables import Table, percent
 
 from .contrast import Contrast
@@ -42,15 +45,18 @@ def compare(
     systems: tuple[str | None, str | None] = (None, None),
     lenient: bool = False,
     conditions: Sequence[str] = (),
+    look: tuple[int, int] = (1, 1),
 ) -> RunComparison:
     """Compare two runs of one simulator over shared conditions and episodes.
 
     Systems of both runs are compared with themselves. If the runs share no system and hold one
     each, these two are compared. Runs under different shifts can be compared, because their scenes
     are the same. Differences are the second's rate − the first's. Without a second run, two
-    `conditions` of the first are compared.
+    `conditions` of the first are compared. `look` is the number of this look at the data and of all
+    planned ones; with several, intervals and levels spend 5% over all looks.
     """
     _check_arguments(first, second, conditions)
+    alpha = look_levels(look[1])[look[0] - 1] if look[1] > 1 else ALPHA
     one = read_rows([first], systems[0], lenient)
     other = one if second is None else read_rows([second], systems[1], lenient)
     _check_scenes(one, other)
@@ -66,7 +72,9 @@ def compare(
             if compared.n:
                 names = (a.outcomes.simulator, b.system, after, (a.system, before), "compare")
                 complete = a.complete(before) and b.complete(after)
-                found.append(Contrast(*names, compared, complete, family=family))
+                bounds = compared.at(1 - alpha)
+                more = {"low": bounds.low, "high": bounds.high}
+                found.append(Contrast(*names, compared, complete, family=family, more=more))
         if a.repeats(b, one, other) and not conditions:
             notes += _noise(a, b, {c: pairs["", (c, c)] for c, _ in both})
     if not found:
@@ -80,6 +88,9 @@ def compare(
             f"no episode of {runs} counts on both sides under {under}",
             f"They hold {' and '.join(dict.fromkeys(existing))}. Compare the same episodes.",
         )
+    for name, own in zip("ab", sides, strict=True):
+        if other is not one or name == "a":
+            notes += _stopped(name, own.values())
     notes += _left_out("a", sides[0].values(), dict(matched), conditions)
     notes += _left_out("b", sides[1].values(), {b: a for a, b in matched}, conditions[::-1])
     spec = TableSpec(
@@ -90,9 +101,24 @@ def compare(
         "from a to b. {how}",
         lambda c: (c.simulator, bool(c.family)),
         "the rows of all families, and among those of single families, of a simulator",
+        alpha=alpha,
     )
     table = comparison_table("compare", found, spec)
-    table = replace(table, note=f"a: {first}; b: {second or first}. {table.note}")
+    looked = (
+        f" Look {look[0]} of {look[1]} (alpha spending like O'Brien and Fleming's boundaries): a "
+        f"difference is significant if p_holm is below {alpha:.2g}, and intervals have the level "
+        f"{1 - alpha:.4%}."
+    )
+    unplanned = [
+        str(path) for rows in (one, other) for path, run in rows.sources.items() if not run
+    ]
+    unknown = (
+        f" Without the record of a run, complete means all episodes that occur: "
+        f"{', '.join(dict.fromkeys(unplanned))}."
+    )
+    note = f"a: {first}; b: {second or first}. {table.note}"
+    note += looked * (look[1] > 1) + unknown * bool(unplanned)
+    table = replace(table, note=note)
     return RunComparison(table, tuple(notes), (one,) if other is one else (one, other))
 
 
@@ -119,13 +145,16 @@ class _Side:
 
     outcomes: Outcomes
     system: str
+    planned: Mapping[str, set[EpisodeId]]  # by condition, in all plans of its runs
 
     @property
     def conditions(self) -> list[str]:
         return self.outcomes.ran(self.system)
 
     def complete(self, condition: str) -> bool:
-        return bool(self.outcomes.complete[self.outcomes.cell(self.system, condition)])
+        """Whether all episodes count that occur or are planned."""
+        whole = self.outcomes.complete[self.outcomes.cell(self.system, condition)]
+        return bool(whole) and self.planned.get(condition, set()) <= self.counted(condition)
 
     def repeats(self, other: "_Side", rows: Rows, others: Rows) -> bool:
         """Whether another run's side is the same system with the same scenes and histories."""
@@ -145,8 +174,12 @@ _Sides = dict[tuple[str, str], _Side]
 
 def _sides(rows: Rows) -> _Sides:
     """Return the systems of a run by simulator and name, in the order of tables."""
+    planned = defaultdict[str, set[EpisodeId]](set)
+    for run in rows.sources.values():
+        for item in run.items if run else ():
+            planned[item.condition].add(item.episode)
     return {
-        (simulator, system): _Side(outcomes, system)
+        (simulator, system): _Side(outcomes, system, planned)
         for simulator, outcomes in outcomes_of(rows, Expected.OBSERVED).items()
         for system in outcomes.systems
     }
@@ -251,6 +284,22 @@ def _noise(a: _Side, b: _Side, pairs: Mapping[str, Pairs]) -> list[str]:
         f"(the noise floor): {', '.join(shares)}."
     )
     return [note] if shares else []
+
+
+def _stopped(name: str, sides: Iterable[_Side]) -> list[str]:
+    """Return a note on planned episodes of a run that do not count, if any."""
+    parts = [
+        f"{side.system} in {side.outcomes.simulator}, {condition} ({lacking:,} of {len(planned):,})"
+        for side in sides
+        for condition, planned in side.planned.items()
+        if (lacking := len(planned - side.counted(condition)))
+    ]
+    listed = "; ".join(parts)
+    note = (
+        f"{name} was stopped early or is still running; planned episodes that do not count: "
+        f"{listed}. Looking again and again finds too much: plan the looks (--looks)."
+    )
+    return [note] if parts else []
 
 
 def _left_out(

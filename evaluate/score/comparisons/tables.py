@@ -72,6 +72,7 @@ class TableSpec:
     group: Callable[[Contrast], Hashable] = attrgetter("simulator")
     among: str = "the tests of this table in one simulator"
     power: bool = field(default=True, kw_only=True)
+    alpha: float = field(default=ALPHA, kw_only=True)  # of the joint intervals
 
 
 _EFFECT = f"{CELLS} n rate against_rate difference {TEST} cohens_h complete"
@@ -152,7 +153,7 @@ def comparison_table(
     rows = []
     for one, p_holm in zip(found, holms, strict=True):
         tests = one.more.get("tests", groups[spec.group(one)])
-        joint = one.pairs.at(simultaneous(tests))
+        joint = one.pairs.at(simultaneous(tests, spec.alpha))
         more = {"p_holm": provisional(p_holm, one.complete), **one.more}
         more |= {"joint_low": joint.low, "joint_high": joint.high}
         rows.append(tuple(more[key] if key in more else _VALUES[key][1](one) for _, key in columns))
@@ -160,7 +161,8 @@ def comparison_table(
     note = spec.note.format(how=_how_to_read(found, correct), correct=correct)
     if spec.power:
         pairs = [one.pairs for one in found if not one.family]
-        note += power.note((one.pairs, one.gained, one.lost) for one in pairs)
+        tests = max((one.more.get("tests", groups[spec.group(one)]) for one in found), default=1)
+        note += power.note(((one.pairs, one.gained, one.lost) for one in pairs), tests)
     return Table.make(name, spec.title, " ".join(column for column, _ in columns), rows, note)
 
 
