@@ -40,9 +40,9 @@ def look_levels(looks: int) -> tuple[float, ...]:
             crossed = float(density @ _above(middle - points))
             low, high = (middle, high) if crossed > due else (low, middle)
         levels.append(2 * float(_above(high / math.sqrt(look))))
-        grid = np.linspace(-high, high, _POINTS)
-        weight = np.full(_POINTS, grid[1] - grid[0])
+        grid = high * np.linspace(-1, 1, _POINTS).astype(np.float64)
+        weight: Floats = np.full(_POINTS, grid[1] - grid[0])
         weight[[0, -1]] /= 2
         steps = np.exp(-((grid[:, None] - points) ** 2) / 2) / math.sqrt(2 * math.pi)
-        points, density = grid, weight * (steps @ density)
+        points, density = grid, np.asarray(weight * (steps @ density), float)
     return tuple(levels)

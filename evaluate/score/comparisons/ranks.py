@@ -11,7 +11,7 @@ from robomme_interference_data.evaluate.systems import is_bound
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.stats.bootstrap import DRAWS, slope_weights
 from robomme_interference_data.stats.significance import ALPHA, holm
-from robomme_interference_data.stats.signs import sign_flips
+from robomme_interference_data.stats.signs import sign_flips, simultaneous
 from robomme_interference_data.viz.tables import Table
 
 from .contrast import Contrast
@@ -88,6 +88,9 @@ def systems_of(outcomes: Outcomes) -> list[Contrast]:
                 rows.append(("systems", one, best, against(outcomes, condition, one, best, every)))
         for table, one, other, pairs in rows:
             more = {"p_holm": corrected[frozenset((one, other))], "tests": len(compared)}
+            if table == "systems":
+                joint = pairs.at(simultaneous(len(compared)))
+                more |= {"low": joint.low, "high": joint.high}
             names = (outcomes.simulator, one, condition, (other, condition), table)
             found[table].append(Contrast(*names, pairs, complete=True, more=more))
     return [*found["systems"], *found["matrix"]]

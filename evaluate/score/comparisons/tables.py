@@ -109,8 +109,8 @@ SPECS = {
         "Difference to the best system",
         _EFFECT,
         "Within each condition, each complete cell against the one with the highest rate (the "
-        "first of equal ones). Since that one is chosen by its rate, p_holm and joint intervals "
-        f"are corrected over all pairs of systems, as in the table matrix. {_BOTH}",
+        "first of equal ones). Since that one is chosen by its rate, p_holm and all intervals are "
+        f"corrected over all pairs of systems; p and p_mid are not. {_BOTH}",
         *_WITHIN,
     ),
     "matrix": TableSpec(
