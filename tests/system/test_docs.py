@@ -148,6 +148,7 @@ def test_the_commands_of_the_pages_run(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_the_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As a reader runs it, on the embedded simulator; the numbers that its text states come out."""
     import nbformat
