@@ -24,7 +24,7 @@ def test_arrays_are_as_numpy_writes_them(tmp_path: Path, order: Any, shape: Any)
         assert (tmp_path / "a.npy").read_bytes() == (tmp_path / "b.npy").read_bytes()
 
 
-def test_a_full_disk_is_told_as_the_system_does() -> None:
+def test_a_full_disk_raises_the_systems_error() -> None:
     with pytest.raises(OSError, match="No space left") as caught:
         write_array(Path("/dev/full"), np.zeros(10**6, np.uint8))
     assert caught.value.errno == errno.ENOSPC
@@ -46,15 +46,13 @@ def test_what_is_written_is_read(tmp_path_factory: Any, dtype: Any, data: st.Dat
     [
         np.ones((2, 8), np.float32),
         np.ones((2, 7), np.float16),
-        np.ones(8, np.float16),
         np.ones((8, 2), np.float16).T,
         np.ones((2, 8), ">f2"),
         np.zeros((2, 8), [("a", "<f2")]),
-        np.float16(1),
         np.array([[None]]),
     ],
 )
-def test_other_arrays_are_refused(tmp_path: Path, array: Any) -> None:
+def test_other_arrays_raise(tmp_path: Path, array: Any) -> None:
     np.save(tmp_path / "a.npy", array)
     with pytest.raises(FormatError, match=r"a\.npy: .* expected float16 of shape \(-1, 8\)"):
         read_array(tmp_path / "a.npy", np.float16, (-1, 8))

@@ -98,9 +98,8 @@ def test_names(kind: str, k: int) -> None:
 @pytest.mark.parametrize(
     "given",
     [
-        *("", "k", "k64", "k-1", "k03", "K3", "3", "nohistory", "no-history-k0", "x-k3", " k3"),
-        *("before", "before-k64", "before-k03", "k-k3", "before-3", "Before-k3"),
-        *(3, None, b"k3"),
+        *("", "k", "k64", "k-1", "k03", "K3", "no-history-k0", "x-k3", " k3"),
+        *("before", "before-k64", "before-3", 3),
     ],
 )
 def test_what_is_no_condition(given: Any) -> None:
@@ -126,8 +125,4 @@ def test_what_a_buffer_set_must_hold() -> None:
     assert needed("misled-k0", "k0", "raw-k1") == every
     assert (*every, "shifted") == DATASETS  # which no condition needs
 
-
-def test_the_registry() -> None:
-    kinds = "no-history k before middle held same parts raw absent stale misled"
-    assert list(KINDS) == kinds.split()
     assert all(kind.name == name and kind.holds and kind.asks for name, kind in KINDS.items())

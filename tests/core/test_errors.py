@@ -44,16 +44,10 @@ def test_an_error_about_something_keeps_the_rest() -> None:
     ("given_name", "known", "sentence"),
     [
         ("VideoRepik", ["VideoRepick", "MoveCube"], "Did you mean 'VideoRepick'?"),
-        ("movecube", ["VideoRepick", "MoveCube"], "Did you mean 'MoveCube'?"),
         ("wirst", ["wrist", "waist"], "Did you mean 'wrist' or 'waist'?"),
         ("xyz", ["front", "wrist"], "Known: front, wrist"),
         ("anything", [], ""),
-        (
-            "###",
-            [f"name{number:02}" for number in range(12)],
-            "Known: name00, name01, name02, name03, name04, name05, name06, name07, name08, "
-            "name09, … (12 in all)",
-        ),
+        ("#", list("abcdefghijkl"), "Known: a, b, c, d, e, f, g, h, i, j, … (12 in all)"),
     ],
 )
 def test_nearest(given_name: str, known: list[str], sentence: str) -> None:

@@ -1,4 +1,4 @@
-"""What columns take is told from their pages' headers: never too little, and strictly read."""
+"""The decoded size of columns, from their page headers: never too small, and strictly read."""
 
 import io
 from pathlib import Path
@@ -89,7 +89,7 @@ def test_a_file_that_is_cut_short(tmp_path: Path, cut: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("column", "said"),
+    ("column", "message"),
     [
         (pa.array([1], pa.timestamp("us", "Mars/Olympus")), "is of type timestamp"),
         (pa.array([[(1, 2)]], pa.map_(pa.int64(), pa.int64())), "is of type map"),
@@ -97,10 +97,10 @@ def test_a_file_that_is_cut_short(tmp_path: Path, cut: int) -> None:
     ],
 )
 def test_kinds_of_columns_that_no_table_of_ours_has(
-    tmp_path: Path, column: pa.Array, said: str
+    tmp_path: Path, column: pa.Array, message: str
 ) -> None:
     pq.write_table(pa.table({"v": column, "w": [1]}), tmp_path / "t")
-    with pytest.raises(FormatError, match=said):
+    with pytest.raises(FormatError, match=message):
         RowSpan(tmp_path / "t").table()
     assert RowSpan(tmp_path / "t").table(["w"]).num_rows == 1
 
@@ -118,7 +118,7 @@ WANTED = {1: (I32, None), 2: (LIST, {1: (I64, None)}), 3: (STRUCT, {2: (I32, Non
 
 
 @pytest.mark.parametrize(
-    ("data", "found"),
+    ("data", "expected"),
     [
         (b"\x00", {}),
         (b"\x15\x03\x00", {1: -2}),
@@ -131,9 +131,9 @@ WANTED = {1: (I32, None), 2: (LIST, {1: (I64, None)}), 3: (STRUCT, {2: (I32, Non
         (b"\x59\x28\x01a\x00\x1a\x15\x02\x1c\x00\x00", {}),
     ],
 )
-def test_thrift(data: bytes, found: dict[int, Any]) -> None:
+def test_thrift(data: bytes, expected: dict[int, Any]) -> None:
     reader = Thrift(data + b"more")
-    assert reader.struct(WANTED) == found
+    assert reader.struct(WANTED) == expected
     assert reader.at == len(data)
     for length in range(len(data)):
         with pytest.raises(IndexError):
@@ -141,7 +141,7 @@ def test_thrift(data: bytes, found: dict[int, Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("data", "said"),
+    ("data", "message"),
     [
         (b"\x16\x02\x00", "field 1 of its metadata is of kind 6"),
         (b"\x15\x02\x05\x02\x02\x00", "or occurs twice"),
@@ -154,8 +154,8 @@ def test_thrift(data: bytes, found: dict[int, Any]) -> None:
         (b"\x49\x19" + b"\x19" * 40, "nested too deeply"),
     ],
 )
-def test_thrift_that_others_would_read_otherwise(data: bytes, said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_thrift_that_others_would_read_otherwise(data: bytes, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         Thrift(data).struct(WANTED)
 
 

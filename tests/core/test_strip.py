@@ -98,7 +98,7 @@ def test_every_session_has_a_place_of_its_own(frames: list[int]) -> None:
 # --- pictures ----------------------------------------------------------------------------------
 
 
-def test_says_what_the_buffer_is(strip: Path, buffer: Buffer) -> None:
+def test_texts_describe_the_buffer(strip: Path, buffer: Buffer) -> None:
     found = labels(strip)
     assert f"{QUERIES[0]}   k3" in found
     assert f"Goal: {buffer.goal}" in found
