@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.buffer_sets import CONDITIONS, GOLDEN, QUERIES
-from support.lerobot_layouts import edit_info
+from support.lerobot_layouts import edit_columns, edit_info
 
 from robomme_interference_data import (
     DecodedCache,
@@ -262,15 +262,10 @@ def rewritten(path: Path, change: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    "change",
-    [
-        lambda table: table.drop_columns(["sessions"]),
-        lambda table: table.set_column(5, "k", table["condition"]),
-        lambda table: put(table, "sessions", [None] * len(table)),
-    ],
+    "columns", [{"sessions": None}, {"k": pa.array(["x"] * 15)}, {"sessions": [None] * 15}]
 )
-def test_damaged_rows(own_buffers: Path, change: Callable[[Any], Any]) -> None:
-    rewritten(own_buffers / ROWS, change)
+def test_damaged_rows(own_buffers: Path, columns: dict[str, Any]) -> None:
+    edit_columns(own_buffers / ROWS, **columns)
     with pytest.raises(FormatError, match=r"buffers\.parquet"):
         load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
 
@@ -282,7 +277,7 @@ def test_a_key_that_occurs_twice(own_buffers: Path) -> None:
 
 
 def other_goals(root: Path) -> None:
-    rewritten(root / ROWS, lambda table: put(table, "goals", [["another"]] * len(table)))
+    edit_columns(root / ROWS, goals=[["another"]] * 15)
 
 
 def other_goals_with_their_sum(root: Path) -> None:
@@ -293,10 +288,7 @@ def other_goals_with_their_sum(root: Path) -> None:
 
 def shorter_lesson(root: Path) -> None:
     for path in ("interference.parquet", "episodes/chunk-000/file-000.parquet"):
-        rewritten(
-            root / "demonstrations/meta" / path,
-            lambda table: put(table, "exec_start_idx", [47] * len(table)),
-        )
+        edit_columns(root / "demonstrations/meta" / path, exec_start_idx=[47] * 3)
 
 
 def other_first_view(root: Path) -> None:
@@ -326,11 +318,6 @@ def test_a_verified_load_checks_the_query(
     load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
     with pytest.raises(HashMismatchError, match=message):
         load_buffer_set(own_buffers).load("MoveCube/test/0", "k3", verify=True)
-
-
-def put(table: Any, name: str, values: Any) -> Any:
-    place = table.column_names.index(name)
-    return table.set_column(place, name, pa.array(values, table.schema.field(name).type))
 
 
 def test_a_session_of_no_dataset(own_buffers: Path) -> None:

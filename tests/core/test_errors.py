@@ -24,7 +24,7 @@ def test_each_is_a_builtin_too_and_travels_between_processes(
     error: type[InterferenceError],
 ) -> None:
     builtins = [base for base in error.__mro__ if base.__module__ == "builtins"]
-    assert len(builtins) > 3  # beyond Exception, BaseException and object there is a telling one
+    assert len(builtins) > 3  # a specific one, besides Exception, BaseException and object
     raised = error("what was found", "what to do", "verify my-buffers")
     for one in (raised, pickle.loads(pickle.dumps(raised))):
         assert type(one) is error

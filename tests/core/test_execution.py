@@ -84,7 +84,7 @@ def test_the_last_worker_may_not_retire() -> None:
     assert function.calls[-1] == "closed"
 
 
-def test_work_that_is_given_up_closes_what_it_holds() -> None:
+def test_abandoned_work_closes_its_function() -> None:
     function = Noted()
     outcomes = Serial().run(function, [1, 2, 3])
     next(outcomes)
@@ -92,7 +92,7 @@ def test_work_that_is_given_up_closes_what_it_holds() -> None:
     assert function.calls == [(1, 0), "closed"]
 
 
-def test_what_is_handed_in_comes_with_the_outcome_however_the_task_ends() -> None:
+def test_sent_files_come_with_the_outcome_even_after_an_error() -> None:
     def write(task: str, worker: Worker) -> None:
         worker.send_file("a.txt", b"first")
         worker.send_file("a.txt", task.encode())
@@ -103,7 +103,7 @@ def test_what_is_handed_in_comes_with_the_outcome_however_the_task_ends() -> Non
     assert (good.files, bad.files) == ({"a.txt": b"good"}, {"a.txt": b"bad"})
 
 
-def test_of_a_task_that_is_tried_again_only_the_last_files_count() -> None:
+def test_only_files_of_the_last_attempt_count() -> None:
     left = [1]
 
     def write(task: str, worker: Worker) -> None:
@@ -118,7 +118,7 @@ def test_of_a_task_that_is_tried_again_only_the_last_files_count() -> None:
 # --- who does the work ---------------------------------------------------------------------------
 
 
-def test_the_executor_that_is_asked_for() -> None:
+def test_executors_by_name() -> None:
     assert make_executor(WorkersConfig(workers=3)) == Processes(3)
     executor = make_executor(WorkersConfig(workers=8, executor="ray", gpus_per_worker=0.25))
     assert vars(executor) == {"workers": 8, "address": "auto", "cpus": 1.0, "gpus": 0.25}

@@ -135,7 +135,7 @@ def test_snapshots_of_the_hubs_cache_link_to_its_blobs(tmp_path: Path) -> None:
         LocalFiles(root).path("other")
 
 
-def test_sums_are_those_of_sha256sum(tmp_path: Path) -> None:
+def test_sums_equal_those_of_sha256sum(tmp_path: Path) -> None:
     (tmp_path / "b").write_bytes(b"")
     (tmp_path / "a").write_bytes(b"abc")
     text = format_sums(tmp_path, ["b", "a"])

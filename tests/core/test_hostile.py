@@ -31,7 +31,7 @@ from robomme_interference_data.schema.manifest import BufferManifest, SessionEnt
 
 MEGABYTES = 700
 """What reading a bomb may add to the memory of a process: the largest frame that is read, more than
-once, and the threads of libraries. Each bomb asks for more, or is refused at once."""
+once, and the threads of libraries. Each bomb needs more, or raises at once."""
 
 _CHILD = """
 import json, resource, sys
@@ -104,14 +104,14 @@ def test_a_buffer_has_a_bounded_number_of_frames_and_sessions(change: dict[str, 
         from_dict(BufferManifest, manifest | {"sessions": many * 2}, "here")
 
 
-@pytest.mark.parametrize("called", ["../../written", "/written", "0" * 64, "", "x\0"])
-def test_the_cache_keeps_frames_under_their_own_digest_alone(tmp_path: Path, called: str) -> None:
+@pytest.mark.parametrize("digest", ["../../written", "/written", "0" * 64, "", "x\0"])
+def test_the_cache_ignores_digests_that_are_not_of_the_frames(tmp_path: Path, digest: str) -> None:
     """Else a buffer set could write elsewhere, or give another one its frames."""
     root = copy_buffer_set(tmp_path / "buffer_set")
     path = root / "distractors/meta/interference.parquet"
     rows = pq.read_table(path).to_pylist()
     for row in rows:
-        row["feature_sha256"]["observation.images.front"] = called
+        row["feature_sha256"]["observation.images.front"] = digest
     pq.write_table(pa.Table.from_pylist(rows), path)
     before = contents(tmp_path)
     cache = tmp_path / "cache" / "inner"
@@ -121,11 +121,11 @@ def test_the_cache_keeps_frames_under_their_own_digest_alone(tmp_path: Path, cal
         assert np.array_equal(buffer.frames(), expected)
         streamed = [chunk.frames["front"] for chunk in buffer.stream(cameras=["front"])]
         assert np.array_equal(np.concatenate(streamed), expected)
-    assert len(list(cache.iterdir())) == 1  # the lesson, which is called as it should be
+    assert len(list(cache.iterdir())) == 1  # the lesson, whose digest is right
     assert {name for name in contents(tmp_path) if not name.startswith("cache/")} == set(before)
 
 
-def test_frames_that_take_too_much_at_once_are_refused(tmp_path: Path) -> None:
+def test_frames_that_need_too_much_memory_raise(tmp_path: Path) -> None:
     root = copy_buffer_set(tmp_path / "buffer_set")
     info = root / "demonstrations/meta/info.json"
     declared = json.loads(info.read_text())
@@ -160,16 +160,16 @@ def test_a_damaged_file_ends_in_an_error_or_a_sound_value(
     tmp_path_factory: pytest.TempPathFactory, name: str
 ) -> None:
     target, root = TARGETS[name], places(tmp_path_factory.mktemp("places"))
-    sound, refused = target.sound(root), []
+    sound, errors = target.sound(root), []
 
     @settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
     @given(st.integers(0, 2**32))
     def check(seed: int) -> None:
         error = target(root, mutated(sound, random.Random(seed)))
-        refused.append(error is not None)
+        errors.append(error is not None)
 
     check()
-    assert any(refused)
+    assert any(errors)
 
 
 @pytest.mark.parametrize(
@@ -184,9 +184,7 @@ def test_a_damaged_file_ends_in_an_error_or_a_sound_value(
         ("manifest", b'"seed": 0', b'"seed": ' + b"9" * 5000),
     ],
 )
-def test_values_that_were_too_much_once(
-    tmp_path: Path, name: str, before: bytes, after: bytes
-) -> None:
+def test_values_that_once_crashed(tmp_path: Path, name: str, before: bytes, after: bytes) -> None:
     target, root = TARGETS[name], places(tmp_path)
     [sound] = target.sound(root)
     assert before in sound

@@ -184,7 +184,6 @@ def test_a_part_does_not_need_datasets_that_its_buffers_do_not_use(
     ("options", "words"),
     [
         (["--families", "MoveCub"], "MoveCub"),
-        (["--conditions", "k1,k9"], "Planned there: no-history k0 k1 k3 k7"),
         (["--cameras", "side"], "side"),
         (["--episodes", "40-49"], "no buffer"),
         (["--index", "thumbnail"], "lacks index"),

@@ -137,9 +137,9 @@ def test_stopped_while_fetching(hub: HubServer, tmp_path: Path, run: Run) -> Non
     assert code == 130 and "kept; resume with:\nrobomme-interference fetch" in err
     assert leftovers(tmp_path) == [] and not (tmp_path / "out").exists()
     assert run(*command)[0] == 0
-    came = [one.path for one in hub.asked if one.method == "GET" and one.status == 200]
-    came = [path for path in came if not path.startswith("/api/")]
-    assert len(came) - len({*came}) <= 8  # those that were on their way come again
+    paths = [one.path for one in hub.asked if one.method == "GET" and one.status == 200]
+    files = [path for path in paths if not path.startswith("/api/")]
+    assert len(files) - len({*files}) <= 8  # unfinished downloads start again
 
 
 def test_an_open_buffer_set_makes_no_requests(hub: HubServer) -> None:

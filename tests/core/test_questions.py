@@ -1,4 +1,4 @@
-"""Questions as a buffer set has them: how they are stored, and what is refused."""
+"""Questions of a buffer set: how they are stored, and which files are invalid."""
 
 import json
 from collections.abc import Callable
@@ -77,7 +77,7 @@ def test_the_golden_questions() -> None:
     assert peg.options[0] == peg.options[2]  # of different pegs, as the picture shows
 
 
-# --- what is refused ---------------------------------------------------------------------------
+# --- invalid questions -------------------------------------------------------------------------
 
 
 def rewrite(root: Path, change: Callable[[pa.Table], pa.Table]) -> None:

@@ -104,6 +104,7 @@ def test_round_trips(found: list[Row]) -> None:
         ({"count": True}, "count: True; expected a whole number"),
         ({"count": 2**63}, "count: a number of 64 bits"),
         ({"share": "0.5"}, "share: '0.5'; expected a number"),
+        ({"share": 10**400}, "share: a number of 1329 bits"),
         ({"fine": 1}, "fine: 1; expected true or false"),
         ({"note": 3}, "note: 3; expected text"),
         ({"episode_id": "MoveCube"}, "'MoveCube' is not an episode id"),

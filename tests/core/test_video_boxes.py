@@ -113,7 +113,7 @@ def test_wherever_ffmpeg_finds_a_table_it_is_looked_at() -> None:
     assert found > 20
 
 
-def test_an_index_of_segments_is_refused(tmp_path: Path) -> None:
+def test_an_index_of_segments_raises(tmp_path: Path) -> None:
     """FFmpeg would jump to fragments that it names, even inside of frames."""
     path = tmp_path / "a.mp4"
     with av.open(str(path), "w", options={"movflags": "empty_moov+global_sidx"}) as container:
