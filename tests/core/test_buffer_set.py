@@ -262,7 +262,13 @@ def rewritten(path: Path, change: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    "columns", [{"sessions": None}, {"k": pa.array(["x"] * 15)}, {"sessions": [None] * 15}]
+    "columns",
+    [
+        {"sessions": None},
+        {"sessions": [None] * 15},
+        {"k": pa.array(["x"] * 15)},
+        {"condition": pa.array([["k3"]] * 15)},
+    ],
 )
 def test_damaged_rows(own_buffers: Path, columns: dict[str, Any]) -> None:
     edit_columns(own_buffers / ROWS, **columns)

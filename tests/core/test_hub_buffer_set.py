@@ -17,7 +17,6 @@ from support.retrieval import make_index
 from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.build_dataset.audit import audit_buffer_set
 from robomme_interference_data.build_dataset.verify import verify_buffer_set
-from robomme_interference_data.cli.main import app
 from robomme_interference_data.constants import MANIFEST_PATH
 from robomme_interference_data.errors import (
     FormatError,
@@ -128,14 +127,12 @@ Fetched = Callable[..., tuple[int, str]]
 
 
 @pytest.fixture
-def fetch(capfd: pytest.CaptureFixture[str]) -> Fetched:
-    from typer.testing import CliRunner
+def fetch(run: Any) -> Fetched:
+    def call(*arguments: object) -> tuple[int, str]:
+        code, out, err = run("fetch", *arguments)
+        return code, err + out
 
-    def run(*arguments: object) -> tuple[int, str]:
-        result = CliRunner().invoke(app, ["fetch", *map(str, arguments)])
-        return result.exit_code, result.output + str(result.exception or "")
-
-    return run
+    return call
 
 
 def test_fetch_the_whole_buffer_set(hub: HubServer, fetch: Fetched, tmp_path: Path) -> None:

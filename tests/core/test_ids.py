@@ -70,6 +70,7 @@ def test_canonical_order() -> None:
 @given(st.sets(st.integers(0, 300), min_size=1))
 def test_numbers_round_trip(numbers: set[int]) -> None:
     assert parse_numbers(format_numbers(sorted(numbers))) == tuple(sorted(numbers))
+    assert format_numbers([0, 1, 2, 5]) == "0-2,5"
 
 
 @pytest.mark.parametrize(

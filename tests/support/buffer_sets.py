@@ -48,9 +48,9 @@ def build(root: Path, kind: str, source: Source, **episodes: Any) -> None:
     build_dataset(plan, root / kind, Serial(), WorkProgress(quiet=True))
 
 
-def plan_again(root: Path, conditions: Iterable[str] = CONDITIONS, seed: int = 0) -> None:
+def plan_again(root: Path, conditions: Iterable[str] = CONDITIONS, **options: Any) -> None:
     """Plan the buffers of a buffer set and replace its manifests."""
-    for _ in write_manifests(plan_manifests(in_folder(root), tuple(conditions), seed), root):
+    for _ in write_manifests(plan_manifests(in_folder(root), tuple(conditions), **options), root):
         pass
 
 

@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 from support.buffer_sets import contents
 from support.build_server import BuildServer
-from support.few import few
 
 from robomme_interference_data.build_dataset.stage import read_staged
 from robomme_interference_data.storage.staging import staging_path
@@ -20,6 +19,10 @@ from robomme_interference_data.storage.staging import staging_path
 pytestmark = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs /proc")
 
 HASH_SEED = "4711"
+
+
+def slow(value: object) -> object:
+    return pytest.param(value, marks=pytest.mark.slow)
 
 
 @pytest.fixture(scope="module")
@@ -60,8 +63,8 @@ def staged(out: Path) -> dict[Path, int]:
     }
 
 
-@pytest.mark.parametrize("times", [1, pytest.param(12, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("sent", few([signal.SIGKILL, signal.SIGINT, signal.SIGTERM], 1))
+@pytest.mark.parametrize("times", [1, slow(12)])
+@pytest.mark.parametrize("sent", [signal.SIGKILL, slow(signal.SIGINT), slow(signal.SIGTERM)])
 def test_stopped_at_random_moments(
     server: BuildServer,
     undisturbed: tuple[dict[str, bytes], float],
