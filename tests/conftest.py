@@ -1,4 +1,4 @@
-"""Isolation: every test runs without the network, without tokens and with caches of its own."""
+"""Isolation: every test runs without the network and tokens, and with separate caches."""
 
 import os
 import shutil
@@ -190,7 +190,7 @@ def robomme_python(bare_python: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(scope="session")
 def tiny_buffers() -> Path:
-    """The golden buffer set: not to be written to. See `support/splits.py`."""
+    """The golden buffer set: not to be written to. See `support/buffer_sets.py`."""
     from support.buffer_sets import GOLDEN
 
     return GOLDEN

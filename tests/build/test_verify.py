@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from support.buffer_sets import GOLDEN, QUERIES, UNITS, renew_sums
+from support.buffer_sets import GOLDEN, QUERIES, UNITS, plan_again, renew_sums
 from support.damage import flipped_bits
 from support.made_up import record, write_metadata
 from support.retrieval import QUIET, TwoSums, make_index
@@ -22,11 +22,6 @@ from support.tabletop import TABLETOP, copy_tabletop
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.audit import Audit, Leak, audit_buffer_set
-from robomme_interference_data.build_dataset.manifests import (
-    in_folder,
-    plan_manifests,
-    write_manifests,
-)
 from robomme_interference_data.build_dataset.verify import verify_buffer_set
 from robomme_interference_data.constants import QUESTIONS_PATH
 from robomme_interference_data.data.questions import read_questions
@@ -347,8 +342,7 @@ def test_a_dataset_that_is_gone(own_buffers: Path) -> None:
 def audited(root: Path, queries: list[Any], units: list[Any], *conditions: str) -> Audit:
     write_metadata(root / "demonstrations", "demonstrations", queries)
     write_metadata(root / "distractors", "distractors", units)
-    for _ in write_manifests(plan_manifests(in_folder(root), conditions or ("k0",)), root):
-        pass
+    plan_again(root, conditions or ("k0",))
     return audit_buffer_set(load_buffer_set(root))
 
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from support.make_golden_cards import cards
+from support.cards import cards
 
 
 @pytest.fixture(scope="session")

@@ -7,15 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.buffer_sets import plan_again
 from support.cards import OF_BUFFER_SET, OF_DEMONSTRATIONS, OF_RESULTS, RUN
 from support.made_up import record, write_metadata
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.build_dataset.manifests import (
-    in_folder,
-    plan_manifests,
-    write_manifests,
-)
 from robomme_interference_data.cards.dataset_facts import (
     buffer_set_facts,
     count_same_family,
@@ -58,9 +54,7 @@ def made_up(
         path, digest = root / kind / IDENTITY_PATH, sha256(sums.encode()).hexdigest()
         write_json(path, {**read_json(path), **(identity or {}), "sums": digest})
         write_json(root / kind / REPORT_PATH, {"skipped": [], **(report or {})})
-    planned = {"conditions": ("no-history", "k0", "k1", "k3"), **options}
-    for _ in write_manifests(plan_manifests(in_folder(root), **planned), root):
-        pass
+    plan_again(root, **{"conditions": ("no-history", "k0", "k1", "k3"), **options})
     return load_buffer_set(root)
 
 

@@ -1,4 +1,4 @@
-"""Buffer sets: list, filter and load; what is missing, damaged or of other types is told."""
+"""Buffer sets: list, filter and load; missing, damaged or mistyped parts raise one error."""
 
 import json
 import pickle
@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.buffer_sets import CONDITIONS, GOLDEN, QUERIES
-from support.lerobot_layouts import edit_info
+from support.lerobot_layouts import edit_columns, edit_info
 
 from robomme_interference_data import (
     DecodedCache,
@@ -57,10 +57,7 @@ def test_what_a_buffer_set_lists() -> None:
     ("filters", "count"),
     [
         ({}, 15),
-        ({"family": "MoveCube"}, 5),
-        ({"condition": "k3"}, 3),
         ({"k": 0}, 3),
-        ({"condition": "no-history", "family": "MoveCube"}, 1),
         ({"condition": ["k3", parse_condition("k0"), "k3"], "family": ("MoveCube",) * 2}, 2),
         ({"condition": (), "family": ("PatternLock", "MoveCube")}, 10),
         ({"difficulty": "easy"}, 15),  # the sample's index 0
@@ -74,22 +71,22 @@ def test_filters(filters: dict[str, Any], count: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("filters", "told"),
+    ("filters", "message"),
     [
         ({"family": ("MoveCube", "MoveCub")}, "Did you mean 'MoveCube'?"),
         ({"difficulty": "hard"}, "Known: easy"),
         ({"condition": "k2"}, "k1"),
     ],
 )
-def test_unknown_filters(filters: dict[str, Any], told: str) -> None:
+def test_unknown_filters(filters: dict[str, Any], message: str) -> None:
     with pytest.raises(UnknownNameError) as caught:
         load_buffer_set(GOLDEN).manifests(**filters)
-    assert told in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_a_buffer_by_its_key() -> None:
     buffer_set = load_buffer_set(GOLDEN)
-    wanted = buffer_set.load("MoveCube/test/0", "k3").manifest
+    expected = buffer_set.load("MoveCube/test/0", "k3").manifest
     name = EpisodeId("MoveCube", "test", 0)
     for found in (
         load_buffer("MoveCube/test/0", "k3", buffer_set=GOLDEN),
@@ -97,72 +94,66 @@ def test_a_buffer_by_its_key() -> None:
         load_buffer("MoveCube/test/0", k=3, buffer_set=str(GOLDEN), verify=True),
         buffer_set.load(name, k=3),
     ):
-        assert found.manifest == wanted
-    assert to_dict(wanted)["episode_id"] == "MoveCube/test/0"
-    assert (to_dict(wanted)["family"], to_dict(wanted)["condition"]) == ("MoveCube", "k3")
+        assert found.manifest == expected
+    assert to_dict(expected)["episode_id"] == "MoveCube/test/0"
+    assert (to_dict(expected)["family"], to_dict(expected)["condition"]) == ("MoveCube", "k3")
 
 
 @pytest.mark.parametrize(
-    ("arguments", "error", "told"),
+    ("arguments", "error", "message"),
     [
         ((), InvalidOptionError, "expected exactly one"),
         (("k3", 3), InvalidOptionError, "expected exactly one"),
         ((None, True), InvalidOptionError, "k True; expected an integer"),
-        ((None, "3"), InvalidOptionError, "k '3'; expected an integer"),
-        ((None, 3.0), InvalidOptionError, "k 3.0; expected an integer"),
         ((None, -1), InvalidIdError, "'k-1' is not a condition"),
-        ((3,), InvalidIdError, "3 is not a condition"),
-        (("K3",), InvalidIdError, "'K3' is not a condition"),
         (("k5",), UnknownNameError, "Planned there: no-history k0 k1 k3 k7"),
     ],
 )
 def test_conditions_that_cannot_be_loaded(
-    arguments: tuple[Any, ...], error: type[InterferenceError], told: str
+    arguments: tuple[Any, ...], error: type[InterferenceError], message: str
 ) -> None:
     given = dict(zip(("condition", "k"), arguments, strict=False))
     with pytest.raises(error) as caught:
         load_buffer("MoveCube/test/0", buffer_set=GOLDEN, **given)
-    assert told in str(caught.value)
+    assert message in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("episode", "error", "told"),
+    ("episode", "error", "message"),
     [
         ("MoveCub/test/0", UnknownNameError, "Did you mean 'MoveCube'?"),
         ("MoveCube/test/1", UnknownNameError, "Did you mean 'MoveCube/test/0'"),
         ("MoveCube", InvalidIdError, "Expected <Family>/<split>/<index>"),
-        (("MoveCube", "test", 0), InvalidIdError, "is not an episode id"),
-        (None, InvalidIdError, "None is not an episode id"),
     ],
 )
 def test_episodes_that_cannot_be_loaded(
-    episode: Any, error: type[InterferenceError], told: str
+    episode: Any, error: type[InterferenceError], message: str
 ) -> None:
     buffer_set = load_buffer_set(GOLDEN)
     for load in (lambda: buffer_set.load(episode, "k3"), lambda: buffer_set.query(episode)):
         with pytest.raises(error) as caught:
             load()
-        assert told in str(caught.value)
+        assert message in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("option", "values", "told"),
+    ("option", "values", "message"),
     [
         ("cache", (3, ["x"], b"x", "", "a\0b"), "expected True, False, a folder"),
         ("threads", (0, -3, True, "2", 1.5), "expected an integer from 1"),
         ("buffer_set", (None, 3, b"g", "", "a\0b"), "expected a folder"),
     ],
 )
-def test_no_such_option(option: str, values: tuple[Any, ...], told: str) -> None:
+def test_no_such_option(option: str, values: tuple[Any, ...], message: str) -> None:
     for value in values:
-        with pytest.raises(InvalidOptionError, match=told):
+        with pytest.raises(InvalidOptionError, match=message):
             load_buffer_set(**{"buffer_set": GOLDEN, option: value})
 
 
 def test_numbers_may_be_numpys() -> None:
     buffer_set = load_buffer_set(GOLDEN, threads=np.int64(2))  # type: ignore[arg-type]
-    made = buffer_set.load("MoveCube/test/0", k=np.int64(1))  # type: ignore[arg-type]
-    np.testing.assert_array_equal(made.frame(np.uint8(60)), made.frames()[60])
+    buffer = buffer_set.load("MoveCube/test/0", k=np.int64(1))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(buffer.frame(np.uint8(60)), buffer.frames()[60])
 
 
 def test_caches_by_folder_or_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -182,19 +173,6 @@ def test_a_buffer_set_travels_between_processes() -> None:
     assert buffer_set.load("MoveCube/test/0", "k0").frames().shape == (48, 32, 32, 3)
 
 
-def test_names_are_imported_one_by_one() -> None:
-    code = (
-        "import sys\n"
-        "from robomme_interference_data import EpisodeId, InterferenceError\n"
-        "from robomme_interference_data.errors import FormatError\n"
-        "print(sorted({'pyarrow', 'av', 'numpy', 'huggingface_hub'} & sys.modules.keys()))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True
-    )
-    assert done.stdout == "[]\n"
-
-
 def test_datasets_are_opened_on_first_use(own_buffers: Path) -> None:
     header = json.loads((own_buffers / HEADER).read_text())
     for name in ("shifted", "contradictions"):
@@ -207,15 +185,12 @@ def test_datasets_are_opened_on_first_use(own_buffers: Path) -> None:
         buffer_set.datasets["shifted"]
 
 
-def test_episodes_are_listed_once() -> None:
-    buffer_set = load_buffer_set(GOLDEN)
-    assert buffer_set.families is buffer_set.families
-    assert buffer_set.episode_ids is buffer_set.episode_ids
-
-
-def test_loading_needs_light_libraries_only() -> None:
+def test_imports_are_lazy_and_loading_needs_light_libraries_only() -> None:
     code = (
         "import sys\n"
+        "from robomme_interference_data import EpisodeId, InterferenceError\n"
+        "from robomme_interference_data.errors import FormatError\n"
+        "print(sorted({'pyarrow', 'av', 'numpy', 'huggingface_hub'} & sys.modules.keys()))\n"
         "from robomme_interference_data import load_buffer\n"
         f"buffer = load_buffer('MoveCube/test/0', 'k3', buffer_set={str(GOLDEN)!r}, verify=True)\n"
         "print(len(buffer.frames()), sorted({'torch', 'lerobot', 'datasets', 'typer',"
@@ -224,7 +199,7 @@ def test_loading_needs_light_libraries_only() -> None:
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True
     )
-    assert done.stdout == "144 []\n"
+    assert done.stdout == "[]\n144 []\n"
 
 
 # --- what is not as it should be ----------------------------------------------------------------
@@ -267,15 +242,10 @@ def test_another_dataset_than_the_manifests_name(own_buffers: Path) -> None:
         ('"conditions": [', '"conditionz": ['),
         ('"datasets": {', '"datasets": null, "x": {'),
         ('"seed": 0', '"seed": null'),
-        ('"seed": 0', '"seed": "0"'),
         ('"demonstrations"', '"demonstration"'),
         ('"distractors": {', '"../distractors": {'),
-        ('"distractors": {', '"/distractors": {'),
-        ('"distractors": {', '"": {'),
         ('"distractors": {', '"a\\u0000b": {'),
-        ('"distractors": {', '"\\ud800": {'),
         ("{", "["),
-        ("{", "{" * 5000),
     ],
 )
 def test_damaged_headers(own_buffers: Path, before: str, after: str) -> None:
@@ -291,31 +261,17 @@ def rewritten(path: Path, change: Any) -> None:
     pq.write_table(change(pq.read_table(path)), path)
 
 
-def truncated(keep: int) -> Callable[[Path], object]:
-    return lambda path: path.write_bytes(path.read_bytes()[:keep])
-
-
 @pytest.mark.parametrize(
-    "damage",
+    "columns",
     [
-        lambda path: rewritten(path, lambda t: t.drop_columns(["sessions"])),
-        lambda path: rewritten(path, lambda t: t.drop_columns(["condition"])),
-        lambda path: rewritten(path, lambda t: t.set_column(5, "k", t["condition"])),
-        lambda path: rewritten(
-            path,
-            lambda t: t.set_column(
-                t.column_names.index("condition"), "condition", [[[c] for c in t["condition"]]]
-            ),
-        ),
-        lambda path: rewritten(
-            path,
-            lambda t: t.set_column(t.column_names.index("sessions"), "sessions", [[None] * len(t)]),
-        ),
-        *map(truncated, (0, 3, 100, 2000)),
+        {"sessions": None},
+        {"sessions": [None] * 15},
+        {"k": pa.array(["x"] * 15)},
+        {"condition": pa.array([["k3"]] * 15)},
     ],
 )
-def test_damaged_rows(own_buffers: Path, damage: Callable[[Path], object]) -> None:
-    damage(own_buffers / ROWS)
+def test_damaged_rows(own_buffers: Path, columns: dict[str, Any]) -> None:
+    edit_columns(own_buffers / ROWS, **columns)
     with pytest.raises(FormatError, match=r"buffers\.parquet"):
         load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
 
@@ -326,26 +282,19 @@ def test_a_key_that_occurs_twice(own_buffers: Path) -> None:
         load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
 
 
-def renew_rows(root: Path) -> None:
-    header = json.loads((root / HEADER).read_text())
-    (root / HEADER).write_text(json.dumps(header | {"rows": sha256_file(root / ROWS)}))
-
-
 def other_goals(root: Path) -> None:
-    rewritten(root / ROWS, lambda table: put(table, "goals", [["another"]] * len(table)))
+    edit_columns(root / ROWS, goals=[["another"]] * 15)
 
 
 def other_goals_with_their_sum(root: Path) -> None:
     other_goals(root)
-    renew_rows(root)
+    header = json.loads((root / HEADER).read_text())
+    (root / HEADER).write_text(json.dumps(header | {"rows": sha256_file(root / ROWS)}))
 
 
 def shorter_lesson(root: Path) -> None:
     for path in ("interference.parquet", "episodes/chunk-000/file-000.parquet"):
-        rewritten(
-            root / "demonstrations/meta" / path,
-            lambda table: put(table, "exec_start_idx", [47] * len(table)),
-        )
+        edit_columns(root / "demonstrations/meta" / path, exec_start_idx=[47] * 3)
 
 
 def other_first_view(root: Path) -> None:
@@ -360,7 +309,7 @@ def other_first_view(root: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         (other_goals, "does not have the SHA-256 in manifest.json"),
         (other_goals_with_their_sum, "goals of MoveCube/test/0 under k3 does not fit its query"),
@@ -369,24 +318,19 @@ def other_first_view(root: Path) -> None:
     ],
 )
 def test_a_verified_load_checks_the_query(
-    own_buffers: Path, change: Callable[[Path], object], told: str
+    own_buffers: Path, change: Callable[[Path], object], message: str
 ) -> None:
     change(own_buffers)
     load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
-    with pytest.raises(HashMismatchError, match=told):
+    with pytest.raises(HashMismatchError, match=message):
         load_buffer_set(own_buffers).load("MoveCube/test/0", "k3", verify=True)
-
-
-def put(table: Any, name: str, values: Any) -> Any:
-    place = table.column_names.index(name)
-    return table.set_column(place, name, pa.array(values, table.schema.field(name).type))
 
 
 def test_a_session_of_no_dataset(own_buffers: Path) -> None:
     header = own_buffers / HEADER
-    told = json.loads(header.read_text())
-    del told["datasets"]["distractors"]
-    header.write_text(json.dumps(told))
+    edited = json.loads(header.read_text())
+    del edited["datasets"]["distractors"]
+    header.write_text(json.dumps(edited))
     assert load_buffer_set(own_buffers).load("MoveCube/test/0", "k0").frames().any()
     with pytest.raises(FormatError, match=r"buffers\.parquet: .* unknown dataset 'distractors'"):
         load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
@@ -401,15 +345,15 @@ def test_features_that_are_not_as_they_must_be(
     own_buffers: Path, feature: str, shape: list[int] | None, condition: str
 ) -> None:
     def change(info: dict[str, Any]) -> None:
-        told = info["features"].pop(feature)
+        declared = info["features"].pop(feature)
         if shape is not None:
-            info["features"][feature] = told | {"shape": shape}
+            info["features"][feature] = declared | {"shape": shape}
 
     edit_info(own_buffers / "demonstrations", change)
     for use in (
-        lambda made: made.frames(),
-        lambda made: made.states,
-        lambda made: made.query.frame(),
+        lambda buffer: buffer.frames(),
+        lambda buffer: buffer.states,
+        lambda buffer: buffer.query.frame(),
     ):
         with pytest.raises(FormatError, match=feature):
             use(load_buffer_set(own_buffers).load("MoveCube/test/0", condition))

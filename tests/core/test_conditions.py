@@ -1,4 +1,4 @@
-"""Conditions are values: names, order, and the sessions that their rules give."""
+"""Conditions, shifts and subgoals are values: their text, order and sessions."""
 
 import pickle
 from collections import Counter
@@ -20,6 +20,8 @@ from robomme_interference_data.schema.conditions import (
     parse_condition,
 )
 from robomme_interference_data.schema.manifest import SessionEntry
+from robomme_interference_data.schema.shifts import SHIFTS, Shift, parse_shift
+from robomme_interference_data.schema.subgoal import Subgoal, read_grounded
 
 
 def entry(role: str, number: int) -> SessionEntry:
@@ -98,9 +100,8 @@ def test_names(kind: str, k: int) -> None:
 @pytest.mark.parametrize(
     "given",
     [
-        *("", "k", "k64", "k-1", "k03", "K3", "3", "nohistory", "no-history-k0", "x-k3", " k3"),
-        *("before", "before-k64", "before-k03", "k-k3", "before-3", "Before-k3"),
-        *(3, None, b"k3"),
+        *("", "k", "k64", "k-1", "k03", "K3", "no-history-k0", "x-k3", " k3"),
+        *("before", "before-k64", "before-3", 3),
     ],
 )
 def test_what_is_no_condition(given: Any) -> None:
@@ -126,8 +127,50 @@ def test_what_a_buffer_set_must_hold() -> None:
     assert needed("misled-k0", "k0", "raw-k1") == every
     assert (*every, "shifted") == DATASETS  # which no condition needs
 
-
-def test_the_registry() -> None:
-    kinds = "no-history k before middle held same parts raw absent stale misled"
-    assert list(KINDS) == kinds.split()
     assert all(kind.name == name and kind.holds and kind.asks for name, kind in KINDS.items())
+
+
+# --- shifts and subgoals -------------------------------------------------------------------------
+
+
+def test_shifts_are_written_as_they_are_read() -> None:
+    assert parse_shift("light:2") == Shift("light", 2)
+    assert parse_shift("none") is None
+    assert list(map(str, SHIFTS)) == [
+        *("light:1", "light:2", "light:3", "camera:1", "camera:2", "camera:3"),
+        *("clutter:1", "clutter:2", "clutter:3"),
+    ]
+    assert tuple(parse_shift(str(shift)) for shift in SHIFTS) == SHIFTS
+
+
+@pytest.mark.parametrize(
+    "text", ["", "light", "light:0", "light:4", "Light:2", "fog:1", "light:2 ", None]
+)
+def test_invalid_shifts(text: Any) -> None:
+    with pytest.raises(InvalidOptionError, match="strength from 1 to 3, such as light:2"):
+        parse_shift(text)
+
+
+_PIXELS = st.tuples(st.integers(0, 255), st.integers(0, 255))
+
+
+def test_with_and_without_places() -> None:
+    subgoal = Subgoal("put the cube at <point> on the target at <point>", ((12, 200), (0, 7)))
+    assert subgoal.grounded == "put the cube at <12, 200> on the target at <0, 7>"
+    assert subgoal.simple == "put the cube on the target"
+    assert Subgoal("wait").grounded == Subgoal("wait").simple == "wait"
+
+
+@given(st.lists(st.tuples(st.sampled_from(["go to", "put it at"]), _PIXELS), max_size=4))
+def test_what_is_written_is_read_again(parts: list[tuple[str, tuple[int, int]]]) -> None:
+    text = " then ".join(["start", *(f"{words} <point>" for words, _ in parts)])
+    subgoal = Subgoal(text, tuple(point for _, point in parts))
+    assert read_grounded(subgoal.grounded) == subgoal
+
+
+@pytest.mark.parametrize(
+    ("text", "points"), [("", ()), ("<point>", ((1, 2),)), ("at <point>", ()), ("go", ((1, 2),))]
+)
+def test_words_and_points_must_go_together(text: str, points: tuple[tuple[int, int], ...]) -> None:
+    with pytest.raises(InvalidOptionError, match="points"):
+        Subgoal(text, points)

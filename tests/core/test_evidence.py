@@ -112,7 +112,7 @@ def test_evidence_of_a_lesson_may_be_unknown(role: str) -> None:
     assert map_evidence(sessions, lambda entry: known.get(entry.dataset)) is None
 
 
-def test_a_buffer_tells_its_evidence(tiny_buffers: Path) -> None:
+def test_evidence_of_a_buffer(tiny_buffers: Path) -> None:
     """The source `sample`: VideoRepick's gripper turns after 20 steps."""
     opened = load_buffer_set(tiny_buffers)
     [lesson] = opened.manifest(QUERIES[0], "k0").sessions

@@ -1,4 +1,4 @@
-"""A buffer set from a stranger is data: whatever a file holds, reading it ends, within bounds."""
+"""Untrusted data: reading any file ends, within bounds of memory and time."""
 
 import json
 import random
@@ -31,7 +31,7 @@ from robomme_interference_data.schema.manifest import BufferManifest, SessionEnt
 
 MEGABYTES = 700
 """What reading a bomb may add to the memory of a process: the largest frame that is read, more than
-once, and the threads of libraries. Each bomb asks for more, or is refused at once."""
+once, and the threads of libraries. Each bomb needs more, or raises at once."""
 
 _CHILD = """
 import json, resource, sys
@@ -82,19 +82,12 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("name", BOMBS)
-def test_a_bomb_is_refused_before_it_goes_off(outcomes: dict[str, str], name: str) -> None:
+def test_a_bomb_raises_before_it_is_decoded(outcomes: dict[str, str], name: str) -> None:
     assert BOMBS[name].message in outcomes[name]
 
 
 @pytest.mark.parametrize(
-    "change",
-    [
-        {"repeat": 2**40},
-        {"stop": 2**62},
-        {"start": 0, "stop": 2**18 + 1},
-        {"start": -1},
-        {"repeat": 0},
-    ],
+    "change", [{"repeat": 2**40}, {"start": 0, "stop": 2**18 + 1}, {"start": -1}, {"repeat": 0}]
 )
 def test_a_session_has_a_bounded_number_of_frames(change: dict[str, int]) -> None:
     session = to_dict(load_buffer(QUERIES[0], "k1", buffer_set=GOLDEN).manifest.sessions[0])
@@ -111,14 +104,14 @@ def test_a_buffer_has_a_bounded_number_of_frames_and_sessions(change: dict[str, 
         from_dict(BufferManifest, manifest | {"sessions": many * 2}, "here")
 
 
-@pytest.mark.parametrize("called", ["../../written", "/written", "0" * 64, "", "x\0"])
-def test_the_cache_keeps_frames_under_their_own_digest_alone(tmp_path: Path, called: str) -> None:
+@pytest.mark.parametrize("digest", ["../../written", "/written", "0" * 64, "", "x\0"])
+def test_the_cache_ignores_digests_that_are_not_of_the_frames(tmp_path: Path, digest: str) -> None:
     """Else a buffer set could write elsewhere, or give another one its frames."""
     root = copy_buffer_set(tmp_path / "buffer_set")
     path = root / "distractors/meta/interference.parquet"
     rows = pq.read_table(path).to_pylist()
     for row in rows:
-        row["feature_sha256"]["observation.images.front"] = called
+        row["feature_sha256"]["observation.images.front"] = digest
     pq.write_table(pa.Table.from_pylist(rows), path)
     before = contents(tmp_path)
     cache = tmp_path / "cache" / "inner"
@@ -128,16 +121,16 @@ def test_the_cache_keeps_frames_under_their_own_digest_alone(tmp_path: Path, cal
         assert np.array_equal(buffer.frames(), expected)
         streamed = [chunk.frames["front"] for chunk in buffer.stream(cameras=["front"])]
         assert np.array_equal(np.concatenate(streamed), expected)
-    assert len(list(cache.iterdir())) == 1  # the lesson, which is called as it should be
+    assert len(list(cache.iterdir())) == 1  # the lesson, whose digest is right
     assert {name for name in contents(tmp_path) if not name.startswith("cache/")} == set(before)
 
 
-def test_frames_that_take_too_much_at_once_are_refused(tmp_path: Path) -> None:
+def test_frames_that_need_too_much_memory_raise(tmp_path: Path) -> None:
     root = copy_buffer_set(tmp_path / "buffer_set")
     info = root / "demonstrations/meta/info.json"
-    told = json.loads(info.read_text())
-    told["features"]["observation.images.front"]["shape"] = [4096, 4096, 3]
-    info.write_text(json.dumps(told))
+    declared = json.loads(info.read_text())
+    declared["features"]["observation.images.front"]["shape"] = [4096, 4096, 3]
+    info.write_text(json.dumps(declared))
     buffer = load_buffer(QUERIES[0], "k7", buffer_set=root)
     short = load_buffer(QUERIES[0], "no-history", buffer_set=root)
     assert len(buffer) * 4096 * 4096 * 3 <= 16 * 2**30  # so its videos are looked at
@@ -152,10 +145,14 @@ def test_frames_that_take_too_much_at_once_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_a_sound_file_is_read(tmp_path: Path, name: str) -> None:
+def test_a_sound_file_is_read_and_a_truncated_one_raises_one_error(
+    tmp_path: Path, name: str
+) -> None:
     target, root = TARGETS[name], places(tmp_path)
     for data in target.sound(root):
         assert target(root, data) is None
+        for share in range(8):
+            target(root, data[: len(data) * share // 8])
 
 
 @pytest.mark.parametrize("name", TARGETS)
@@ -163,16 +160,16 @@ def test_a_damaged_file_ends_in_an_error_or_a_sound_value(
     tmp_path_factory: pytest.TempPathFactory, name: str
 ) -> None:
     target, root = TARGETS[name], places(tmp_path_factory.mktemp("places"))
-    sound, refused = target.sound(root), []
+    sound, errors = target.sound(root), []
 
     @settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
     @given(st.integers(0, 2**32))
     def check(seed: int) -> None:
         error = target(root, mutated(sound, random.Random(seed)))
-        refused.append(error is not None)
+        errors.append(error is not None)
 
     check()
-    assert any(refused)
+    assert any(errors)
 
 
 @pytest.mark.parametrize(
@@ -187,9 +184,7 @@ def test_a_damaged_file_ends_in_an_error_or_a_sound_value(
         ("manifest", b'"seed": 0', b'"seed": ' + b"9" * 5000),
     ],
 )
-def test_values_that_were_too_much_once(
-    tmp_path: Path, name: str, before: bytes, after: bytes
-) -> None:
+def test_values_that_once_crashed(tmp_path: Path, name: str, before: bytes, after: bytes) -> None:
     target, root = TARGETS[name], places(tmp_path)
     [sound] = target.sound(root)
     assert before in sound
@@ -202,15 +197,7 @@ def test_half_a_character_in_a_header(tmp_path: Path) -> None:
     assert target(root, sound.replace(b'"k7"', b'"\\ud800"')) is None
 
 
-@pytest.mark.parametrize("name", TARGETS)
-def test_of_a_file_any_part_may_be_missing(tmp_path: Path, name: str) -> None:
-    target, root = TARGETS[name], places(tmp_path)
-    for data in target.sound(root):
-        for share in range(8):
-            target(root, data[: len(data) * share // 8])
-
-
-def test_messages_are_short_and_show_what_a_terminal_would_obey() -> None:
+def test_messages_are_short_and_escape_control_characters() -> None:
     error = FormatError.damaged("a\x1b[2Jb", "x" * 10_000 + "\n")
     assert str(error).startswith(r"a\x1b[2Jb: xxx")
     assert len(str(error)) < 5_000

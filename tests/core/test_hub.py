@@ -13,7 +13,6 @@ from huggingface_hub import constants
 from support.hub_server import HubServer
 from support.lerobot_layouts import write_lerobot
 
-from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.sources import open_source
 from robomme_interference_data.errors import (
     FormatError,
@@ -35,15 +34,22 @@ FILES |= {"README.md": b"read me", "meta/deep/a.parquet": b"a"}
 # --- where a location leads ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("text", ["robomme", "a/b/c", "/a/b", "~/a", "a/", "a b/c", "a/b@", "@v1"])
-def test_what_is_none(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.parametrize(
+    "text", ["robomme", "a/b/c", "/a/b", "~/a", "a/", "./a/b", "a//b", "a b/c", "a/b@", "@v1"]
+)
+def test_invalid_locations_are_never_requested(hub: HubServer, text: str) -> None:
     with pytest.raises(InvalidOptionError, match="neither a folder nor a model repository"):
         locate(text, "model")
-    found = locate("A-1/b.c_d@v1.0")
-    assert isinstance(found, HubFiles) and (found.repo_id, found.revision) == ("A-1/b.c_d", "v1.0")
+    assert hub.requests == []
+
+
+def test_folders_take_precedence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    files = locate("A-1/b.c_d@v1.0")
+    assert isinstance(files, HubFiles) and (files.repo_id, files.revision) == ("A-1/b.c_d", "v1.0")
     (tmp_path / REPO).mkdir(parents=True)
-    assert isinstance(locate(REPO), LocalFiles)  # a folder goes before a repository
+    assert isinstance(locate(REPO), LocalFiles)
+    assert locate(tmp_path).location == str(tmp_path)
 
 
 # --- what is fetched -----------------------------------------------------------------------------
@@ -52,12 +58,12 @@ def test_what_is_none(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_path_and_list(hub: HubServer) -> None:
     commit = hub.push(DATASET, FILES)
     files = HubFiles(REPO)
-    assert (files.describe(), hub.requests) == ("someone/small@main", [])  # nothing is asked yet
+    assert (files.describe(), hub.requests) == ("someone/small@main", [])  # no request yet
     assert files.path("README.md").read_bytes() == b"read me"
     assert files.list("meta") == sorted(name for name in FILES if name.startswith("meta/"))
     assert files.list("meta", ".parquet") == ["meta/deep/a.parquet"]
     assert files.list("nothing") == []
-    assert files.describe() == f"someone/small@{commit}"
+    assert files.describe() == files.location == f"someone/small@{commit}"
     before = len(hub.requests)
     assert files.path("README.md").read_bytes() == b"read me"
     assert len(hub.requests) == before  # from the cache, without a request
@@ -86,22 +92,7 @@ def test_no_path_leads_out(hub: HubServer, path: str) -> None:
     assert hub.requests == []
 
 
-@pytest.mark.parametrize("text", ["./a/b", "a//b", "a/b/"])
-def test_a_folder_that_is_not_there_is_not_asked_for_on_the_hub(hub: HubServer, text: str) -> None:
-    with pytest.raises(InvalidOptionError, match="neither a folder nor"):
-        load_buffer_set(text)
-    assert hub.requests == []
-
-
-def test_a_location_leads_back(hub: HubServer, tmp_path: Path) -> None:
-    commit = hub.push(DATASET, FILES)
-    files = locate(REPO)
-    assert files.location == f"{REPO}@{commit}"
-    assert locate(files.location).path("README.md").read_bytes() == b"read me"
-    assert locate(tmp_path).location == str(tmp_path)
-
-
-# --- refusals ------------------------------------------------------------------------------------
+# --- errors --------------------------------------------------------------------------------------
 
 
 def test_missing_file(hub: HubServer) -> None:
@@ -113,26 +104,22 @@ def test_missing_file(hub: HubServer) -> None:
 
 
 @pytest.mark.parametrize(
-    ("repo", "revision", "telling", "hint"),
+    ("repo", "revision", "message", "hint"),
     [
-        (
-            "someone/smal",
-            None,
-            "dataset repository 'someone/smal' .* does not exist",
-            "hf auth login",
-        ),
+        ("someone/smal", None, "repository 'someone/smal' .* does not exist", "hf auth login"),
         (REPO, "v9", "has no revision 'v9'", "/tree/main"),
         (REPO, "0" * 40, "has no revision '0000", "/tree/main"),
         ("someone/gated", None, "is gated", "/datasets/someone/gated, then log in: hf auth login"),
-        ("someone/gated", "0" * 40, "is gated", "hf auth login"),
     ],
 )
-def test_refusals(hub: HubServer, repo: str, revision: str, telling: str, hint: str) -> None:
+def test_errors_of_the_hub(
+    hub: HubServer, repo: str, revision: str, message: str, hint: str
+) -> None:
     hub.push(DATASET, FILES)
     hub.push(REPO, FILES)  # a model of the same name is another repository
     hub.push("datasets/someone/gated", FILES)
     hub.gated.add("datasets/someone/gated")
-    with pytest.raises(HubError, match=telling) as caught:
+    with pytest.raises(HubError, match=message) as caught:
         HubFiles(repo, revision).path("README.md")
     assert hint in str(caught.value.hint)
 
@@ -148,9 +135,7 @@ def test_an_unreachable_hub(hub: HubServer, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.parametrize("revision", [None, "0" * 40])
-def test_a_token_that_is_no_more(
-    hub: HubServer, login: Callable[..., None], revision: str | None
-) -> None:
+def test_a_revoked_token(hub: HubServer, login: Callable[..., None], revision: str | None) -> None:
     hub.push(DATASET, FILES)
     login("someone")
     hub.tokens.clear()
@@ -176,7 +161,7 @@ def test_offline(hub: HubServer, offline: Callable[[], None]) -> None:
     HubFiles(REPO).path("meta/part-1.json")
     assert HubFiles(REPO).list("meta/deep") == ["meta/deep/a.parquet"]
     offline()
-    asked = len(hub.requests)
+    before = len(hub.requests)
     files = HubFiles(REPO)
     assert files.commit == commit
     assert files.path("meta/part-1.json").read_bytes() == b"1"
@@ -187,14 +172,13 @@ def test_offline(hub: HubServer, offline: Callable[[], None]) -> None:
     for ask in (lambda: HubFiles("a/b").commit, lambda: HubFiles("a/b", "0" * 40).list("meta")):
         with pytest.raises(HubError, match="not in the cache, .* HF_HUB_OFFLINE is set"):
             ask()
-    assert len(hub.requests) == asked
+    assert len(hub.requests) == before
 
 
-@pytest.mark.parametrize("wrong", ["part-1", "deep/a"])
-def test_a_folder_that_comes_damaged(hub: HubServer, wrong: str) -> None:
+def test_a_folder_that_comes_damaged(hub: HubServer) -> None:
     hub.push(DATASET, FILES)
-    fault = hub.fault("GET", f"/meta/{wrong}.*", wrong=True)
-    with pytest.raises(HashMismatchError, match=f"meta/{wrong}.* came damaged"):
+    fault = hub.fault("GET", "/meta/part-1.*", wrong=True)
+    with pytest.raises(HashMismatchError, match="meta/part-1.* came damaged"):
         HubFiles(REPO).list("meta")
     fault.times = 0
     before = len(hub.downloads())
@@ -203,21 +187,10 @@ def test_a_folder_that_comes_damaged(hub: HubServer, wrong: str) -> None:
     assert len(hub.downloads()) == before + 1  # nothing but what was damaged
 
 
-def test_a_folder_of_a_folder_that_comes_damaged(hub: HubServer) -> None:
-    hub.push(DATASET, FILES)
-    files = HubFiles(REPO).inside("meta")
-    hub.fault("GET", "/meta/deep/.*", wrong=True)
-    with pytest.raises(HashMismatchError, match=r"^deep/a\.parquet of "):
-        files.snapshot("deep/*")
-    assert (files.snapshot("deep/*") / "deep" / "a.parquet").read_bytes() == b"a"
-
-
 # --- no address of a Hub -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "given", ["", "not a url", "http://", "http://[", "http://a:b", "http://a b", "ftp://a", "a:9"]
-)
+@pytest.mark.parametrize("given", ["", "http://", "http://[", "http://a:b", "ftp://a"])
 def test_no_address_of_a_hub(monkeypatch: pytest.MonkeyPatch, run: Run, given: str) -> None:
     monkeypatch.setenv("HF_ENDPOINT", given)
     with pytest.raises(InvalidOptionError, match="HF_ENDPOINT .* such as https://huggingface.co"):
@@ -225,19 +198,15 @@ def test_no_address_of_a_hub(monkeypatch: pytest.MonkeyPatch, run: Run, given: s
     code, out, err = run("fetch", REPO)
     assert (code, out) == (1, "")
     assert repr(given) in err and "unset HF_ENDPOINT" in err
-
-
-@pytest.mark.parametrize("given", ["https://huggingface.co/", "http://[::1]:80/hub"])
-def test_addresses_of_a_hub(monkeypatch: pytest.MonkeyPatch, given: str) -> None:
-    monkeypatch.setenv("HF_ENDPOINT", given)
+    monkeypatch.setenv("HF_ENDPOINT", "http://[::1]:80/hub")
     assert HubFiles(REPO).repo_id == REPO
 
 
 def test_a_client_that_cannot_be_imported(tmp_path: Path) -> None:
     """The client reads the address when it is imported, and ends there."""
-    told = os.environ | {"HF_ENDPOINT": "http://[", "HF_HUB_OFFLINE": "0"}
+    environment = os.environ | {"HF_ENDPOINT": "http://[", "HF_HUB_OFFLINE": "0"}
     command = [sys.executable, "-m", "robomme_interference_data.cli.main", "fetch", REPO]
-    done = subprocess.run(command, env=told, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr and "unset HF_ENDPOINT" in done.stderr
 

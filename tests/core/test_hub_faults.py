@@ -1,9 +1,9 @@
-"""Loading from a Hub when something goes wrong: one clear error, and the same call goes on."""
+"""Loading from a Hub when something goes wrong: one clear error, and the same call resumes."""
 
 import os
 import shutil
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from huggingface_hub import constants
 from support.buffer_sets import GOLDEN
-from support.hub import BASE, BUFFER_SET, push_buffer_set, running_hub
+from support.hub import BASE, BUFFER_SET, push_buffer_set
 from support.hub_server import HubServer
 from support.machine import full_disk
 
@@ -27,10 +27,9 @@ STATES = r"/data/.*\.parquet"
 
 
 @pytest.fixture
-def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[HubServer]:
-    with running_hub(tmp_path / "cache", monkeypatch) as server:
-        push_buffer_set(server, GOLDEN, tmp_path / "work")
-        yield server
+def hub(hub: HubServer, tmp_path: Path) -> HubServer:
+    push_buffer_set(hub, GOLDEN, tmp_path / "work")
+    return hub
 
 
 def load() -> Buffer:
@@ -138,12 +137,12 @@ def test_stopped_while_fetching(hub: HubServer, tmp_path: Path, run: Run) -> Non
     assert code == 130 and "kept; resume with:\nrobomme-interference fetch" in err
     assert leftovers(tmp_path) == [] and not (tmp_path / "out").exists()
     assert run(*command)[0] == 0
-    came = [one.path for one in hub.asked if one.method == "GET" and one.status == 200]
-    came = [path for path in came if not path.startswith("/api/")]
-    assert len(came) - len({*came}) <= 8  # those that were on their way come again
+    paths = [one.path for one in hub.asked if one.method == "GET" and one.status == 200]
+    files = [path for path in paths if not path.startswith("/api/")]
+    assert len(files) - len({*files}) <= 8  # unfinished downloads start again
 
 
-def test_nothing_is_asked_of_a_buffer_set_that_is_open(hub: HubServer) -> None:
+def test_an_open_buffer_set_makes_no_requests(hub: HubServer) -> None:
     buffer_set = load_buffer_set(BUFFER_SET, revision=VERSION)
     buffer_set.load(QUERY, "k3")
     hub.down = True

@@ -1,4 +1,4 @@
-"""Episode ids and lists of numbers: parse and format are inverses, and slips are told."""
+"""Episode ids and lists of numbers: parse and format are inverses, and typos get a hint."""
 
 from typing import Any
 
@@ -31,9 +31,8 @@ def test_round_trip(episode: EpisodeId) -> None:
     [
         *("", "MoveCube", "MoveCube/test", "MoveCube/test/1/2/3", "MoveCube/test/01", "/test/1"),
         *("MoveCube/test/-1", "MoveCube/test/1.0", "MoveCube/test/", "MoveCube/tset/1"),
-        *("9Family/test/1", "Move Cube/test/1", "MoveCube/test/1 ", "MoveCube/test/٣"),
-        *("MoveCube/test/1234567890123456789", "../test/1"),
-        *(None, 7, True, b"MoveCube/test/1", ("MoveCube", "test", 1)),
+        *("9Family/test/1", "Move Cube/test/1", "MoveCube/test/1 ", "MoveCube/test/٣", "../test/1"),
+        *("MoveCube/test/1234567890123456789", None, 7, ("MoveCube", "test", 1)),
     ],
 )
 def test_what_is_no_id(given: Any) -> None:
@@ -49,13 +48,10 @@ def test_indices_and_answers_are_numbers(number: Any) -> None:
         EpisodeId("MoveCube", "test", 1, number)
 
 
-def test_the_scene_of_another_answer() -> None:
+def test_answers_scenes_and_a_misspelled_split() -> None:
     assert EpisodeId.parse("MoveCube/test/1/2") == EpisodeId("MoveCube", "test", 1, 2)
     assert str(EpisodeId("MoveCube", "test", 1, 0)) == "MoveCube/test/1/0"
     assert EpisodeId("MoveCube", "test", 1, 2).scene == EpisodeId("MoveCube", "test", 1)
-
-
-def test_a_slip_in_the_buffer_set_is_offered() -> None:
     with pytest.raises(InvalidIdError) as caught:
         EpisodeId.parse("MoveCube/tset/1")
     assert caught.value.hint == "Did you mean 'test'?"
@@ -74,6 +70,7 @@ def test_canonical_order() -> None:
 @given(st.sets(st.integers(0, 300), min_size=1))
 def test_numbers_round_trip(numbers: set[int]) -> None:
     assert parse_numbers(format_numbers(sorted(numbers))) == tuple(sorted(numbers))
+    assert format_numbers([0, 1, 2, 5]) == "0-2,5"
 
 
 @pytest.mark.parametrize(

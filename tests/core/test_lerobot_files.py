@@ -10,22 +10,16 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.damage import flipped_bits
 from support.lerobot_layouts import DATA, NAMES, TABLE, edit_columns, edit_info, write_lerobot
 from support.recordings import EPISODES
 
-from robomme_interference_data.errors import (
-    FormatError,
-    InterferenceError,
-    MissingFileError,
-    UnknownNameError,
-)
+from robomme_interference_data.errors import FormatError, MissingFileError, UnknownNameError
 from robomme_interference_data.storage.files import LocalFiles
 from robomme_interference_data.storage.lerobot import LeRobotFiles, fill_template
 
 VIDEO = "videos/observation.images.front/"
 V21 = "chunk-000/episode_000002"
-PLACES = {  # of the third episode, which begins with frame 19 of the common files of v3.0
+LOCATIONS = {  # of the third episode, which begins with frame 19 of the common files of v3.0
     "v3.0": (9, DATA, (VIDEO + "chunk-000/file-000.mkv", 19)),
     "v2.1": (9, f"data/{V21}.parquet", (f"videos/image/{V21}.mkv", 0)),
 }
@@ -36,7 +30,7 @@ def opened(root: Path) -> LeRobotFiles:
 
 
 def read_all(root: Path) -> None:
-    """Read everything there is, as the sources and datasets do."""
+    """Read everything, as sources and datasets do."""
     lerobot = opened(root)
     assert lerobot.tasks
     for index in range(len(lerobot)):
@@ -61,7 +55,7 @@ def v30(tmp_path: Path) -> Path:
 # --- what is read --------------------------------------------------------------------------------
 
 
-def test_values_frames_and_places(root: Path) -> None:
+def test_values_frames_and_locations(root: Path) -> None:
     lerobot = opened(root)
     front = NAMES[str(lerobot.version)]["front"]
     assert (len(lerobot), lerobot.fps, lerobot.shape(front)) == (3, 10.0, (16, 24, 3))
@@ -70,8 +64,9 @@ def test_values_frames_and_places(root: Path) -> None:
         frames = episode.images["front"]
         found = np.stack(list(lerobot.iter_frames(index, front, 2, 6)))
         np.testing.assert_array_equal(found, frames[2:6])
-    place = lerobot.locate(2)
-    assert (place.length, place.data, place.videos[front]) == PLACES[str(lerobot.version)]
+    location = lerobot.locate(2)
+    expected = LOCATIONS[str(lerobot.version)]
+    assert (location.length, location.data, location.videos[front]) == expected
     with pytest.raises(UnknownNameError, match="episode 3 is not in .* 3 episodes"):
         lerobot.row(3)
     with pytest.raises(FormatError, match="7 stored frames; frames 4 to 7"):
@@ -115,22 +110,16 @@ def test_any_template_is_filled_or_one_clear_error(template: str) -> None:
     ("path", "message"),
     [
         ("{video_key.__class__}/{file_index}", "cannot be filled in"),
-        ("{file_index!r}", "cannot be filled in"),
         ("{file_index:999999999d}", "cannot be filled in"),
         ("data/{chunk_index:03d/file.parquet", "cannot be filled in"),
-        ("data/file}.parquet", "cannot be filled in"),
         ("{nothing}", "cannot be filled in"),
-        ("../../etc/passwd", "leads out of it"),
-        ("/etc/passwd", "leads out of it"),
         ("videos/../../outside.mkv", "leads out of it"),
-        ("videos/\ud800.mkv", "is not a valid path"),
-        ("x" * 1000, "is too long"),
         ("{file_index}" * 500, "_path is '"),
         ("linked.mkv", "is a link that leads out of the folder"),
     ],
 )
 @pytest.mark.parametrize("which", ["data_path", "video_path"])
-def test_paths_that_are_refused(root: Path, which: str, path: str, message: str) -> None:
+def test_invalid_paths(root: Path, which: str, path: str, message: str) -> None:
     outside = root.parent / "outside.mkv"
     outside.write_bytes(b"secret")
     (root / "linked.mkv").symlink_to(outside)
@@ -167,8 +156,6 @@ FEATURE = {
         [1] * 10**6,
         [100_000, 100_000, 3],
         [-16, 24, 3],
-        [32, 24, 3],
-        [256],
         [32, 24, 1],
     ),
     "info": ("ffv1",),
@@ -201,16 +188,12 @@ GOOD = json.dumps(LINE) + "\n"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{\n", "line 1: "),
         ("[0, 1]\n", "line 1: not a JSON object"),
         (GOOD + "[" * 100_000, "line 2: "),
-        (GOOD, "the episodes 0 to 2, each once"),
         (GOOD * 3, "the episodes 0 to 2, each once"),
         ("", "no whole numbers 'episode_index'"),
-        ('{"episode_index": 0}\n', "no whole numbers 'length'"),
         (GOOD + '{"episode_index": 1}\n', "no whole numbers 'length'"),
         (json.dumps(LINE | {"length": 10**30}), "cannot be read"),
-        (json.dumps(LINE | {"tasks": ["\ud800"]}), "cannot be read"),
         (GOOD + json.dumps(LINE | {"tasks": 7}), "cannot be read"),
     ],
 )
@@ -226,7 +209,6 @@ def test_lines_that_are_wrong(tmp_path: Path, text: str, message: str) -> None:
     [
         {"length": None},
         {"length": [12, None, 9]},
-        {"length": [12, 10**12, 9]},
         {"length": [12, 8, 9]},
         {"length": pa.array([12.0, 7.0, 9.0])},
         {"episode_index": [0, 1, 1]},
@@ -235,7 +217,6 @@ def test_lines_that_are_wrong(tmp_path: Path, text: str, message: str) -> None:
         {VIDEO + "from_timestamp": [0.0, float("nan"), 1.9]},
         {VIDEO + "from_timestamp": [0.0, 1.25, 1.9]},  # between two frames
         {VIDEO + "from_timestamp": [0.0, 2.5, 1.9]},  # ends after the file does
-        {VIDEO + "from_timestamp": [0.0, 1e8, 1.9]},
         {VIDEO + "chunk_index": [0, 0, None]},
     ],
 )
@@ -249,7 +230,6 @@ def test_episode_tables_that_are_wrong(v30: Path, columns: dict[str, Any]) -> No
     ("columns", "message"),
     [
         ({"episode_index": [0] * 13 + [1] * 6 + [2] * 9}, "13 rows of episode 0; .* 12,"),
-        ({"episode_index": [0, 1] * 14}, "14 rows of episode 0; .* 12,"),
         ({"frame_index": [0, 2, 1, *range(3, 12), *range(7), *range(9)]}, "one after the other"),
         ({"episode_index": None}, "no column 'episode_index'"),
         ({"observation.state": pa.array([[0.0]] * 28)}, "1 values a frame; info.json"),
@@ -269,12 +249,3 @@ def test_files_that_are_missing(v30: Path) -> None:
     (v30 / "meta/info.json").unlink()
     with pytest.raises(MissingFileError, match=r"is no LeRobot dataset: meta/info\.json"):
         opened(v30)
-
-
-@pytest.mark.parametrize("name", ["meta/info.json", TABLE, DATA])
-def test_any_flipped_bit_is_one_clear_error_or_none(v30: Path, name: str) -> None:
-    for _ in flipped_bits(v30 / name, 32):
-        try:
-            read_all(v30)
-        except InterferenceError as error:
-            assert "\n" not in error.message

@@ -49,26 +49,6 @@ def test_even_sample_is_numpys_linspace() -> None:
         assert even_sample(history) == expected.tolist()
 
 
-@pytest.mark.parametrize(
-    ("lesson", "history", "expected"),
-    [
-        (25, 25, 25 / 26),  # 26 frames, all taken; the last is the live observation
-        (30, 30, 30 / 31),
-        (31, 31, 31 / 32),
-        (66, 66, 31 / 32),  # 67 frames, 32 taken: all but the live observation are lesson
-        (1077, 1077, 31 / 32),
-        (10, 20, 10 / 21),
-        (0, 0, 0.0),  # the live observation alone
-        (0, 32, 0.0),
-        (66, 98, 21 / 32),  # ⌊j·98/31⌋ < 66 for j ≤ 20: 63.2 → 63, and 66.4 → 66
-        (25, 249, 4 / 32),  # ⌊j·249/31⌋ < 25 for j ≤ 3: 24.1 → 24, and 32.1 → 32
-        (750, 974, 24 / 32),  # ⌊j·974/31⌋ < 750 for j ≤ 23: 722.6 → 722, and 754.1 → 754
-    ],
-)
-def test_lesson_share_by_hand(lesson: int, history: int, expected: float) -> None:
-    assert share(lesson, history) == expected
-
-
 def test_a_lesson_that_comes_last_in_parts_or_not_at_all() -> None:
     # 98 frames: of the sample's 31 history frames 10 are before frame 32: ⌊j·98/31⌋ ≤ 31 for j ≤ 10
     assert even_sample(98)[10:12] == [31, 34]

@@ -108,7 +108,7 @@ def test_frames_are_the_callers(videos: dict[str, Video]) -> None:
     np.testing.assert_array_equal(np.stack(found), video.frames[:20])
 
 
-# --- what is not there, or not a video -----------------------------------------------------------
+# --- missing frames and files that are no videos -------------------------------------------------
 
 
 @pytest.mark.parametrize("start", [0, COUNT - 1, COUNT, 5000])
@@ -118,9 +118,7 @@ def test_frames_after_the_end(videos: dict[str, Video], start: int) -> None:
             list(iter_frames(video.path, start, max(start, COUNT) + 1, FPS))
 
 
-@pytest.mark.parametrize(
-    "data", [b"", b"\0" * 5000, b"not a video " * 400, b"\x00\x00\x00\x20ftyp"]
-)
+@pytest.mark.parametrize("data", [b"", b"\0" * 5000, b"\x00\x00\x00\x20ftyp"])
 def test_not_a_video(tmp_path: Path, data: bytes) -> None:
     (tmp_path / "file.mp4").write_bytes(data)
     for name in ("file.mp4", "."):  # a folder is none either
@@ -171,7 +169,7 @@ def is_whole(path: Path, video: Video, start: int, stop: int) -> bool:
 
 @pytest.mark.parametrize("name", ["lossless.mp4", "ffv1.mkv", "h264-reordered.mp4"])
 def test_files_cut_anywhere(videos: dict[str, Video], name: str, tmp_path: Path) -> None:
-    """Frames that still come are right ones, and the end is told: wherever the file is cut."""
+    """Wherever the file is cut, frames that still decode are right, and the end raises."""
     video = videos[name]
     data = video.path.read_bytes()
     path = tmp_path / f"cut{video.path.suffix}"

@@ -34,24 +34,27 @@ def video(path: Path, *boxes: bytes) -> Path:
     return path
 
 
+def add_video(container: Any, frames: int = 20) -> None:
+    stream = container.add_stream("mjpeg", rate=10)
+    stream.pix_fmt, stream.height, stream.width = "yuvj444p", 16, 32
+    for _ in range(frames):
+        container.mux(stream.encode(av.VideoFrame(32, 16, "yuvj444p")))
+    container.mux(stream.encode(None))
+
+
 @pytest.mark.parametrize("name", ["a.mp4", "a.mov", "a.mkv", "a.avi"])
 @pytest.mark.parametrize("fragmented", [False, True])
 def test_what_writers_make_is_read(tmp_path: Path, name: str, fragmented: bool) -> None:
     flags = {"movflags": "frag_keyframe+empty_moov"} if fragmented and name[2] == "m" else {}
     with av.open(str(tmp_path / name), "w", options=flags) as container:
-        stream = container.add_stream("mjpeg", rate=10)
-        stream.pix_fmt, stream.height, stream.width = "yuvj444p", 16, 32
-        for _ in range(20):
-            image = av.VideoFrame.from_ndarray(np.zeros((16, 32, 3), np.uint8), format="rgb24")
-            container.mux(stream.encode(image))
-        container.mux(stream.encode(None))
-    found = {".mp4": "mp4", ".mov": "mp4", ".mkv": "matroska", ".avi": "avi"}
-    assert find_container(tmp_path / name) == found[(tmp_path / name).suffix]
+        add_video(container)
+    containers = {".mp4": "mp4", ".mov": "mp4", ".mkv": "matroska", ".avi": "avi"}
+    assert find_container(tmp_path / name) == containers[(tmp_path / name).suffix]
     assert len(list(iter_frames(tmp_path / name, 0, None, 10, (16, 32, 3)))) == 20
 
 
 @pytest.mark.parametrize(
-    ("boxes", "said"),
+    ("boxes", "message"),
     [
         ([box(b"moov", table(b"stsz", 100, 1 << 23))], "declares 8388608 frames"),
         ([box(b"moov", table(b"stz2", 8, 1 << 23))], "declares 8388608 frames"),
@@ -62,12 +65,10 @@ def test_what_writers_make_is_read(tmp_path: Path, name: str, fragmented: bool) 
         ([table(b"stsc", 1 << 23)], "too long"),
         ([box(b"moov", table(b"elst", 0) * (1 << 18))], "boxes"),
         ([box(b"moov", box(b"cmov"))], "compressed"),
-        ([table(b"sidx", 0, 0, 0, 1)], "segment index"),
-        ([box(b"moof") * (1 << 18)], "boxes"),
     ],
 )
-def test_what_declares_too_much(tmp_path: Path, boxes: list[bytes], said: str) -> None:
-    with pytest.raises(FormatError, match=said):
+def test_what_declares_too_much(tmp_path: Path, boxes: list[bytes], message: str) -> None:
+    with pytest.raises(FormatError, match=message):
         find_container(video(tmp_path / "a.mp4", *boxes))
 
 
@@ -86,15 +87,12 @@ PLACES = (
 
 
 def test_wherever_ffmpeg_finds_a_table_it_is_looked_at() -> None:
-    """FFmpeg says how many durations it was told of; of sizes in the same place, we do."""
+    """Where FFmpeg reads a count of durations, a count of sizes is checked, too."""
     data, found, count = VIDEO.read_bytes(), 0, 1 << 23
     moov, trak = data.rindex(b"moov") - 4, data.rindex(b"trak") - 4
     size = int.from_bytes(data[trak : trak + 4])
-    before_it, track, after = (
-        data[moov + 8 : trak],
-        data[trak + 8 : trak + size],
-        data[trak + size :],
-    )
+    before_it, track = data[moov + 8 : trak], data[trak + 8 : trak + size]
+    after = data[trak + size :]
     fields = (b"", bytes(4), bytes(8), bytes(4) + box(b"hdlr", bytes(8), b"mdir", bytes(12)))
     for name, before, outer in itertools.product(PLACES.split(), fields, (b"udta", None)):
 
@@ -107,22 +105,19 @@ def test_wherever_ffmpeg_finds_a_table_it_is_looked_at() -> None:
 
         with suppress(av.error.FFmpegError):
             with av.open(hidden(table(b"stts", 1, count, 1)), format="mp4") as container:
-                told = [stream.frames for stream in container.streams]
-            if count in told:
+                counts = [stream.frames for stream in container.streams]
+            if count in counts:
                 found += 1
                 with pytest.raises(ValueError, match="declares"):
                     _check_declared(hidden(table(b"stsz", 100, count)))
     assert found > 20
 
 
-def test_an_index_of_segments_is_refused(tmp_path: Path) -> None:
+def test_an_index_of_segments_raises(tmp_path: Path) -> None:
     """FFmpeg would jump to fragments that it names, even inside of frames."""
     path = tmp_path / "a.mp4"
     with av.open(str(path), "w", options={"movflags": "empty_moov+global_sidx"}) as container:
-        stream = container.add_stream("mjpeg", rate=10)
-        stream.pix_fmt, stream.height, stream.width = "yuvj444p", 16, 32
-        container.mux(stream.encode(av.VideoFrame(32, 16, "yuvj444p")))
-        container.mux(stream.encode(None))
+        add_video(container, 1)
     assert b"sidx" in path.read_bytes()
     with pytest.raises(FormatError, match="segment index.* ffmpeg"):
         list(iter_frames(path, 0, None, 10))
@@ -143,13 +138,8 @@ def test_a_video_with_sound_is_read_whatever_its_texts_hold(
     path = tmp_path / "a.mov"
     with av.open(str(path), "w") as container:
         container.metadata["comment"] = container.metadata["title"] = names.decode()
-        stream = container.add_stream("mjpeg", rate=10)
-        stream.pix_fmt, stream.height, stream.width = "yuvj444p", 16, 32
         heard = container.add_stream(sound, rate=8000, layout="mono")
-        for _ in range(20):
-            image = av.VideoFrame.from_ndarray(np.zeros((16, 32, 3), np.uint8), format="rgb24")
-            container.mux(stream.encode(image))
-        container.mux(stream.encode(None))
+        add_video(container)
         silence = np.zeros((1, 1024), np.uint8 if kind == "u8" else np.float32)
         frame = av.AudioFrame.from_ndarray(silence, format=kind, layout="mono")
         frame.sample_rate = 8000
@@ -159,14 +149,6 @@ def test_a_video_with_sound_is_read_whatever_its_texts_hold(
     assert len(list(iter_frames(path, 0, None, 10, (16, 32, 3)))) == 20
     path.write_bytes(path.read_bytes() + box(b"free", names * 9))
     assert find_container(path) == "mp4"
-
-
-def test_a_cut_video_is_an_error_wherever_it_is_cut(tmp_path: Path) -> None:
-    data = VIDEO.read_bytes()
-    for length in range(0, len(data) - 70, 311):
-        (tmp_path / "a.mp4").write_bytes(data[:length])
-        with pytest.raises(InterferenceError):
-            list(iter_frames(tmp_path / "a.mp4", 0, 49, 10, (32, 32, 3)))
 
 
 @pytest.mark.parametrize(

@@ -1,18 +1,29 @@
 """The tiny golden buffer set, copies of it, and what its frames must be."""
 
 import shutil
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.build_dataset.build import build_dataset
+from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
 from robomme_interference_data.build_dataset.frame_selection import FRAME_SELECTORS
-from robomme_interference_data.build_dataset.sources import Frame
+from robomme_interference_data.build_dataset.manifests import (
+    in_folder,
+    plan_manifests,
+    write_manifests,
+)
+from robomme_interference_data.build_dataset.sources import Frame, Source
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.constants import SUMS_PATH
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.runtime.executor import Serial
+from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.manifest import BufferManifest, SessionEntry
 from robomme_interference_data.storage.files import LocalFiles, format_sums, sha256_file
 
@@ -29,6 +40,18 @@ UNITS = 17
 def copy_buffer_set(folder: Path) -> Path:
     """Copy the golden buffer set, to be damaged."""
     return Path(shutil.copytree(GOLDEN, folder))
+
+
+def build(root: Path, kind: str, source: Source, **episodes: Any) -> None:
+    """Build a dataset of a buffer set from some episodes of a source."""
+    plan = BuildPlan(kind, (source,), list_episodes((source,), **episodes))
+    build_dataset(plan, root / kind, Serial(), WorkProgress(quiet=True))
+
+
+def plan_again(root: Path, conditions: Iterable[str] = CONDITIONS, **options: Any) -> None:
+    """Plan the buffers of a buffer set and replace its manifests."""
+    for _ in write_manifests(plan_manifests(in_folder(root), tuple(conditions), **options), root):
+        pass
 
 
 def contents(root: Path) -> dict[str, bytes]:
@@ -88,10 +111,10 @@ def with_sessions(manifest: BufferManifest, *entries: SessionEntry) -> BufferMan
 
 
 def renew_sums(root: Path) -> None:
-    """Write the SHA-256 of a dataset's files anew, as whoever changed them might."""
+    """Recompute the SHA-256 of a dataset's files, as whoever changed them might."""
     listed = [line.split("  ", 1)[1] for line in (root / SUMS_PATH).read_text().splitlines()]
-    there = [path for path in listed if (root / path).is_file()]
+    existing = [path for path in listed if (root / path).is_file()]
     before = sha256_file(root / SUMS_PATH)
-    (root / SUMS_PATH).write_text(format_sums(root, there))
+    (root / SUMS_PATH).write_text(format_sums(root, existing))
     identity = root / "meta" / "interference.json"
     identity.write_text(identity.read_text().replace(before, sha256_file(root / SUMS_PATH)))

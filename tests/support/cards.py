@@ -1,16 +1,21 @@
 """Cards of the golden buffer set and run, and the trees that are published of them."""
 
 import shutil
+from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 
 from support.buffer_sets import GOLDEN
 
+from robomme_interference_data import load_buffer_set
+from robomme_interference_data.cards.dataset_facts import buffer_set_facts, demonstrations_facts
 from robomme_interference_data.cards.publication import Publication
+from robomme_interference_data.cards.render import card_files
+from robomme_interference_data.cards.results import results_facts
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, MANIFESTS
 
 CARDS = GOLDEN.parent / "cards"
-"""Golden cards, made by `support/make_golden_cards.py`."""
+"""Golden cards, made by `support/make_golden.py`."""
 
 RUN = GOLDEN.parent / "run"
 
@@ -25,6 +30,15 @@ OF_BUFFER_SET = Publication(
 OF_RESULTS = Publication(
     "robot-memory/tiny-results", "1.0.1", base=f"{OF_BUFFER_SET.repo_id}@{'abcdef0123' * 4}"
 )
+
+
+def cards() -> Iterator[tuple[str, dict[str, bytes]]]:
+    """Yield the golden cards by name."""
+    buffer_set = load_buffer_set(GOLDEN)
+    lessons = demonstrations_facts(buffer_set.datasets["demonstrations"])
+    yield "demonstrations", card_files(lessons, OF_DEMONSTRATIONS)
+    yield "buffer_set", card_files(buffer_set_facts(buffer_set), OF_BUFFER_SET)
+    yield "results", card_files(results_facts(RUN), OF_RESULTS)
 
 
 def without_version(file: bytes) -> str:

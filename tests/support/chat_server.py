@@ -46,9 +46,8 @@ class Seen:
         text, images, videos = "", [], []
         for message in body["messages"]:
             content = message["content"]
-            for part in (
-                [{"type": "text", "text": content}] if isinstance(content, str) else content
-            ):
+            parts = [{"type": "text", "text": content}] if isinstance(content, str) else content
+            for part in parts:
                 if part["type"] == "text":
                     text += part["text"]
                 elif part["type"] == "image_url":
@@ -66,12 +65,7 @@ def _data(url: str, kind: str) -> bytes:
 
 
 class ChatServer:
-    """Serves one model in threads of this process; see the module.
-
-    Attributes:
-        seen: What was asked, in order, faults among it.
-        connections: How many there were.
-    """
+    """Serves one model in threads of this process; `seen` are all requests, in order."""
 
     def __init__(
         self,
@@ -99,9 +93,8 @@ class ChatServer:
                 if self.path != "/v1/models":
                     self._send(404, {"error": {"message": "no such page"}})
                     return
-                self._send(
-                    200, {"object": "list", "data": [{"id": outer.model, "object": "model"}]}
-                )
+                models = [{"id": outer.model, "object": "model"}]
+                self._send(200, {"object": "list", "data": models})
 
             def do_POST(self) -> None:
                 size = int(self.headers["Content-Length"])
@@ -173,22 +166,9 @@ class ChatServer:
             handler._send(status, answer, **headers)
             return
         text = None if fault == REFUSED else self.answer(self.seen[-1])
-        handler._send(
-            200,
-            {
-                "id": "1",
-                "object": "chat.completion",
-                "created": 0,
-                "model": self.model,
-                "choices": [
-                    {
-                        "index": 0,
-                        "finish_reason": "stop",
-                        "message": {"role": "assistant", "content": text},
-                    }
-                ],
-                "usage": {}
-                if fault == UNCOUNTED
-                else {"prompt_tokens": 100, "completion_tokens": 5, "total_tokens": 105},
-            },
-        )
+        message = {"role": "assistant", "content": text}
+        choice = {"index": 0, "finish_reason": "stop", "message": message}
+        completion = {"id": "1", "object": "chat.completion", "created": 0, "model": self.model}
+        usage = {"prompt_tokens": 100, "completion_tokens": 5, "total_tokens": 105}
+        completion |= {"choices": [choice], "usage": {} if fault == UNCOUNTED else usage}
+        handler._send(200, completion)

@@ -29,7 +29,7 @@ def full_grid(*, retrieval: bool = False) -> list[Rollout]:
         own = hard + 0.6 * numbers.normal(size=hard.shape)
         won = own <= np.sort(own, axis=None)[round(cell.rate * cell.n) - 1]
         k, kept = parse_condition(cell.condition).k, numbers.random(hard.shape)
-        told = "framesamp" in cell.system and cell.condition != "no-history"
+        samples = "framesamp" in cell.system and cell.condition != "no-history"
         base = made.row(cell.system, cell.condition, made.FAMILIES[0], 0, "f")
         for place, episode in np.ndindex(hard.shape):
             success = bool(won[place, episode])
@@ -43,7 +43,7 @@ def full_grid(*, retrieval: bool = False) -> list[Rollout]:
                 difficulty=DIFFICULTIES[episode % 3],
                 status="success" if success else "fail",
                 success=success,
-                evidence_kept=share if told else None,
+                evidence_kept=share if samples else None,
             )
             rows.append(row)
     return rows

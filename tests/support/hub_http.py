@@ -1,4 +1,4 @@
-"""An HTTP server on loopback that remembers what it was asked, and breaks when told to."""
+"""An HTTP server on loopback that records its requests and injects faults."""
 
 import gzip
 import json
@@ -63,18 +63,18 @@ class Answer:
 
     @classmethod
     def json(cls, value: Any, status: int = 200, headers: dict[str, str] | None = None) -> Self:
-        told = {"Content-Type": "application/json", **(headers or {})}
-        return cls(json.dumps(value).encode(), status, told, plain=True)
+        headers = {"Content-Type": "application/json", **(headers or {})}
+        return cls(json.dumps(value).encode(), status, headers, plain=True)
 
-    def fit(self, asked: HTTPMessage) -> None:
-        """Leave only the requested end, or compress the body if it may be and is worth it."""
-        span = re.fullmatch(r"bytes=(\d+)-", asked.get("Range", ""))
+    def fit(self, request: HTTPMessage) -> None:
+        """Keep only the requested end, or compress the body if the client accepts it."""
+        span = re.fullmatch(r"bytes=(\d+)-", request.get("Range", ""))
         size = len(self.body)
         if span and self.status == 200:
             start = int(span[1])
             self.status, self.body = 206, self.body[start:]
             self.headers["Content-Range"] = f"bytes {start}-{size - 1}/{size}"
-        elif self.plain and size >= _SQUEEZED and "gzip" in asked.get("Accept-Encoding", ""):
+        elif self.plain and size >= _SQUEEZED and "gzip" in request.get("Accept-Encoding", ""):
             self.body = gzip.compress(self.body, 1)
             self.headers["Content-Encoding"] = "gzip"
 

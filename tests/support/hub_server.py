@@ -204,9 +204,9 @@ class HubServer(LoopbackServer):
         try:
             return self._route(request)
         except Refused as error:
-            told = {"X-Error-Code": error.code, "X-Error-Message": str(error)}
-            told["X-Repo-Commit"] = error.commit
-            headers = {name: text for name, text in told.items() if text}
+            fields = {"X-Error-Code": error.code, "X-Error-Message": str(error)}
+            fields["X-Repo-Commit"] = error.commit
+            headers = {name: text for name, text in fields.items() if text}
             return Answer.json({"error": str(error)}, error.status, headers)
 
     def _route(self, request: Request) -> Answer:
@@ -218,8 +218,8 @@ class HubServer(LoopbackServer):
             if match := pattern.fullmatch(request.path):
                 name = match["repo"].removeprefix("models/")
                 if name in self.renamed:
-                    there = request.target.replace(name, self.renamed[name], 1)
-                    return Answer.json({}, 307, {"Location": there})
+                    target = request.target.replace(name, self.renamed[name], 1)
+                    return Answer.json({}, 307, {"Location": target})
                 return serve(request, self._repository(name, user), user, match)
         return self._account(request, user)
 
@@ -251,13 +251,13 @@ class HubServer(LoopbackServer):
         name = repo_id if kind == "model" else f"{kind}s/{repo_id}"
         made = Repository(name, private=asked.get("visibility") == "private")
         _check_write(user, made)
-        told = {"name": repo_id, "url": f"{self.endpoint}/{made.name}"}
+        description = {"name": repo_id, "url": f"{self.endpoint}/{made.name}"}
         if made.name in self.repositories:
-            return Answer.json({"error": "You already created this repo", **told}, 409)
+            return Answer.json({"error": "You already created this repo", **description}, 409)
         self.repositories[made.name] = made
         first = {".gitattributes": Blob(GITATTRIBUTES, large=False)}
         made.add(first, "initial commit")
-        return Answer.json(told)
+        return Answer.json(description)
 
     def _api(self, request: Request, repo: Repository, user: User | None, match: Match) -> Answer:
         what, rest = match["what"] or "revision", unquote(match["rest"] or "main")
@@ -330,14 +330,14 @@ class HubServer(LoopbackServer):
             if len(repo.store.get(asked["oid"], b"")) != asked["size"]:
                 raise Refused(400, "", "this file has not come")
             return Answer.json({})
-        told = []
+        objects_found = []
         for one in asked["objects"]:
-            told.append({"oid": one["oid"], "size": one["size"]})
+            objects_found.append({"oid": one["oid"], "size": one["size"]})
             if one["oid"] not in repo.store:
                 upload = {"href": f"{self.elsewhere}/store/{repo.name}/{one['oid']}"}
                 verify = {"href": f"{self.endpoint}/{objects}/verify"}
-                told[-1]["actions"] = {"upload": upload, "verify": verify}
-        return Answer.json({"transfer": "basic", "objects": told})
+                objects_found[-1]["actions"] = {"upload": upload, "verify": verify}
+        return Answer.json({"transfer": "basic", "objects": objects_found})
 
     def _stored(self, request: Request, repo: Repository, match: re.Match[str]) -> Answer:
         """Serve the place of large files: its addresses are secret, and it takes no token."""

@@ -76,8 +76,8 @@ def write_lerobot(
         for camera in cameras if stored == "video" else ():
             frames = np.concatenate([listed[i].images[camera] for i in group])
             write_video(root / f"videos/{names[camera]}/chunk-000/{file}.mkv", frames)
-    told = {name: values for name, values in (per_episode | columns).items() if values is not None}
-    _write_metadata(root / "meta", version, tasks, told)
+    table = {name: values for name, values in (per_episode | columns).items() if values is not None}
+    _write_metadata(root / "meta", version, tasks, table)
     v21 = version == "v2.1"
     file = "episode_{episode_index:06d}" if v21 else "file-{file_index:03d}"
     chunk = "chunk-{episode_chunk:03d}" if v21 else "chunk-{chunk_index:03d}"
@@ -161,14 +161,16 @@ def _features(
     return features
 
 
-def _write_metadata(meta: Path, version: str, tasks: list[str], told: dict[str, list[Any]]) -> None:
+def _write_metadata(
+    meta: Path, version: str, tasks: list[str], table: dict[str, list[Any]]
+) -> None:
     numbered = [{"task_index": number, "task": task} for number, task in enumerate(tasks)]
     (meta / "episodes/chunk-000").mkdir(parents=True)
     if version == "v3.0":
-        pq.write_table(pa.table(told), meta.parent / TABLE)
+        pq.write_table(pa.table(table), meta.parent / TABLE)
         pq.write_table(pa.Table.from_pylist(numbered), meta / "tasks.parquet")
         return
-    rows = [dict(zip(told, values, strict=True)) for values in zip(*told.values(), strict=True)]
+    rows = [dict(zip(table, values, strict=True)) for values in zip(*table.values(), strict=True)]
     for name, lines in (("episodes", rows), ("tasks", numbered)):
         text = "".join(json.dumps(line) + "\n" for line in lines)
         (meta / f"{name}.jsonl").write_text(text)

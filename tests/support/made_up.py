@@ -36,7 +36,7 @@ SHAPES = {"observation.images.front": (4, 6, 3), "observation.state": (8,)}
 def record(
     kind: str, episode: str, index: int = 0, *, lesson: int = 20, **changes: Any
 ) -> EpisodeRecord:
-    """The record of an episode that was never recorded; its digests tell its id."""
+    """The record of an episode that was never recorded; its digests contain its id."""
     unit = kind == "distractors"
     digests = {name: f"{episode} {name}" for name in SHAPES}
     known: dict[str, Any] = {
@@ -113,8 +113,8 @@ class MadeUpSource(Source):
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
         chosen = choose_cameras(cameras, self.cameras)
         frames = self._frames(str(episode.id), chosen)
-        told = (f"do {episode.id}",), 7, "easy", "made-up"
-        return Recording(*told, True, frames, self.evidence, self.robot)
+        header = (f"do {episode.id}",), 7, "easy", "made-up"
+        return Recording(*header, True, frames, self.evidence, self.robot)
 
     def _frames(self, name: str, cameras: tuple[str, ...]) -> Generator[Frame]:
         length, lesson = self.lengths[name]

@@ -1,18 +1,13 @@
 """Publish the golden buffer set, or one like it, without the checks and with cards of a line."""
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from support.buffer_sets import plan_again  # noqa: F401
 from support.hub_server import HubServer
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.build_dataset.manifests import (
-    in_folder,
-    plan_manifests,
-    write_manifests,
-)
 from robomme_interference_data.cards import publish as publish_module
 from robomme_interference_data.cards.facts import Facts
 from robomme_interference_data.cards.publication import Publication, PublishConfig
@@ -58,16 +53,10 @@ def publish(root: Path, repo_id: str = UNITS, **options: Any) -> list[RepoPlan]:
     return publish_buffer_set(content, publisher, plans)
 
 
-def plan_again(root: Path, conditions: Iterable[str], seed: int = 0) -> None:
-    """Plan the buffers of a buffer set anew."""
-    for _ in write_manifests(plan_manifests(in_folder(root), tuple(conditions), seed), root):
-        pass
-
-
 def tags(hub: HubServer, repo_id: str) -> dict[str, str]:
-    """Return the tags of a repository; none if it is not there."""
-    found = hub.repositories.get(f"datasets/{repo_id}")
-    return dict(found.tags) if found else {}
+    """Return the tags of a repository; none if it does not exist."""
+    repository = hub.repositories.get(f"datasets/{repo_id}")
+    return dict(repository.tags) if repository else {}
 
 
 def files(hub: HubServer, repo_id: str, revision: str = "main") -> dict[str, bytes]:

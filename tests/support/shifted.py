@@ -4,19 +4,12 @@ from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
 
-from robomme_interference_data.build_dataset.build import build_dataset
-from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
+from support.buffer_sets import build, plan_again
+
 from robomme_interference_data.build_dataset.frame_selection import select_demonstration
-from robomme_interference_data.build_dataset.manifests import (
-    in_folder,
-    plan_manifests,
-    write_manifests,
-)
 from robomme_interference_data.build_dataset.sources import Frame, Recording, SourceEpisode
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.constants import SHIFTED
-from robomme_interference_data.runtime.executor import Serial
-from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.shifts import SHIFTS
 
 
@@ -39,8 +32,5 @@ def add_shifted(buffer_set: Path, *families: str, kind: str = "sample") -> None:
     source = ShiftedSample(size=32)
     source.provenance["kind"] = kind
     families = families or ("VideoRepick", "MoveCube", "PatternLock")
-    tasks = list_episodes((source,), families=families, split="test")
-    plan = BuildPlan(SHIFTED, (source,), tasks)
-    build_dataset(plan, buffer_set / SHIFTED, Serial(), WorkProgress(quiet=True))
-    for _ in write_manifests(plan_manifests(in_folder(buffer_set)), buffer_set):
-        pass
+    build(buffer_set, SHIFTED, source, families=families, split="test")
+    plan_again(buffer_set)

@@ -11,21 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from support.buffer_sets import build, plan_again
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.build_dataset.build import build_dataset
-from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
-from robomme_interference_data.build_dataset.manifests import (
-    in_folder,
-    plan_manifests,
-    write_manifests,
-)
 from robomme_interference_data.build_dataset.questions import make_questions, write_questions
 from robomme_interference_data.build_dataset.sources import Frame, Recording, Source, SourceEpisode
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.runtime.executor import Serial
-from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.evidence import spans_of_parts
 from robomme_interference_data.simulators.tabletop import SUITE_VERSION
 from robomme_interference_data.simulators.tabletop.camera import SIZE
@@ -85,8 +77,8 @@ class Drawn(Source):
         parts, seed = scene.parts(answer), seed_of(episode.id)
         seen = shown(len(parts))
         evidence = spans_of_parts(seen, parts)
-        told = (scene.goal,), seed, difficulty_of(seed), "tabletop", True
-        return Recording(*told, self._frames(episode.key, seen), evidence)
+        header = (scene.goal,), seed, difficulty_of(seed), "tabletop", True
+        return Recording(*header, self._frames(episode.key, seen), evidence)
 
     def _frames(self, number: int, seen: Sequence[Sequence[int]]) -> Generator[Frame]:
         for place in range(UNIT):
@@ -99,10 +91,7 @@ class Drawn(Source):
 
 def make_tabletop(root: Path) -> None:
     """Build the buffer set, and its questions."""
-    source, quiet = (Drawn(),), WorkProgress(quiet=True)
-    for kind, split in (("demonstrations", "test"), ("distractors", "train")):
-        plan = BuildPlan(kind, source, list_episodes(source, split=split))
-        build_dataset(plan, root / kind, Serial(), quiet)
-    for _ in write_manifests(plan_manifests(in_folder(root), CONDITIONS), root):
-        pass
+    build(root, "demonstrations", Drawn(), split="test")
+    build(root, "distractors", Drawn(), split="train")
+    plan_again(root, CONDITIONS)
     write_questions([*make_questions(load_buffer_set(root))], root)
