@@ -1,8 +1,8 @@
 """A history buffer: its sessions in order, and their frames, decoded on demand."""
 
+import logging
 from bisect import bisect_right
 from collections.abc import Generator, Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -90,9 +90,11 @@ class Buffer:
         """Return the film strip for notebooks; without matplotlib they show the text."""
         from robomme_interference_data.viz.filmstrip import strip_png
 
-        with suppress(MissingExtraError):
+        try:
             return strip_png(self)
-        return None
+        except MissingExtraError as error:
+            logging.getLogger(__name__).warning("%s", error)
+            return None
 
     def __len__(self) -> int:
         """Return the number of history frames, without the first live observation."""

@@ -156,15 +156,11 @@ class LeRobotFiles:
         start = int(found[0]) if len(found) else 0
         rows = file.part(start, start + len(found))
         numbers = np.arange(len(found))  # not `location.length`, which may be huge
-        if (
-            len(found) != location.length
-            or (found != start + numbers).any()
-            or (rows.scalars("frame_index") != numbers).any()
-        ):
-            what = (
-                f"{len(found)} rows of episode {index}; expected {location.length}, one after the "
-                "other, with a frame_index from 0"
-            )
+        if len(found) != location.length:
+            what = f"{len(found)} rows of episode {index}; expected {location.length}"
+            raise FormatError.damaged(path, what)
+        if (found != start + numbers).any() or (rows.scalars("frame_index") != numbers).any():
+            what = f"rows of episode {index} that are not in the order of frame_index, from 0"
             raise FormatError.damaged(path, what)
         return rows
 

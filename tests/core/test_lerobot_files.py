@@ -229,8 +229,8 @@ def test_episode_tables_that_are_wrong(v30: Path, columns: dict[str, Any]) -> No
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
-        ({"episode_index": [0] * 13 + [1] * 6 + [2] * 9}, "13 rows of episode 0; .* 12,"),
-        ({"frame_index": [0, 2, 1, *range(3, 12), *range(7), *range(9)]}, "one after the other"),
+        ({"episode_index": [0] * 13 + [1] * 6 + [2] * 9}, "13 rows of episode 0; expected 12"),
+        ({"frame_index": [0, 2, 1, *range(3, 12), *range(7), *range(9)]}, "not in the order of"),
         ({"episode_index": None}, "no column 'episode_index'"),
         ({"observation.state": pa.array([[0.0]] * 28)}, "1 values a frame; info.json"),
         ({"observation.state": pa.array([["x"]] * 28)}, "expected lists of floats"),

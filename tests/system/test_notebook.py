@@ -31,8 +31,8 @@ def test_the_example_runs(shell: InteractiveShell, monkeypatch: pytest.MonkeyPat
     assert ["text/html", "text/plain"] in shown and ["image/png", "text/plain"] in shown
 
 
-def test_without_matplotlib_a_buffer_is_text(
-    shell: InteractiveShell, monkeypatch: pytest.MonkeyPatch
+def test_without_matplotlib_a_buffer_is_text_and_the_extra_is_named(
+    shell: InteractiveShell, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     for name in [one for one in sys.modules if one.partition(".")[0] == "matplotlib"]:
         monkeypatch.delitem(sys.modules, name)
@@ -40,3 +40,4 @@ def test_without_matplotlib_a_buffer_is_text(
     buffer = load_buffer("MoveCube/test/0", "k1", buffer_set=GOLDEN)
     formats, _ = shell.display_formatter.format(buffer)
     assert [*formats] == ["text/plain"] and "MoveCube/test/0" in formats["text/plain"]
+    assert "[score]" in caplog.text
