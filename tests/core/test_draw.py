@@ -11,6 +11,7 @@ import random
 import subprocess
 import sys
 from collections import Counter
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -227,6 +228,13 @@ def test_usage_of_the_nominal_pool(seed: int) -> None:
         assert max(uses(NOMINAL, k, seed).values()) <= 4
     if seed == 0:
         assert Counter(seven.values()) == {1: 8, 2: 64, 3: 298, 4: 530}
+
+
+def test_consecutive_queries_draw_different_units() -> None:
+    pool = UnitPool(units_of(NOMINAL))
+    for family in FAMILIES:
+        draws = [set(pool.draw(EpisodeId(family, "test", index), 7)) for index in range(50)]
+        assert all(not one & other for one, other in pairwise(draws))
 
 
 @pytest.mark.parametrize("seed", [0, 1])
