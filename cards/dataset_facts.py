@@ -27,7 +27,7 @@ from robomme_interference_data.storage.files import read_json, sha256_file
 from robomme_interference_data.viz.filmstrip import shown_camera, strip_png
 
 from .facts import CardTable, Facts, data_limits, dataset_rows, repositories_of, source_kinds_of
-from .markdown import code
+from .markdown import Raw, code
 from .tables import condition_table, count_table, goal_table, unit_table
 
 STRIP = "README-strip.png"
@@ -60,6 +60,7 @@ def demonstrations_facts(dataset: Dataset) -> Facts:
         [more] * bool(skipped),
         {
             "cameras": dataset.cameras,
+            "fps": Raw(f"{dataset.fps:g}"),
             "episodes": len(records),
             "counts": count_table(records),
             "goals": goal_table(records),
