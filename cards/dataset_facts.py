@@ -19,7 +19,12 @@ from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.questions import Question
-from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
+from robomme_interference_data.errors import (
+    FormatError,
+    InvalidOptionError,
+    MissingFileError,
+    counted,
+)
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
 from robomme_interference_data.schema.manifest import BufferManifest
 from robomme_interference_data.schema.records import EpisodeRecord
@@ -69,8 +74,9 @@ def demonstrations_facts(dataset: Dataset) -> Facts:
         },
         kind=DEMONSTRATIONS,
         title="RoboMME-Interference demonstrations",
-        description=f"Demonstrations of RoboMME-Interference: {len(records):,} query episodes, "
-        f"{frames:,} frames, families {', '.join(_families(records))}.",
+        description="Demonstrations of RoboMME-Interference: "
+        f"{counted(len(records), 'query episode')}, {counted(frames, 'frame')}, "
+        f"families {', '.join(_families(records))}.",
         origin="Recorded episodes were cut, encoded, decoded again and compared.",
         examples=frames,
         tables=[_episodes(dataset, records)],
@@ -126,9 +132,9 @@ def buffer_set_facts(buffer_set: BufferSet) -> Facts:
         },
         kind="buffer_set",
         title="RoboMME-Interference buffers",
-        description=f"History buffers of RoboMME-Interference: {len(manifests):,} buffers of "
-        f"{len(queries):,} query episodes under {', '.join(buffer_set.conditions)}, and the "
-        "distractor units that they hold.",
+        description="History buffers of RoboMME-Interference: "
+        f"{counted(len(manifests), 'buffer')} of {counted(len(queries), 'query episode')} "
+        f"under {', '.join(buffer_set.conditions)}, and the distractor units that they hold.",
         origin="The sessions of every buffer were drawn by SHA-256, rule version "
         f"{header.rule_version}, seed {header.seed}.",
         examples=sum(record.length for record in units),

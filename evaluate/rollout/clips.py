@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.data.buffer import Buffer
-from robomme_interference_data.errors import MissingExtraError
+from robomme_interference_data.errors import MissingExtraError, counted
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.sampling import spread
@@ -100,7 +100,7 @@ class Clip:
     ) -> None:
         """Draw the first picture, with the history frames that were given."""
         self._goal, self._fps = info.goal, max(1, round(buffer.query.dataset.fps))
-        self._given = f"history given: {len(given)} frames" if given else "no history"
+        self._given = f"history given: {counted(len(given), 'frame')}" if given else "no history"
         self._views = {"given": history_picture(buffer, given)}
         self._lesson = self._file.enter_context(closing(_lesson_of(buffer)))
         self._show(first)

@@ -25,6 +25,7 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     MissingFileError,
     UnknownNameError,
+    counted,
 )
 from robomme_interference_data.ids import EpisodeId, whole_number
 from robomme_interference_data.schema.codec import from_table, to_dict
@@ -94,7 +95,8 @@ class BufferSet:
         counts = Counter(zip(self._keys["family"], self._keys["condition"], strict=True))
         return Table.make(
             "buffers",
-            f"{self.name}: {len(self):,} buffers of {len(self.episode_ids):,} query episodes",
+            f"{self.name}: {counted(len(self), 'buffer')} of "
+            f"{counted(len(self.episode_ids), 'query episode')}",
             " ".join(["family", *(f"{name}:count" for name in self.conditions)]),
             ((one, *(counts[one, name] for name in self.conditions)) for one in self.families),
             f"Buffers by family and condition. Cameras: {', '.join(self.cameras)}.",
