@@ -228,8 +228,8 @@ def _export(files: "RepoFiles", to: Path, *, dry_run: bool, as_json: bool) -> No
         print_json({"to": str(to), "files": len(files), "bytes": size, "written": written})
     else:
         outcome = "dry run" if dry_run else "written" if written else "unchanged"
-        size = f"{total_size(files):,} bytes"
-        print_status(f"{to}: {counted(len(files), 'file')}, {size}; {outcome}")
+        count = f"{counted(len(files), 'file')}, {total_size(files):,} bytes"
+        print_status(f"{to}: {count}; {outcome}")
 
 
 def _carry_out(

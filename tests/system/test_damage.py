@@ -1,7 +1,7 @@
 """Every kind of damage to every kind of file: `verify` reports it, and no run has another result.
 
 A buffer set that is loaded may be damaged where nothing that is loaded lies: then all its buffers
-are as before. Fast tests try every damage and every file, slow ones all pairs.
+are as before. Fast tests try a sample of files and damages, slow ones all pairs.
 """
 
 import os
