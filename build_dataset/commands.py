@@ -12,6 +12,7 @@ from robomme_interference_data.constants import (
     CONTRADICTIONS,
     DEMONSTRATIONS,
     DISTRACTORS,
+    EXECUTIONS,
     MANIFESTS,
     RAW_DISTRACTORS,
     REPORT_PATH,
@@ -107,6 +108,15 @@ _DATASETS = {
     Example:
     ```
     robomme-interference build shifted my-buffers --source tabletop --split test --episodes 0-4
+    ```
+    """,
+    EXECUTIONS: """Build what follows each lesson: live frames and states, with the next actions.
+
+    To train and test policies. Use the query episodes; build the manifests afterwards.
+
+    Example:
+    ```
+    robomme-interference build executions my-buffers --source tabletop --split test --episodes 0-4
     ```
     """,
 }

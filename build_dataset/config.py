@@ -12,6 +12,7 @@ from robomme_interference_data.constants import (
     CONTRADICTIONS,
     DEMONSTRATIONS,
     DISTRACTORS,
+    EXECUTIONS,
     LESSONS,
     POSITION_LIMIT,
     SHIFTED,
@@ -103,6 +104,9 @@ class AllConfig(BuildConfig):
     shifted: bool = setting(
         False, help="Also build the query episodes' views under each shift (tabletop only)."
     )
+    executions: bool = setting(
+        False, help="Also build what follows each lesson: live frames, states and actions."
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,7 +164,8 @@ class BuildPlan:
 def plan_all(config: AllConfig, plan: PlanConfig) -> dict[str, BuildPlan]:
     """Plan the datasets of a buffer set, and check everything known before episodes are read."""
     units = dataclasses.replace(config, families=(), episodes=config.unit_episodes, split="train")
-    names = [*datasets_of(in_order(plan.conditions)), *[SHIFTED] * config.shifted]
+    optional = {SHIFTED: config.shifted, EXECUTIONS: config.executions}
+    names = [*datasets_of(in_order(plan.conditions)), *(one for one in optional if optional[one])]
     plans = {name: plan_build(name, units if name in UNITS else config) for name in names}
     queries = (episode.id for _, episode in plans[DEMONSTRATIONS].tasks)
     _check_plans(queries, plans, config.buffer_set, plan)
@@ -260,16 +265,16 @@ def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
         for text in config.source
     )
     for text, source in zip(config.source, sources, strict=True):
-        if kind in UNITS and not source.whole:
+        if kind in (*UNITS, EXECUTIONS) and not source.whole:
             raise InvalidOptionError(
-                f"{text} plays demonstrations only, and distractor units need whole episodes",
-                "Build the distractors from RoboMME's training recordings.",
-                "build distractors BUFFER_SET --source robomme-h5:FOLDER",
+                f"{text} plays demonstrations only, and {kind} need whole episodes",
+                f"Build the {kind} from RoboMME's recordings.",
+                f"build {kind} BUFFER_SET --source robomme-h5:FOLDER",
             )
     split = config.split or ("train" if kind in UNITS else None)
     tasks = list_episodes(sources, families=config.families, split=split, numbers=numbers)
     unmarked = next((one for _, one in tasks if not one.marked), None)
-    if kind in LESSONS and unmarked is not None:
+    if kind in (*LESSONS, EXECUTIONS) and unmarked is not None:
         raise unmarked_error().about(unmarked.id)
     if kind == CONTRADICTIONS:
         tasks = tuple((number, sources[number].contradict(one)) for number, one in tasks)

@@ -6,13 +6,19 @@ from functools import cache
 from typing import Any
 
 from robomme_interference_data.constants import (
+    CONTRADICTIONS,
     DEMONSTRATIONS,
+    DISTRACTORS,
+    EXECUTIONS,
     MANIFEST_ROWS,
     MANIFESTS,
     QUESTIONS_PATH,
+    RAW_DISTRACTORS,
     RECORDS_PATH,
     REPORT_PATH,
+    SHIFTED,
     SUMS_PATH,
+    UNITS,
 )
 from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.data.buffer_set import BufferSet
@@ -38,6 +44,12 @@ from .tables import condition_table, count_table, goal_table, unit_table
 STRIP = "README-strip.png"
 
 _BUFFERS = f"{MANIFESTS}/{MANIFEST_ROWS}"
+_FOLDERS = {
+    RAW_DISTRACTORS: "the distractor units at full rate",
+    CONTRADICTIONS: "lessons in the scenes of the queries with other answers",
+    SHIFTED: "the first live observations under shifts of light, camera and clutter",
+    EXECUTIONS: "what follows each lesson: live frames, states and actions",
+}
 _FILE_SETS = {"frames": "data/*/*.parquet", "videos": "videos/*/*/*.mp4"}
 
 
@@ -90,7 +102,7 @@ def buffer_set_facts(buffer_set: BufferSet) -> Facts:
     header, datasets = buffer_set.header, dict(buffer_set.datasets)
     records = {name: _records(dataset) for name, dataset in datasets.items()}
     lessons, ids = records.pop(DEMONSTRATIONS), {*buffer_set.episode_ids}
-    units = [record for found in records.values() for record in found]
+    units = [record for name in UNITS for record in records.get(name, ())]
     queries = tuple(record for record in lessons if record.episode_id in ids)
     manifests = tuple(buffer_set.manifests())
     if not (manifests and queries):
@@ -104,8 +116,8 @@ def buffer_set_facts(buffer_set: BufferSet) -> Facts:
     )
     split_name, questions = one_split(queries), _questions(buffer_set)
     tables = [CardTable("buffers", BufferManifest, _BUFFERS, header.rows, split_name)]
-    for name in [*records][:1]:
-        tables.append(_episodes(datasets[name], records[name], one_split(units)))
+    if DISTRACTORS in records:
+        tables.append(_episodes(datasets[DISTRACTORS], records[DISTRACTORS], one_split(units)))
     if questions is not None:
         tables.append(CardTable("questions", Question, QUESTIONS_PATH, questions, split_name))
     return _facts(
@@ -123,6 +135,7 @@ def buffer_set_facts(buffer_set: BufferSet) -> Facts:
             "condition_table": condition_table(buffer_set.conditions, manifests),
             "counts": unit_table(queries, units),
             "goals": goal_table(lessons),
+            "folders": {name: what for name, what in _FOLDERS.items() if name in datasets},
             "questions": questions is not None,
             "header": header,
             "other_conditions": _beyond_paper(buffer_set.conditions),
