@@ -131,7 +131,10 @@ def batches(data: HistoryDataset, args: argparse.Namespace, step: int) -> Iterat
         generator = torch.Generator().manual_seed(args.seed * 1_000_003 + epoch)
         order = torch.randperm(len(data), generator=generator)
         rest = order[done * args.batch : per_epoch * args.batch].tolist()
-        loader = DataLoader(Subset(data, rest), args.batch, num_workers=args.workers)
+        # With its own generator, the loader does not change what dropout draws.
+        loader = DataLoader(
+            Subset(data, rest), args.batch, num_workers=args.workers, generator=generator
+        )
         for batch in loader:
             if step == args.steps:
                 return

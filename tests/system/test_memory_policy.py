@@ -1,6 +1,7 @@
 """The example `examples/memory_policy`: it trains, resumes, answers, and acts in rollouts."""
 
 import csv
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -61,20 +62,30 @@ def weights(run: Path) -> dict[str, torch.Tensor]:
 
 
 def test_it_learns_to_answer_and_writes_rows(program: Any, tmp_path: Path) -> None:
-    """The golden lessons show their answers in color: a hundred steps learn them by heart."""
-    run = tmp_path / "run"
-    program("train", TABLETOP, "--out", run, "--conditions", "k0", "--steps", 100, *SMALL)
+    """Six golden lessons are learned by heart."""
+    run, families = tmp_path / "run", ("VideoRepick", "MoveCube", "InsertPeg")
+    options = (
+        "--conditions",
+        "k0",
+        "--steps",
+        80,
+        "--learning-rate",
+        3e-3,
+        "--families",
+        *families,
+    )
+    program("train", TABLETOP, "--out", run, *options, *SMALL)
     with (run / "log.csv").open() as file:
         log = [*csv.DictReader(file)]
-    assert [line["step"] for line in log] == ["20", "40", "60", "80", "100"]
+    assert [line["step"] for line in log] == ["20", "40", "60", "80"]
     out = tmp_path / "rows.csv"
     program("answer", run, TABLETOP, "--system", "learned-k0", "--out", out, "--seed", 3)
     rows = read_rows([out]).rows
     assert len(rows) == 3 * 18 and {row.model_seed for row in rows} == {3}
     assert {row.condition for row in rows} == {"no-history", "k0", "k1"}
     assert {row.revision for row in rows} == {load_buffer_set(TABLETOP).revision}
-    right = [row.success for row in rows if row.condition == "k0"]
-    assert sum(map(bool, right)) >= 12  # by chance about 5 of 18
+    seen = [row.success for row in rows if row.condition == "k0" and row.family in families]
+    assert sum(map(bool, seen)) >= 5  # by chance about 2 of 6
 
 
 def test_an_interrupted_run_ends_like_another(
@@ -136,3 +147,25 @@ def test_a_checkpoint_of_the_other_task(program: Any, acting: Path, tmp_path: Pa
         program("answer", run, TABLETOP, "--system", "x", "--out", tmp_path / "rows.csv")
     with pytest.raises(SystemExit, match="is not a checkpoint"):
         program("answer", tmp_path, TABLETOP, "--system", "x", "--out", tmp_path / "rows.csv")
+
+
+PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "train-a-policy.md"
+
+
+def test_the_pages_commands_and_its_example(
+    acting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = PAGE.read_text()
+    lines = re.findall(r"^python examples/memory_policy/(\w+)\.py (.*)$", text, flags=re.M)
+    assert {name for name, _ in lines} == {"train", "answer"}
+    for name, line in lines:
+        monkeypatch.setattr(sys, "argv", [name, *line.split()])
+        __import__(name)
+        assert sys.modules[name].arguments().out
+    [code] = re.findall(r"<!-- example: train -->\n```python\n(.*?)```", text, flags=re.S)
+    (tmp_path / "my-training").symlink_to(acting)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(code.replace("image_size=96", "image_size=16"), names)  # of 32 pixels
+    item = names["item"]
+    assert item["memory.images.front"].shape == (31, 3, 16, 16) and item["action"].shape == (16, 8)
