@@ -348,7 +348,9 @@ class HistoryDataset(torch.utils.data.Dataset[dict[str, Any]]):
         planned, names = {}, self._conditions.names
         with progress.status("Laying out histories"):
             for shift in self._shifts.names:
-                every = self._histories.planned(names, frozenset(self._episodes), parse_shift(shift))
+                every = self._histories.planned(
+                    names, frozenset(self._episodes), parse_shift(shift)
+                )
                 for (episode, name), history in every:
                     planned[episode, name, shift] = history
         return planned
