@@ -46,6 +46,10 @@ def results_facts(results: Score | Path) -> Facts:
         results: The folder of a run, a file of rows, or the score of either.
     """
     found = results if isinstance(results, Score) else score(Settings(rows=(results,)))
+    if not found.outcomes:
+        raise InvalidOptionError(
+            "the rows are of an offline run", "Publish the results of rollouts or questions."
+        )
     if len(found.rows.sources) != 1:
         raise InvalidOptionError(
             f"the score is of {len(found.rows.sources)} files of rows; expected one run",

@@ -90,7 +90,7 @@ def error_table(rows: Iterable[Rollout]) -> Table:
     return Table.make(
         "errors",
         "Mean absolute action error by family and condition",
-        " ".join(["family", *(f"{one}:ratio" for one in conditions)]),
+        " ".join(["family", *(f"{one}:number" for one in conditions)]),
         (
             (name, *(fmean(cell) if cell else None for cell in line))
             for name, line in zip(names, cells, strict=True)
