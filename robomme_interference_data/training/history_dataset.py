@@ -11,19 +11,22 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, EXECUTIONS, SHIFTED, STATE
 from robomme_interference_data.data.buffer_set import BufferSet
-from robomme_interference_data.data.dataset import Dataset, camera_feature
+from robomme_interference_data.data.dataset import camera_feature
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.data.query_sessions import SessionSource
-from robomme_interference_data.errors import InvalidOptionError, MissingFileError, UnknownNameError
+from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.ids import EpisodeId, parse_numbers, whole_number
 from robomme_interference_data.runtime.progress import WorkProgress
-from robomme_interference_data.schema.conditions import datasets_of, parse_condition
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFTS, parse_shift
 from robomme_interference_data.storage.cache import default_cache_folder
 
 from .histories import Histories, History, Retrieval, Rows, Weights, number_from
+from .moments import check_size, choose_moments, needed_datasets
 from .question_tensors import QuestionTensors
+
+_Key = tuple[EpisodeId, str, str]
+"""Query episode, condition and shift."""
 
 
 class HistoryDataset(torch.utils.data.Dataset[dict[str, Any]]):
@@ -111,75 +114,86 @@ class HistoryDataset(torch.utils.data.Dataset[dict[str, Any]]):
     ):
         opened = isinstance(buffer_set, BufferSet)
         self.buffer_set: BufferSet = buffer_set if opened else load_buffer_set(buffer_set)  # type: ignore[assignment,arg-type]
-        self.memory, self.chunk, self.seed = Memory.parse(memory), _chunk(chunk), seed
+        self._arguments = {
+            **{
+                "conditions": conditions,
+                "memory": memory,
+                "cameras": tuple(cameras),
+                "image_size": image_size,
+            },
+            **{"chunk": chunk, "families": tuple(families), "episodes": episodes},
+            **{"retrieval": retrieval, "retrieval_rule": retrieval_rule},
+            **{"retrieval_camera": retrieval_camera, "shifts": shifts, "questions": questions},
+            **{"redraw": redraw, "unit_episodes": unit_episodes, "seed": seed, "store": store},
+        }
+        self.memory, self.seed = Memory.parse(memory), seed
+        self.chunk = whole_number("chunk", chunk, "an integer from 0, such as 16")
         self.cameras = tuple(camera_feature(one) for one in cameras)
         self._conditions = Weights.parse("conditions", conditions)
         self._shifts = Weights.parse("shifts", shifts or {NO_SHIFT: 1})
-        self._redraw = redraw
+        self._redraw, shifted = redraw, self._shifts.names != (NO_SHIFT,)
         self._units = None if unit_episodes is None else frozenset(parse_numbers(unit_episodes))
-        if self._units is not None and not redraw:
-            raise InvalidOptionError(
-                f"unit_episodes {unit_episodes!r} has no effect on planned buffers",
-                "Set redraw=True, or leave it out.",
-            )
-        size = self._check_size(image_size)
-        self._rows = Rows(self._needed_datasets())
-        folder = default_cache_folder().parent / "frames" if store is None else Path(store)
-        step = None
-        if retrieval is not None:
-            step = Retrieval(retrieval, retrieval_rule, retrieval_camera)
+        self._check(unit_episodes, shifted=shifted)
+        datasets = needed_datasets(
+            self.buffer_set,
+            self._conditions.names,
+            actions=self.chunk > 0,
+            shifts=shifted,
+            planned=not redraw,
+        )
+        size = check_size(self.buffer_set, self.cameras, image_size)
+        self._rows, actions = Rows(datasets), self.chunk > 0
+        self._moments = choose_moments(
+            self.buffer_set, self._rows, families, episodes, actions=actions
+        )
+        step = Retrieval(retrieval, retrieval_rule, retrieval_camera) if retrieval else None
         self._histories = Histories(self.buffer_set, self._rows, step)
-        self._episodes = self._choose_episodes(families, episodes)
+        self._questions = QuestionTensors(self.buffer_set) if questions else None
+        folder = default_cache_folder().parent / "frames" if store is None else Path(store)
         with WorkProgress(unit="episodes", quiet=quiet) as progress:
             for camera in self.cameras:
                 self._rows.load(camera, folder, size, progress)
             self._rows.load(STATE, folder, None, progress)
-            if chunk:
+            if actions:
                 self._rows.load(ACTION, folder, None, progress, (EXECUTIONS,))
-            self._planned = {} if redraw else self._plan(progress)
-        self._redrawn: (
-            tuple[int, SessionSource, dict[tuple[EpisodeId, str, str], History]] | None
-        ) = None
+            with progress.status("Laying out histories"):
+                self._planned = {} if redraw else self._plan()
+        self._redrawn: tuple[int, SessionSource, dict[_Key, History]] | None = None
         self._size = self.memory_frames
-        self._parts = max(
-            (
-                span.part + 1
-                for one in self.buffer_set.datasets[DEMONSTRATIONS].records()
-                for span in one.evidence or ()
-            ),
-            default=1,
+        spans = (
+            span
+            for one in self.buffer_set.datasets[DEMONSTRATIONS].records()
+            for span in one.evidence or ()
         )
-        self._questions = QuestionTensors(self.buffer_set) if questions else None
-        # Shared with the processes of a loader, which keep copies of the dataset.
+        self._parts = max((span.part + 1 for span in spans), default=1)
+        # Shared with the processes of a loader, which have copies of the dataset.
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _open_again, (self.buffer_set.location, self._arguments, self._epoch)
+
     def __len__(self) -> int:
-        """Return the number of moments."""
-        return int(self._stops[-1])
+        """Return the number of items."""
+        return len(self._moments)
 
     def __repr__(self) -> str:
         return (
             f"HistoryDataset({self.buffer_set.name}, conditions={list(self._conditions.names)}, "
-            f"memory={self.memory}, episodes={len(self._episodes)}, items={len(self)})"
+            f"memory={self.memory}, episodes={len(self.episode_ids)}, items={len(self)})"
         )
 
     @property
     def episode_ids(self) -> tuple[EpisodeId, ...]:
         """Ids of the query episodes in use, in canonical order."""
-        return self._episodes
+        return self._moments.episodes
 
     @property
     def memory_frames(self) -> int:
         """Number M of places in memory, without the current frame."""
         if self.memory.rule != "full":
             return self.memory.frames - 1
-        if self._redraw:
-            raise InvalidOptionError(
-                "memory 'full' has no fixed size if sessions are drawn anew",
-                "Set a size, such as memory='window:512', or redraw=False.",
-            )
         longest = max(len(history.rows) for history in self._planned.values())
-        return longest + int(np.diff(self._stops, prepend=0).max()) - 1
+        return longest + self._moments.most - 1
 
     @property
     def epoch(self) -> int:
@@ -194,29 +208,23 @@ class HistoryDataset(torch.utils.data.Dataset[dict[str, Any]]):
         """Return the index of the item of an episode's moment.
 
         Raises:
-            ValueError: The episode is not in use, or does not have this moment.
+            UnknownNameError: The episode is not in use, or does not have this moment.
         """
-        number = self._episodes.index(EpisodeId.parse(episode_id))
-        first = int(self._stops[number - 1]) if number else 0
-        if not 0 <= frame_index < self._stops[number] - first:
-            raise ValueError(f"{episode_id} has no moment {frame_index}")
-        return first + frame_index
+        return self._moments.index_of(EpisodeId.parse(episode_id), frame_index)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         """Return an item; see the class."""
         if not -len(self) <= index < len(self):
             raise IndexError(f"index {index} of {len(self)} items")
         index %= len(self)
-        epoch = self.epoch
-        number = int(np.searchsorted(self._stops, index, "right"))
-        moment = index - (int(self._stops[number - 1]) if number else 0)
-        episode = self._episodes[number]
+        epoch, (number, moment) = self.epoch, self._moments.locate(index)
+        episode = self.episode_ids[number]
+        first, actions = self._moments.first[number], self._moments.actions[number]
         condition = self._conditions.draw("condition", self.seed, epoch, index)
         shift = self._shifts.draw("shift", self.seed, epoch, index)
         history = self._history(epoch, episode, condition, shift)
         live = len(history.rows) + moment
         kept = np.asarray(self.memory.earlier(live), np.int64)
-        first, actions = self._live_rows[number]
         current = first + moment
         if shift != NO_SHIFT:
             current = self._shifted_row(episode, shift)
@@ -272,88 +280,34 @@ class HistoryDataset(torch.utils.data.Dataset[dict[str, Any]]):
             drawn[key] = self._histories.draw(source, episode, condition, parse_shift(shift))
         return drawn[key]
 
-    def _needed_datasets(self) -> dict[str, Dataset]:
-        """Return the datasets whose frames items can have."""
-        parsed = [parse_condition(name) for name in self._conditions.names]
-        needed = [*datasets_of(parsed)]
-        if self.chunk:
-            needed.append(EXECUTIONS)
-        if self._shifts.names != (NO_SHIFT,):
-            if self.chunk:
-                expected = "none with actions: only first live views are stored under shifts"
-                raise InvalidOptionError.expected("shifts", list(self._shifts.names), expected)
-            needed.append(SHIFTED)
-        for name in needed:
-            if name not in self.buffer_set.datasets:
-                location = self.buffer_set.location
-                raise MissingFileError(
-                    f"{location} has no {name}, which these items need",
-                    "Build them from the source of its demonstrations, then run build manifests "
-                    "again."
-                    + " Without actions (chunk=0), items need no executions."
-                    * (name == EXECUTIONS),
-                    f"build {name} {location} --source KIND:PATH",
-                )
-        if not self._redraw:
-            for condition in parsed:
-                self.buffer_set.planned(condition)
-        return {name: self.buffer_set.datasets[name] for name in needed}
-
-    def _check_size(self, size: int | None) -> int | None:
-        if size is None:
-            return None
-        size = whole_number("image_size", size, "an integer from 1, or None")
-        demonstrations = self.buffer_set.datasets[DEMONSTRATIONS]
-        for camera in self.cameras:
-            height, width, _ = demonstrations.shape(camera)
-            if not 0 < size <= min(height, width):
-                expected = f"1 to {min(height, width)}: {camera} has {width}×{height} pixels"
-                raise InvalidOptionError.expected("image_size", size, expected)
-        return size
-
-    def _choose_episodes(
-        self, families: Sequence[str], episodes: str | None
-    ) -> tuple[EpisodeId, ...]:
-        """Return the query episodes to use, and set the rows and numbers of their moments."""
-        every, known = self.buffer_set.episode_ids, self.buffer_set.families
-        for family in families:
-            if family not in known:
-                raise UnknownNameError.among("family", family, self.buffer_set.location, known)
-        numbers = None if episodes is None else frozenset(parse_numbers(episodes))
-        live = self.buffer_set.datasets[EXECUTIONS if self.chunk else DEMONSTRATIONS]
-        recorded = {record.episode_id: record for record in live.records()}
-        chosen = tuple(
-            one
-            for one in every
-            if one.family in (families or known)
-            and (numbers is None or one.index in numbers)
-            and one in recorded
-        )
-        if not chosen:
-            raise InvalidOptionError.expected(
-                "episodes", episodes, f"episodes of the {live.kind} of {self.buffer_set.location}"
+    def _check(self, unit_episodes: str | None, *, shifted: bool) -> None:
+        """Check arguments against each other."""
+        if self.chunk < 0:
+            raise InvalidOptionError.expected("chunk", self.chunk, "an integer from 0, such as 16")
+        if unit_episodes is not None and not self._redraw:
+            raise InvalidOptionError(
+                f"unit_episodes {unit_episodes!r} has no effect on planned buffers",
+                "Set redraw=True, or leave it out.",
             )
-        self._live_rows, lengths = [], []
-        for episode in chosen:
-            record = recorded[episode]
-            first = self._rows.first(live.kind, record.episode_index)
-            actions = record.length if self.chunk else 0
-            self._live_rows.append((first + (record.exec_start_idx or 0), actions))
-            lengths.append(actions or 1)
-        self._stops = np.cumsum(lengths)
-        return chosen
+        if self._redraw and self.memory.rule == "full":
+            raise InvalidOptionError(
+                "memory 'full' has no fixed size if sessions are drawn anew",
+                "Set a size, such as memory='window:512', or redraw=False.",
+            )
+        if shifted and self.chunk:
+            expected = "none with actions: only first live views are stored under shifts"
+            raise InvalidOptionError.expected("shifts", list(self._shifts.names), expected)
 
-    def _plan(self, progress: WorkProgress) -> dict[tuple[EpisodeId, str, str], History]:
-        """Return the planned histories by episode, condition and shift."""
-        planned, names = {}, self._conditions.names
-        with progress.status("Laying out histories"):
-            for shift in self._shifts.names:
-                every = self._histories.planned(
-                    names, frozenset(self._episodes), parse_shift(shift)
-                )
-                for (episode, name), history in every:
-                    planned[episode, name, shift] = history
-        return planned
+    def _plan(self) -> "dict[_Key, History]":
+        """Return the planned histories."""
+        used = frozenset(self.episode_ids)
+        return {
+            (episode, name, shift): history
+            for shift in self._shifts.names
+            for (episode, name), history in self._histories.planned(
+                self._conditions.names, used, parse_shift(shift)
+            )
+        }
 
     def _shifted_row(self, episode: EpisodeId, shift: str) -> int:
         views = self.buffer_set.datasets[SHIFTED]
@@ -368,9 +322,8 @@ def _padded(values: NDArray[np.int64], size: int) -> torch.Tensor:
     return out
 
 
-def _chunk(given: int) -> int:
-    expected = "an integer from 0, such as 16"
-    chunk = whole_number("chunk", given, expected)
-    if chunk < 0:
-        raise InvalidOptionError.expected("chunk", chunk, expected)
-    return chunk
+def _open_again(location: str, arguments: dict[str, Any], epoch: torch.Tensor) -> HistoryDataset:
+    """Return a dataset in another process; memory maps and tables cannot be pickled."""
+    made = HistoryDataset(location, **arguments, quiet=True)
+    made._epoch = epoch
+    return made
