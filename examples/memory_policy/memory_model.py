@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 WORDS = 1024  # buckets for hashed words
+CHANNELS = 16  # of a frame's feature map
 
 
 @dataclass(frozen=True)
@@ -43,24 +44,20 @@ class Config:
 
 
 class FrameEncoder(nn.Module):
-    """A patch encoder: patches of 4 × 4 pixels, then two convolutions."""
+    """A patch encoder: patches of 4 × 4 pixels, then a convolution over neighbors."""
 
     def __init__(self, width: int):
         super().__init__()
-        self.layers = nn.Sequential(
-            nn.Conv2d(3, 24, 4, stride=4),
-            nn.GELU(),
-            nn.Conv2d(24, 24, 3, padding=1),
-            nn.GELU(),
-            nn.Conv2d(24, 24, 3, padding=1),
+        self.patches = nn.Sequential(
+            nn.Conv2d(3, CHANNELS, 4, stride=4), nn.GELU(), nn.Conv2d(CHANNELS, CHANNELS, 3, padding=1)
         )
         self.whole = nn.Sequential(
-            nn.GELU(), nn.AdaptiveAvgPool2d(4), nn.Flatten(), nn.Linear(24 * 16, width)
+            nn.GELU(), nn.AdaptiveAvgPool2d(4), nn.Flatten(), nn.Linear(16 * CHANNELS, width)
         )
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Return feature maps `(N, 24, h, w)` and vectors `(N, width)` of `(N, 3, S, S) uint8`."""
-        maps = self.layers(images.float() / 127.5 - 1)
+        """Return maps `(N, CHANNELS, h, w)` and vectors `(N, width)` of `(N, 3, S, S) uint8`."""
+        maps = self.patches(images.float() / 127.5 - 1)
         return maps, self.whole(maps)
 
 
@@ -73,7 +70,7 @@ class MemoryModel(nn.Module):
         self.encoders = nn.ModuleList(FrameEncoder(width) for _ in config.cameras)
         self.state = nn.Linear(config.state, width)
         # At each point of an option: what the first camera shows there, and where it is.
-        self.at_points = nn.Linear(26 * config.points, width)
+        self.at_points = nn.Linear((CHANNELS + 2) * config.points, width)
         self.mix = nn.Sequential(nn.GELU(), nn.Linear(width, width), nn.GELU())
         self.mixed = nn.Linear(width, width)
         self.words = nn.EmbeddingBag(WORDS, width, mode="mean", padding_idx=0)
@@ -114,7 +111,7 @@ class MemoryModel(nn.Module):
         """Return a token per frame, `(B, M + 1, width)`, and maps of the first camera."""
         tokens: Tensor = self.state(_with_current(batch, "state"))
         size = self.config.image_size // 4
-        maps = tokens.new_zeros(len(tokens), tokens.shape[1], 24, size, size)
+        maps = tokens.new_zeros(len(tokens), tokens.shape[1], CHANNELS, size, size)
         if not self.config.pictures:
             return torch.zeros_like(tokens), maps
         for number, (encoder, camera) in enumerate(
@@ -134,7 +131,7 @@ class MemoryModel(nn.Module):
         grid = (2 * points.flip(-1) - 1).view(count, 1, 1, options * places, 2)
         grid = grid.expand(-1, frames, -1, -1, -1).flatten(0, 1)
         sampled = functional.grid_sample(maps.flatten(0, 1), grid, align_corners=False)
-        sampled = sampled.view(count, frames, 24, options, places).permute(0, 3, 1, 4, 2)
+        sampled = sampled.view(count, frames, CHANNELS, options, places).permute(0, 3, 1, 4, 2)
         where = points[:, :, None].expand(-1, -1, frames, -1, -1)
         seen = torch.cat([sampled, where], -1).masked_fill(is_pad[:, :, None, :, None], 0)
         at_points: Tensor = self.at_points(seen.flatten(3))
