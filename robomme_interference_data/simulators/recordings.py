@@ -8,11 +8,13 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import ACTION, EXECUTIONS, MAX_STEPS, STATE
 from robomme_interference_data.data.buffer_set import BufferSet
-from robomme_interference_data.data.dataset import Dataset
+from robomme_interference_data.data.dataset import Dataset, camera_feature
 from robomme_interference_data.data.loading import load_buffer_set
-from robomme_interference_data.errors import MissingFileError, UnknownNameError
+from robomme_interference_data.errors import HashMismatchError, MissingFileError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.storage.arrays import FeatureDigests
 
 from .base import Begun, Demonstration, EpisodeInfo, Observation, Simulator, choose_cameras
 from .registry import RECORDINGS
@@ -56,10 +58,9 @@ class Recordings(Simulator):
         query, executions = self._buffer_set.query(episode), self._executions
         index = executions.index_of(episode)
         record = executions.record(index)
-        length = min(record.length, MAX_STEPS)
-        self._actions = executions.read_vectors(index, ACTION, 0, length).astype(float)
+        self._actions = executions.read_vectors(index, ACTION, 0, min(record.length, MAX_STEPS))
         self._errors: list[NDArray[np.float64]] = []
-        self._observations = self._observed(index, length)
+        self._observations = self._observed(record, len(self._actions))
         self._seen = next(self._observations)
         states = query.dataset.read_vectors(
             query.record.episode_index, STATE, 0, query.lesson_frames
@@ -72,21 +73,37 @@ class Recordings(Simulator):
     def _execute(
         self, episode: EpisodeId, action: NDArray[np.float32], observe: bool
     ) -> tuple[Observation, Status]:
-        self._errors.append(np.abs(action - self._actions[len(self._errors)]))
-        if len(self._errors) == len(self._actions):
+        recorded = self._actions[len(self._errors)].astype(float)
+        self._errors.append(np.abs(action - recorded))
+        seen = next(self._observations, None)
+        if seen is None:
             return self._seen, Status.MEASURED
-        self._seen = next(self._observations)
-        return self._seen, Status.ONGOING
+        self._seen = seen
+        return seen, Status.ONGOING
 
-    def _observed(self, index: int, length: int) -> Iterator[Observation]:
+    def _observed(self, record: EpisodeRecord, length: int) -> Iterator[Observation]:
+        """Yield the observations, and compare whole recordings with their SHA-256."""
+        index, digests = record.episode_index, FeatureDigests()
         states = self._executions.read_vectors(index, STATE, 0, length)
+        digests.update(STATE, states)
+        digests.update(ACTION, self._actions)
         streams = {
             camera: self._executions.iter_frames(index, camera, 0, length)
             for camera in self._cameras
         }
         for state in states:
             images = {camera: np.array(next(stream)) for camera, stream in streams.items()}
+            for camera, image in images.items():
+                digests.update(camera_feature(camera), image)
             yield Observation(images, state)
+        recorded, found = record.feature_sha256, digests.current()
+        if length == record.length and not found.items() <= recorded.items():
+            raise HashMismatchError(
+                f"the execution {record.episode_id} in {self._executions.files.describe()} differs "
+                "from its recorded SHA-256",
+                "Download or build it again.",
+                "verify BUFFER_SET",
+            )
 
 
 def executions_of(buffer_set: BufferSet) -> Dataset:

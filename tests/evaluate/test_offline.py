@@ -1,5 +1,6 @@
 """Offline evaluation: the policy acts along a recording, and its actions are compared."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from support.made_up import MadeUpSource
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.sources import Frame
-from robomme_interference_data.errors import InterferenceError, PolicyError
+from robomme_interference_data.errors import HashMismatchError, InterferenceError, PolicyError
 from robomme_interference_data.evaluate import Policy, RolloutInfo, RunConfig, run_evaluation
 from robomme_interference_data.evaluate.rollout.rollout import run_rollout
 from robomme_interference_data.evaluate.run.kind import Run
@@ -136,6 +137,19 @@ def test_recorded_images_are_shown(buffers: Path) -> None:
     assert simulator.step(np.full(8, -6.0))[1] == "ongoing"
     assert simulator.step(np.full(8, -6.0))[1] == "measured"
     assert simulator.columns()["action_l1"] == 0.5
+
+
+def test_damaged_recordings_are_an_error(buffers: Path, tmp_path: Path) -> None:
+    """The video of another recording, of the same length."""
+    root = Path(shutil.copytree(buffers, tmp_path / "damaged"))
+    other = tmp_path / "other"
+    build(other, "executions", MadeUpSource({"OpenDrawer/test/1": (25, 5)}))
+    [video] = other.rglob("*.mp4")
+    made = load_buffer_set(root).datasets["executions"]
+    index = made.index_of(EpisodeId.parse(DRAWER))
+    shutil.copyfile(video, root / "executions" / made.files_of(index, ["front"])[1])
+    with pytest.raises(HashMismatchError, match=DRAWER):
+        walk(root, Constant(np.zeros((16, 8))))
 
 
 def test_long_recordings_end_like_rollouts(buffers: Path, monkeypatch: pytest.MonkeyPatch) -> None:
