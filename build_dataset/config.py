@@ -20,7 +20,7 @@ from robomme_interference_data.constants import (
     UNIT_FRAMES,
     UNITS,
 )
-from robomme_interference_data.errors import InvalidOptionError, SourceError
+from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
 from robomme_interference_data.ids import EpisodeId, parse_numbers
 from robomme_interference_data.runtime.executor import WorkersConfig, make_executor
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, datasets_of, in_order
@@ -114,7 +114,9 @@ class NewConfig(BuildConfig):
     """Settings of a build of a buffer set for published demonstrations."""
 
     demonstrations: str = setting(
-        metavar="NAME", help="Repository of the demonstrations, NAMESPACE/NAME[@REVISION]."
+        metavar="NAME",
+        help="Repository of the demonstrations, NAMESPACE/NAME[@REVISION], or their folder, which "
+        "is linked.",
     )
 
 
@@ -173,18 +175,24 @@ def plan_all(config: AllConfig, plan: PlanConfig) -> dict[str, BuildPlan]:
 def plan_new(config: NewConfig, plan: PlanConfig) -> "tuple[Dataset, BuildPlan]":
     """Open published demonstrations, and plan units with their cameras; see `plan_all`."""
     from robomme_interference_data.data.dataset import Dataset
-    from robomme_interference_data.storage.hub import HubFiles, locate
+    from robomme_interference_data.storage.files import LocalFiles
+    from robomme_interference_data.storage.hub import locate
 
     from .manifests import check_needs, in_folder
 
     base = Dataset(locate(config.demonstrations))
-    if not isinstance(base.files, HubFiles) or base.kind != DEMONSTRATIONS:
+    if base.kind != DEMONSTRATIONS:
         raise InvalidOptionError.expected(
             "demonstrations",
             config.demonstrations,
-            "published demonstrations",
-            "The card of a published buffer set names their repository. For demonstrations in a "
-            "folder, build distractors and manifests beside them.",
+            f"a repository or folder of demonstrations, not of {base.kind}",
+            "The card of a published buffer set names the repository of its demonstrations.",
+        )
+    link = config.buffer_set / DEMONSTRATIONS
+    if isinstance(base.files, LocalFiles) and link.exists() and not link.samefile(base.files.root):
+        raise BuildError(
+            f"{link} exists, and is not {base.files.root}",
+            "Choose another `buffer_set`, or remove the folder first.",
         )
     check_needs(in_order(plan.conditions), in_folder(config.buffer_set))
     cameras = config.cameras or base.cameras

@@ -83,8 +83,9 @@ def _buffer_set(buffer_set: BufferSet, decode: bool, progress: WorkProgress) -> 
             datasets[name] = Dataset(LocalFiles(buffer_set.dataset_files(name).snapshot("*")))
         except InterferenceError as error:
             yield Violation(name, error.message)
-    frames = sum(dataset.identity.counts.frames for dataset in datasets.values())
-    progress.start("Verifying", frames if decode else 0)
+    if decode:
+        frames = sum(dataset.identity.counts.frames for dataset in datasets.values())
+        progress.start("Verifying", frames)
     for name, dataset in datasets.items():
         yield from caught(
             name, dataset_violations(name, dataset, header, progress if decode else None)

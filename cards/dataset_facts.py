@@ -25,7 +25,12 @@ from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.questions import Question
-from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
+from robomme_interference_data.errors import (
+    FormatError,
+    InvalidOptionError,
+    MissingFileError,
+    counted,
+)
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
 from robomme_interference_data.schema.manifest import BufferManifest
 from robomme_interference_data.schema.records import EpisodeRecord
@@ -33,7 +38,7 @@ from robomme_interference_data.storage.files import read_json, sha256_file
 from robomme_interference_data.viz.filmstrip import shown_camera, strip_png
 
 from .facts import CardTable, Facts, data_limits, dataset_rows, repositories_of, source_kinds_of
-from .markdown import code
+from .markdown import Raw, code
 from .tables import condition_table, count_table, goal_table, unit_table
 
 STRIP = "README-strip.png"
@@ -72,6 +77,7 @@ def demonstrations_facts(dataset: Dataset) -> Facts:
         [more] * bool(skipped),
         {
             "cameras": dataset.cameras,
+            "fps": Raw(f"{dataset.fps:g}"),
             "episodes": len(records),
             "counts": count_table(records),
             "goals": goal_table(records),
@@ -80,8 +86,9 @@ def demonstrations_facts(dataset: Dataset) -> Facts:
         },
         kind=DEMONSTRATIONS,
         title="RoboMME-Interference demonstrations",
-        description=f"Demonstrations of RoboMME-Interference: {len(records):,} query episodes, "
-        f"{frames:,} frames, families {', '.join(_families(records))}.",
+        description="Demonstrations of RoboMME-Interference: "
+        f"{counted(len(records), 'query episode')}, {counted(frames, 'frame')}, "
+        f"families {', '.join(_families(records))}.",
         origin="Recorded episodes were cut, encoded, decoded again and compared.",
         examples=frames,
         tables=[_episodes(dataset, records)],
@@ -138,9 +145,9 @@ def buffer_set_facts(buffer_set: BufferSet) -> Facts:
         },
         kind="buffer_set",
         title="RoboMME-Interference buffers",
-        description=f"History buffers of RoboMME-Interference: {len(manifests):,} buffers of "
-        f"{len(queries):,} query episodes under {', '.join(buffer_set.conditions)}, and the "
-        "distractor units that they hold.",
+        description="History buffers of RoboMME-Interference: "
+        f"{counted(len(manifests), 'buffer')} of {counted(len(queries), 'query episode')} "
+        f"under {', '.join(buffer_set.conditions)}, and the distractor units that they hold.",
         origin="The sessions of every buffer were drawn by SHA-256, rule version "
         f"{header.rule_version}, seed {header.seed}.",
         examples=sum(record.length for record in units),

@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from robomme_interference_data.constants import PROTOCOL_VERSION, RUN_HEADER, RUN_RECORD, RUN_TABLES
-from robomme_interference_data.errors import InvalidOptionError, PublishError
+from robomme_interference_data.errors import InvalidOptionError, PublishError, counted
 from robomme_interference_data.evaluate.run.log import RunHeader, read_record
 from robomme_interference_data.evaluate.score.config import Expected, Settings
 from robomme_interference_data.evaluate.score.outcomes import STATUSES
@@ -81,7 +81,7 @@ def results_facts(results: Score | Path) -> Facts:
         kind="results",
         title="RoboMME-Interference results",
         description=f"Rollouts of {', '.join(names)} on RoboMME-Interference: "
-        f"{len(found.rows):,} rows.",
+        f"{counted(len(found.rows), 'row')}.",
         origin="A policy was rolled out in a simulator, one row per episode.",
         examples=len(found.rows),
         tables=[rows],

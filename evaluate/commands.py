@@ -14,6 +14,7 @@ from robomme_interference_data.cli.console import (
     print_status,
 )
 from robomme_interference_data.cli.options import AsJson, BufferSetFolder, with_settings
+from robomme_interference_data.errors import counted
 from robomme_interference_data.schema.shifts import NO_SHIFT
 
 from .run.config import AskConfig, CeilingConfig, RunConfig
@@ -162,7 +163,7 @@ def merge(
             more = f" and {len(items) - 5:,} more" if len(items) > 5 else ""
             shown = ", ".join(map(str, items[:5]))
             print_status(f"{len(items):,} {_LISTS[name]}: {shown}{more}")
-    echo(f"{len(merged.rows):,} of {merged.planned:,} rollouts in {out}")
+    echo(f"{len(merged.rows):,} of {counted(merged.planned, 'rollout')} in {out}")
 
 
 _LISTS = {

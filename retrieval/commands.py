@@ -26,7 +26,7 @@ from robomme_interference_data.cli.options import (
     with_settings,
 )
 from robomme_interference_data.constants import EXECUTIONS, IDENTITY_PATH, MANIFEST_PATH
-from robomme_interference_data.errors import InvalidOptionError, MissingFileError
+from robomme_interference_data.errors import InvalidOptionError, MissingFileError, counted
 from robomme_interference_data.runtime.executor import Serial, WorkersConfig, make_executor
 from robomme_interference_data.schema.settings import setting
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
@@ -125,7 +125,7 @@ def index(
     current = {"in": image_encoder.computed_in, "batch": image_encoder.batch}
     for report in reports:
         frames, recorded = report.header.frames, report.header.computed
-        echo(f"{report.folder}: {frames} frames, {report.embedded} embedded now")
+        echo(f"{report.folder}: {counted(frames, 'frame')}, {report.embedded:,} embedded now")
         if recorded != current:
             print_status(
                 f"{report.folder} is kept, computed with {recorded['in']}, batch "

@@ -169,8 +169,10 @@ class RunTask[C: RunConfig | AskConfig](ABC):
 
     def describe(self) -> dict[str, str]:
         """Return what must be the same on all machines that run the task."""
-        revision = load_buffer_set(self.run.config.buffer_set).revision
-        return package_versions(self.run.config) | {"the buffer set's revision": revision}
+        buffer_set = load_buffer_set(self.run.config.buffer_set)
+        buffer_set.check_tables(buffer_set.conditions)
+        revision = {"the buffer set's revision": buffer_set.revision}
+        return package_versions(self.run.config) | revision
 
     @abstractmethod
     def work(self, task: Any, worker: Worker) -> Any:

@@ -52,6 +52,10 @@ class History:
     evidence: tuple[tuple[int, int, int], ...] | None
 
 
+_Piece = tuple[int, NDArray[np.int64], int, int]
+"""Number of a dataset, rows in it, and their start and stop (excluded) among all rows."""
+
+
 class Rows:
     """The stored values of several datasets, by row."""
 
@@ -80,24 +84,30 @@ class Rows:
     ) -> None:
         """Open a feature of all datasets, or of those with these names; see `stored_values`."""
         self._values[feature] = [
-            stored_values(dataset, feature, folder, size, progress)
+            np.asarray(stored_values(dataset, feature, folder, size, progress))
             if names is None or name in names
             else None
             for name, dataset in self._datasets.items()
         ]
 
-    def take(self, feature: str, rows: NDArray[np.int64], out: NDArray[Any]) -> None:
-        """Copy the values of rows into `out`, `(len(rows), …)`."""
-        owner = np.searchsorted(self._starts, rows, "right") - 1
-        bounds = [0, *(np.flatnonzero(np.diff(owner)) + 1).tolist(), len(rows)]
-        for start, stop in pairwise(bounds):
-            if start < stop:
-                number = int(owner[start])
-                values = self._values[feature][number]
-                assert values is not None
-                local = rows[start:stop] - self._starts[number]
-                # The mode lets numpy write into `out` without a copy in between.
-                np.take(np.asarray(values), local, axis=0, out=out[start:stop], mode="clip")
+    def pieces(self, rows: NDArray[np.int64]) -> "list[_Piece]":
+        """Return where rows are stored: the runs of rows of the same dataset."""
+        owner = self._starts.searchsorted(rows, "right") - 1
+        bounds = [0, *((owner[1:] != owner[:-1]).nonzero()[0] + 1).tolist(), len(rows)]
+        return [
+            (number := int(owner[start]), rows[start:stop] - self._starts[number], start, stop)
+            for start, stop in pairwise(bounds)
+            if start < stop
+        ]
+
+    def take(self, feature: str, pieces: "list[_Piece]", out: NDArray[Any]) -> None:
+        """Copy the values of rows, in pieces, into `out`, `(len(rows), …)`."""
+        arrays = self._values[feature]
+        for number, local, start, stop in pieces:
+            values = arrays[number]
+            assert values is not None
+            # The mode lets numpy write into `out` without a copy in between.
+            values.take(local, axis=0, out=out[start:stop], mode="clip")
 
     def shape(self, feature: str) -> tuple[int, ...]:
         """Return the shape of a value."""

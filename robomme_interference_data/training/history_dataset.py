@@ -233,9 +233,15 @@ class HistoryDataset(torch.utils.data.Dataset[dict[str, Any]]):
             [history.rows[kept[earlier]], first + kept[~earlier] - len(history.rows)]
         )
         item: dict[str, Any] = {}
+        earlier_pieces, now = self._rows.pieces(rows), self._rows.pieces(np.array([current]))
         for name in (*self.cameras, STATE):
-            item[name] = self._take(name, np.array([current]), 1)[0]
-            item[f"memory.{name.removeprefix('observation.')}"] = self._take(name, rows, self._size)
+            values = self._empty(name, self._size + 1)
+            self._rows.take(name, earlier_pieces, values[: len(rows)])
+            values[len(rows) : self._size] = 0
+            self._rows.take(name, now, values[self._size :])
+            both = torch.from_numpy(values)
+            item[name] = both[self._size]
+            item[f"memory.{name.removeprefix('observation.')}"] = both[: self._size]
         item["memory.position"] = _padded(kept, self._size)
         item["memory.is_pad"] = torch.arange(self._size) >= len(kept)
         evidence = np.zeros((self._size, self._parts), bool)
@@ -246,7 +252,10 @@ class HistoryDataset(torch.utils.data.Dataset[dict[str, Any]]):
         item["position"] = torch.tensor(live)
         if self.chunk:
             steps = np.arange(moment, moment + self.chunk)
-            item[ACTION] = self._take(ACTION, first + np.minimum(steps, actions - 1), self.chunk)
+            executed = self._empty(ACTION, self.chunk)
+            pieces = self._rows.pieces(first + np.minimum(steps, actions - 1))
+            self._rows.take(ACTION, pieces, executed)
+            item[ACTION] = torch.from_numpy(executed)
             item["action_is_pad"] = torch.from_numpy(steps >= actions)
         if self._questions is not None:
             item |= self._questions.of(episode)
@@ -259,13 +268,9 @@ class HistoryDataset(torch.utils.data.Dataset[dict[str, Any]]):
             "index": torch.tensor(index),
         }
 
-    def _take(self, feature: str, rows: NDArray[np.int64], size: int) -> torch.Tensor:
-        """Return the values of rows, followed by zeros up to a size."""
+    def _empty(self, feature: str, count: int) -> NDArray[Any]:
         dtype = np.float32 if feature in (STATE, ACTION) else np.uint8
-        out = np.empty((size, *self._rows.shape(feature)), dtype)
-        self._rows.take(feature, rows, out[: len(rows)])
-        out[len(rows) :] = 0
-        return torch.from_numpy(out)
+        return np.empty((count, *self._rows.shape(feature)), dtype)
 
     def _history(self, epoch: int, episode: EpisodeId, condition: str, shift: str) -> History:
         if not self._redraw:

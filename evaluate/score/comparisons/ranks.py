@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 
 from robomme_interference_data.evaluate.score.outcomes import Flags, Outcomes, rate_of, success
-from robomme_interference_data.evaluate.systems import is_bound
+from robomme_interference_data.evaluate.systems import is_reference
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.stats.bootstrap import DRAWS, slope_weights
 from robomme_interference_data.stats.significance import ALPHA, holm
@@ -64,7 +64,7 @@ def ranked(outcomes: Outcomes) -> Iterator[tuple[str, list[str]]]:
     """Yield each condition and the systems ranked in it: complete cells, no references."""
     for place, condition in enumerate(outcomes.conditions):
         whole = zip(outcomes.systems, outcomes.complete[:, place], strict=True)
-        yield condition, [system for system, has in whole if has and not is_bound(system)]
+        yield condition, [system for system, has in whole if has and not is_reference(system)]
 
 
 def systems_of(outcomes: Outcomes) -> list[Contrast]:
@@ -134,7 +134,7 @@ def interactions_of(outcomes: Outcomes, draws: int = DRAWS) -> list[Contrast]:
     references.
     """
     values = success(outcomes.status)
-    systems = [name for name in outcomes.systems if not is_bound(name)]
+    systems = [name for name in outcomes.systems if not is_reference(name)]
     pairs, slopes = list[tuple[str, str, list[str]]](), []
     for one, other in combinations(systems, 2):
         conditions = [c for c in outcomes.ran(one) if c in outcomes.ran(other)]

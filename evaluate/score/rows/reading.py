@@ -9,7 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.errors import FormatError, InterferenceError, InvalidOptionError
+from robomme_interference_data.errors import (
+    FormatError,
+    InterferenceError,
+    InvalidOptionError,
+    counted,
+)
 from robomme_interference_data.evaluate.run.log import RunHeader
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.schema.rollouts import FINAL, success_of
@@ -82,7 +87,7 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
     checks.check_repeats()
     refusals = [f"{checks.locate(at)}: {reason}" for at, reason in sorted(checks.reasons.items())]
     if refusals and not lenient:
-        lines = [f"{len(refusals):,} bad row{'s' * (len(refusals) > 1)}:", *refusals[:_SHOWN]]
+        lines = [f"{counted(len(refusals), 'bad row')}:", *refusals[:_SHOWN]]
         lines += [f"… and {len(refusals) - _SHOWN:,} more"] * (len(refusals) > _SHOWN)
         raise FormatError("\n".join(lines), "Correct them, or leave them out with lenient=True.")
     rows = tuple(checks.sound.values())

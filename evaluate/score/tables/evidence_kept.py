@@ -12,7 +12,7 @@ from robomme_interference_data.viz.tables import Table
 def ceiling_of(system: str) -> str | None:
     """Return the ideal observer with a system's memory and retrieval step, if one is known."""
     known = known_system(system)
-    if known is None or known.sampling is None or known.bound:
+    if known is None or known.sampling is None or known.reference:
         return None
     step = known.step.removeprefix("extrapolate").removeprefix("-")  # not of the memory
     return f"{'retrieval-' * known.retrieval}recall-{known.sampling}{'-' * bool(step)}{step}"
