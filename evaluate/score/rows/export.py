@@ -6,7 +6,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import InvalidOptionError, counted
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.registry import RECORDINGS
 from robomme_interference_data.storage.files import atomic_path
@@ -33,7 +33,7 @@ def export(rows: Rows, folder: Path) -> list[Path]:
     wrong = [f"{seeds} model seeds"] * (seeds > 1)
     wrong += [f"{other:,} rows of train or val episodes"] * (other > 0)
     offline = sum(row.simulator == RECORDINGS for row in rows)
-    wrong += [f"{offline:,} rows of offline runs"] * (offline > 0)
+    wrong += [f"{counted(offline, 'row')} of offline runs"] * (offline > 0)
     wrong += [f"{rows.refused:,} bad rows"] * (rows.refused > 0)
     if wrong:
         raise InvalidOptionError(
