@@ -75,6 +75,7 @@ ELSEWHERE = (
     "--source lerobot",  # a dataset on the Hub
     "--source frames",  # recordings
     "--shift ",  # a renderer
+    "runs/offline",  # executions
     "k31",  # more units than the golden buffer set has
     "stale-k7",  # contradicting lessons, which a renderer plays
     "retrieval_rollouts.csv",  # the released rows
