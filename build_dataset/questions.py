@@ -88,7 +88,7 @@ def _planned(query: Query, revision: str) -> tuple[Question, Marks]:
         tuple(one.words for one in options),
         tuple(numbers[one] for one in chosen),
         chosen.index(right),
-        tuple(tuple(value for point in points for value in point) for points in marks),
+        tuple(" ".join(f"{y},{x}" for y, x in points) for points in marks),
         picture=b"",
     )
     return question, marks

@@ -1,5 +1,6 @@
 """Questions about the past: at most one per query of a buffer set, with a marked picture."""
 
+import re
 import string
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from robomme_interference_data.constants import DEMONSTRATIONS, QUESTIONS_PATH
 from robomme_interference_data.errors import FormatError, MissingFileError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import from_table, to_dict
+from robomme_interference_data.schema.subgoal import Pixel
 from robomme_interference_data.storage.files import LocalFiles, digest_json
 from robomme_interference_data.storage.parquet import open_parquet, read_table
 
@@ -17,6 +19,9 @@ from .buffer_set import BufferSet
 
 LETTERS = string.ascii_uppercase[:8]
 """Letters of options, in order."""
+
+
+_POINTS = re.compile(r"(?:-?\d{1,5},-?\d{1,5}(?: -?\d{1,5},-?\d{1,5})*)?")
 
 
 @dataclass(frozen=True)
@@ -35,8 +40,9 @@ class Question:
     ]
     right: Annotated[int, "Index of the right option, from 0."]
     points: Annotated[
-        tuple[tuple[int, ...], ...],
-        "Marked points of each option in the picture, in pixels: y, x, y, x, …; none for words.",
+        tuple[str, ...],
+        "Marked points of each option in the picture, `y,x` in pixels, separated by spaces; empty "
+        "where only the words show it.",
     ]
     picture: Annotated[bytes, "The first live view with marked and lettered options, a PNG file."]
 
@@ -46,8 +52,16 @@ class Question:
             raise FormatError(f"{count} options with {len(set(self.answers))} different answers")
         if not 0 <= self.right < count or min(self.answers) < 0:
             raise FormatError(f"right option {self.right} of {count}, answers {self.answers}")
-        if len(self.points) != count or any(len(one) % 2 for one in self.points):
+        if len(self.points) != count or not all(map(_POINTS.fullmatch, self.points)):
             raise FormatError(f"{count} options with the points {self.points}")
+
+    @property
+    def pixels(self) -> tuple[tuple[Pixel, ...], ...]:
+        """The marked points of each option: row and column, (y, x)."""
+        return tuple(
+            tuple((int(y), int(x)) for y, x in (point.split(",") for point in points.split()))
+            for points in self.points
+        )
 
     @property
     def letters(self) -> str:

@@ -3,10 +3,9 @@
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, EXECUTIONS, SHIFTED, STATE
@@ -25,11 +24,14 @@ from .histories import Histories, History, Retrieval, Rows, Weights, number_from
 from .moments import check_size, choose_moments, needed_datasets
 from .question_tensors import QuestionTensors
 
+if TYPE_CHECKING:
+    import torch
+
 _Key = tuple[EpisodeId, str, str]
 """Query episode, condition and shift."""
 
 
-class HistoryDataset(torch.utils.data.Dataset[dict[str, Any]]):
+class HistoryDataset:
     """Moments of executions, with the memory that a policy has at that step of a rollout.
 
     Item `i` is moment t of an execution, the part of an episode after its lesson. Its history is
@@ -166,8 +168,10 @@ class HistoryDataset(torch.utils.data.Dataset[dict[str, Any]]):
             for span in one.evidence or ()
         )
         self._parts = max((span.part + 1 for span in spans), default=1)
+        import torch
+
         # Shared with the processes of a loader, which have copies of the dataset.
-        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
+        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # type: ignore[no-untyped-call]
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _open_again, (self.buffer_set.location, self._arguments, self._epoch)
@@ -214,6 +218,8 @@ class HistoryDataset(torch.utils.data.Dataset[dict[str, Any]]):
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         """Return an item; see the class."""
+        import torch
+
         if not -len(self) <= index < len(self):
             raise IndexError(f"index {index} of {len(self)} items")
         index %= len(self)
@@ -321,13 +327,15 @@ class HistoryDataset(torch.utils.data.Dataset[dict[str, Any]]):
         return self._rows.first(SHIFTED, views.index_of(episode)) + SHIFTS.index(parsed)
 
 
-def _padded(values: NDArray[np.int64], size: int) -> torch.Tensor:
+def _padded(values: NDArray[np.int64], size: int) -> "torch.Tensor":
+    import torch
+
     out = torch.zeros(size, dtype=torch.int64)
     out[: len(values)] = torch.from_numpy(values)
     return out
 
 
-def _open_again(location: str, arguments: dict[str, Any], epoch: torch.Tensor) -> HistoryDataset:
+def _open_again(location: str, arguments: dict[str, Any], epoch: "torch.Tensor") -> HistoryDataset:
     """Return a dataset in another process; memory maps and tables cannot be pickled."""
     made = HistoryDataset(location, **arguments, quiet=True)
     made._epoch = epoch

@@ -25,7 +25,7 @@ COLUMNS = {
     "options": "list<element: string not null>",
     "answers": "list<element: int64 not null>",
     "right": "int64",
-    "points": "list<element: list<element: int64 not null> not null>",
+    "points": "list<element: string not null>",
     "picture": "binary",
 }
 
@@ -33,16 +33,14 @@ COLUMNS = {
 def question(**changes: Any) -> Question:
     known = {"options": ("", "", ""), "answers": (4, 0, 9), "right": 1}
     fields = (
-        {"revision": "r", "text": "Which?", "picture": b"", "points": ((), (), ())}
-        | known
-        | changes
+        {"revision": "r", "text": "Which?", "picture": b"", "points": ("",) * 3} | known | changes
     )
     return Question(episode_id=MOVE, **fields)
 
 
 def test_letters_and_chance() -> None:
     assert (question().letters, question().chance) == ("ABC", 1 / 3)
-    eight = question(options=("",) * 8, answers=tuple(range(8)), points=((),) * 8)
+    eight = question(options=("",) * 8, answers=tuple(range(8)), points=("",) * 8)
     assert (eight.letters, eight.chance) == ("ABCDEFGH", 0.125)
 
 
@@ -55,8 +53,8 @@ def test_letters_and_chance() -> None:
         {"answers": (4, 0, 4)},
         {"answers": (4, 0, -1)},
         {"right": 3},
-        {"points": ((), ())},
-        {"points": ((1, 2), (3,), ())},
+        {"points": ("", "")},
+        {"points": ("1,2", "3", "")},
     ],
 )
 def test_what_is_no_question(changes: dict[str, Any]) -> None:
@@ -83,7 +81,8 @@ def test_the_golden_questions() -> None:
     assert (peg.letters, peg.answers, peg.right) == ("ABCD", (0, 7, 4, 1), 3)
     assert peg.options[3] == "held at its head, inserted from the right"
     assert peg.options[0] == peg.options[2]  # of different pegs, as the picture shows
-    assert [len(points) for points in peg.points] == [4] * 4 and one.points == ((), (), ())
+    assert [len(points) for points in peg.pixels] == [2] * 4 and one.points == ("",) * 3
+    assert question(points=("1,2 -3,40", "5,6", "")).pixels == (((1, 2), (-3, 40)), ((5, 6),), ())
 
 
 # --- invalid questions -------------------------------------------------------------------------

@@ -160,9 +160,9 @@ def test_questions_as_tensors(tmp_path: Path) -> None:
             place >= count for place in range(len(item["question.options"]))
         ]
         points = (~item["question.point_is_pad"]).sum(1)[:count].tolist()
-        assert points == [len(one) // 2 for one in question.points]
-        if question.points[0]:
-            y, x = question.points[0][:2]
+        assert points == [len(one) for one in question.pixels]
+        if question.pixels[0]:
+            y, x = question.pixels[0][0]
             expected = [(y + 0.5) / 256, (x + 0.5) / 256]
             np.testing.assert_allclose(item["question.points"][0, 0], expected, rtol=1e-6)
 
