@@ -19,8 +19,19 @@ from .tables import cells, chance, equivalence, evidence_kept, paper
 
 TABLES = (
     *("main", "chance", "systems", "ranks", "family", "difficulty", "lift", "effects"),
-    *("interaction", "equivalence", "interference", "by_evidence_kept", "ceiling", "decay"),
-    *("noise", "families", "family_effects", "matrix", "coverage", "paper", "paper_family"),
+    *("interaction", "equivalence", "interference", "by_evidence_kept", "evidence_effects"),
+    *(
+        "evidence_use",
+        "ceiling",
+        "decay",
+        "noise",
+        "families",
+        "family_effects",
+        "matrix",
+        "coverage",
+        "paper",
+        "paper_family",
+    ),
 )
 """Every table that a score may have, in order."""
 
@@ -81,7 +92,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         ranks.rank_table(every),
         *(comparison_table(name, [*compared, *by_family]) for name in SPECS),
         families.families_table(every, compared),
-        evidence_kept.evidence_table(every),
+        *evidence_kept.evidence_tables(every),
         effects.decay_table(decays),
         effects.noise_table(every),
         cells.coverage_table(found),

@@ -17,7 +17,6 @@ from robomme_interference_data.stats.intervals import (
     fieller,
     newcombe,
     newcombe_paired,
-    stratified_n,
     wilson,
 )
 from robomme_interference_data.stats.significance import (
@@ -106,13 +105,6 @@ def test_what_repeats_are_worth_by_hand() -> None:
     assert effective_n(0.5, 0.25 * 10 / 9, 10, 10) == 10
     # Where all episodes agree nothing tells repeats from copies.
     assert effective_n(1.0, 0.0, 10, 30) == 10
-
-
-def test_what_fixed_strata_are_worth_by_hand() -> None:
-    # p̃ 11/12 and 1/12: 2 · 10 · 11/144 / 400 = 0.0038194, and 0.25 / 0.0038194.
-    assert stratified_n([10, 0], [10, 10]) == pytest.approx(65.4545, abs=1e-4)
-    # Strata of one rate are worth no more than their trials, and neither is certainty.
-    assert stratified_n([5, 5], [10, 10]) == stratified_n([10, 10], [10, 10]) == 20
 
 
 def test_two_proportions_by_hand() -> None:

@@ -21,7 +21,8 @@ from robomme_interference_data.evaluate.systems import display_name, is_bound
 from robomme_interference_data.ids import EpisodeId, format_numbers
 from robomme_interference_data.schema.conditions import in_order
 from robomme_interference_data.schema.rollouts import Status
-from robomme_interference_data.stats.intervals import stratified_n, wilson
+from robomme_interference_data.stats.intervals import wilson
+from robomme_interference_data.stats.strata import stratified_n
 from robomme_interference_data.viz.tables import Table, percent
 
 _ERROR = STATUSES.index(Status.ERROR)
@@ -124,7 +125,8 @@ def _fixed(outcomes: Outcomes, system: int, condition: int, rate: Rate) -> tuple
     parts = [part for part in parts if part.n]
     if len(parts) < 2:
         return math.nan, math.nan
-    trials = stratified_n([p.value * p.n for p in parts], [p.n for p in parts])
+    n = np.array([part.n for part in parts], float)
+    trials = stratified_n(n * [part.value for part in parts], n)
     trials *= rate.trials / rate.n
     return wilson(rate.value * trials, trials)
 
