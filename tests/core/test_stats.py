@@ -26,7 +26,7 @@ from robomme_interference_data.stats.significance import (
     sign_flip,
     two_proportions,
 )
-from robomme_interference_data.stats.signs import sign_flips
+from robomme_interference_data.stats.signs import sign_flips, vector_sign_flips
 
 COUNTS = st.tuples(*[st.integers(0, 300)] * 4).filter(any)
 
@@ -175,6 +175,24 @@ def test_the_interval_of_sign_flips_agrees_with_its_test(values: list[int], leve
     # A shift of all values shifts the interval.
     (moved,) = sign_flips(np.array(values, float)[:, None] + 5, "key", 400)
     assert moved.at(level)[1:] == pytest.approx([b + 5 for b in interval[1:]], nan_ok=True)
+
+
+def test_sign_flips_of_vectors_by_hand() -> None:
+    # Of equal vectors, two of sixteen draws are as far from zero: no flip, or all.
+    equal = np.array([[1.0, 2.0]] * 4 + [[np.nan, 1.0]])
+    # A and −A cancel out.
+    none = np.array([[1.0, 2.0], [-1.0, -2.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    found = vector_sign_flips([equal, none, 0 * none, np.nan * none], "key", 20_000)
+    assert found[:3] == pytest.approx([2 / 16, 1, 1], abs=0.01)
+    assert math.isnan(found[3]) and vector_sign_flips([], "key") == []
+    # Of one column, it is the test of the mean; of a normal sample, Hotelling's.
+    values = np.random.default_rng(4).normal(0.3, 1, (60, 2)) @ [[1, 0.5], [0, 1]]
+    (one,) = vector_sign_flips([values[:, :1]], "key", 20_000)
+    assert one == sign_flips(values[:, :1], "key", 20_000)[0].p
+    mean = values.mean(axis=0)
+    statistic = 60 * mean @ np.linalg.solve(np.cov(values.T), mean) * 58 / (2 * 59)
+    (two,) = vector_sign_flips([values], "key", 20_000)
+    assert two == pytest.approx(scipy.stats.f.sf(statistic, 2, 58), abs=0.01)
 
 
 @given(st.integers(0, 200), st.integers(0, 200), st.integers(0, 50))

@@ -14,11 +14,8 @@ import pytest
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.comparisons.families import over_families
 from robomme_interference_data.evaluate.score.comparisons.pairs import pair
-from robomme_interference_data.evaluate.score.comparisons.ranks import (
-    interactions_of,
-    rank_table,
-    systems_of,
-)
+from robomme_interference_data.evaluate.score.comparisons.ranks import rank_table, systems_of
+from robomme_interference_data.evaluate.score.comparisons.slopes import interactions_of
 from robomme_interference_data.evaluate.score.comparisons.tables import comparison_table
 from robomme_interference_data.evaluate.score.outcomes import Outcomes
 from robomme_interference_data.ids import EpisodeId
@@ -49,7 +46,8 @@ def made_up(systems: int, shared: float, key: str) -> Outcomes:
     names = tuple(f"system-{number:02}" for number in range(systems))
     shape = (systems, len(CONDITIONS))
     return Outcomes(
-        *("made-up", names, CONDITIONS, EPISODES, (0,), status, np.full(status.shape, np.nan)),
+        *("made-up", names, CONDITIONS, EPISODES, (0,), status),
+        *(np.full(status.shape, np.nan), np.full(status.shape, np.nan)),
         *(np.zeros(len(EPISODES), int), np.full(len(EPISODES), np.nan), every),
         *(np.ones(shape, bool), np.zeros(systems, bool)),
     )

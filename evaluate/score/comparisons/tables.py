@@ -120,14 +120,16 @@ SPECS = {
         "Which system falls faster",
         "simulator system against_system conditions:text n slope:points=rate "
         "against_slope:points=against_rate difference low high gained lost p p_holm:p "
-        "joint_low:points joint_high:points complete",
+        "joint_low:points joint_high:points p_fit:p p_fit_holm:p complete",
         "slope: change of the success rate per doubling of the sessions (least-squares line over "
         "log2(k + 1) of all conditions listed); difference: between the two slopes, positive if "
         "the system falls more slowly than the other one. Each pair of systems once; those whose "
         "histories may differ are left out. Over the n episodes that count in all cells; gained "
         "and lost: episodes whose own slope is higher or lower than the other system's. p: "
         "sign-flip test of the episodes' differences; low to high: the 95% interval of all "
-        "differences that this test does not reject, if at least ten episodes differ. {correct}",
+        "differences that this test does not reject, if at least ten episodes differ. {correct} "
+        "p_fit: whether the difference between the two rates departs from a line over log2(k + 1), "
+        "by sign flips; p_fit_holm: after the same correction.",
         power=False,
     ),
     "family_effects": TableSpec(

@@ -171,6 +171,7 @@ def _use(cells: _Cells) -> Table:
 
 
 _ADVICE = (
-    " Without a control: evaluate the same episodes with --policy oracle, or with the system's own "
-    "policy and --subgoals oracle --system <system>-oracle, and score both runs together."
+    " Without a control: evaluate the same episodes with --policy oracle (tabletop), or with the "
+    "system's own policy and --subgoals oracle --system <system>-oracle, and score both runs "
+    "together."
 )
