@@ -14,12 +14,12 @@ from .comparisons.tables import SPECS, comparison_table
 from .config import Against, Expected, Settings
 from .outcomes import Outcomes, outcomes_of
 from .rows.reading import Rows, read_rows
-from .tables import cells, chance, equivalence, evidence_kept, paper, steps
+from .tables import cells, chance, equivalence, evidence_kept, model, paper, steps
 
 TABLES = (
     *("main", "chance", "systems", "ranks", "family", "difficulty", "lift", "effects"),
     *("interaction", "equivalence", "interference", "by_evidence_kept", "evidence_effects"),
-    *("evidence_use", "ceiling", "decay", "steps", "noise", "families", "family_effects"),
+    *("evidence_use", "ceiling", "decay", "model", "steps", "noise", "families", "family_effects"),
     *("matrix", "coverage", "paper", "paper_family"),
 )
 """Every table that a score may have, in order."""
@@ -90,6 +90,8 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     if settings.margin is not None:
         margin = settings.margin
         tables.append(equivalence.equivalence_table(compared, found, published, margin))
+    if settings.model:
+        tables.append(model.model_table(every))
     if published:
         # The paper's rates are over the benchmark's grid.
         whole = cells.cells_of(outcomes_of(rows, Expected.BENCHMARK).values())
