@@ -43,8 +43,8 @@ def slope_weights(ks: Sequence[int]) -> Floats:
     double the sessions.
     """
     x = np.log2(np.asarray(ks, float) + 1)
-    centred = x - x.mean()
-    return np.asarray(centred / (centred**2).sum())
+    centered = x - x.mean()
+    return np.asarray(centered / (centered**2).sum())
 
 
 def departures(ks: Sequence[int]) -> Floats:

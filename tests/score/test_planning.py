@@ -111,9 +111,9 @@ def test_a_margin_is_in_points(margin: float) -> None:
 
 def test_power_by_hand() -> None:
     # Of 6 episodes each flips one way or another with 0.5; six flips alike are found: 2/64 ≤ 0.05.
-    # All six against the difference of 0.5 have 0; in its favour 0.5⁶.
+    # All six against the difference of 0.5 have 0; in its favor 0.5⁶.
     assert power(0.5, 6, 0.0) == pytest.approx(0.5**6)
-    # With flips of 0.2: six of 0.6 in favour, or six of 0.1 against it.
+    # With flips of 0.2: six of 0.6 in favor, or six of 0.1 against it.
     assert power(0.5, 6, 0.2) == pytest.approx(0.6**6 + 0.1**6)
     # Five alike are not enough: 2/32.
     assert power(1.0, 5, 0.0) == 0.0 and smallest(5, 0.0) is None
@@ -197,6 +197,6 @@ def test_looks_spend_the_level() -> None:
     assert often.looks == levels and alone.looks == ()
     assert alone.power - 0.06 < often.power < alone.power + 0.02
     done = run("power", "--looks", "5")
-    assert "look 5 after 450 episodes: significant if p_holm is below  0.042" in done.stdout
+    assert "look 5 after 450 episodes: significant if p holm is below  0.042" in done.stdout
     with pytest.raises(InvalidOptionError, match="looks 21"):
         plan(0.05, 450, 0.06, looks=21)

@@ -114,8 +114,8 @@ def rank_table(every: Iterable[Outcomes]) -> Table:
         "Ranks of systems",
         "simulator condition system rate:rate rank:count rank_low:count rank_high:count",
         rows,
-        "Complete cells only; rank 1 is the highest rate, and equal rates share a rank. rank_low "
-        "to rank_high: the ranks that the system can have, from the significant differences of the "
-        "table matrix (p_holm below 0.05): 1 + the systems that are better, to the number of "
+        "Complete cells only; rank 1 is the highest rate, and equal rates share a rank. rank low "
+        "to rank high: the ranks that the system can have, from the significant differences of the "
+        "table matrix (p holm below 0.05): 1 + the systems that are better, to the number of "
         "systems less those that are worse. All of a condition hold at once with 95% confidence.",
     )

@@ -56,9 +56,9 @@ def decay_table(every: Iterable[Outcomes], draws: int = DRAWS) -> Table:
         "slope: change of the success rate per doubling of the sessions in the buffer, the lesson "
         "included (least-squares line over log2(k + 1)). 95% BCa bootstrap interval over episodes, "
         f"if at least {MIN_EPISODES} episodes contribute to the slope. p: sign-flip test of no "
-        "trend. p_fit: whether the rates depart from the line, by sign flips of the episodes' "
-        "departures; if they do, the slope describes the fall only on average. p_holm and "
-        "p_fit_holm: after Holm's correction among the systems of a simulator."
+        "trend. p fit: whether the rates depart from the line, by sign flips of the episodes' "
+        "departures; if they do, the slope describes the fall only on average. p holm and "
+        "p fit holm: after Holm's correction among the systems of a simulator."
         + " p†: provisional, because a cell is incomplete."
         * any(not row[-1] for row in rows),
     )

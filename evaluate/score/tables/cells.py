@@ -32,7 +32,7 @@ _NOTE = (
     "cell without any rollout is missing."
 )
 _ERRORS = (
-    " if_errors_fail: the rate if every error were a failure, the least that it can be if errors "
+    " if errors fail: the rate if every error were a failure, the least that it can be if errors "
     "depend on the outcome."
 )
 _BEST = (
@@ -40,7 +40,7 @@ _BEST = (
     "correction over all pairs of systems."
 )
 _FIXED = (
-    " fixed_low to fixed_high: Wilson's interval for other episodes of the same families in the "
+    " fixed low to fixed high: Wilson's interval for other episodes of the same families in the "
     "same numbers, narrower because the families' rates differ."
 )
 

@@ -44,7 +44,7 @@ def equivalence_table(
         "p_holm:p complete",
         f"Two one-sided tests at 5%: {EQUIVALENT} if the 90% interval of the difference is within "
         f"the margin, {BEYOND} if it is outside, {OPEN} otherwise. p: of a difference as large as "
-        "the margin, the larger of both tests: below 0.05 where the verdict is equivalent; p_holm: "
+        "the margin, the larger of both tests: below 0.05 where the verdict is equivalent; p holm: "
         "after Holm's correction among the tests of this table in one simulator, which the verdict "
         "is not corrected for. State the margin before you see the rows. The intervals are of the "
         "same methods as in the other tables, and unpaired for published rates. †: provisional, "

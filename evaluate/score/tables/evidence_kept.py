@@ -117,7 +117,7 @@ def _effects(cells: _Cells) -> Table:
         "not count as an effect. Only families with episodes of both levels contribute; each "
         "weighs n1 n2 / (n1 + n2) (Mantel and Haenszel), in rates and difference alike. low to "
         "high: 95% interval, from Wilson's stratified intervals of both rates. p: Cochran-Mantel-"
-        "Haenszel test; p_holm: after Holm's correction among the tests of this table in one "
+        "Haenszel test; p holm: after Holm's correction among the tests of this table in one "
         "simulator. Within a family, episodes that keep less may still be harder."
         + " p†: provisional, because a cell is incomplete."
         * any(not row[-1] for row in rows),

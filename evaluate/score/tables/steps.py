@@ -25,7 +25,7 @@ def steps_table(every: Iterable[Outcomes], draws: int = DRAWS) -> Table:
         f"Over the n episodes that succeed. difference: mean steps minus those under {START}, over "
         "the pairs: episodes that succeed under both conditions. Episodes that only one of them "
         "solves are not compared, so an effect on them shows in the rates alone. low to high and "
-        "p: sign flips of the episodes' differences, if at least ten differ; p_holm: after Holm's "
+        "p: sign flips of the episodes' differences, if at least ten differ; p holm: after Holm's "
         "correction among the tests of this table in one simulator."
         + " p†: provisional, because a cell is incomplete."
         * any(not row[-1] for row in rows),
