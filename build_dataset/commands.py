@@ -1,6 +1,5 @@
 """Commands that build and check buffer sets: `build …`, `new-buffer-set`, `verify`, `audit`."""
 
-from collections.abc import Sized
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,12 +12,13 @@ from robomme_interference_data.constants import (
     CONTRADICTIONS,
     DEMONSTRATIONS,
     DISTRACTORS,
+    EXECUTIONS,
     MANIFESTS,
     RAW_DISTRACTORS,
     REPORT_PATH,
     SHIFTED,
 )
-from robomme_interference_data.errors import MissingFileError
+from robomme_interference_data.errors import MissingFileError, counted
 from robomme_interference_data.runtime.executor import WorkersConfig, make_executor
 
 from .config import (
@@ -110,6 +110,15 @@ _DATASETS = {
     robomme-interference build shifted my-buffers --source tabletop --split test --episodes 0-4
     ```
     """,
+    EXECUTIONS: """Build what follows each lesson: live frames and states, with the next actions.
+
+    To train and test policies. Use the query episodes; build the manifests afterwards.
+
+    Example:
+    ```
+    robomme-interference build executions my-buffers --source tabletop --split test --episodes 0-4
+    ```
+    """,
 }
 """Kind of dataset to the help of its command."""
 
@@ -176,7 +185,7 @@ def questions(buffer_set: _Folder, as_json: AsJson = False) -> None:
     if as_json:
         print_json({"out": str(out), "questions": len(made)})
     else:
-        print_status(f"{out}: {len(made):,} questions")
+        print_status(f"{out}: {counted(len(made), 'question')}")
 
 
 @app.command(name="all")
@@ -216,12 +225,20 @@ def new_buffer_set(config: NewConfig, plan: PlanConfig, as_json: AsJson = False)
     robomme-interference new-buffer-set my-buffers --demonstrations namespace/name@data-1.0.0 \
         --source lerobot:NAMESPACE/NAME
     robomme-interference publish my-buffers --repo-id my-name/my-buffers
+    robomme-interference new-buffer-set trial --demonstrations my-buffers/demonstrations \
+        --source frames:mine/
     ```
     """
+    from robomme_interference_data.storage.files import LocalFiles
+
     with graceful_interrupt(_KEPT):
         base, units = plan_new(config, plan)
         print_status(f"Demonstrations: {base.files.describe()}; units from {len(units.tasks):,}")
         _build(units, config.buffer_set / DISTRACTORS, config, as_json=False)
+        if isinstance(base.files, LocalFiles):
+            link = config.buffer_set / DEMONSTRATIONS
+            if not link.exists():
+                link.symlink_to(base.files.root.resolve(), target_is_directory=True)
         _plan(config.buffer_set, plan, as_json=as_json, base=base.files)
         audit(str(config.buffer_set))
     print_status(f"Next: robomme-interference publish {config.buffer_set} --repo-id NAMESPACE/NAME")
@@ -235,7 +252,8 @@ def _build(plan: BuildPlan, out: Path, workers: WorkersConfig, *, as_json: bool)
     with WorkProgress(unit="episodes") as progress:
         result = build_dataset(plan, out, make_executor(workers), progress)
     added = f"{result.added} added" if result.added else "nothing to add"
-    print_status(f"{out}: {added}; {result.episodes} episodes, {result.frames:,} frames")
+    episodes, frames = counted(result.episodes, "episode"), counted(result.frames, "frame")
+    print_status(f"{out}: {added}; {episodes}, {frames}")
     for name, reason in sorted(result.skipped.items())[:_MAX_SKIPPED]:
         print_status(f"  skipped {name}: {reason}")
     if len(result.skipped) > _MAX_SKIPPED:
@@ -263,7 +281,8 @@ def _plan(
     if as_json:
         print_json({"out": str(out), **counts})
     else:
-        print_status(f"{out}: {counts['buffers']:,} buffers of {counts['queries']:,} queries")
+        queries = counted(counts["queries"], "query", "queries")
+        print_status(f"{out}: {counted(counts['buffers'], 'buffer')} of {queries}")
 
 
 def verify(
@@ -295,7 +314,8 @@ def verify(
         for violation in violations:
             echo(f"{violation.where}: {violation.what}")
         what = "hashes and rules" if decode else "files, tables and rules (frames not decoded)"
-        print_status(_count(violations, "violation") or f"All {what} of {buffer_set} hold.")
+        found = counted(len(violations), "violation") if violations else ""
+        print_status(found or f"All {what} of {buffer_set} hold.")
     if violations:
         raise typer.Exit(1)
 
@@ -320,10 +340,6 @@ def audit(buffer_set: BufferSetFolder, as_json: AsJson = False) -> None:
         echo(tables_text(report.tables()) + "\n")
         for leak in report.leaks:
             echo(f"LEAK, {leak.kind}: {leak.where}")
-        print_status(_count(report.leaks, "leak") or "No leaks.")
+        print_status(counted(len(report.leaks), "leak") if report.leaks else "No leaks.")
     if report.leaks:
         raise typer.Exit(1)
-
-
-def _count(items: Sized, what: str) -> str:
-    return f"{len(items)} {what}{'s' * (len(items) > 1)}" if items else ""

@@ -12,6 +12,7 @@ from robomme_interference_data.constants import (
     CONTRADICTIONS,
     DEMONSTRATIONS,
     DISTRACTORS,
+    EXECUTIONS,
     LESSONS,
     POSITION_LIMIT,
     SHIFTED,
@@ -19,7 +20,7 @@ from robomme_interference_data.constants import (
     UNIT_FRAMES,
     UNITS,
 )
-from robomme_interference_data.errors import InvalidOptionError, SourceError
+from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
 from robomme_interference_data.ids import EpisodeId, parse_numbers
 from robomme_interference_data.runtime.executor import WorkersConfig, make_executor
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, datasets_of, in_order
@@ -103,6 +104,9 @@ class AllConfig(BuildConfig):
     shifted: bool = setting(
         False, help="Also build the query episodes' views under each shift (tabletop only)."
     )
+    executions: bool = setting(
+        False, help="Also build what follows each lesson: live frames, states and actions."
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +114,9 @@ class NewConfig(BuildConfig):
     """Settings of a build of a buffer set for published demonstrations."""
 
     demonstrations: str = setting(
-        metavar="NAME", help="Repository of the demonstrations, NAMESPACE/NAME[@REVISION]."
+        metavar="NAME",
+        help="Repository of the demonstrations, NAMESPACE/NAME[@REVISION], or their folder, which "
+        "is linked.",
     )
 
 
@@ -158,7 +164,8 @@ class BuildPlan:
 def plan_all(config: AllConfig, plan: PlanConfig) -> dict[str, BuildPlan]:
     """Plan the datasets of a buffer set, and check everything known before episodes are read."""
     units = dataclasses.replace(config, families=(), episodes=config.unit_episodes, split="train")
-    names = [*datasets_of(in_order(plan.conditions)), *[SHIFTED] * config.shifted]
+    optional = {SHIFTED: config.shifted, EXECUTIONS: config.executions}
+    names = [*datasets_of(in_order(plan.conditions)), *(one for one in optional if optional[one])]
     plans = {name: plan_build(name, units if name in UNITS else config) for name in names}
     queries = (episode.id for _, episode in plans[DEMONSTRATIONS].tasks)
     _check_plans(queries, plans, config.buffer_set, plan)
@@ -168,18 +175,24 @@ def plan_all(config: AllConfig, plan: PlanConfig) -> dict[str, BuildPlan]:
 def plan_new(config: NewConfig, plan: PlanConfig) -> "tuple[Dataset, BuildPlan]":
     """Open published demonstrations, and plan units with their cameras; see `plan_all`."""
     from robomme_interference_data.data.dataset import Dataset
-    from robomme_interference_data.storage.hub import HubFiles, locate
+    from robomme_interference_data.storage.files import LocalFiles
+    from robomme_interference_data.storage.hub import locate
 
     from .manifests import check_needs, in_folder
 
     base = Dataset(locate(config.demonstrations))
-    if not isinstance(base.files, HubFiles) or base.kind != DEMONSTRATIONS:
+    if base.kind != DEMONSTRATIONS:
         raise InvalidOptionError.expected(
             "demonstrations",
             config.demonstrations,
-            "published demonstrations",
-            "The card of a published buffer set names their repository. For demonstrations in a "
-            "folder, build distractors and manifests beside them.",
+            f"a repository or folder of demonstrations, not of {base.kind}",
+            "The card of a published buffer set names the repository of its demonstrations.",
+        )
+    link = config.buffer_set / DEMONSTRATIONS
+    if isinstance(base.files, LocalFiles) and link.exists() and not link.samefile(base.files.root):
+        raise BuildError(
+            f"{link} exists, and is not {base.files.root}",
+            "Choose another `buffer_set`, or remove the folder first.",
         )
     check_needs(in_order(plan.conditions), in_folder(config.buffer_set))
     cameras = config.cameras or base.cameras
@@ -252,16 +265,16 @@ def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
         for text in config.source
     )
     for text, source in zip(config.source, sources, strict=True):
-        if kind in UNITS and not source.whole:
+        if kind in (*UNITS, EXECUTIONS) and not source.whole:
             raise InvalidOptionError(
-                f"{text} plays demonstrations only, and distractor units need whole episodes",
-                "Build the distractors from RoboMME's training recordings.",
-                "build distractors BUFFER_SET --source robomme-h5:FOLDER",
+                f"{text} plays demonstrations only, and {kind} need whole episodes",
+                f"Build the {kind} from RoboMME's recordings.",
+                f"build {kind} BUFFER_SET --source robomme-h5:FOLDER",
             )
     split = config.split or ("train" if kind in UNITS else None)
     tasks = list_episodes(sources, families=config.families, split=split, numbers=numbers)
     unmarked = next((one for _, one in tasks if not one.marked), None)
-    if kind in LESSONS and unmarked is not None:
+    if kind in (*LESSONS, EXECUTIONS) and unmarked is not None:
         raise unmarked_error().about(unmarked.id)
     if kind == CONTRADICTIONS:
         tasks = tuple((number, sources[number].contradict(one)) for number, one in tasks)

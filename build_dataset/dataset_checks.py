@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     DISTRACTORS,
+    EXECUTIONS,
     IDENTITY_PATH,
     INDEX_DIR,
     INDEX_HEADER,
@@ -151,6 +152,8 @@ def _record(where: str, name: str, record: EpisodeRecord) -> Iterator[Violation]
         expected = range(start + 1, start + 2)
     elif name == SHIFTED:
         expected = range(len(SHIFTS), len(SHIFTS) + 1)
+    elif name == EXECUTIONS:
+        expected = range(1, record.length + 1)
     else:
         most, stride = UNITS[name]
         expected = range((UNIT_MIN_RAW_FRAMES - 1) // stride + 1, most + 1)

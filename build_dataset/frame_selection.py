@@ -4,23 +4,26 @@ A demonstration is every raw frame of the demonstration section and then the fir
 observation. A distractor unit is the first 256 raw frames of an episode subsampled at stride 8:
 32 frames, raw indices 0, 8, …, 248 (paper, section "The history buffer", footnote); a raw unit has
 all of them, 249 at least, so that every unit has a raw one. No frame after the last needed one is
-read.
+read. An execution is every live frame: its first one is the query frame of the demonstration.
 """
 
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
     DEMONSTRATIONS,
+    EXECUTIONS,
     SHIFTED,
     UNIT_MIN_RAW_FRAMES,
     UNITS,
     Unit,
 )
-from robomme_interference_data.errors import SourceError
+from robomme_interference_data.errors import InvalidOptionError, SourceError, counted
 
-from .sources.base import Frame
+from .sources.base import Frame, Recording
 
 
 class NothingToStore(Exception):
@@ -31,9 +34,9 @@ def unmarked_error() -> SourceError:
     """Return the error for an episode whose demonstration has no known end."""
     return SourceError(
         "the source does not mark which frames are the demonstration",
-        "Demonstrations need a column is_demo or exec_start_idx in the source, or exec_start_idx "
-        "in `families_file`; `columns` names another column, as in is_demo=NAME. Distractor units "
-        "can be built without.",
+        "Demonstrations and executions need a column is_demo or exec_start_idx in the source, or "
+        "exec_start_idx in `families_file`; `columns` names another column, as in is_demo=NAME. "
+        "Distractor units can be built without.",
     )
 
 
@@ -63,10 +66,47 @@ def select_unit(frames: Iterable[Frame], unit: Unit) -> Iterator[Frame]:
         raise NothingToStore(f"{count} raw frames; a unit needs {UNIT_MIN_RAW_FRAMES}")
 
 
+def select_execution(frames: Iterable[Frame]) -> Iterator[Frame]:
+    """Yield the live frames, which need actions."""
+    lesson = live = 0
+    for frame in frames:
+        if frame.is_demonstration is None:
+            raise unmarked_error()
+        if frame.is_demonstration:
+            lesson += 1
+            continue
+        if not lesson:
+            raise NothingToStore("no demonstration frame")
+        if frame.action is None:
+            raise InvalidOptionError(
+                "the source has no actions of its live frames, which executions need",
+                "Record actions, name their column with `columns` (action=NAME), or build without "
+                "executions.",
+                option="source",
+            )
+        live += 1
+        yield frame
+    if live < 2:
+        raise NothingToStore(f"{counted(live, 'live frame')}; an execution needs 2")
+
+
 FRAME_SELECTORS: dict[str, Callable[[Iterable[Frame]], Iterator[Frame]]] = {
     DEMONSTRATIONS: select_demonstration,
     CONTRADICTIONS: select_demonstration,
     SHIFTED: iter,
+    EXECUTIONS: select_execution,
     **{kind: partial(select_unit, unit=unit) for kind, unit in UNITS.items()},
 }
 """Kind of dataset to the frames that it stores of an episode."""
+
+
+def select_frames(kind: str, recording: Recording) -> Iterator[Frame]:
+    """Yield the frames that a kind of dataset stores of a recording.
+
+    Each frame of an execution has the action that was executed after it, so that policies can be
+    trained and tested on it; an observation after the last action is left out.
+    """
+    frames = FRAME_SELECTORS[kind](recording.frames)
+    if kind != EXECUTIONS or not recording.action_first:
+        return frames
+    return (replace(frame, action=after.action) for frame, after in pairwise(frames))

@@ -16,6 +16,7 @@ from robomme_interference_data.constants import (
     ACTION,
     DEMONSTRATIONS,
     DISTRACTORS,
+    EXECUTIONS,
     FORMAT_VERSION,
     IDENTITY_PATH,
     MANIFEST_HEADER,
@@ -32,6 +33,7 @@ from robomme_interference_data.data.buffer_set import pending_rows
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.query_sessions import QuerySessions, SessionSource
 from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
+from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, Condition, in_order
 from robomme_interference_data.schema.manifest import (
@@ -102,6 +104,8 @@ def plan_manifests(
             )
     if SHIFTED in opened:
         _check_scenes(opened[SHIFTED], opened[DEMONSTRATIONS])
+    if EXECUTIONS in opened:
+        _check_executions(opened[EXECUTIONS], opened[DEMONSTRATIONS])
     return ManifestPlan(SessionSource(opened, seed), ordered, position_limit)
 
 
@@ -145,6 +149,27 @@ def _check_scenes(shifted: Dataset, base: Dataset) -> None:
             "Build it from all query episodes, or remove it.",
             f"build {SHIFTED}",
         )
+
+
+def _check_executions(executions: Dataset, base: Dataset) -> None:
+    """Check that every execution follows a demonstration: the same goals, seed and difficulty."""
+
+    def recorded(dataset: Dataset) -> dict[EpisodeId, tuple[object, ...]]:
+        return {
+            one.episode_id: (one.goals, one.seed, one.difficulty, one.simulator)
+            for one in dataset.records()
+        }
+
+    expected = recorded(base)
+    for episode, metadata in recorded(executions).items():
+        if metadata != expected.get(episode):
+            where, other = executions.files.describe(), expected.get(episode)
+            raise SourceError(
+                f"{where} has {episode} with goals, seed, difficulty and simulator {metadata}, "
+                f"and the demonstrations {'lack it' if other is None else f'have {other}'}",
+                "Build both from the same recordings.",
+                f"build {EXECUTIONS}",
+            )
 
 
 def planned_buffers(plan: ManifestPlan) -> Iterator[BufferManifest]:

@@ -80,6 +80,7 @@ def _planned(query: Query, revision: str) -> tuple[Question, Marks]:
         others = others[: _DRAWN - 1]
     chosen = sorted([right, *others], key=lambda one: _lot(name, "order", one))
     options = [scene.option(one) for one in chosen]
+    marks = [scene.pixels(one.marks) for one in options]
     question = Question(
         query.episode_id,
         revision,
@@ -87,9 +88,10 @@ def _planned(query: Query, revision: str) -> tuple[Question, Marks]:
         tuple(one.words for one in options),
         tuple(numbers[one] for one in chosen),
         chosen.index(right),
+        tuple(tuple(value for point in points for value in point) for points in marks),
         picture=b"",
     )
-    return question, [scene.pixels(one.marks) for one in options]
+    return question, marks
 
 
 def _lot(*parts: Any) -> bytes:

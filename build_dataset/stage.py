@@ -33,7 +33,7 @@ from robomme_interference_data.storage.files import canonical_json, read_header,
 from robomme_interference_data.storage.video import iter_frames
 
 from .config import BuildPlan
-from .frame_selection import FRAME_SELECTORS, NothingToStore
+from .frame_selection import NothingToStore, select_frames
 from .image_stats import STATISTICS, ImageStats
 from .lerobot_writer import StoredEpisode
 from .sources import Frame, Recording, Robot, SourceEpisode
@@ -124,7 +124,7 @@ class StageTask:
         codec = get_codec(self.plan.codec)
         writer = _Writer(codec, folder, recording.robot.fps)
         try:
-            for frame in FRAME_SELECTORS[self.plan.kind](recording.frames):
+            for frame in select_frames(self.plan.kind, recording):
                 writer.add(frame)
         except NothingToStore as reason:
             writer.close()

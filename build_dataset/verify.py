@@ -7,7 +7,9 @@ from typing import Any
 
 from robomme_interference_data.constants import (
     DATASETS,
+    DEMONSTRATIONS,
     DISTRACTORS,
+    EXECUTIONS,
     MANIFEST_HEADER,
     MANIFEST_ROWS,
     MANIFESTS,
@@ -22,7 +24,8 @@ from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.codec import arrow_schema, to_dict
 from robomme_interference_data.schema.conditions import datasets_of
 from robomme_interference_data.schema.manifest import BufferManifest
-from robomme_interference_data.storage.encode import decode_image
+from robomme_interference_data.storage.arrays import combine
+from robomme_interference_data.storage.encode import CODECS, decode_image
 from robomme_interference_data.storage.files import LocalFiles, all_files, sha256_file
 from robomme_interference_data.storage.parquet import open_parquet
 
@@ -49,7 +52,7 @@ def verify_buffer_set(
     every frame and vector of every episode against its recorded hashes; LeRobot's columns and
     statistics; the hashes of embeddings, which are not recomputed; every manifest row and question,
     which are planned again from the datasets, rules and seed and compared, except the questions'
-    pictures.
+    pictures; with `decode`, the first frame of every execution against the query frame.
 
     Args:
         buffer_set: The buffer set; one on the Hub is downloaded completely.
@@ -80,8 +83,9 @@ def _buffer_set(buffer_set: BufferSet, decode: bool, progress: WorkProgress) -> 
             datasets[name] = Dataset(LocalFiles(buffer_set.dataset_files(name).snapshot("*")))
         except InterferenceError as error:
             yield Violation(name, error.message)
-    frames = sum(dataset.identity.counts.frames for dataset in datasets.values())
-    progress.start("Verifying", frames if decode else 0)
+    if decode:
+        frames = sum(dataset.identity.counts.frames for dataset in datasets.values())
+        progress.start("Verifying", frames)
     for name, dataset in datasets.items():
         yield from caught(
             name, dataset_violations(name, dataset, header, progress if decode else None)
@@ -89,6 +93,8 @@ def _buffer_set(buffer_set: BufferSet, decode: bool, progress: WorkProgress) -> 
         yield from index_violations(name, dataset, datasets.get(DISTRACTORS))
     if len(datasets) == len(header.datasets):
         yield from caught(MANIFESTS, _buffers(buffer_set, datasets))
+    if decode and {DEMONSTRATIONS, EXECUTIONS} <= datasets.keys():
+        yield from caught(EXECUTIONS, _executions(datasets[EXECUTIONS], datasets[DEMONSTRATIONS]))
     if (root / QUESTIONS_PATH).is_file():
         yield from caught(QUESTIONS_PATH, _table(root, QUESTIONS_PATH, Question))
         yield from caught(QUESTIONS_PATH, _questions(buffer_set))
@@ -132,6 +138,20 @@ def _buffers(buffer_set: BufferSet, datasets: Mapping[str, Dataset]) -> Iterator
     needed = set(datasets_of(plan.conditions))
     if not needed <= header.datasets.keys() <= {*DATASETS}:
         yield Violation(HEADER, f"datasets are {sorted(header.datasets)}")
+
+
+def _executions(executions: Dataset, demonstrations: Dataset) -> Iterator[Violation]:
+    """Check that executions begin with the query frames of demonstrations, bit for bit."""
+    codecs = [CODECS.get(one.identity.codec) for one in (executions, demonstrations)]
+    if not all(codec and codec.exact for codec in codecs):
+        return
+    queries = {one.episode_id: one.span_sha256 for one in demonstrations.records()}
+    for record in executions.records():
+        [first] = executions.digests(record.episode_index, [(0, 1)])
+        query = queries.get(record.episode_id)
+        if query is not None and combine(first) != query.query:
+            what = f"does not begin with the query frame of the {DEMONSTRATIONS}"
+            yield Violation(f"{EXECUTIONS} {record.episode_id}", what)
 
 
 def _questions(buffer_set: BufferSet) -> Iterator[Violation]:

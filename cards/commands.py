@@ -15,7 +15,7 @@ from robomme_interference_data.cli.console import (
     print_status,
 )
 from robomme_interference_data.cli.options import AsJson, BufferSetFolder, with_settings
-from robomme_interference_data.errors import InvalidOptionError, MissingFileError
+from robomme_interference_data.errors import InvalidOptionError, MissingFileError, counted
 from robomme_interference_data.evaluate.score.config import Expected
 
 from .publication import OTHER, Publication, PublishConfig
@@ -228,7 +228,8 @@ def _export(files: "RepoFiles", to: Path, *, dry_run: bool, as_json: bool) -> No
         print_json({"to": str(to), "files": len(files), "bytes": size, "written": written})
     else:
         outcome = "dry run" if dry_run else "written" if written else "unchanged"
-        print_status(f"{to}: {len(files):,} files, {total_size(files):,} bytes; {outcome}")
+        count = f"{counted(len(files), 'file')}, {total_size(files):,} bytes"
+        print_status(f"{to}: {count}; {outcome}")
 
 
 def _carry_out(

@@ -6,20 +6,31 @@ from functools import cache
 from typing import Any
 
 from robomme_interference_data.constants import (
+    CONTRADICTIONS,
     DEMONSTRATIONS,
+    DISTRACTORS,
+    EXECUTIONS,
     MANIFEST_ROWS,
     MANIFESTS,
     QUESTIONS_PATH,
+    RAW_DISTRACTORS,
     RECORDS_PATH,
     REPORT_PATH,
+    SHIFTED,
     SUMS_PATH,
+    UNITS,
 )
 from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.questions import Question
-from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
+from robomme_interference_data.errors import (
+    FormatError,
+    InvalidOptionError,
+    MissingFileError,
+    counted,
+)
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
 from robomme_interference_data.schema.manifest import BufferManifest
 from robomme_interference_data.schema.records import EpisodeRecord
@@ -27,12 +38,18 @@ from robomme_interference_data.storage.files import read_json, sha256_file
 from robomme_interference_data.viz.filmstrip import shown_camera, strip_png
 
 from .facts import CardTable, Facts, data_limits, dataset_rows, repositories_of, source_kinds_of
-from .markdown import code
+from .markdown import Raw, code
 from .tables import condition_table, count_table, goal_table, unit_table
 
 STRIP = "README-strip.png"
 
 _BUFFERS = f"{MANIFESTS}/{MANIFEST_ROWS}"
+_FOLDERS = {
+    RAW_DISTRACTORS: "the distractor units at full rate",
+    CONTRADICTIONS: "lessons in the scenes of the queries with other answers",
+    SHIFTED: "the first live observations under shifts of light, camera and clutter",
+    EXECUTIONS: "what follows each lesson: live frames, states and actions",
+}
 _FILE_SETS = {"frames": "data/*/*.parquet", "videos": "videos/*/*/*.mp4"}
 
 
@@ -60,6 +77,7 @@ def demonstrations_facts(dataset: Dataset) -> Facts:
         [more] * bool(skipped),
         {
             "cameras": dataset.cameras,
+            "fps": Raw(f"{dataset.fps:g}"),
             "episodes": len(records),
             "counts": count_table(records),
             "goals": goal_table(records),
@@ -68,8 +86,9 @@ def demonstrations_facts(dataset: Dataset) -> Facts:
         },
         kind=DEMONSTRATIONS,
         title="RoboMME-Interference demonstrations",
-        description=f"Demonstrations of RoboMME-Interference: {len(records):,} query episodes, "
-        f"{frames:,} frames, families {', '.join(_families(records))}.",
+        description="Demonstrations of RoboMME-Interference: "
+        f"{counted(len(records), 'query episode')}, {counted(frames, 'frame')}, "
+        f"families {', '.join(_families(records))}.",
         origin="Recorded episodes were cut, encoded, decoded again and compared.",
         examples=frames,
         tables=[_episodes(dataset, records)],
@@ -83,7 +102,7 @@ def buffer_set_facts(buffer_set: BufferSet) -> Facts:
     header, datasets = buffer_set.header, dict(buffer_set.datasets)
     records = {name: _records(dataset) for name, dataset in datasets.items()}
     lessons, ids = records.pop(DEMONSTRATIONS), {*buffer_set.episode_ids}
-    units = [record for found in records.values() for record in found]
+    units = [record for name in UNITS for record in records.get(name, ())]
     queries = tuple(record for record in lessons if record.episode_id in ids)
     manifests = tuple(buffer_set.manifests())
     if not (manifests and queries):
@@ -97,8 +116,8 @@ def buffer_set_facts(buffer_set: BufferSet) -> Facts:
     )
     split_name, questions = one_split(queries), _questions(buffer_set)
     tables = [CardTable("buffers", BufferManifest, _BUFFERS, header.rows, split_name)]
-    for name in [*records][:1]:
-        tables.append(_episodes(datasets[name], records[name], one_split(units)))
+    if DISTRACTORS in records:
+        tables.append(_episodes(datasets[DISTRACTORS], records[DISTRACTORS], one_split(units)))
     if questions is not None:
         tables.append(CardTable("questions", Question, QUESTIONS_PATH, questions, split_name))
     return _facts(
@@ -116,6 +135,7 @@ def buffer_set_facts(buffer_set: BufferSet) -> Facts:
             "condition_table": condition_table(buffer_set.conditions, manifests),
             "counts": unit_table(queries, units),
             "goals": goal_table(lessons),
+            "folders": {name: what for name, what in _FOLDERS.items() if name in datasets},
             "questions": questions is not None,
             "header": header,
             "other_conditions": _beyond_paper(buffer_set.conditions),
@@ -125,9 +145,9 @@ def buffer_set_facts(buffer_set: BufferSet) -> Facts:
         },
         kind="buffer_set",
         title="RoboMME-Interference buffers",
-        description=f"History buffers of RoboMME-Interference: {len(manifests):,} buffers of "
-        f"{len(queries):,} query episodes under {', '.join(buffer_set.conditions)}, and the "
-        "distractor units that they hold.",
+        description="History buffers of RoboMME-Interference: "
+        f"{counted(len(manifests), 'buffer')} of {counted(len(queries), 'query episode')} "
+        f"under {', '.join(buffer_set.conditions)}, and the distractor units that they hold.",
         origin="The sessions of every buffer were drawn by SHA-256, rule version "
         f"{header.rule_version}, seed {header.seed}.",
         examples=sum(record.length for record in units),

@@ -7,7 +7,7 @@ from typing import Any
 
 from robomme_interference_data.constants import FAMILIES, IDENTITY_PATH
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import InvalidOptionError, counted
 from robomme_interference_data.evaluate.score.outcomes import TEST_EPISODES
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.simulators.registry import SIMULATORS, simulator_class
@@ -99,7 +99,7 @@ def data_limits(
     limits = [origin_limit(simulators)]
     if not is_whole_grid(queries):
         limits.append(
-            f"{len(queries):,} query episode{'s' * (len(queries) != 1)} instead of the paper's "
+            f"{counted(len(queries), 'query episode')} instead of the paper's "
             f"{len(FAMILIES)} families × {TEST_EPISODES} test episodes: success rates are not "
             "comparable with those of the benchmark."
         )

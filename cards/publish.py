@@ -1,7 +1,7 @@
 """Check a buffer set, and publish it: its demonstrations, then its units and manifests."""
 
 import logging
-from collections.abc import Iterable, Sequence, Sized
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
@@ -26,7 +26,7 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.questions import read_questions
-from robomme_interference_data.errors import MissingFileError, PublishError
+from robomme_interference_data.errors import MissingFileError, PublishError, counted
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.manifest import BufferManifest
@@ -234,7 +234,7 @@ def check_buffer_set(buffer_set: BufferSet, progress: WorkProgress | None = None
     if violations:
         first = violations[0]
         raise PublishError(
-            f"{buffer_set.location} has {_number(violations, 'violation')}, such as "
+            f"{buffer_set.location} has {counted(len(violations), 'violation')}, such as "
             f"{first.where}: {first.what}",
             "List all violations.",
             f"verify {buffer_set.location}",
@@ -242,7 +242,7 @@ def check_buffer_set(buffer_set: BufferSet, progress: WorkProgress | None = None
     leaks = audit_buffer_set(buffer_set).leaks
     if leaks:
         raise PublishError(
-            f"{buffer_set.location} has {_number(leaks, 'leak')}, such as {leaks[0].kind}: "
+            f"{buffer_set.location} has {counted(len(leaks), 'leak')}, such as {leaks[0].kind}: "
             f"{leaks[0].where}",
             "List all leaks.",
             f"audit {buffer_set.location}",
@@ -279,7 +279,3 @@ def open_with_lerobot(name: str, root: Path) -> None:
         ) from error
     finally:
         logging.disable(before)
-
-
-def _number(items: Sized, noun: str) -> str:
-    return f"{len(items)} {noun}{'s' * (len(items) > 1)}"

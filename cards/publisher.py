@@ -10,7 +10,7 @@ from functools import cache
 from typing import Any
 
 from robomme_interference_data.constants import PARTS_PATH
-from robomme_interference_data.errors import FormatError, MissingFileError, PublishError
+from robomme_interference_data.errors import FormatError, MissingFileError, PublishError, counted
 from robomme_interference_data.storage.files import digest_json, indented_json, read_json
 from robomme_interference_data.storage.hub import HubFiles
 from robomme_interference_data.viz.tables import Table
@@ -91,7 +91,7 @@ class RepoPlan:
             return f"published, {self.published[:12]}"
         status = "new repository" if self.head is None else "exists"
         if self.difference.removed and not self.content.pending:
-            status += f", {len(self.difference.removed)} files are removed"
+            status += f", removes {counted(len(self.difference.removed), 'file')}"
         return status + ", without files that name the demonstrations" * self.content.pending
 
 

@@ -14,7 +14,6 @@ import pyarrow as pa
 
 from robomme_interference_data.constants import (
     FORMAT_VERSION,
-    FPS,
     MAX_STEPS,
     POSITION_LIMIT,
     UNIT_FRAMES,
@@ -43,7 +42,6 @@ BIBTEX = f"""@article{{rathi2026robommeinterference,
 
 _TAGS = ("robotics", "robot-memory", "RoboMME-Interference")
 _PROTOCOL = {
-    "fps": FPS,
     "unit_frames": UNIT_FRAMES,
     "unit_stride": UNIT_STRIDE,
     "unit_min": UNIT_MIN_RAW_FRAMES,

@@ -11,11 +11,9 @@ from dataclasses import dataclass
 from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.query import Query
-from robomme_interference_data.data.views import live_embedding
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.retrieval.encoders import encoder_name, published_threshold
 from robomme_interference_data.retrieval.grade import ALL
-from robomme_interference_data.retrieval.select import Rule, choose, measure
+from robomme_interference_data.retrieval.selector import select_stored
 from robomme_interference_data.schema.conditions import NO_HISTORY, in_order
 from robomme_interference_data.schema.evidence import known_parts
 from robomme_interference_data.schema.sampling import MEMORIES, check_memory, evidence_kept
@@ -116,11 +114,15 @@ def _given(buffer_set: BufferSet, buffer: Buffer, config: CeilingConfig) -> Sequ
         return range(len(buffer))
     if not len(buffer):
         return None
-    name = encoder_name(config.retrieval)
-    rule = Rule.parse(config.retrieval_rule, published_threshold(name))
-    shift, camera = parse_shift(config.shift), config.retrieval_camera
-    live = live_embedding(buffer_set, buffer, shift, name, camera)
-    return choose(measure(buffer, name, camera, live), rule).frames.tolist()
+    chosen = select_stored(
+        buffer_set,
+        buffer,
+        config.retrieval,
+        rule=config.retrieval_rule,
+        camera=config.retrieval_camera,
+        shift=parse_shift(config.shift),
+    )
+    return chosen.tolist()
 
 
 def _cells(every: Sequence[Left], families: Iterable[str]) -> Iterator[Ceiling]:

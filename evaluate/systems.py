@@ -34,8 +34,8 @@ class System:
             keeps none.
         position_limit: Maximum history and live frames together in memory; None: no limit.
         paper: Whether the paper reports it.
-        bound: Whether it is only a reference: with the answer, with what a memory shows of it, by
-            chance, or without motion. Such a system is never ranked.
+        reference: Whether it is a reference only: with the answer, with what a memory shows of it,
+            by chance, or without motion. Such a system is never ranked.
     """
 
     name: str
@@ -49,7 +49,7 @@ class System:
     sampling: str | None = None
     position_limit: int | None = None
     paper: bool = False
-    bound: bool = False
+    reference: bool = False
 
     @property
     def keeps_frames(self) -> bool | None:
@@ -110,7 +110,7 @@ PAPER_SYSTEMS: tuple[System, ...] = (
 _KEPT = {"Full": "all frames", "FrameSamp": "frames", "Window": "last frames"}
 
 
-def _control(kind: str, *, retrieval: bool, bound: bool = False) -> tuple[System, ...]:
+def _control(kind: str, *, retrieval: bool, reference: bool = False) -> tuple[System, ...]:
     """A control with each memory rule."""
     name = f"Retrieval-{kind}" if retrieval else kind
     return tuple(
@@ -118,7 +118,7 @@ def _control(kind: str, *, retrieval: bool, bound: bool = False) -> tuple[System
             *(f"{name}-{rule}".lower(), f"{name}-{rule}", frames),
             retrieval=retrieval,
             sampling=rule.lower(),
-            bound=bound,
+            reference=reference,
         )
         for rule, frames in _KEPT.items()
     )
@@ -126,21 +126,21 @@ def _control(kind: str, *, retrieval: bool, bound: bool = False) -> tuple[System
 
 _CONTROLS = (
     *(
-        System(name.lower(), name, "none", bound=True)
+        System(name.lower(), name, "none", reference=True)
         for name in ("Oracle", "Guess", "Noop", "Follow-Subgoals", "Follow-Subgoals-Oracle")
     ),
     *_control("Replay", retrieval=False),
     *_control("Replay", retrieval=True),
-    *_control("Recall", retrieval=False, bound=True),
-    *_control("Recall", retrieval=True, bound=True),
-    System("questions-guess", "Questions-Guess", "none", bound=True),
+    *_control("Recall", retrieval=False, reference=True),
+    *_control("Recall", retrieval=True, reference=True),
+    System("questions-guess", "Questions-Guess", "none", reference=True),
     System(
         *("retrieval-questions-guess", "Retrieval-Questions-Guess", "none"),
         retrieval=True,
-        bound=True,
+        reference=True,
     ),
-    *_control("Questions-Recall", retrieval=False, bound=True),
-    *_control("Questions-Recall", retrieval=True, bound=True),
+    *_control("Questions-Recall", retrieval=False, reference=True),
+    *_control("Questions-Recall", retrieval=True, reference=True),
 )
 
 SYSTEMS: dict[str, System] = {system.name: system for system in (*PAPER_SYSTEMS, *_CONTROLS)}
@@ -187,10 +187,10 @@ def base_of(name: str) -> str | None:
     return base + option * plain.startswith(base + option)
 
 
-def is_bound(name: str) -> bool:
-    """Whether a system is only a reference, see `System.bound`; a new one never is."""
+def is_reference(name: str) -> bool:
+    """Whether a system is only a reference, see `System.reference`; a new one never is."""
     known = known_system(name)
-    return known is not None and known.bound
+    return known is not None and known.reference
 
 
 def check_history(system: System, frames: Mapping[str, int]) -> None:

@@ -25,8 +25,8 @@ from robomme_interference_data.cli.options import (
     QueryName,
     with_settings,
 )
-from robomme_interference_data.constants import IDENTITY_PATH, MANIFEST_PATH
-from robomme_interference_data.errors import InvalidOptionError, MissingFileError
+from robomme_interference_data.constants import EXECUTIONS, IDENTITY_PATH, MANIFEST_PATH
+from robomme_interference_data.errors import InvalidOptionError, MissingFileError, counted
 from robomme_interference_data.runtime.executor import Serial, WorkersConfig, make_executor
 from robomme_interference_data.schema.settings import setting
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
@@ -78,7 +78,7 @@ def index(
     workers: WorkersConfig,
     as_json: AsJson = False,
 ) -> None:
-    """Embed every stored frame, and store the embeddings beside the data.
+    """Embed every stored frame but those of executions, and store them beside the data.
 
     An interrupted run resumes, and a valid index is kept, whichever device computed it. For
     datasets on the Hub, the command checks whether they have embeddings there.
@@ -99,6 +99,7 @@ def index(
     folder = Path(buffer_set)
     paths = [folder / IDENTITY_PATH, *sorted(folder.glob(f"*/{IDENTITY_PATH}"))]
     roots = [path.parent.parent for path in paths if path.is_file()]
+    roots = [root for root in roots if root == folder or root.name != EXECUTIONS]
     if not roots:
         raise MissingFileError(
             f"{buffer_set} is neither a buffer set nor a dataset of this package",
@@ -124,7 +125,7 @@ def index(
     current = {"in": image_encoder.computed_in, "batch": image_encoder.batch}
     for report in reports:
         frames, recorded = report.header.frames, report.header.computed
-        echo(f"{report.folder}: {frames} frames, {report.embedded} embedded now")
+        echo(f"{report.folder}: {counted(frames, 'frame')}, {report.embedded:,} embedded now")
         if recorded != current:
             print_status(
                 f"{report.folder} is kept, computed with {recorded['in']}, batch "

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     DISTRACTORS,
+    EXECUTIONS,
     FORMAT_VERSION,
     INDEX_HEADER,
 )
@@ -128,7 +129,7 @@ def look_on_hub(buffer_set: BufferSet, encoder: Encoder, camera: str = "front") 
     """Yield for each dataset on the Hub a message on whether it has embeddings by this encoder."""
     for name, recorded in buffer_set.header.datasets.items():
         files = buffer_set.dataset_files(name)
-        if not isinstance(files, HubFiles):
+        if name == EXECUTIONS or not isinstance(files, HubFiles):
             continue
         try:
             index = EmbeddingIndex(files, recorded.revision, encoder.name, camera)

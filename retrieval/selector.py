@@ -8,10 +8,13 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import CAMERA_PREFIX
 from robomme_interference_data.data.buffer import Buffer
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.embeddings import BufferSetIndex, index_folder
+from robomme_interference_data.data.views import live_embedding
 from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.schema.shifts import Shift
 
-from .encoders import check_encoder, make_encoder, published_threshold
+from .encoders import check_encoder, encoder_name, make_encoder, published_threshold
 from .select import Rule, choose, measure
 
 
@@ -83,3 +86,31 @@ class Selector:
         index = buffer.index(self._encoder.name, self.camera)
         check_encoder(index.units.header.encoder, self._encoder, index.units.remedy)
         return index
+
+
+def select_stored(
+    buffer_set: BufferSet,
+    buffer: Buffer,
+    encoder: str,
+    *,
+    rule: str = "max",
+    camera: str = "front",
+    shift: Shift | None = None,
+) -> NDArray[np.int64]:
+    """Choose the frames of a buffer that match its stored first live view; no image is embedded.
+
+    Args:
+        buffer_set: The buffer set of the buffer.
+        buffer: The history, with at least one frame.
+        encoder: Name of the encoder of the index, as for `Selector`.
+        rule: Rule of the choice, see `Rule.parse`.
+        camera: Camera whose frames are compared.
+        shift: Shift of the first live view.
+
+    Returns:
+        Indices in the buffer, ascending, `(n,) int64`, n at least 1.
+    """
+    name = encoder_name(encoder)
+    live = live_embedding(buffer_set, buffer, shift, name, camera)
+    parsed = Rule.parse(rule, published_threshold(name))
+    return choose(measure(buffer, name, camera, live), parsed).frames

@@ -94,6 +94,8 @@ CONTRADICTIONS = "contradictions"
 """Lessons in the scenes of the queries with other answers."""
 SHIFTED = "shifted"
 """First live views of the queries under shifts: a frame for each of `shifts.SHIFTS`."""
+EXECUTIONS = "executions"
+"""Recordings of the queries from the first live observation on, with actions."""
 
 LESSONS = (DEMONSTRATIONS, CONTRADICTIONS)
 """Datasets of lessons followed by their query frame."""
@@ -117,7 +119,7 @@ UNITS = {
 }
 """Datasets of units, with the size of a unit."""
 
-OPTIONAL_DATASETS = (RAW_DISTRACTORS, CONTRADICTIONS, SHIFTED)
+OPTIONAL_DATASETS = (RAW_DISTRACTORS, CONTRADICTIONS, SHIFTED, EXECUTIONS)
 """Datasets that a buffer set may lack; on the Hub, folders of its repository."""
 
 DATASETS = (DEMONSTRATIONS, DISTRACTORS, *OPTIONAL_DATASETS)

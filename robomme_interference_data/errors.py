@@ -259,6 +259,11 @@ def nearest(given: str, known: Iterable[str], *, more: str = "Known: ") -> str:
     return more + ", ".join(names[:10]) + rest
 
 
+def counted(count: int, noun: str, plural: str | None = None) -> str:
+    """Return a number with its noun, such as `1 episode` or `1,200 episodes`."""
+    return f"{count:,} {noun if count == 1 else plural or f'{noun}s'}"
+
+
 def visible(text: str, escape: str = "\\x{:02x}") -> str:
     """Return text with control characters escaped, which a terminal would interpret."""
     return _CONTROL.sub(lambda match: escape.format(ord(match[0])), text)

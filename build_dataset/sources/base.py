@@ -92,6 +92,8 @@ class Recording:
         evidence: Which frames of the demonstration show the hidden answer, part by part; None
             if unknown.
         robot: The robot.
+        action_first: Whether the action of a frame was executed before its observation, instead of
+            after it.
     """
 
     goals: tuple[str, ...]
@@ -102,6 +104,7 @@ class Recording:
     frames: Generator[Frame]
     evidence: tuple[EvidenceSpan, ...] | None = None
     robot: Robot = Robot()
+    action_first: bool = False
 
     def __post_init__(self) -> None:
         if not self.goals or not all(goal.strip() for goal in self.goals):
@@ -123,7 +126,8 @@ class Source(Protocol):
         provenance: What a dataset built from the source records about it, including its `kind`;
             the same on every machine (no local paths), e.g. a Hub repository with its commit.
         time_limit_s: Default limit in seconds for reading and storing one episode.
-        whole: Whether episodes continue after the first live observation, as units require.
+        whole: Whether episodes continue after the first live observation, as units and executions
+            require.
     """
 
     provenance: dict[str, Any]

@@ -108,6 +108,7 @@ class H5Source(Source):
                 exact=True,
                 frames=_frames(path, number, steps, lesson, chosen),
                 evidence=spans_of_texts(texts),
+                action_first=True,
             )
 
 

@@ -9,7 +9,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.errors import FormatError, UnknownNameError, nearest
+from robomme_interference_data.errors import FormatError, UnknownNameError, counted, nearest
 
 from .model import Part, Video
 
@@ -54,7 +54,9 @@ def as_text(parts: Sequence[Part]) -> str:
     """Return a prompt for transcripts, with `[image]` and `[video of n frames]`."""
     texts = []
     for part in parts:
-        image = f"[video of {len(part.frames)} frames]" if isinstance(part, Video) else "[image]"
+        image = "[image]"
+        if isinstance(part, Video):
+            image = f"[video of {counted(len(part.frames), 'frame')}]"
         texts.append(part if isinstance(part, str) else image)
     return "".join(texts)
 

@@ -244,6 +244,6 @@ def _check_features(path: str, config: Any, names: dict[str, str]) -> None:
     if wrong:
         raise PolicyError(
             f"the policy {path} does not fit: it {'; it '.join(wrong)}",
-            f"Train it on {FRONT}, {WRIST}, {STATE} and {ACTION} of a buffer set's demonstrations; "
+            f"Train it on {FRONT}, {WRIST}, {STATE} and {ACTION} of a buffer set's executions; "
             "see docs/how-to/lerobot-policy.md.",
         )

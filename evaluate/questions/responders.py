@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import FPS
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.questions import Question
 from robomme_interference_data.errors import FormatError
@@ -101,7 +100,7 @@ class ModelResponder:
             if self._control == "blank":
                 frames = np.full_like(frames, 128)
             if len(frames):
-                views["<history>"] = [Video(frames, FPS)]
+                views["<history>"] = [Video(frames, prompted.query.dataset.fps)]
         messages = self._prompt.fill(prompted.query.goal, prompted.question, views)
         reply = self._model.reply(messages)
         letter = read_letter(reply.text, prompted.question.letters)

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import FPS, MAX_STEPS
+from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.data.buffer import Buffer
-from robomme_interference_data.errors import MissingExtraError
+from robomme_interference_data.errors import MissingExtraError, counted
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.sampling import spread
@@ -40,9 +40,6 @@ _COLORS = {
     Status.TIMEOUT: Hue.ORANGE,
     Status.ERROR: "#000000",
 }
-_LAST = 10
-"""Frames for which the last picture stays."""
-
 _LETTERS = 34
 """Maximum letters in a line of text."""
 
@@ -76,7 +73,7 @@ def _harmless[**P](method: Callable[P, None]) -> Callable[P, None]:
 
 
 class Clip:
-    """Draws a rollout at 10 pictures a second and encodes them; `data` is the closed MP4 file.
+    """Draws and encodes a rollout at the pace of its recordings; `data` is the closed MP4 file.
 
     A fault in the clip does not break the rollout: `problem` has its traceback, and `data` is None.
     """
@@ -92,6 +89,7 @@ class Clip:
         self._lesson: Iterator[NDArray[np.uint8]] = iter(())
         self._subgoal: Subgoal | None = None
         self._steps = 0
+        self._fps = 1
         self._file = ExitStack()
         self._path = Path()
         self._encoder: VideoEncoder | None = None
@@ -101,15 +99,15 @@ class Clip:
         self, buffer: Buffer, given: Sequence[int], first: Observation, info: EpisodeInfo
     ) -> None:
         """Draw the first picture, with the history frames that were given."""
-        self._goal = info.goal
-        self._given = f"history given: {len(given)} frames" if given else "no history"
+        self._goal, self._fps = info.goal, max(1, round(buffer.query.dataset.fps))
+        self._given = f"history given: {counted(len(given), 'frame')}" if given else "no history"
         self._views = {"given": history_picture(buffer, given)}
         self._lesson = self._file.enter_context(closing(_lesson_of(buffer)))
         self._show(first)
         self._path = Path(
             self._file.enter_context(TemporaryDirectory(dir=self._folder)), "clip.mp4"
         )
-        self._encoder = VideoEncoder(self._path, CLIP, FPS, _HEIGHT, _WIDTH, container="mp4")
+        self._encoder = VideoEncoder(self._path, CLIP, self._fps, _HEIGHT, _WIDTH, container="mp4")
         self._encoder.add(self._picture(Status.ONGOING))
 
     @_harmless
@@ -126,7 +124,7 @@ class Clip:
         """Show the end for a second, and close the clip, if it began."""
         if self._encoder is not None:
             picture = self._picture(status, error=error)
-            for _ in range(_LAST):
+            for _ in range(self._fps):
                 self._encoder.add(picture)
             self._encoder.close()
             self.data = self._path.read_bytes()

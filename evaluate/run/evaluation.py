@@ -90,6 +90,7 @@ def run_evaluation(
         UnknownNameError, InvalidOptionError, InvalidIdError: A setting is invalid.
         InvalidOptionError: A buffer exceeds the system's position limit.
         MissingFileError: The buffer set does not exist, or has no questions.
+        HashMismatchError: Its manifests or episode records do not have their recorded hashes.
         RunError: `out` holds another run, or other files.
         PolicyError: The policy cannot be made.
         PolicyServerError: No policy server can be reached, another run drives it, or it serves
@@ -122,6 +123,7 @@ def run_evaluation(
             buffer_set.manifest(
                 buffer_set.episode_ids[0], condition
             )  # raises, with the available ones
+        buffer_set.check_tables(plan.conditions)
         kind.check(plan, items)
         existing = read_record(folder)
         todo = [item for item in items if item not in existing or not is_done(existing[item])]
@@ -144,6 +146,10 @@ def _kind(config: RunConfig | AskConfig, buffer_set: BufferSet) -> RunKind[Any]:
         from robomme_interference_data.evaluate.questions.kind import Questions
 
         return Questions(config, buffer_set)
+    if config.offline:
+        from robomme_interference_data.evaluate.offline.kind import Offline
+
+        return Offline(config, buffer_set)
     from robomme_interference_data.evaluate.rollout.kind import Rollouts
 
     return Rollouts(config, buffer_set)

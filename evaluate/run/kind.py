@@ -16,7 +16,7 @@ from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.runtime.executor import Session, Worker
-from robomme_interference_data.schema.rollouts import Rollout, Status
+from robomme_interference_data.schema.rollouts import Rollout, Status, success_of
 from robomme_interference_data.schema.sampling import even_sample, lesson_frames, lesson_share
 from robomme_interference_data.simulators.registry import simulator_class
 
@@ -67,7 +67,7 @@ class Run[C: RunConfig | AskConfig]:
             model_seed=self.config.model_seed,
             protocol_version=PROTOCOL_VERSION,
             status=str(status),
-            success=None if status is Status.ERROR else status is Status.SUCCESS,
+            success=success_of(status),
             **values,
         )
 
@@ -169,8 +169,10 @@ class RunTask[C: RunConfig | AskConfig](ABC):
 
     def describe(self) -> dict[str, str]:
         """Return what must be the same on all machines that run the task."""
-        revision = load_buffer_set(self.run.config.buffer_set).revision
-        return package_versions(self.run.config) | {"the buffer set's revision": revision}
+        buffer_set = load_buffer_set(self.run.config.buffer_set)
+        buffer_set.check_tables(buffer_set.conditions)
+        revision = {"the buffer set's revision": buffer_set.revision}
+        return package_versions(self.run.config) | revision
 
     @abstractmethod
     def work(self, task: Any, worker: Worker) -> Any:

@@ -14,7 +14,7 @@ from statistics import median
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import InvalidOptionError, counted
 from robomme_interference_data.stats.bootstrap import generator_of
 from robomme_interference_data.stats.intervals import newcombe_paired, z_of
 from robomme_interference_data.stats.sequential import MOST_LOOKS, look_levels
@@ -206,6 +206,6 @@ def note(counts: Iterable[tuple[int, int, int]], tests: int) -> str:
     shown = "no difference" if least is None else f"a difference of {100 * least:.1f} points"
     corrected = f" after correction for {tests} tests" * (tests > 1)
     return (
-        f" With {n:,} episode{'s' * (n > 1)}, of which {percent(differing)} differ (the median "
+        f" With {counted(n, 'episode')}, of which {percent(differing)} differ (the median "
         f"here), {shown} can be detected with 80% power{corrected}."
     )

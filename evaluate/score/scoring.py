@@ -14,13 +14,14 @@ from .comparisons.tables import SPECS, comparison_table
 from .config import Against, Expected, Settings
 from .outcomes import Outcomes, outcomes_of
 from .rows.reading import Rows, read_rows
-from .tables import cells, chance, equivalence, evidence_kept, model, paper, steps
+from .tables import action_error, cells, chance, equivalence, evidence_kept, model, paper, steps
 
 TABLES = (
     *("main", "chance", "systems", "ranks", "family", "difficulty", "lift", "effects"),
     *("interaction", "equivalence", "interference", "by_evidence_kept", "evidence_effects"),
     *("evidence_use", "ceiling", "decay", "model", "steps", "noise", "families", "family_effects"),
     *("matrix", "coverage", "paper", "paper_family"),
+    *action_error.ERROR_TABLES,
 )
 """Every table that a score may have, in order."""
 
@@ -86,6 +87,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         effects.noise_table(every),
         steps.steps_table(every, draws),
         cells.coverage_table(found),
+        *action_error.error_tables(rows, draws),
     ]
     if settings.margin is not None:
         margin = settings.margin

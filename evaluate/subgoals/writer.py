@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import FPS
 from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.evaluate.models.model import Video
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
@@ -39,8 +38,8 @@ class History:
 
     def video(self, places: Sequence[int]) -> Video:
         """Decode frames as a video in real time."""
-        seconds = (places[-1] - places[0]) / FPS
-        return Video(self.frames(places), (len(places) - 1) / seconds if seconds else FPS)
+        rate, steps = self._buffer.query.dataset.fps, places[-1] - places[0]
+        return Video(self.frames(places), (len(places) - 1) * rate / steps if steps else rate)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from robomme_interference_data.data.fetch import FetchConfig
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import InvalidOptionError, counted
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
 
 from .console import check_output, echo, graceful_interrupt, print_json, print_status
@@ -60,7 +60,8 @@ def list_buffers(
         "lesson share: of an even 32-frame sample of the history",
     )
     episodes = len({manifest.episode_id for manifest in manifests})
-    echo(f"{table.text()}\n\n{len(manifests):,} buffers of {episodes:,} episodes")
+    total = f"{counted(len(manifests), 'buffer')} of {counted(episodes, 'episode')}"
+    echo(f"{table.text()}\n\n{total}")
 
 
 def list_conditions(as_json: AsJson = False) -> None:

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -25,10 +25,11 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     MissingFileError,
     UnknownNameError,
+    counted,
 )
 from robomme_interference_data.ids import EpisodeId, whole_number
 from robomme_interference_data.schema.codec import from_table, to_dict
-from robomme_interference_data.schema.conditions import Condition, parse_condition
+from robomme_interference_data.schema.conditions import Condition, datasets_of, parse_condition
 from robomme_interference_data.schema.manifest import BufferManifest, ManifestHeader
 from robomme_interference_data.storage.files import (
     LocalFiles,
@@ -94,7 +95,8 @@ class BufferSet:
         counts = Counter(zip(self._keys["family"], self._keys["condition"], strict=True))
         return Table.make(
             "buffers",
-            f"{self.name}: {len(self):,} buffers of {len(self.episode_ids):,} query episodes",
+            f"{self.name}: {counted(len(self), 'buffer')} of "
+            f"{counted(len(self.episode_ids), 'query episode')}",
             " ".join(["family", *(f"{name}:count" for name in self.conditions)]),
             ((one, *(counts[one, name] for name in self.conditions)) for one in self.families),
             f"Buffers by family and condition. Cameras: {', '.join(self.cameras)}.",
@@ -293,11 +295,27 @@ class BufferSet:
         buffer = self._buffer(self.manifest(episode_id, condition, k=k))
         buffer.fetch(cameras)
         if verify:
-            if sha256_file(self._path) != self.header.rows:
-                what = f"{self._path} does not have the SHA-256 in {MANIFEST_HEADER}"
-                raise HashMismatchError(what, self.fix)
+            self._check_rows()
             buffer.verify()
         return buffer
+
+    def check_tables(self, conditions: Iterable[Condition | str]) -> None:
+        """Check the rows of all buffers, and the records of all episodes, against their hashes.
+
+        Args:
+            conditions: The conditions whose datasets' records are checked.
+
+        Raises:
+            HashMismatchError: They differ.
+        """
+        self._check_rows()
+        for name in datasets_of(map(parse_condition, conditions)):
+            self.datasets[name].check_records()
+
+    def _check_rows(self) -> None:
+        if sha256_file(self._path) != self.header.rows:
+            what = f"{self._path} does not have the SHA-256 in {MANIFEST_HEADER}"
+            raise HashMismatchError(what, self.fix, "verify BUFFER_SET")
 
     def buffers(self, **properties: Any) -> Iterator[Buffer]:
         """Yield all buffers, or those with all the given properties; see `manifests`."""

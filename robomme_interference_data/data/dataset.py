@@ -126,6 +126,11 @@ class Dataset:
                 raise FormatError.damaged(self._name, what)
         return shapes
 
+    @property
+    def fps(self) -> float:
+        """Recorded frames per second."""
+        return self.lerobot.fps
+
     @cached_property
     def cameras(self) -> tuple[str, ...]:
         """Names of the cameras, such as `front` and `wrist`, sorted."""

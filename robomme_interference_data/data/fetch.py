@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,
+    EXECUTIONS,
     INDEX_DIR,
     INDEX_HEADER,
     MANIFEST_PATH,
@@ -55,6 +56,9 @@ class FetchConfig:
     questions: bool = setting(
         False, help="Download the questions too; a full download has them.", group=_CONTENT
     )
+    executions: bool = setting(
+        False, help="Download the executions too; a full download has them.", group=_CONTENT
+    )
 
 
 @dataclass(frozen=True)
@@ -82,7 +86,7 @@ def plan_fetch(buffer_set: "BufferSet", config: FetchConfig) -> list[Part]:
             "Give the buffer set as namespace/name.",
         )
     cameras = config.cameras or buffer_set.cameras
-    whole = replace(config, index=None, questions=False) == FetchConfig()
+    whole = replace(config, index=None, questions=False, executions=False) == FetchConfig()
     datasets, episodes = _needed(buffer_set, config, whole=whole)
     others = {n: one.files for n, one in datasets.items() if one.files is not buffer_set.files}
     parts = []
@@ -157,7 +161,8 @@ def _needed(
     datasets = {
         name: buffer_set.datasets[name]
         for name, some in episodes.items()
-        if name != SHIFTED and (whole or some or name in (DEMONSTRATIONS, DISTRACTORS))
+        if name not in (SHIFTED, EXECUTIONS)
+        and (whole or some or name in (DEMONSTRATIONS, DISTRACTORS))
     }
     if SHIFTED in episodes:
         try:
@@ -167,6 +172,13 @@ def _needed(
             if whole:
                 raise
             logger.warning("views under shifts are left out: %s", error.message)
+    if config.executions and EXECUTIONS not in episodes:
+        raise MissingFileError(f"{buffer_set.location} has no executions")
+    if EXECUTIONS in episodes and (whole or config.executions):
+        executions = datasets[EXECUTIONS] = buffer_set.datasets[EXECUTIONS]
+        episodes[EXECUTIONS] = {
+            one.episode_index for one in executions.records() if one.episode_id in queries
+        }
     return datasets, episodes
 
 

@@ -3,7 +3,7 @@
 The draw of distractor units is in `schema/draw.py`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -35,15 +35,21 @@ _ROLES = {
 
 @dataclass(frozen=True)
 class SessionSource:
-    """The datasets of a buffer set by name, and the seed of the draw."""
+    """The datasets of a buffer set by name, and the seed of the draw.
+
+    `unit_episodes` are the indices of the episodes whose units may be drawn; None for all.
+    """
 
     datasets: Mapping[str, Dataset]
     seed: int = 0
+    unit_episodes: Collection[int] | None = None
 
     @cached_property
     def pool(self) -> UnitPool:
         """The units to draw from."""
-        return UnitPool((one.episode_id for one in self.datasets[DISTRACTORS].records()), self.seed)
+        allowed = self.unit_episodes
+        units = (record.episode_id for record in self.datasets[DISTRACTORS].records())
+        return UnitPool((u for u in units if allowed is None or u.index in allowed), self.seed)
 
     def session(self, name: str, episode: EpisodeId) -> SessionEntry:
         """Return the session of an episode in a dataset; contradictions go by their query's id."""

@@ -34,6 +34,10 @@ class Question:
         tuple[int, ...], "Number of each option's answer among the scene's possible answers."
     ]
     right: Annotated[int, "Index of the right option, from 0."]
+    points: Annotated[
+        tuple[tuple[int, ...], ...],
+        "Marked points of each option in the picture, in pixels: y, x, y, x, …; none for words.",
+    ]
     picture: Annotated[bytes, "The first live view with marked and lettered options, a PNG file."]
 
     def __post_init__(self) -> None:
@@ -42,6 +46,8 @@ class Question:
             raise FormatError(f"{count} options with {len(set(self.answers))} different answers")
         if not 0 <= self.right < count or min(self.answers) < 0:
             raise FormatError(f"right option {self.right} of {count}, answers {self.answers}")
+        if len(self.points) != count or any(len(one) % 2 for one in self.points):
+            raise FormatError(f"{count} options with the points {self.points}")
 
     @property
     def letters(self) -> str:

@@ -149,7 +149,9 @@ class DatasetIdentity:
     exact: Annotated[bool, "Whether all episodes are exact."]
     codec: Annotated[str, "Name of the video settings."]
     cameras: Annotated[tuple[str, ...], "Names of the cameras, sorted."]
-    unit: Annotated[dict[str, int] | None, "`frames` and `stride` of a unit; None for lessons."]
+    unit: Annotated[
+        dict[str, int] | None, "`frames` and `stride` of a unit; None for other datasets."
+    ]
     simulators: Annotated[tuple[str, ...], "Simulators of the episodes."]
     sources: Annotated[tuple[dict[str, Any], ...], "Metadata of the sources."]
     counts: Annotated[Counts, "Numbers of episodes and frames."]

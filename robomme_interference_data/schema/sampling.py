@@ -2,11 +2,12 @@
 
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
 from itertools import groupby
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from robomme_interference_data.constants import SAMPLE_FRAMES
-from robomme_interference_data.errors import UnknownNameError
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 
 from .manifest import Session
 
@@ -43,6 +44,46 @@ def check_memory(name: str, of: str) -> None:
     """Check the name of a memory rule; `of` is the option's owner, for the message."""
     if name not in MEMORIES:
         raise UnknownNameError.among("memory", name, of, MEMORIES)
+
+
+@dataclass(frozen=True)
+class Memory:
+    """A memory rule and its size.
+
+    Attributes:
+        rule: One of `MEMORIES`.
+        frames: Size with the live observation, at least 2; `full` has no limit.
+    """
+
+    rule: str
+    frames: int = SAMPLE_FRAMES
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Read `full`, `framesamp` or `window`, with the size after a colon: `framesamp:32`.
+
+        Raises:
+            UnknownNameError: There is no such rule.
+            InvalidOptionError: The size is not a whole number from 2.
+        """
+        rule, colon, frames = text.partition(":")
+        check_memory(rule, "the memory rules")
+        sized = rule != "full" and frames.isascii() and frames.isdigit() and int(frames) > 1
+        if colon and not sized:
+            expected = f"{', '.join(MEMORIES)}, or framesamp:N or window:N with N from 2"
+            raise InvalidOptionError.expected("memory", text, expected)
+        return cls(rule, int(frames)) if colon else cls(rule)
+
+    def earlier(self, live: int) -> Sequence[int]:
+        """Return the ascending indices of the frames in memory before the live observation.
+
+        Args:
+            live: Index of the live observation: number of frames of history and rollout before it.
+        """
+        return MEMORIES[self.rule](live, self.frames)
+
+    def __str__(self) -> str:
+        return self.rule if self.rule == "full" else f"{self.rule}:{self.frames}"
 
 
 def spread(start: int, stop: int, count: int) -> list[int]:

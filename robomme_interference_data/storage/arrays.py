@@ -8,6 +8,7 @@ of the actions. Both can be recomputed from decoded arrays with hashlib alone.
 
 import hashlib
 import math
+import os
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -40,6 +41,20 @@ def write_array(path: Path, array: NDArray[Any]) -> None:
             np.lib.format.header_data_from_array_1_0(array),  # type: ignore[no-untyped-call]
         )
         file.write(array.data)
+
+
+def allocate_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:
+    """Create an array for `map_array` on disk, and return it as a writable memory map.
+
+    All its space is allocated at once: on a full disk this raises `OSError`, whereas writing to a
+    sparse map would end the process.
+    """
+    header = {"descr": np.dtype(dtype).str, "fortran_order": False, "shape": shape}
+    with path.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, header)  # type: ignore[no-untyped-call]
+        start, size = file.tell(), math.prod(shape) * np.dtype(dtype).itemsize
+        os.posix_fallocate(file.fileno(), 0, start + size)
+    return np.memmap(path, dtype, "r+", start, shape)
 
 
 def map_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:

@@ -269,13 +269,13 @@ def test_units_are_of_train_episodes(tmp_path: Path) -> None:
     assert len(few["distractors"].tasks) == 18
 
 
-def test_views_under_shifts_are_of_the_queries(tmp_path: Path) -> None:
-    asked = config(tmp_path, "tabletop", split="test", episodes="0-1", shifted=True)
+def test_views_under_shifts_and_executions_are_of_the_queries(tmp_path: Path) -> None:
+    further = {"shifted": True, "executions": True}
+    asked = config(tmp_path, "tabletop", split="test", episodes="0-1", **further)
     plans = plan_all(asked, PlanConfig(("k1",)))
-    assert [*plans] == ["demonstrations", "distractors", "shifted"]
-    assert [one.id for _, one in plans["shifted"].tasks] == [
-        one.id for _, one in plans["demonstrations"].tasks
-    ]
+    assert [*plans] == ["demonstrations", "distractors", *further]
+    for name in further:
+        assert plans[name].tasks == plans["demonstrations"].tasks
 
 
 @pytest.mark.parametrize(

@@ -56,6 +56,22 @@ def test_the_golden_manifests_come_out_again(tmp_path: Path, name: str) -> None:
     assert contents(root) == contents(GOLDEN)
 
 
+def test_buffers_of_train_episodes(tmp_path: Path) -> None:
+    """Units are of other families, or of the own one, and never of the query's own episode."""
+    names = [f"{family}/train/{number}" for family in FAMILIES for number in range(3)]
+    queries = [record("demonstrations", name) for name in names]
+    root = made_up(tmp_path, queries=queries)
+    conditions = ("k7", "before-k7", "absent-k7", "same-k2")
+    buffers = [*planned_buffers(plan_manifests(in_folder(root), conditions))]
+    assert len(buffers) == len(names) * len(conditions)
+    for one in buffers:
+        units = [session.source for session in one.sessions if session.role == "distractor"]
+        same = one.condition == "same-k2"
+        assert len({*units}) == len(units) == (2 if same else 7)
+        assert one.episode_id not in units
+        assert all((unit.family == one.episode_id.family) == same for unit in units)
+
+
 def test_lesson_parts_without_digests_are_an_error(tmp_path: Path) -> None:
     queries = [record("demonstrations", "MoveCube/test/0", span_sha256=None)]
     root = made_up(tmp_path, queries=queries)

@@ -226,7 +226,7 @@ INFO, STATS, REPORT, IDENTITY = (
         (DATA, first("timestamp", 0.05), "timestamp of episode 3"),
         (DATA, table(as_text("timestamp")), "timestamp of episode 3 is of type string"),
         (DATA, first("task_index", 0), "task_index of episode 3"),
-        (DATA, first("frame_index", 1), "32 rows of episode 3"),
+        (DATA, first("frame_index", 1), "not in the order of frame_index"),
         (RECORDS, first("dataset_from_index", 7), "dataset_from_index"),
         (RECORDS, first(f"{FRONT}/to_timestamp", 1.0), "to_timestamp"),
         (RECORDS, first("data/file_index", 1), "is shared by episodes"),

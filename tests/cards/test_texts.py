@@ -22,6 +22,7 @@ from robomme_interference_data.cards.render import card_files, card_text, croiss
 from robomme_interference_data.cards.results import results_facts
 from robomme_interference_data.constants import IDENTITY_PATH, RECORDS_PATH, REPORT_PATH, SUMS_PATH
 from robomme_interference_data.data.buffer_set import BufferSet
+from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import FormatError, InvalidOptionError
 from robomme_interference_data.evaluate.score.config import Settings
 from robomme_interference_data.evaluate.score.scoring import Score, score
@@ -78,6 +79,13 @@ def test_lossy_data_is_called_so(tmp_path: Path, part: str, inexact: int) -> Non
     assert f"**Lossy.** {inexact} of 4 buffers" in text
     demonstrations = demonstrations_text(buffer_set)
     assert ("**Lossy.** 1 of 1 episodes" in demonstrations) == (part == "query")
+
+
+def test_the_pace_is_that_of_the_recordings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Dataset, "fps", 12.5)
+    assert "frames at 12.5 frames per second" in demonstrations_text(made_up(tmp_path))
 
 
 def test_the_lossy_copy_of_the_recordings_is_named(tmp_path: Path) -> None:

@@ -125,7 +125,7 @@ def test_what_a_buffer_set_must_hold() -> None:
     assert needed("no-history", "before-k3") == ("demonstrations", "distractors")
     every = "demonstrations", "distractors", "distractors-raw", "contradictions"
     assert needed("misled-k0", "k0", "raw-k1") == every
-    assert (*every, "shifted") == DATASETS  # which no condition needs
+    assert (*every, "shifted", "executions") == DATASETS  # no condition needs the last two
 
     assert all(kind.name == name and kind.holds and kind.asks for name, kind in KINDS.items())
 

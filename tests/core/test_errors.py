@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robomme_interference_data import errors
-from robomme_interference_data.errors import InterferenceError, InvalidOptionError, nearest
+from robomme_interference_data.errors import InterferenceError, InvalidOptionError, counted, nearest
 
 CLASSES = [
     value
@@ -69,3 +69,17 @@ def test_nearest_of_very_many_names_is_quick() -> None:
     sentence = nearest("VideoRepick/test/1234x", known)
     assert time.perf_counter() - started < 10
     assert "'VideoRepick/test/1234'" in sentence
+
+
+@pytest.mark.parametrize(
+    ("count", "nouns", "text"),
+    [
+        (0, ("row",), "0 rows"),
+        (1, ("row",), "1 row"),
+        (1200, ("row",), "1,200 rows"),
+        (1, ("query", "queries"), "1 query"),
+        (2, ("query", "queries"), "2 queries"),
+    ],
+)
+def test_counted(count: int, nouns: tuple[str, ...], text: str) -> None:
+    assert counted(count, *nouns) == text

@@ -24,19 +24,25 @@ COLUMNS = {
     **{"revision": "string", "text": "string"},
     "options": "list<element: string not null>",
     "answers": "list<element: int64 not null>",
-    **{"right": "int64", "picture": "binary"},
+    "right": "int64",
+    "points": "list<element: list<element: int64 not null> not null>",
+    "picture": "binary",
 }
 
 
 def question(**changes: Any) -> Question:
     known = {"options": ("", "", ""), "answers": (4, 0, 9), "right": 1}
-    fields = {"revision": "r", "text": "Which?", "picture": b""} | known | changes
+    fields = (
+        {"revision": "r", "text": "Which?", "picture": b"", "points": ((), (), ())}
+        | known
+        | changes
+    )
     return Question(episode_id=MOVE, **fields)
 
 
 def test_letters_and_chance() -> None:
     assert (question().letters, question().chance) == ("ABC", 1 / 3)
-    eight = question(options=("",) * 8, answers=tuple(range(8)))
+    eight = question(options=("",) * 8, answers=tuple(range(8)), points=((),) * 8)
     assert (eight.letters, eight.chance) == ("ABCDEFGH", 0.125)
 
 
@@ -49,6 +55,8 @@ def test_letters_and_chance() -> None:
         {"answers": (4, 0, 4)},
         {"answers": (4, 0, -1)},
         {"right": 3},
+        {"points": ((), ())},
+        {"points": ((1, 2), (3,), ())},
     ],
 )
 def test_what_is_no_question(changes: dict[str, Any]) -> None:
@@ -75,6 +83,7 @@ def test_the_golden_questions() -> None:
     assert (peg.letters, peg.answers, peg.right) == ("ABCD", (0, 7, 4, 1), 3)
     assert peg.options[3] == "held at its head, inserted from the right"
     assert peg.options[0] == peg.options[2]  # of different pegs, as the picture shows
+    assert [len(points) for points in peg.points] == [4] * 4 and one.points == ((), (), ())
 
 
 # --- invalid questions -------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from support.runs import EPISODE, run_one
 from support.worlds import World
 
 from robomme_interference_data import Buffer, load_buffer
+from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.evaluate.rollout.clips import history_picture
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.schema.rollouts import Rollout
@@ -53,6 +54,16 @@ def test_a_rollout_writes_a_video(tmp_path: Path, buffer: Buffer) -> None:
         taught = buffer.frame(step)
         seen = image[24 : 24 + len(taught), : taught.shape[1]]
         assert np.abs(seen.astype(int) - taught).mean() < 10
+
+
+def test_a_video_has_the_pace_of_the_recordings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Dataset, "fps", 5.0)
+    run_one(tmp_path / "run", conditions=("k0",), policy="noop", videos=True)
+    with av.open(str(tmp_path / "run/videos/MoveCube_test_0_k0.mp4")) as container:
+        [stream] = container.streams.video
+        assert (stream.average_rate, stream.frames) == (5, 1 + 40 + 5)
 
 
 @pytest.mark.parametrize(("start", "stop"), [(40, 57), (3, 3)])

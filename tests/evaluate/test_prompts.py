@@ -30,7 +30,7 @@ NO_IMAGES: dict[str, Any] = {"<history>": [], "<picture>": []}
 
 def question(*options: str) -> Question:
     episode, answers = EpisodeId("MoveCube", "test", 0), tuple(range(len(options)))
-    return Question(episode, "r", "Which one?", options, answers, 0, b"")
+    return Question(episode, "r", "Which one?", options, answers, 0, ((),) * len(options), b"")
 
 
 def prompt(**changes: object) -> Prompt:

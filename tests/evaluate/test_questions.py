@@ -285,7 +285,7 @@ def test_a_model_answers_questions_whose_options_recall_does_not_know(tmp_path: 
     root = copy_buffer_set(tmp_path / "buffer_set")
     buffer_set = load_buffer_set(root)
     revision = buffer_set.datasets[DEMONSTRATIONS].identity.revision
-    others = revision, "Which?", ("red", "blue"), (0, 1), 1, questions()[MOVE].picture
+    others = revision, "Which?", ("red", "blue"), (0, 1), 1, ((), ()), questions()[MOVE].picture
     write_questions([Question(episode, *others) for episode in buffer_set.episode_ids], root)
     with pytest.raises(InvalidOptionError, match="recall does not know"):
         ask(tmp_path / "recall", buffer_set=root)

@@ -8,12 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.runs import header, run, run_one, untimed
 from support.worlds import World
 
-from robomme_interference_data.errors import RunError, SimulatorCrashError
+from robomme_interference_data.errors import HashMismatchError, RunError, SimulatorCrashError
 from robomme_interference_data.evaluate.rollout import worker
 from robomme_interference_data.evaluate.run.log import read_record
 from robomme_interference_data.runtime.executor import Outcome, Serial
@@ -251,3 +252,25 @@ def test_a_buffer_set_may_move_and_keeps_its_label(tmp_path: Path, tiny_buffers:
         ("MoveCube", "buffer_set"),
     ]
     assert len(read_record(tmp_path / "run")) == 2
+
+
+@pytest.mark.parametrize(
+    ("path", "column", "message"),
+    [
+        ("manifests/buffers.parquet", "sessions", "does not have the SHA-256 in manifest.json"),
+        ("demonstrations/meta/interference.parquet", "goals", "are not those of its revision"),
+        ("distractors/meta/interference.parquet", "goals", "are not those of its revision"),
+    ],
+)
+def test_a_changed_table_is_an_error_before_the_run(
+    own_buffers: Path, tmp_path: Path, path: str, column: str, message: str
+) -> None:
+    """The order of sessions, and wordings of goals."""
+    table = pq.read_table(own_buffers / path)
+    lists = [one[::-1] if len(one) > 1 else one * 2 for one in table[column].to_pylist()]
+    values = pa.array(lists, table.schema.field(column).type)
+    changed = table.set_column(table.column_names.index(column), column, values)
+    pq.write_table(changed, own_buffers / path)
+    with pytest.raises(HashMismatchError, match=message):
+        run(tmp_path / "run", conditions=("k1",), buffer_set=own_buffers)
+    assert not (tmp_path / "run").exists()

@@ -26,6 +26,7 @@ from support.runs import config, header, roll, run, run_one
 from support.worlds import buffer_set_here
 
 from robomme_interference_data import load_buffer_set
+from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import (
     InterferenceError,
     InvalidOptionError,
@@ -104,6 +105,15 @@ def test_a_model_gets_an_even_sample_of_the_history_and_the_current_view() -> No
     assert "move it" in "".join(part for part in parts if isinstance(part, str))
     [turn] = writer.turns
     assert "[video of 5 frames]" in str(turn.prompt) and "[image]" in str(turn.prompt)
+
+
+def test_the_history_has_the_pace_of_its_recordings(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Dataset, "fps", 30.0)
+    for frames, pace in ((5, 4 / (47 / 30)), (48, 30.0), (1, 30.0)):
+        model = Scripted("go")
+        written(begun(model, frames=frames), 0, 0)
+        [video] = [part for part in model.asked[0] if isinstance(part, Video)]
+        assert video.fps == pytest.approx(pace)
 
 
 def test_without_history_the_prompt_has_the_word_none() -> None:

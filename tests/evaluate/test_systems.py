@@ -8,7 +8,7 @@ from robomme_interference_data.evaluate.systems import (
     base_of,
     check_history,
     display_name,
-    is_bound,
+    is_reference,
     name_system,
 )
 
@@ -38,7 +38,7 @@ def test_a_control_behind_another_retrieval_step(step: str) -> None:
     assert system.display == f"Retrieval-Recall-FrameSamp ({step})"
     assert system.sampling == "framesamp"
     assert not system.applies("no-history") and system.applies("k0")
-    assert is_bound(system.name) and not is_bound(f"retrieval-replay-window-{step}")
+    assert is_reference(system.name) and not is_reference(f"retrieval-replay-window-{step}")
     assert base_of(system.name) == "recall-framesamp"
     assert display_name(system.name) == system.display
 
@@ -69,7 +69,7 @@ def test_names_outside_the_table() -> None:
 def test_recall_and_guess_of_questions_are_bounds(sampling: str) -> None:
     for name in ("questions-guess", f"questions-recall-{sampling}"):
         for known in (name, f"retrieval-{name}", f"retrieval-{name}-joined"):
-            assert name_system(known).name == known and is_bound(known)
+            assert name_system(known).name == known and is_reference(known)
         assert base_of(f"retrieval-{name}") == base_of(f"retrieval-{name}-joined") == name
 
 

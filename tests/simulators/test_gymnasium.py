@@ -119,3 +119,13 @@ def test_without_a_vulkan_device_there_is_one_error() -> None:
     done = run(code, VK_ICD_FILENAMES="/nonexistent", VK_DRIVER_FILES="/nonexistent")
     assert "no Vulkan device on this machine can render" in done.stdout, done.stderr
     assert "sudo make vulkan" in done.stdout
+
+
+def test_without_a_writable_home_the_renderer_prints_nothing() -> None:
+    code = (
+        "from robomme_interference_data.simulators.tabletop.renderer import make_renderer\n"
+        "make_renderer()\n"
+    )
+    caches = dict.fromkeys(("XDG_CACHE_HOME", "MESA_SHADER_CACHE_DIR"), "")
+    done = run(code, HOME="/proc/nonexistent", **caches)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

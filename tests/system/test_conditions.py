@@ -5,21 +5,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.buffer_sets import QUERIES
+from support.buffer_sets import QUERIES, build, plan_again
 from support.hub_server import HubServer
 from support.publishing import UNITS, plain_cards, publish
 from support.retrieval import make_index
 from support.shifted import add_shifted
 
 from robomme_interference_data import load_buffer_set
+from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.build_dataset.verify import verify_buffer_set
-from robomme_interference_data.constants import SHIFTED
+from robomme_interference_data.constants import EXECUTIONS, SHIFTED
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.views import live_embedding, live_frame
 from robomme_interference_data.schema.shifts import SHIFTS
 
 Run = Callable[..., tuple[int, str, str]]
 QUERY = "MoveCube/test/0"
+FAMILIES = ("VideoRepick", "MoveCube", "PatternLock")
 PARTS = (slice(0, 24), slice(48, 80), slice(24, 48))  # of k1: 48 frames of lesson, 32 of a unit
 
 
@@ -103,6 +105,32 @@ def test_optional_datasets_are_published_and_fetched(
     finish("fetch", UNITS, "--conditions", "k1", "--to", part)
     assert load_buffer_set(part).load(QUERY, "k1", verify=True).condition == "k1"
     assert not list(part.rglob("contradictions/videos"))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_logged_in")
+def test_executions_are_published_and_fetched(
+    hub: HubServer, finish: Callable[..., None], own_buffers: Path
+) -> None:
+    """Only a full download has them, unless they are requested; no buffer needs them."""
+    build(own_buffers, EXECUTIONS, SampleSource(size=32), split="test", families=FAMILIES)
+    plan_again(own_buffers)
+    publish(own_buffers)
+    published = load_buffer_set(UNITS)
+    published.load(QUERY, "k7", verify=True).frames()
+    assert not any(path.startswith(f"{EXECUTIONS}/") for path in hub.downloads())
+    made = published.datasets[EXECUTIONS]
+    index = made.index_of(published.query(QUERY).episode_id)
+    [first] = made.iter_frames(index, "front", 0, 1)
+    assert (first == published.query(QUERY).frame()).all()
+    folders = {name: own_buffers.parent / name for name in ("whole", "part", "with")}
+    finish("fetch", UNITS, "--to", folders["whole"])
+    finish("verify", folders["whole"])
+    finish("fetch", UNITS, "--conditions", "k1", "--to", folders["part"])
+    words = ("--families", "MoveCube", "--cameras", "front", "--executions")
+    finish("fetch", UNITS, *words, "--to", folders["with"])
+    videos = {name: len([*(one / EXECUTIONS).rglob("*.mp4")]) for name, one in folders.items()}
+    assert videos == {"whole": 6, "part": 0, "with": 1}
 
 
 @pytest.mark.slow

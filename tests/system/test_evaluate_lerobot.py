@@ -9,13 +9,14 @@ pytest.importorskip("lerobot")
 pytestmark = pytest.mark.slow
 
 
-def test_a_policy_trained_on_built_demonstrations_acts(tmp_path: Path) -> None:
+def test_a_policy_trained_on_built_executions_acts(tmp_path: Path) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.policies.factory import (
         get_policy_class,
         make_policy_config,
         make_pre_post_processors,
     )
+    from lerobot.utils.feature_utils import dataset_to_policy_features
     from support.lerobot_policies import SMALL, features, play
 
     from robomme_interference_data.build_dataset.build import build_dataset
@@ -25,16 +26,19 @@ def test_a_policy_trained_on_built_demonstrations_acts(tmp_path: Path) -> None:
     from robomme_interference_data.runtime.executor import Serial
     from robomme_interference_data.runtime.progress import WorkProgress
 
-    out = tmp_path / "demonstrations"
+    out = tmp_path / "executions"
     config = BuildConfig(source=("sample:MoveCube,PatternLock",), buffer_set=out, split="test")
-    plan = plan_build("demonstrations", config)
+    plan = plan_build("executions", config)
     build_dataset(plan, out, Serial(), WorkProgress(quiet=True))
-    given = {"device": "cpu", "push_to_hub": False, "pretrained_backbone_weights": None}
-    act = make_policy_config("act", **given, **features(), **SMALL["act"])
+    options = {"device": "cpu", "push_to_hub": False, "pretrained_backbone_weights": None}
+    act = make_policy_config("act", **options, **features(), **SMALL["act"])
     steps = [step / 10 for step in act.action_delta_indices]
     dataset = LeRobotDataset(
         "local/it", root=out, delta_timestamps={ACTION: steps}, video_backend="pyav"
     )
+    inferred = dataset_to_policy_features(dataset.meta.features)
+    given = features()
+    assert inferred == given["input_features"] | given["output_features"]
     before, after = make_pre_post_processors(act, dataset_stats=dataset.meta.stats)
     model = get_policy_class("act")(act).train()
     optimizer = torch.optim.AdamW(model.parameters(), 1e-3)

@@ -61,6 +61,26 @@ def test_a_buffer_set_for_published_demonstrations(
     assert [*verify_buffer_set(buffer_set)] == []
 
 
+def test_a_buffer_set_for_demonstrations_in_a_folder(mine: str, tmp_path: Path, run: Any) -> None:
+    """The demonstrations are linked, stay unchanged, and are exported with the buffer set."""
+    base = shutil.copytree(GOLDEN / "demonstrations", tmp_path / "base/demonstrations")
+    before = {path: path.read_bytes() for path in base.rglob("*") if path.is_file()}
+    out, export = tmp_path / "own", tmp_path / "export"
+    given = ("--demonstrations", base, "--source", mine, "--workers", 1, "--conditions", "k0,k2")
+    assert run("new-buffer-set", out, *given)[0] == 0
+    assert run("new-buffer-set", out, *given)[0] == 0  # again: nothing to add
+    assert run("verify", out)[0] == 0
+    publish = ("--repo-id", "me/own", "--to", export)
+    assert run("publish", out, *publish)[0] == 0
+    local = load_buffer_set(out).load("MoveCube/test/0", "k2", verify=True)
+    exported = load_buffer_set(export).load("MoveCube/test/0", "k2", verify=True)
+    assert np.array_equal(local.frames(), exported.frames())
+    assert {path: path.read_bytes() for path in base.rglob("*") if path.is_file()} == before
+    other = shutil.copytree(base, tmp_path / "other")
+    code, _, err = run("new-buffer-set", out, *given, "--demonstrations", other)
+    assert code == 1 and "exists, and is not" in err
+
+
 def test_retrieval_on_published_demonstrations(
     hub: HubServer, mine: str, tmp_path: Path, run: Any
 ) -> None:
@@ -116,7 +136,7 @@ def test_published_demonstrations_without_an_index(
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--demonstrations", str(GOLDEN / "demonstrations")], "published"),
+        (["--demonstrations", str(GOLDEN / "distractors")], "not of distractors"),
         (["--demonstrations", "nobody/nothing"], "dataset repository 'nobody/nothing'"),
         (["--demonstrations", BASE, "--conditions", "k3"], "needs 3 distractor units"),
     ],

@@ -6,7 +6,7 @@ from itertools import combinations
 import numpy as np
 
 from robomme_interference_data.evaluate.score.outcomes import Flags, Outcomes, rate_of
-from robomme_interference_data.evaluate.systems import is_bound
+from robomme_interference_data.evaluate.systems import is_reference
 from robomme_interference_data.stats.significance import ALPHA, holm
 from robomme_interference_data.stats.signs import simultaneous
 from robomme_interference_data.viz.tables import Table
@@ -61,7 +61,7 @@ def ranked(outcomes: Outcomes) -> Iterator[tuple[str, list[str]]]:
     """Yield each condition and the systems ranked in it: complete cells, no references."""
     for place, condition in enumerate(outcomes.conditions):
         whole = zip(outcomes.systems, outcomes.complete[:, place], strict=True)
-        yield condition, [system for system, has in whole if has and not is_bound(system)]
+        yield condition, [system for system, has in whole if has and not is_reference(system)]
 
 
 def systems_of(outcomes: Outcomes) -> list[Contrast]:

@@ -8,18 +8,25 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.errors import FormatError, InterferenceError, InvalidOptionError
+from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.errors import (
+    FormatError,
+    InterferenceError,
+    InvalidOptionError,
+    counted,
+)
 from robomme_interference_data.evaluate.run.log import RunHeader
 from robomme_interference_data.evaluate.systems import name_system
-from robomme_interference_data.schema.rollouts import FINAL, Status
+from robomme_interference_data.schema.rollouts import FINAL, success_of
 from robomme_interference_data.schema.shifts import NO_SHIFT
+from robomme_interference_data.simulators.registry import RECORDINGS
 
 from .files import Part, find_sources, read_file, system_of
 from .values import DEFAULTS, Row, parse, shifted
 
 _SHOWN = 10  # bad rows that are listed; the others are counted
 
-_SUCCESS = {str(one): one == Status.SUCCESS for one in FINAL} | {str(Status.ERROR): None}
+_SUCCESS = {str(one): success_of(one) for one in FINAL}
 _EPISODE = ("simulator", "family", "split", "episode")
 _ROLLOUT = ("system", "condition", "model_seed", *_EPISODE)
 
@@ -80,7 +87,7 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
     checks.check_repeats()
     refusals = [f"{checks.locate(at)}: {reason}" for at, reason in sorted(checks.reasons.items())]
     if refusals and not lenient:
-        lines = [f"{len(refusals):,} bad row{'s' * (len(refusals) > 1)}:", *refusals[:_SHOWN]]
+        lines = [f"{counted(len(refusals), 'bad row')}:", *refusals[:_SHOWN]]
         lines += [f"… and {len(refusals) - _SHOWN:,} more"] * (len(refusals) > _SHOWN)
         raise FormatError("\n".join(lines), "Correct them, or leave them out with lenient=True.")
     rows = tuple(checks.sound.values())
@@ -132,6 +139,10 @@ class _Checks:
             if at not in wrong and row.success is not _SUCCESS[row.status]:
                 shown = "(empty)" if row.success is None else row.success
                 wrong[at] = f"success {shown} contradicts status {row.status!r}"
+            offline = row.simulator == RECORDINGS  # of any robot's families
+            if at not in wrong and row.family not in FAMILIES and not offline:
+                error = InvalidOptionError.one_of("family", row.family, FAMILIES)
+                wrong[at] = f"{error.message}. {error.hint or ''}".strip()
             if at in wrong:
                 self.reasons[number, line] = wrong[at]
             elif row.shift == NO_SHIFT:

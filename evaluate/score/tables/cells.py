@@ -17,7 +17,7 @@ from robomme_interference_data.evaluate.score.outcomes import (
     Rate,
     rate_of,
 )
-from robomme_interference_data.evaluate.systems import display_name, is_bound
+from robomme_interference_data.evaluate.systems import display_name, is_reference
 from robomme_interference_data.ids import EpisodeId, format_numbers
 from robomme_interference_data.schema.conditions import in_order
 from robomme_interference_data.schema.rollouts import Status
@@ -141,7 +141,7 @@ def _fixed(outcomes: Outcomes, system: int, condition: int, rate: Rate) -> tuple
 def _ranked(outcomes: Outcomes, cells: list[Cell], parts: Mapping[str, Flags]) -> list[Cell]:
     groups = defaultdict[tuple[str, str], list[int]](list)
     for place, cell in enumerate(cells):
-        if cell.complete and not is_bound(cell.system):
+        if cell.complete and not is_reference(cell.system):
             groups[cell.condition, cell.part].append(place)
     for (condition, part), places in groups.items():
         group = [cells[place] for place in places]
@@ -197,7 +197,7 @@ def main_grids(cells: Sequence[Cell]) -> list[Table]:
             for system in dict.fromkeys(cell.system for cell in found)
         )
         errors = sum(cell.errors for cell in found)
-        references = dict.fromkeys(display_name(c.system) for c in found if is_bound(c.system))
+        references = dict.fromkeys(display_name(c.system) for c in found if is_reference(c.system))
         notes = [] if several or not episodes else [f"n = {episodes.pop()} in each cell."]
         if not grids:  # once for all grids
             notes.append(_NOTE + _BEST * any(cell.best for cell in whole))

@@ -10,7 +10,7 @@ from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.comparisons.pairs import pair
 from robomme_interference_data.evaluate.score.comparisons.tables import corrected, provisional
 from robomme_interference_data.evaluate.score.outcomes import Outcomes, Statuses, counting, rate_of
-from robomme_interference_data.evaluate.systems import is_bound, known_system
+from robomme_interference_data.evaluate.systems import is_reference, known_system
 from robomme_interference_data.stats.strata import mantel_haenszel
 from robomme_interference_data.viz.tables import Table
 
@@ -21,7 +21,7 @@ CONTROLS = ("follow-subgoals-oracle", "oracle")
 def ceiling_of(system: str) -> str | None:
     """Return the ideal observer with a system's memory and retrieval step, if one is known."""
     known = known_system(system)
-    if known is None or known.sampling is None or known.bound:
+    if known is None or known.sampling is None or known.reference:
         return None
     step = known.step.removeprefix("extrapolate").removeprefix("-")  # not of the memory
     return f"{'retrieval-' * known.retrieval}recall-{known.sampling}{'-' * bool(step)}{step}"
@@ -137,7 +137,12 @@ def _use(cells: _Cells) -> Table:
     for outcomes, cell, levels in cells:
         kept = levels.get("all")
         system, condition = cell[1:]
-        if kept is None or is_bound(system) or system.endswith("-oracle") or not rate_of(kept).n:
+        if (
+            kept is None
+            or is_reference(system)
+            or system.endswith("-oracle")
+            or not rate_of(kept).n
+        ):
             continue
         control = control_of(outcomes, system)
         if control is None:

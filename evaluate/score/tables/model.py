@@ -13,7 +13,7 @@ from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.errors import MissingExtraError
 from robomme_interference_data.evaluate.score.comparisons.tables import corrected, provisional
 from robomme_interference_data.evaluate.score.outcomes import Outcomes, counting
-from robomme_interference_data.evaluate.systems import is_bound
+from robomme_interference_data.evaluate.systems import is_reference
 from robomme_interference_data.schema.conditions import NO_HISTORY, parse_condition
 from robomme_interference_data.stats.bootstrap import MIN_EPISODES, Floats
 from robomme_interference_data.stats.intervals import LEVEL, z_of
@@ -168,7 +168,7 @@ def _rows(outcomes: Outcomes) -> Iterator[tuple[object, ...]]:
             for name in outcomes.ran(system)
             if name == NO_HISTORY or parse_condition(name).kind.name == "k"
         ]
-        if is_bound(system) or not conditions:
+        if is_reference(system) or not conditions:
             continue
         terms, fit = _fit(outcomes, system, conditions)
         whole = all(bool(outcomes.complete[outcomes.cell(system, c)]) for c in conditions)

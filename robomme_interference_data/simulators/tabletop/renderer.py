@@ -3,9 +3,11 @@
 ManiSkill and torch are not imported, so that this check is fast.
 """
 
+import os
 import re
 import sys
 from pathlib import Path
+from tempfile import TemporaryFile
 
 import sapien
 
@@ -17,6 +19,7 @@ SHADERS = Path(__file__).parent / "shaders"
 
 def make_renderer() -> sapien.render.RenderSystem:
     """Return sapien's renderer."""
+    _check_shader_cache()
     try:
         return sapien.render.RenderSystem(sapien.Device("cpu"))
     except RuntimeError as error:
@@ -25,6 +28,17 @@ def make_renderer() -> sapien.render.RenderSystem:
             "Install a software driver: sudo make vulkan. Without the repository: libvulkan1 and "
             "mesa-vulkan-drivers 24.3 or newer (Debian 12 has it in bookworm-backports).",
         ) from error
+
+
+def _check_shader_cache() -> None:
+    """Switch Mesa's shader cache off if it cannot be written: Mesa would print that many times."""
+    try:
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        folder = Path(os.environ.get("MESA_SHADER_CACHE_DIR") or cache)
+        folder.mkdir(parents=True, exist_ok=True)
+        TemporaryFile(dir=folder).close()
+    except (OSError, RuntimeError):  # RuntimeError: there is no home directory
+        os.environ.setdefault("MESA_SHADER_CACHE_DISABLE", "true")
 
 
 def main() -> None:

@@ -1,0 +1,113 @@
+"""How many items a processor second gives for training, and how flat memory stays.
+
+An item has 32 frames of the front camera, sampled evenly from a k7 buffer and the first live view.
+HistoryDataset is compared with a copy of as many bytes, with Buffer.stream of the same frames, and
+with LeRobotDataset, whose delta_timestamps take 32 frames from one episode, the lesson.
+"""
+
+import argparse
+import gc
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from common import add_buffer_set, demo_buffers, machine, megabytes, peak_memory, positive, table
+
+from robomme_interference_data import load_buffer_set
+from robomme_interference_data.constants import DEMONSTRATIONS, FPS, FRONT
+from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.schema.sampling import Memory
+from robomme_interference_data.training import HistoryDataset
+
+MEMORY = Memory("framesamp", 32)
+
+
+def items_per_second(
+    ways: dict[str, tuple[int, Callable[[int], object]]], rounds: int
+) -> dict[str, float]:
+    """Return each way's items per processor second: the median of rounds, taken in turn."""
+    rates: dict[str, list[float]] = {name: [] for name in ways}
+    for number in range(rounds + 1):
+        for name, (count, make) in ways.items():
+            gc.collect()
+            began = time.process_time()
+            for item in range(count):
+                make(item)
+            if number:
+                rates[name].append(count / (time.process_time() - began))
+    return {name: statistics.median(values) for name, values in rates.items()}
+
+
+def main() -> None:
+    """Measure, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    add_buffer_set(parser)
+    parser.add_argument("--image-size", type=positive, default=96)
+    parser.add_argument("--rounds", type=positive, default=3)
+    args = parser.parse_args()
+    root = args.buffer_set or demo_buffers()
+    with tempfile.TemporaryDirectory() as store:
+        buffer_set = load_buffer_set(root)
+        options = {"chunk": 0, "store": store, "quiet": True}
+        data = HistoryDataset(buffer_set, ["k7"], image_size=args.image_size, **options)
+        large = HistoryDataset(buffer_set, ["k7"], **options)
+        count = len(data)
+        buffers = [buffer_set.load(episode, "k7") for episode in data.episode_ids]
+        kept = [list(MEMORY.earlier(len(buffer))) for buffer in buffers]
+
+        def copying(size: int) -> Callable[[int], object]:
+            # Larger than any cache, as the store is.
+            pool = np.ones((1000, 3, size, size), np.uint8)
+            rows = np.random.default_rng(0).integers(0, len(pool), (500, 32))
+            return lambda number: pool.take(rows[number], axis=0)
+
+        def stream(number: int) -> object:
+            return list(buffers[number].stream(64, ["front"], kept[number]))
+
+        side = buffer_set.datasets[DEMONSTRATIONS].shape("front")[0]
+        ways: dict[str, tuple[int, Callable[[int], object]]] = {
+            f"HistoryDataset, {args.image_size} px": (500, lambda n: data[n % count]),
+            f"copy of as many bytes, {args.image_size} px": (500, copying(args.image_size)),
+            f"HistoryDataset, {side} px": (100, lambda n: large[n % count]),
+            f"copy of as many bytes, {side} px": (100, copying(side)),
+            f"Buffer.stream(indices=…), {side} px": (min(4, count), stream),
+            f"LeRobotDataset, delta_timestamps, {side} px": (4, lerobot(Path(root))),
+        }
+        rates = items_per_second(ways, args.rounds)
+        before = peak_memory()
+        for number in range(4 * count):
+            data[number % count]
+        grown = peak_memory() - before
+    base = rates[f"HistoryDataset, {args.image_size} px"]
+    rows = [[name, f"{rate:,.1f}", f"{base / rate:,.1f}"] for name, rate in rates.items()]
+    title = f"Items of 32 frames, one process, {machine('numpy', 'torch', 'lerobot')}:"
+    print(
+        table(title, ("<way", ">items per processor second", ">HistoryDataset is faster by"), rows)
+    )
+    print(f"\nFour more epochs add {megabytes(grown)} MB to the peak memory.")
+
+
+def lerobot(root: Path) -> Callable[[int], object]:
+    """Return how LeRobot gives 32 frames of a lesson, evenly spread, as one item."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    folder = root / DEMONSTRATIONS
+    plain = LeRobotDataset("local/it", root=folder, video_backend="pyav")
+    length = int(plain.meta.episodes[0]["length"])
+    steps = sorted({step * (length - 1) // 31 for step in range(32)})
+    offsets = {FRONT: [(step - length + 1) / FPS for step in steps]}
+    dataset = LeRobotDataset(
+        "local/it", root=folder, delta_timestamps=offsets, video_backend="pyav"
+    )
+    return lambda number: dataset[length - 1]
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except InterferenceError as error:
+        sys.exit(f"error: {error}")

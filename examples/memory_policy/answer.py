@@ -1,0 +1,116 @@
+"""Let a trained model answer the questions of a buffer set: rows that `score` and `compare` read.
+
+    python examples/memory_policy/answer.py runs/k0 my-buffers --system learned-k0 --out k0.csv
+
+Memory, cameras and image size are those of the training; conditions and retrieval may differ.
+"""
+
+import argparse
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+from memory_model import MemoryModel, load_checkpoint
+from torch.utils.data import DataLoader
+
+from robomme_interference_data import EpisodeId, Rollout, load_buffer_set
+from robomme_interference_data.constants import PROTOCOL_VERSION
+from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.schema.codec import to_dict
+from robomme_interference_data.training import HistoryDataset
+
+
+def arguments() -> argparse.Namespace:
+    """Parse the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("checkpoint", type=Path, help="folder of a run of train.py --task answer")
+    add("buffer_set", help="folder, or namespace/name on the Hub, with questions")
+    add("--out", type=Path, required=True, help="CSV file to write")
+    add("--system", required=True, help="label of the rows, such as learned-k0")
+    add("--conditions", nargs="+", help="default: all that are planned")
+    add("--retrieval", help="encoder of a retrieval step before the memory, such as thumbnail")
+    add("--seed", type=int, default=0, help="seed of the training, for the column model_seed")
+    add("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    return parser.parse_args()
+
+
+def main() -> None:
+    """Answer, and write the rows."""
+    args = arguments()
+    model = load_checkpoint(args.checkpoint, args.device)
+    if model.config.task != "answer":
+        raise SystemExit(f"{args.checkpoint} was trained to act; expected --task answer")
+    with args.out.open("w", newline="") as file:
+        writer = None
+        for row in rows(model, args):
+            values = to_dict(row)
+            if writer is None:
+                writer = csv.DictWriter(file, values)
+                writer.writeheader()
+            writer.writerow(values)
+
+
+def rows(model: MemoryModel, args: argparse.Namespace) -> Iterator[Rollout]:
+    """Yield a row for each query episode under each condition."""
+    config, buffer_set = model.config, load_buffer_set(args.buffer_set)
+    for condition in args.conditions or buffer_set.conditions:
+        data = HistoryDataset(
+            buffer_set,
+            [condition],
+            memory=config.memory,
+            cameras=config.cameras,
+            image_size=config.image_size,
+            chunk=0,
+            questions=True,
+            retrieval=args.retrieval if condition != "no-history" else None,
+            quiet=True,
+        )
+        right = 0
+        for batch in DataLoader(data, 32):
+            on_device = {
+                name: value.to(args.device) if isinstance(value, torch.Tensor) else value
+                for name, value in batch.items()
+            }
+            with torch.inference_mode():
+                chosen = model(on_device).argmax(1).tolist()
+            for number, option in enumerate(chosen):
+                episode = EpisodeId.parse(batch["episode_id"][number])
+                record = buffer_set.query(episode).record
+                success = option == int(batch["question.answer"][number])
+                right += success
+                yield Rollout(
+                    system=args.system,
+                    simulator="questions",
+                    buffer_set=buffer_set.name,
+                    revision=buffer_set.revision,
+                    family=episode.family,
+                    condition=condition,
+                    split=episode.split,
+                    episode=episode.index,
+                    shift="none",
+                    model_seed=args.seed,
+                    protocol_version=PROTOCOL_VERSION,
+                    seed=record.seed,
+                    difficulty=record.difficulty,
+                    goal=record.goal,
+                    status="success" if success else "fail",
+                    success=success,
+                    steps=0,
+                    history_frames=int(batch["position"][number]),
+                    lesson_frames=0,
+                    lesson_share=None,
+                    answer="ABCDEFGH"[option],
+                    chance=1 / int((~batch["question.option_is_pad"][number]).sum()),
+                )
+        print(f"{args.system}, {condition}: {right} of {len(data)} right")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except InterferenceError as error:
+        raise SystemExit(f"error: {error}") from None

@@ -1,0 +1,189 @@
+"""A small memory policy in plain PyTorch: it answers questions about the past, or acts.
+
+Each frame in memory becomes a token: what the picture shows as a whole and at the points of an
+option, the robot's state, and how long ago it was. A transformer (or a recurrent network) reads
+the tokens and ends in a score for each option, or in a chunk of actions.
+"""
+
+import json
+import zlib
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+from torch.nn import functional
+
+WORDS = 1024  # buckets for hashed words
+CHANNELS = 16  # of a frame's feature map
+
+
+@dataclass(frozen=True)
+class Config:
+    """What a checkpoint depends on; `data` is the revision of the buffer set it was trained on."""
+
+    task: str  # "answer" or "act"
+    data: str
+    memory: str
+    cameras: tuple[str, ...]
+    image_size: int
+    points: int = 1  # most points of an option
+    state: int = 8
+    action: int = 8
+    chunk: int = 16
+    width: int = 96
+    layers: int = 2
+    trunk: str = "transformer"
+    pictures: bool = True  # False: the control that sees positions and lengths only
+
+    def __post_init__(self) -> None:
+        if self.image_size % 4:
+            raise ValueError(f"image_size {self.image_size}; expected a multiple of 4, the patch")
+
+
+class FrameEncoder(nn.Module):
+    """A patch encoder: patches of 4 × 4 pixels, then a convolution over neighbors."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.patches = nn.Sequential(
+            nn.Conv2d(3, CHANNELS, 4, stride=4),
+            nn.GELU(),
+            nn.Conv2d(CHANNELS, CHANNELS, 3, padding=1),
+        )
+        self.whole = nn.Sequential(
+            nn.GELU(), nn.AdaptiveAvgPool2d(4), nn.Flatten(), nn.Linear(16 * CHANNELS, width)
+        )
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Return maps `(N, CHANNELS, h, w)` and vectors `(N, width)` of `(N, 3, S, S) uint8`."""
+        maps = self.patches(images.float() / 127.5 - 1)
+        return maps, self.whole(maps)
+
+
+class MemoryModel(nn.Module):
+    """See the module; its input is a batch of `HistoryDataset` items."""
+
+    def __init__(self, config: Config):
+        super().__init__()
+        self.config, width = config, config.width
+        self.encoders = nn.ModuleList(FrameEncoder(width) for _ in config.cameras)
+        self.state = nn.Linear(config.state, width)
+        # At each point of an option: what the first camera shows there, and where it is.
+        self.at_points = nn.Linear((CHANNELS + 2) * config.points, width)
+        self.mix = nn.Sequential(nn.GELU(), nn.Linear(width, width), nn.GELU())
+        self.mixed = nn.Linear(width, width)
+        self.words = nn.EmbeddingBag(WORDS, width, mode="mean", padding_idx=0)
+        self.time = nn.Linear(18, width)
+        if config.trunk == "gru":
+            self.trunk: nn.Module = nn.GRU(width, width, config.layers, batch_first=True)
+        else:
+            layer = nn.TransformerEncoderLayer(
+                width, 4, 2 * width, 0.1, "gelu", batch_first=True, norm_first=True
+            )
+            self.trunk = nn.TransformerEncoder(layer, config.layers, enable_nested_tensor=False)
+        outputs = 1 if config.task == "answer" else config.chunk * config.action
+        self.head = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, outputs))
+
+    def forward(self, batch: dict[str, Any]) -> Tensor:
+        """Return scores of the options, `(B, O)`, or actions, `(B, chunk, D)`."""
+        tokens, maps = self._frames(batch)
+        is_pad = functional.pad(batch["memory.is_pad"], (0, 1))  # the current frame is the last
+        time = self._time(batch) + self._text(batch["task"])[:, None]
+        if self.config.task == "act":
+            read = self._read(self.mixed(self.mix(tokens)) + time, is_pad)
+            change = self.head(read).unflatten(1, (self.config.chunk, -1))
+            # Joint targets near the current joints, and the gripper's command.
+            return functional.pad(batch["observation.state"][:, None, :-1], (0, 1)) + change
+        batch_size, options = batch["question.option_is_pad"].shape
+        # The loader turns B lists of O texts into O lists of B.
+        words = [text for texts in zip(*batch["question.options"], strict=True) for text in texts]
+        text = self._text(words).unflatten(0, (batch_size, options))[:, :, None]
+        seen = tokens[:, None] + self._at_points(batch, maps) + text
+        read = self._read(
+            (self.mixed(self.mix(seen)) + time[:, None] + text).flatten(0, 1),
+            is_pad.repeat_interleave(options, 0),
+        )
+        scores = self.head(read).view(batch_size, options)
+        return scores.masked_fill(batch["question.option_is_pad"], -torch.inf)
+
+    def _frames(self, batch: dict[str, Any]) -> tuple[Tensor, Tensor]:
+        """Return a token per frame, `(B, M + 1, width)`, and maps of the first camera."""
+        tokens: Tensor = self.state(_with_current(batch, "state"))
+        size = self.config.image_size // 4
+        maps = tokens.new_zeros(len(tokens), tokens.shape[1], CHANNELS, size, size)
+        if not self.config.pictures:
+            return torch.zeros_like(tokens), maps
+        for number, (encoder, camera) in enumerate(
+            zip(self.encoders, self.config.cameras, strict=True)
+        ):
+            images = _with_current(batch, f"images.{camera}")
+            seen, whole = encoder(images.flatten(0, 1))
+            tokens = tokens + whole.view_as(tokens)
+            if number == 0:
+                maps = seen.unflatten(0, images.shape[:2])
+        return tokens, maps
+
+    def _at_points(self, batch: dict[str, Any], maps: Tensor) -> Tensor:
+        """Return what each frame shows at the points of each option, `(B, O, M + 1, width)`."""
+        points, is_pad = batch["question.points"], batch["question.point_is_pad"]
+        (count, frames), (options, places) = maps.shape[:2], points.shape[1:3]
+        grid = (2 * points.flip(-1) - 1).view(count, 1, 1, options * places, 2)
+        grid = grid.expand(-1, frames, -1, -1, -1).flatten(0, 1)
+        sampled = functional.grid_sample(maps.flatten(0, 1), grid, align_corners=False)
+        sampled = sampled.view(count, frames, CHANNELS, options, places).permute(0, 3, 1, 4, 2)
+        where = points[:, :, None].expand(-1, -1, frames, -1, -1)
+        seen = torch.cat([sampled, where], -1).masked_fill(is_pad[:, :, None, :, None], 0)
+        at_points: Tensor = self.at_points(seen.flatten(3))
+        return at_points
+
+    def _time(self, batch: dict[str, Any]) -> Tensor:
+        """Return how old each frame is and how far from the beginning, `(B, M + 1, width)`."""
+        live = batch["position"][:, None]
+        positions = torch.cat([batch["memory.position"], live], 1)
+        far = torch.log1p(torch.stack([live - positions, positions], -1).float())
+        waves = [wave(far * 2.0**power) for wave in (torch.sin, torch.cos) for power in range(4)]
+        time: Tensor = self.time(torch.cat([far, *waves], -1))
+        return time
+
+    def _text(self, texts: list[str]) -> Tensor:
+        """Return the mean of the embeddings of hashed words, `(N, width)`."""
+        hashed = [[1 + zlib.crc32(w.encode()) % (WORDS - 1) for w in t.split()] for t in texts]
+        longest = max(1, *map(len, hashed))
+        padded = [one + [0] * (longest - len(one)) for one in hashed]
+        text: Tensor = self.words(torch.tensor(padded, device=self.words.weight.device))
+        return text
+
+    def _read(self, tokens: Tensor, is_pad: Tensor) -> Tensor:
+        """Return what the trunk has read at the current frame, `(N, width)`."""
+        if self.config.trunk == "transformer":
+            return self.trunk(tokens, src_key_padding_mask=is_pad)[:, -1]  # type: ignore[no-any-return]
+        # A recurrent network needs the padding at the beginning.
+        order = torch.arange(tokens.shape[1], device=tokens.device) - is_pad.sum(1, keepdim=True)
+        order[:, -1] = tokens.shape[1] - 1
+        moved = tokens.gather(1, order.clamp(0)[..., None].expand_as(tokens))
+        return self.trunk(moved * (order >= 0)[..., None])[0][:, -1]  # type: ignore[no-any-return]
+
+
+def _with_current(batch: dict[str, Any], name: str) -> Tensor:
+    """Return a feature of the frames in memory and of the current one, `(B, M + 1, …)`."""
+    return torch.cat([batch[f"memory.{name}"], batch[f"observation.{name}"][:, None]], 1)
+
+
+def save_checkpoint(model: MemoryModel, folder: Path) -> None:
+    """Write `model.safetensors` and `config.json`."""
+    save_file(model.state_dict(), folder / "model.safetensors")
+    (folder / "config.json").write_text(json.dumps(asdict(model.config), indent=2) + "\n")
+
+
+def load_checkpoint(folder: Path, device: str = "cpu") -> MemoryModel:
+    """Read what `save_checkpoint` wrote."""
+    try:
+        values = json.loads((folder / "config.json").read_text())
+        model = MemoryModel(Config(**values | {"cameras": tuple(values["cameras"])}))
+        model.load_state_dict(load_file(folder / "model.safetensors"))
+    except FileNotFoundError as error:
+        raise SystemExit(f"{folder} is not a checkpoint: {error.filename} is missing") from None
+    return model.to(device).eval()

@@ -1,0 +1,99 @@
+"""The trained policy in rollouts: `evaluate --policy python:memory_policy:MemoryPolicy`.
+
+PYTHONPATH=examples/memory_policy robomme-interference evaluate my-buffers \
+      --policy python:memory_policy:MemoryPolicy --policy-option checkpoint=runs/acts \
+      --system learned --out results/learned
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from memory_model import load_checkpoint
+from numpy.typing import NDArray
+
+from robomme_interference_data.evaluate import Observation, Policy, RolloutInfo
+from robomme_interference_data.storage.files import sha256_file
+from robomme_interference_data.training import Memory, resize
+
+
+class MemoryPolicy(Policy):
+    """Keeps all frames in small, and acts on those that its memory rule selects.
+
+    Args:
+        checkpoint: Folder of a run of `train.py --task act`.
+        device: Device to compute on; None for a GPU if there is one.
+    """
+
+    every_frame = True  # in training, memory has every live frame
+
+    def __init__(self, checkpoint: str, device: str | None = None):
+        self._folder = Path(checkpoint)
+        self._device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+        self._model = load_checkpoint(self._folder, self._device)
+        self.config = self._model.config
+        if self.config.task != "act":
+            raise ValueError(f"{checkpoint} was trained to answer; expected --task act")
+        self.cameras = self.history_cameras = self.config.cameras
+        self._memory = Memory.parse(self.config.memory)
+
+    def reset(self, info: RolloutInfo) -> None:
+        """Clear the memory."""
+        self._frames: dict[str, list[NDArray[Any]]] = {name: [] for name in self.cameras}
+        self._states: list[NDArray[Any]] = []
+
+    def add_history(
+        self,
+        frames: Mapping[str, NDArray[np.uint8]],
+        states: NDArray[np.float32],
+        exec_start_idx: int,
+    ) -> None:
+        """Store frames; the memory rule selects from them when the policy acts."""
+        self.observe(frames, states)
+
+    def observe(self, frames: Mapping[str, NDArray[np.uint8]], states: NDArray[np.float32]) -> None:
+        """Store live frames, which are history of later ones."""
+        for name in self.cameras:
+            self._frames[name].extend(resize(frames[name], self.config.image_size))
+        self._states.extend(np.array(states))
+
+    def batch(self, goal: str) -> dict[str, Any]:
+        """Return a batch of one: what `HistoryDataset` gives at this moment of an execution."""
+        live = len(self._states) - 1
+        kept = list(self._memory.earlier(live))
+        places = len(kept) if self._memory.rule == "full" else self._memory.frames - 1
+
+        def earlier(values: list[NDArray[Any]]) -> torch.Tensor:
+            padded = np.zeros((1, places, *values[0].shape), values[0].dtype)
+            for place, frame in enumerate(kept):
+                padded[0, place] = values[frame]
+            return torch.from_numpy(padded)
+
+        batch: dict[str, Any] = {"task": [goal], "position": torch.tensor([live])}
+        for name, values in (
+            ("state", self._states),
+            *((f"images.{camera}", self._frames[camera]) for camera in self.cameras),
+        ):
+            batch[f"observation.{name}"] = torch.from_numpy(values[live][None])
+            batch[f"memory.{name}"] = earlier(values)
+        batch["memory.position"] = torch.tensor([[*kept, *[0] * (places - len(kept))]])
+        batch["memory.is_pad"] = torch.arange(places)[None] >= len(kept)
+        return batch
+
+    def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
+        """Return the next chunk of actions, `(chunk, 8) float32`."""
+        batch = {
+            name: value.to(self._device) if isinstance(value, torch.Tensor) else value
+            for name, value in self.batch(goal).items()
+        }
+        with torch.inference_mode():
+            actions: NDArray[np.float32] = self._model(batch)[0].cpu().numpy()
+        actions[:, -1] = np.sign(actions[:, -1])
+        return actions
+
+    def metadata(self) -> dict[str, Any]:
+        """Return what identifies the policy."""
+        weights = sha256_file(self._folder / "model.safetensors")
+        return {"policy": "memory_policy", "weights_sha256": weights, **vars(self.config)}

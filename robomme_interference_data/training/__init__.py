@@ -1,0 +1,29 @@
+"""Train on history buffers: a map-style PyTorch dataset, whose items are what a rollout gives.
+
+```python
+from robomme_interference_data.training import HistoryDataset
+
+data = HistoryDataset("my-buffers", conditions={"k0": 1, "k7": 1}, memory="framesamp:32")
+```
+"""
+
+from typing import TYPE_CHECKING
+
+from robomme_interference_data.lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from robomme_interference_data.schema.sampling import Memory
+
+    from .history_dataset import HistoryDataset
+    from .images import resize
+
+__all__ = ["HistoryDataset", "Memory", "resize"]
+
+__getattr__ = lazy_exports(
+    __name__,
+    {
+        ".history_dataset": "HistoryDataset",
+        ".images": "resize",
+        "robomme_interference_data.schema.sampling": "Memory",
+    },
+)

@@ -1,0 +1,198 @@
+"""Which stored frames the history of each query holds under each condition.
+
+A *row* is a frame of any dataset of the buffer set: rows of the datasets follow one another.
+"""
+
+import hashlib
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.data.buffer import Buffer
+from robomme_interference_data.data.buffer_set import BufferSet
+from robomme_interference_data.data.dataset import Dataset
+from robomme_interference_data.data.query_sessions import QuerySessions, SessionSource
+from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.retrieval.selector import select_stored
+from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.schema.conditions import parse_condition
+from robomme_interference_data.schema.evidence import among
+from robomme_interference_data.schema.shifts import Shift
+
+from .frame_store import first_rows, stored_values
+
+
+@dataclass(frozen=True)
+class Retrieval:
+    """A retrieval step in front of the memory; see `retrieval.selector.select_stored`."""
+
+    encoder: str
+    rule: str = "max"
+    camera: str = "front"
+
+
+@dataclass(frozen=True)
+class History:
+    """The history of a query that a memory gets, which a retrieval step may have shortened.
+
+    Attributes:
+        rows: The rows of its frames in order, `(T,) int64`.
+        evidence: Spans of `rows` that show a part of the answer: start, stop (excluded) and number
+            of the part; None if unknown.
+    """
+
+    rows: NDArray[np.int64]
+    evidence: tuple[tuple[int, int, int], ...] | None
+
+
+_Piece = tuple[int, NDArray[np.int64], int, int]
+"""Number of a dataset, rows in it, and their start and stop (excluded) among all rows."""
+
+
+class Rows:
+    """The stored values of several datasets, by row."""
+
+    def __init__(self, datasets: Mapping[str, Dataset]):
+        self._datasets = dict(datasets)
+        self._first: dict[str, NDArray[np.int64]] = {}
+        starts, total = [], 0
+        for name, dataset in self._datasets.items():
+            self._first[name] = total + first_rows(dataset)
+            starts.append(total)
+            total = int(self._first[name][-1])
+        self._starts = np.array(starts)
+        self._values: dict[str, list[NDArray[Any] | None]] = {}
+
+    def first(self, dataset: str, episode: int) -> int:
+        """Return the row of an episode's first frame."""
+        return int(self._first[dataset][episode])
+
+    def load(
+        self,
+        feature: str,
+        folder: Path,
+        size: int | None,
+        progress: WorkProgress,
+        names: Collection[str] | None = None,
+    ) -> None:
+        """Open a feature of all datasets, or of those with these names; see `stored_values`."""
+        self._values[feature] = [
+            np.asarray(stored_values(dataset, feature, folder, size, progress))
+            if names is None or name in names
+            else None
+            for name, dataset in self._datasets.items()
+        ]
+
+    def pieces(self, rows: NDArray[np.int64]) -> "list[_Piece]":
+        """Return where rows are stored: the runs of rows of the same dataset."""
+        owner = self._starts.searchsorted(rows, "right") - 1
+        bounds = [0, *((owner[1:] != owner[:-1]).nonzero()[0] + 1).tolist(), len(rows)]
+        return [
+            (number := int(owner[start]), rows[start:stop] - self._starts[number], start, stop)
+            for start, stop in pairwise(bounds)
+            if start < stop
+        ]
+
+    def take(self, feature: str, pieces: "list[_Piece]", out: NDArray[Any]) -> None:
+        """Copy the values of rows, in pieces, into `out`, `(len(rows), …)`."""
+        arrays = self._values[feature]
+        for number, local, start, stop in pieces:
+            values = arrays[number]
+            assert values is not None
+            # The mode lets numpy write into `out` without a copy in between.
+            values.take(local, axis=0, out=out[start:stop], mode="clip")
+
+    def shape(self, feature: str) -> tuple[int, ...]:
+        """Return the shape of a value."""
+        return next(one.shape[1:] for one in self._values[feature] if one is not None)
+
+
+class Histories:
+    """The histories of queries: the planned ones, or with units drawn anew.
+
+    Args:
+        buffer_set: The buffer set.
+        rows: The rows of its datasets.
+        retrieval: A retrieval step, or None.
+    """
+
+    def __init__(self, buffer_set: BufferSet, rows: Rows, retrieval: Retrieval | None):
+        self._set, self._rows, self._retrieval = buffer_set, rows, retrieval
+
+    def planned(
+        self, conditions: Sequence[str], episodes: Collection[EpisodeId], shift: Shift | None
+    ) -> Iterator[tuple[tuple[EpisodeId, str], History]]:
+        """Yield the planned histories of episodes, with their episode and condition."""
+        for buffer in self._set.buffers(condition=conditions):
+            if buffer.episode_id in episodes:
+                yield (buffer.episode_id, buffer.condition), self._history(buffer, shift)
+
+    def draw(
+        self, source: SessionSource, episode: EpisodeId, condition: str, shift: Shift | None
+    ) -> History:
+        """Return the history of a query with sessions of another source than the manifests."""
+        query = self._set.query(episode)
+        manifest = QuerySessions(source, query.record).buffer(parse_condition(condition))
+        return self._history(Buffer(manifest, query, self._set.datasets), shift)
+
+    def _history(self, buffer: Buffer, shift: Shift | None) -> History:
+        parts: list[NDArray[np.int64]] = [np.empty(0, np.int64)]
+        for entry in buffer.manifest.sessions:
+            first = self._rows.first(entry.dataset, entry.episode_index)
+            parts.append(
+                np.repeat(np.arange(first + entry.start, first + entry.stop), entry.repeat)
+            )
+        rows, evidence = np.concatenate(parts), buffer.evidence
+        if self._retrieval is not None and len(rows):
+            step = self._retrieval
+            chosen = select_stored(
+                self._set, buffer, step.encoder, rule=step.rule, camera=step.camera, shift=shift
+            )
+            rows = rows[chosen]
+            evidence = evidence if evidence is None else among(evidence, chosen.tolist())
+        if evidence is None:
+            return History(rows, None)
+        shown = (one for one in evidence if one.session.role != "contradiction")
+        return History(rows, tuple((one.start, one.stop, one.span.part) for one in shown))
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Names with the probabilities with which they are drawn."""
+
+    names: tuple[str, ...]
+    cumulative: tuple[float, ...]
+
+    @classmethod
+    def parse(cls, option: str, given: Mapping[str, float] | Sequence[str] | str) -> "Weights":
+        """Read weights by name, or names with equal weights."""
+        if isinstance(given, str):
+            given = (given,)
+        weights = dict(given) if isinstance(given, Mapping) else dict.fromkeys(given, 1.0)
+        numbers = [one for one in weights.values() if isinstance(one, int | float)]
+        if len(numbers) < len(weights) or not all(0 < one < math.inf for one in numbers):
+            expected = "a positive weight for each name, such as {'k0': 1, 'k7': 2}"
+            raise InvalidOptionError.expected(option, given, expected)
+        if not weights:
+            raise InvalidOptionError.expected(option, given, "at least one name")
+        sums = np.cumsum(numbers) / sum(numbers)
+        return cls(tuple(weights), tuple(sums.tolist()))
+
+    def draw(self, *key: int | str) -> str:
+        """Return the name that a key draws, the same on every machine."""
+        lot = (number_from(*key) >> 11) / 2**53
+        numbers = (n for n, stop in enumerate(self.cumulative) if lot < stop)
+        return self.names[next(numbers, len(self.names) - 1)]
+
+
+def number_from(*key: int | str) -> int:
+    """Return an integer of 64 bits that follows from a key, evenly distributed."""
+    text = "\n".join(map(str, key))
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest())

@@ -1,0 +1,334 @@
+"""A map-style PyTorch dataset of moments in executions, each with the memory of its history."""
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, EXECUTIONS, SHIFTED, STATE
+from robomme_interference_data.data.buffer_set import BufferSet
+from robomme_interference_data.data.dataset import camera_feature
+from robomme_interference_data.data.loading import load_buffer_set
+from robomme_interference_data.data.query_sessions import SessionSource
+from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.ids import EpisodeId, parse_numbers, whole_number
+from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.schema.sampling import Memory
+from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFTS, parse_shift
+from robomme_interference_data.storage.cache import default_cache_folder
+
+from .histories import Histories, History, Retrieval, Rows, Weights, number_from
+from .moments import check_size, choose_moments, needed_datasets
+from .question_tensors import QuestionTensors
+
+_Key = tuple[EpisodeId, str, str]
+"""Query episode, condition and shift."""
+
+
+class HistoryDataset(torch.utils.data.Dataset[dict[str, Any]]):
+    """Moments of executions, with the memory that a policy has at that step of a rollout.
+
+    Item `i` is moment t of an execution, the part of an episode after its lesson. Its history is
+    the buffer of the episode under a condition that is drawn from `conditions`; its memory is what
+    the rule `memory` keeps of the history and the live frames before t. Everything that is drawn
+    follows from `seed`, the epoch and the index: items are the same for any number of workers and
+    ranks, in any order. Frames come from a store of decoded frames, which the first use fills.
+
+    An item has, with M memory frames, S the image size and P the most parts of an answer:
+
+    - `observation.images.<camera>`: `(3, S, S) uint8` RGB, the current frame;
+    - `observation.state`: `(D,) float32`: 7 joint positions in rad, opening of a finger in m;
+    - `memory.images.<camera>`: `(M, 3, S, S) uint8`, the frames in memory, oldest first;
+    - `memory.state`: `(M, D) float32`;
+    - `memory.position`: `(M,) int64`, index of each frame in history and execution together;
+    - `memory.is_pad`: `(M,) bool`, True for the places after the last frame, which are 0;
+    - `memory.evidence`: `(M, P) bool`, which parts of the hidden answer each frame shows; and
+      `evidence_known`: `() bool`, False where that is unknown;
+    - `position`: `() int64`, index of the current frame in history and execution together;
+    - `action`: `(chunk, D) float32`, the actions executed from the current frame on, and
+      `action_is_pad`: `(chunk,) bool`, True after the last one, which is repeated;
+    - with `questions`, for O options with at most P points: `question` and
+      `question.options` (O texts, `""` where only the points show it), `question.points`:
+      `(O, P, 2) float32`, (y, x) as fractions of the front image's height and width,
+      `question.point_is_pad`: `(O, P) bool`, `question.option_is_pad`: `(O,) bool`, and
+      `question.answer`: `() int64`, the index of the right option;
+    - `task`: the goal; `condition`, `shift`, `episode_id`: text;
+    - `frame_index`: `() int64`, t; `index`: `() int64`, the item's index.
+
+    Args:
+        buffer_set: Folder, `namespace/name` on the Hub, or a `BufferSet`.
+        conditions: Names of conditions with the weights to draw them, or names with equal weights.
+        memory: `framesamp:N`, `window:N` or `full`; N counts the current frame. See `Memory`.
+        cameras: Cameras of current and memory frames; may be empty.
+        image_size: Side of the images in pixels, see `resize`; None for no change of size.
+        chunk: Actions per item. If 0, items have no actions and there is one per episode: the
+            first live moment. Then the buffer set needs no executions.
+        families: Families to use; empty for all.
+        episodes: Indices of the query episodes to use, such as `0-79`; None for all.
+        retrieval: Encoder of a retrieval step before the memory, such as `thumbnail`; its index
+            must be stored. `retrieval_rule` and `retrieval_camera` are those of `evaluate`.
+        shifts: Shifts of the first live view, with weights; needs the dataset `shifted` and
+            `chunk=0`, since only first views are stored.
+        questions: Whether items have the question about the past, see `build questions`.
+        redraw: Draw the sessions of the conditions anew in every epoch, instead of the planned
+            ones. Then conditions need not be planned.
+        unit_episodes: With `redraw`, indices of the train episodes whose units may be drawn, such
+            as `0-5`, so that others can be kept for testing; None for all.
+        seed: Seed of everything that is drawn.
+        store: Folder of the decoded frames; None for `~/.cache/robomme-interference/frames`.
+        quiet: Show no progress.
+
+    Raises:
+        MissingFileError: The buffer set, a dataset that is needed (executions, shifted, a
+            condition's), or an index is missing.
+        UnknownNameError: A condition is not planned; there is no such camera, family or rule.
+        InvalidOptionError: Another argument has an invalid value.
+        HashMismatchError: Frames differ from the recorded ones.
+    """
+
+    def __init__(
+        self,
+        buffer_set: "str | os.PathLike[str] | BufferSet",
+        conditions: Mapping[str, float] | Sequence[str],
+        *,
+        memory: str = "framesamp:32",
+        cameras: Sequence[str] = ("front",),
+        image_size: int | None = None,
+        chunk: int = 16,
+        families: Sequence[str] = (),
+        episodes: str | None = None,
+        retrieval: str | None = None,
+        retrieval_rule: str = "max",
+        retrieval_camera: str = "front",
+        shifts: Mapping[str, float] | None = None,
+        questions: bool = False,
+        redraw: bool = False,
+        unit_episodes: str | None = None,
+        seed: int = 0,
+        store: str | os.PathLike[str] | None = None,
+        quiet: bool = False,
+    ):
+        opened = isinstance(buffer_set, BufferSet)
+        self.buffer_set: BufferSet = buffer_set if opened else load_buffer_set(buffer_set)  # type: ignore[assignment,arg-type]
+        self._arguments = {
+            **{
+                "conditions": conditions,
+                "memory": memory,
+                "cameras": tuple(cameras),
+                "image_size": image_size,
+            },
+            **{"chunk": chunk, "families": tuple(families), "episodes": episodes},
+            **{"retrieval": retrieval, "retrieval_rule": retrieval_rule},
+            **{"retrieval_camera": retrieval_camera, "shifts": shifts, "questions": questions},
+            **{"redraw": redraw, "unit_episodes": unit_episodes, "seed": seed, "store": store},
+        }
+        self.memory, self.seed = Memory.parse(memory), seed
+        self.chunk = whole_number("chunk", chunk, "an integer from 0, such as 16")
+        self.cameras = tuple(camera_feature(one) for one in cameras)
+        self._conditions = Weights.parse("conditions", conditions)
+        self._shifts = Weights.parse("shifts", shifts or {NO_SHIFT: 1})
+        self._redraw, shifted = redraw, self._shifts.names != (NO_SHIFT,)
+        self._units = None if unit_episodes is None else frozenset(parse_numbers(unit_episodes))
+        self._check(unit_episodes, shifted=shifted)
+        datasets = needed_datasets(
+            self.buffer_set,
+            self._conditions.names,
+            actions=self.chunk > 0,
+            shifts=shifted,
+            planned=not redraw,
+        )
+        size = check_size(self.buffer_set, self.cameras, image_size)
+        self._rows, actions = Rows(datasets), self.chunk > 0
+        self._moments = choose_moments(
+            self.buffer_set, self._rows, families, episodes, actions=actions
+        )
+        step = Retrieval(retrieval, retrieval_rule, retrieval_camera) if retrieval else None
+        self._histories = Histories(self.buffer_set, self._rows, step)
+        self._questions = QuestionTensors(self.buffer_set) if questions else None
+        folder = default_cache_folder().parent / "frames" if store is None else Path(store)
+        with WorkProgress(unit="episodes", quiet=quiet) as progress:
+            for camera in self.cameras:
+                self._rows.load(camera, folder, size, progress)
+            self._rows.load(STATE, folder, None, progress)
+            if actions:
+                self._rows.load(ACTION, folder, None, progress, (EXECUTIONS,))
+            with progress.status("Laying out histories"):
+                self._planned = {} if redraw else self._plan()
+        self._redrawn: tuple[int, SessionSource, dict[_Key, History]] | None = None
+        self._size = self.memory_frames
+        spans = (
+            span
+            for one in self.buffer_set.datasets[DEMONSTRATIONS].records()
+            for span in one.evidence or ()
+        )
+        self._parts = max((span.part + 1 for span in spans), default=1)
+        # Shared with the processes of a loader, which have copies of the dataset.
+        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _open_again, (self.buffer_set.location, self._arguments, self._epoch)
+
+    def __len__(self) -> int:
+        """Return the number of items."""
+        return len(self._moments)
+
+    def __repr__(self) -> str:
+        return (
+            f"HistoryDataset({self.buffer_set.name}, conditions={list(self._conditions.names)}, "
+            f"memory={self.memory}, episodes={len(self.episode_ids)}, items={len(self)})"
+        )
+
+    @property
+    def episode_ids(self) -> tuple[EpisodeId, ...]:
+        """Ids of the query episodes in use, in canonical order."""
+        return self._moments.episodes
+
+    @property
+    def memory_frames(self) -> int:
+        """Number M of places in memory, without the current frame."""
+        if self.memory.rule != "full":
+            return self.memory.frames - 1
+        longest = max(len(history.rows) for history in self._planned.values())
+        return longest + self._moments.most - 1
+
+    @property
+    def epoch(self) -> int:
+        """The epoch, from 0."""
+        return int(self._epoch)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Set the epoch, on which all draws depend, in this process and in those of its loaders."""
+        self._epoch.fill_(epoch)
+
+    def index_of(self, episode_id: EpisodeId | str, frame_index: int = 0) -> int:
+        """Return the index of the item of an episode's moment.
+
+        Raises:
+            UnknownNameError: The episode is not in use, or does not have this moment.
+        """
+        return self._moments.index_of(EpisodeId.parse(episode_id), frame_index)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        """Return an item; see the class."""
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"index {index} of {len(self)} items")
+        index %= len(self)
+        epoch, (number, moment) = self.epoch, self._moments.locate(index)
+        episode = self.episode_ids[number]
+        first, actions = self._moments.first[number], self._moments.actions[number]
+        condition = self._conditions.draw("condition", self.seed, epoch, index)
+        shift = self._shifts.draw("shift", self.seed, epoch, index)
+        history = self._history(epoch, episode, condition, shift)
+        live = len(history.rows) + moment
+        kept = np.asarray(self.memory.earlier(live), np.int64)
+        current = first + moment
+        if shift != NO_SHIFT:
+            current = self._shifted_row(episode, shift)
+        earlier = kept < len(history.rows)
+        rows = np.concatenate(
+            [history.rows[kept[earlier]], first + kept[~earlier] - len(history.rows)]
+        )
+        item: dict[str, Any] = {}
+        earlier_pieces, now = self._rows.pieces(rows), self._rows.pieces(np.array([current]))
+        for name in (*self.cameras, STATE):
+            values = self._empty(name, self._size + 1)
+            self._rows.take(name, earlier_pieces, values[: len(rows)])
+            values[len(rows) : self._size] = 0
+            self._rows.take(name, now, values[self._size :])
+            both = torch.from_numpy(values)
+            item[name] = both[self._size]
+            item[f"memory.{name.removeprefix('observation.')}"] = both[: self._size]
+        item["memory.position"] = _padded(kept, self._size)
+        item["memory.is_pad"] = torch.arange(self._size) >= len(kept)
+        evidence = np.zeros((self._size, self._parts), bool)
+        for start, stop, part in history.evidence or ():
+            evidence[: len(kept), part] |= (kept >= start) & (kept < stop)
+        item["memory.evidence"] = torch.from_numpy(evidence)
+        item["evidence_known"] = torch.tensor(history.evidence is not None)
+        item["position"] = torch.tensor(live)
+        if self.chunk:
+            steps = np.arange(moment, moment + self.chunk)
+            executed = self._empty(ACTION, self.chunk)
+            pieces = self._rows.pieces(first + np.minimum(steps, actions - 1))
+            self._rows.take(ACTION, pieces, executed)
+            item[ACTION] = torch.from_numpy(executed)
+            item["action_is_pad"] = torch.from_numpy(steps >= actions)
+        if self._questions is not None:
+            item |= self._questions.of(episode)
+        return item | {
+            "task": self.buffer_set.query(episode).goal,
+            "condition": condition,
+            "shift": shift,
+            "episode_id": str(episode),
+            "frame_index": torch.tensor(moment),
+            "index": torch.tensor(index),
+        }
+
+    def _empty(self, feature: str, count: int) -> NDArray[Any]:
+        dtype = np.float32 if feature in (STATE, ACTION) else np.uint8
+        return np.empty((count, *self._rows.shape(feature)), dtype)
+
+    def _history(self, epoch: int, episode: EpisodeId, condition: str, shift: str) -> History:
+        if not self._redraw:
+            return self._planned[episode, condition, shift]
+        if self._redrawn is None or self._redrawn[0] != epoch:
+            seed = number_from("draw", self.seed, epoch)
+            source = SessionSource(self.buffer_set.datasets, seed, self._units)
+            self._redrawn = epoch, source, {}
+        _, source, drawn = self._redrawn
+        key = episode, condition, shift
+        if key not in drawn:
+            drawn[key] = self._histories.draw(source, episode, condition, parse_shift(shift))
+        return drawn[key]
+
+    def _check(self, unit_episodes: str | None, *, shifted: bool) -> None:
+        """Check arguments against each other."""
+        if self.chunk < 0:
+            raise InvalidOptionError.expected("chunk", self.chunk, "an integer from 0, such as 16")
+        if unit_episodes is not None and not self._redraw:
+            raise InvalidOptionError(
+                f"unit_episodes {unit_episodes!r} has no effect on planned buffers",
+                "Set redraw=True, or leave it out.",
+            )
+        if self._redraw and self.memory.rule == "full":
+            raise InvalidOptionError(
+                "memory 'full' has no fixed size if sessions are drawn anew",
+                "Set a size, such as memory='window:512', or redraw=False.",
+            )
+        if shifted and self.chunk:
+            expected = "none with actions: only first live views are stored under shifts"
+            raise InvalidOptionError.expected("shifts", list(self._shifts.names), expected)
+
+    def _plan(self) -> "dict[_Key, History]":
+        """Return the planned histories."""
+        used = frozenset(self.episode_ids)
+        return {
+            (episode, name, shift): history
+            for shift in self._shifts.names
+            for (episode, name), history in self._histories.planned(
+                self._conditions.names, used, parse_shift(shift)
+            )
+        }
+
+    def _shifted_row(self, episode: EpisodeId, shift: str) -> int:
+        views = self.buffer_set.datasets[SHIFTED]
+        parsed = parse_shift(shift)
+        assert parsed is not None
+        return self._rows.first(SHIFTED, views.index_of(episode)) + SHIFTS.index(parsed)
+
+
+def _padded(values: NDArray[np.int64], size: int) -> torch.Tensor:
+    out = torch.zeros(size, dtype=torch.int64)
+    out[: len(values)] = torch.from_numpy(values)
+    return out
+
+
+def _open_again(location: str, arguments: dict[str, Any], epoch: torch.Tensor) -> HistoryDataset:
+    """Return a dataset in another process; memory maps and tables cannot be pickled."""
+    made = HistoryDataset(location, **arguments, quiet=True)
+    made._epoch = epoch
+    return made

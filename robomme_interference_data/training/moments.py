@@ -1,0 +1,126 @@
+"""Which datasets and moments a `HistoryDataset` has, and the checks of its arguments."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import DEMONSTRATIONS, EXECUTIONS, SHIFTED
+from robomme_interference_data.data.buffer_set import BufferSet
+from robomme_interference_data.data.dataset import Dataset
+from robomme_interference_data.errors import InvalidOptionError, MissingFileError, UnknownNameError
+from robomme_interference_data.ids import EpisodeId, parse_numbers, whole_number
+from robomme_interference_data.schema.conditions import datasets_of, parse_condition
+
+from .histories import Rows
+
+
+def needed_datasets(
+    buffer_set: BufferSet, conditions: Sequence[str], *, actions: bool, shifts: bool, planned: bool
+) -> dict[str, Dataset]:
+    """Return the datasets whose frames items can have, by name."""
+    parsed = [parse_condition(name) for name in conditions]
+    for name in (*datasets_of(parsed), *[EXECUTIONS] * actions, *[SHIFTED] * shifts):
+        if name not in buffer_set.datasets:
+            without = " Items without actions (chunk=0) need no executions." * (name == EXECUTIONS)
+            raise MissingFileError(
+                f"{buffer_set.location} has no {name}, which these items need",
+                "Build them from the source of its demonstrations, then run build manifests again."
+                + without,
+                f"build {name} {buffer_set.location} --source KIND:PATH",
+            )
+    if planned:
+        for condition in parsed:
+            buffer_set.planned(condition)
+    needed = [*datasets_of(parsed), *[EXECUTIONS] * actions, *[SHIFTED] * shifts]
+    return {name: buffer_set.datasets[name] for name in needed}
+
+
+def check_size(buffer_set: BufferSet, cameras: Sequence[str], size: int | None) -> int | None:
+    """Check that the frames of cameras can be resized to squares of a size."""
+    demonstrations = buffer_set.datasets[DEMONSTRATIONS]
+    shapes = {camera: demonstrations.shape(camera) for camera in cameras}
+    if size is None:
+        return None
+    size = whole_number("image_size", size, "an integer from 1, or None")
+    for camera, (height, width, _) in shapes.items():
+        if not 0 < size <= min(height, width):
+            expected = f"1 to {min(height, width)}: {camera} has {width}×{height} pixels"
+            raise InvalidOptionError.expected("image_size", size, expected)
+    return size
+
+
+@dataclass(frozen=True)
+class Moments:
+    """The moments of the query episodes in use, which the items are, in canonical order.
+
+    Attributes:
+        episodes: The episodes.
+        first: Row of each episode's first live frame.
+        actions: Actions of each episode from there on; 0 where only the first moment is used.
+        stops: Index after the last item of each episode, `(E,) int64`.
+    """
+
+    episodes: tuple[EpisodeId, ...]
+    first: tuple[int, ...]
+    actions: tuple[int, ...]
+    stops: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return int(self.stops[-1])
+
+    @property
+    def most(self) -> int:
+        """Most moments of an episode."""
+        return int(np.diff(self.stops, prepend=0).max())
+
+    def locate(self, index: int) -> tuple[int, int]:
+        """Return the number of the episode of an item, and the moment."""
+        number = int(np.searchsorted(self.stops, index, "right"))
+        return number, index - (int(self.stops[number - 1]) if number else 0)
+
+    def index_of(self, episode: EpisodeId, moment: int) -> int:
+        """Return the index of the item of an episode's moment."""
+        if episode not in self.episodes:
+            raise UnknownNameError.among("episode", str(episode), "the items", self.episodes)
+        number = self.episodes.index(episode)
+        first = int(self.stops[number - 1]) if number else 0
+        if not 0 <= moment < self.stops[number] - first:
+            last = int(self.stops[number]) - first - 1
+            raise UnknownNameError(f"{episode} has the moments 0 to {last}; got {moment}")
+        return first + moment
+
+
+def choose_moments(
+    buffer_set: BufferSet,
+    rows: Rows,
+    families: Sequence[str],
+    episodes: str | None,
+    *,
+    actions: bool,
+) -> Moments:
+    """Return the moments of executions, or the first live views where actions are not needed."""
+    known = buffer_set.families
+    for family in families:
+        if family not in known:
+            raise UnknownNameError.among("family", family, buffer_set.location, known)
+    numbers = None if episodes is None else frozenset(parse_numbers(episodes))
+    live = buffer_set.datasets[EXECUTIONS if actions else DEMONSTRATIONS]
+    recorded = {record.episode_id: record for record in live.records()}
+    chosen = tuple(
+        one
+        for one in buffer_set.episode_ids
+        if one.family in (families or known)
+        and (numbers is None or one.index in numbers)
+        and one in recorded
+    )
+    if not chosen:
+        expected = f"episodes of the {live.kind} of {buffer_set.location}"
+        raise InvalidOptionError.expected("episodes", episodes, expected)
+    records = [recorded[one] for one in chosen]
+    counts = tuple(one.length if actions else 0 for one in records)
+    first = (
+        rows.first(live.kind, one.episode_index) + (one.exec_start_idx or 0) for one in records
+    )
+    return Moments(chosen, tuple(first), counts, np.cumsum([count or 1 for count in counts]))

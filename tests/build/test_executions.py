@@ -1,0 +1,192 @@
+"""Executions: what follows the lesson in a recording, from every source that has actions."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.buffer_sets import build, dataset, plan_again
+from support.lerobot_layouts import write_lerobot
+from support.made_up import MadeUpSource, record, write_metadata
+from support.recordings import EPISODES, write_frames, write_h5
+
+from robomme_interference_data import load_buffer, load_buffer_set
+from robomme_interference_data.build_dataset.config import BuildConfig, plan_build
+from robomme_interference_data.build_dataset.frame_selection import FRAME_SELECTORS, NothingToStore
+from robomme_interference_data.build_dataset.manifests import in_folder, plan_manifests
+from robomme_interference_data.build_dataset.sources import Frame, open_source
+from robomme_interference_data.build_dataset.verify import verify_buffer_set
+from robomme_interference_data.constants import (
+    DEMONSTRATIONS,
+    DISTRACTORS,
+    EXECUTIONS,
+    IDENTITY_PATH,
+    STATE,
+)
+from robomme_interference_data.errors import (
+    HashMismatchError,
+    InterferenceError,
+    InvalidOptionError,
+    SourceError,
+)
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.storage.files import read_json
+
+QUERY = "MoveCube/test/0"
+QUERIES = {QUERY: (9, 5), "PatternLock/test/0": (8, 5)}
+UNITS = {f"{family}/train/0": (249, None) for family in ("MoveCube", "PatternLock")}
+
+
+def buffer_set(root: Path, source: MadeUpSource) -> Path:
+    """Build a buffer set of two queries, with executions from `source`."""
+    build(root, DEMONSTRATIONS, MadeUpSource(QUERIES))
+    build(root, DISTRACTORS, MadeUpSource(UNITS))
+    build(root, EXECUTIONS, source)
+    plan_again(root, ("k0", "k1"))
+    return root
+
+
+def problems(root: Path) -> list[str]:
+    found = verify_buffer_set(load_buffer_set(root))
+    return [f"{one.where}: {one.what}" for one in found]
+
+
+@pytest.mark.parametrize(
+    ("kind", "write"),
+    [
+        ("robomme-h5", lambda folder: write_h5(folder, EPISODES)),
+        ("lerobot", write_lerobot),
+        ("frames", lambda folder: write_frames(folder, EPISODES)),
+    ],
+)
+def test_live_frames_of_every_source(
+    tmp_path: Path, kind: str, write: Callable[[Path], Any]
+) -> None:
+    """MoveCube/train/0 has 12 frames, of them 5 of the demonstration; others have none or only."""
+    write(tmp_path / "recorded")
+    recorded = EPISODES["MoveCube/train/0"]
+    build(tmp_path, EXECUTIONS, open_source(f"{kind}:{tmp_path}/recorded"))
+    made = dataset(tmp_path, EXECUTIONS)
+    # RoboMME records the observation after each action: the next action follows it.
+    first, stop = (6, 11) if kind == "robomme-h5" else (5, 12)
+    assert [str(one.episode_id) for one in made.records()] == ["MoveCube/train/0"]
+    length = made.record(0).length
+    assert length == stop - 5
+    for camera, images in recorded.images.items():
+        assert np.array_equal([*made.iter_frames(0, camera, 0, length)], images[5:stop])
+    assert np.array_equal(made.read_vectors(0, STATE, 0, length), recorded.state[5:stop])
+    assert recorded.action is not None
+    actions = recorded.action[first : first + length]
+    assert np.array_equal(made.read_vectors(0, "action", 0, length), actions)
+    skipped = read_json(tmp_path / EXECUTIONS / "meta/build_report.json")["skipped"]
+    assert {one["episode_id"]: one["why"] for one in skipped} == {
+        "MoveCube/train/1": "no demonstration frame",
+        "InsertPeg/train/0": "0 live frames; an execution needs 2",
+    }
+
+
+def frame(shown: bool | None, action: float | None = 1.0) -> Frame:
+    vector = None if action is None else np.full(8, action, np.float32)
+    return Frame({}, np.zeros(8, np.float32), vector, shown)
+
+
+@pytest.mark.parametrize(
+    ("frames", "error", "message"),
+    [
+        ([frame(False), frame(False)], NothingToStore, "no demonstration frame"),
+        ([frame(True)], NothingToStore, "0 live frames"),
+        ([frame(True), frame(False)], NothingToStore, "1 live frame;"),
+        ([frame(None), frame(None)], SourceError, "does not mark"),
+        ([frame(True), frame(False, None)], InvalidOptionError, "no actions"),
+    ],
+)
+def test_episodes_without_an_execution(
+    frames: list[Frame], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        list(FRAME_SELECTORS[EXECUTIONS](frames))
+
+
+def test_a_source_without_actions_is_one_error(tmp_path: Path) -> None:
+    with pytest.raises(InvalidOptionError, match="MoveCube/test/0: the source has no actions"):
+        build(tmp_path, EXECUTIONS, MadeUpSource(QUERIES, actions=False))
+    assert not (tmp_path / EXECUTIONS).exists()
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [("robomme", "executions need whole episodes"), ("lerobot:recorded", "does not mark")],
+)
+def test_sources_that_have_none_are_found_before_reading(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str, message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_lerobot(tmp_path / "recorded", marked=False)
+    with pytest.raises(InterferenceError, match=message):
+        plan_build(EXECUTIONS, BuildConfig(source=(source,), buffer_set=tmp_path))
+
+
+def test_a_buffer_set_with_executions(tmp_path: Path) -> None:
+    source = MadeUpSource(QUERIES)
+    root = buffer_set(tmp_path, source)
+    assert problems(root) == []
+    opened = load_buffer_set(root)
+    made = opened.datasets[EXECUTIONS]
+    index = made.index_of(opened.query(QUERY).episode_id)
+    first, *others = made.iter_frames(index, "front", 0, 4)
+    assert np.array_equal(first, opened.query(QUERY).frame("front")) and len(others) == 3
+    assert np.array_equal(others[2], source.frame(QUERY, 8, 5).images["front"])
+    assert made.read_vectors(index, "action", 0, 4)[:, 0].tolist() == [-5, -6, -7, -8]
+    (root / EXECUTIONS / IDENTITY_PATH).unlink()  # buffers do not need them
+    assert len(load_buffer(QUERY, "k1", buffer_set=root, verify=True)) == 5 + 32
+
+
+def test_manifests_know_the_revision(tmp_path: Path) -> None:
+    root = buffer_set(tmp_path, MadeUpSource({QUERY: (9, 5)}))
+    build(root, EXECUTIONS, MadeUpSource(QUERIES))
+    with pytest.raises(HashMismatchError, match="executions has revision"):
+        load_buffer_set(root).datasets[EXECUTIONS]
+
+
+def test_executions_begin_with_the_query_frame(tmp_path: Path) -> None:
+    other = MadeUpSource(QUERIES)
+    shown = other.frame(QUERY, 5, 5)
+    image = shown.images["front"].copy()
+    image[3, 4, 1] ^= 1
+    for changes in ({"images": {"front": image}}, {"state": shown.state + np.float32(1)}):
+        other.wrong = {QUERY: {5: replace(shown, **changes)}}
+        root = buffer_set(tmp_path / next(iter(changes)), other)
+        assert problems(root) == [
+            f"executions {QUERY}: does not begin with the query frame of the demonstrations"
+        ]
+    other.wrong = {QUERY: {5: replace(shown, action=shown.action + np.float32(1))}}
+    assert problems(buffer_set(tmp_path / "action", other)) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seed": 8}, r"8, None, None\), and the demonstrations have \(.*7, None, None\)"),
+        ({"goals": ("do it", "again")}, "'again'"),
+        ({"difficulty": "hard"}, "'hard'"),
+        (
+            {"episode_id": EpisodeId("MoveCube", "test", 1)},
+            "MoveCube/test/1 with.*demonstrations lack it",
+        ),
+    ],
+)
+def test_executions_of_other_episodes(
+    tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    known = {"seed": 7, "goals": ("do it",)}
+    write_metadata(tmp_path / DEMONSTRATIONS, DEMONSTRATIONS, [record("", QUERY, **known)])
+    write_metadata(
+        tmp_path / DISTRACTORS, DISTRACTORS, [record(DISTRACTORS, "PatternLock/train/0")]
+    )
+    live = {"exec_start_idx": None, "span_sha256": None}
+    executions = [record("", QUERY, **live | known | changes)]
+    write_metadata(tmp_path / EXECUTIONS, EXECUTIONS, executions)
+    with pytest.raises(SourceError, match=message):
+        plan_manifests(in_folder(tmp_path), ("k0",))

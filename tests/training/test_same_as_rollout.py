@@ -1,0 +1,161 @@
+"""What a policy receives in a rollout is, bit for bit, what an item of training holds."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from support.buffer_sets import build, copy_buffer_set, plan_again
+from support.retrieval import make_index
+from support.runs import config
+from support.worlds import BUFFER_SET
+
+from robomme_interference_data import BufferSet, load_buffer_set
+from robomme_interference_data.build_dataset.sources.sample import SampleSource
+from robomme_interference_data.constants import ACTION, EXECUTIONS, STATE
+from robomme_interference_data.evaluate import Observation, Policy, RolloutInfo
+from robomme_interference_data.evaluate.rollout.rollout import run_rollout
+from robomme_interference_data.evaluate.run.kind import Run
+from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.retrieval.selector import Selector
+from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.simulators.base import Demonstration, EpisodeInfo
+from robomme_interference_data.training import HistoryDataset, Memory, resize
+
+EPISODE = EpisodeId("MoveCube", "test", 0)
+CAMERAS = ("front", "wrist")
+
+
+@pytest.fixture(scope="module")
+def buffers(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = copy_buffer_set(tmp_path_factory.mktemp("same") / "buffers")
+    build(root, EXECUTIONS, SampleSource(size=32), families=("MoveCube",), split="test")
+    plan_again(root, ("no-history", "k0", "k3", "before-k3"))
+    make_index(root)
+    return root
+
+
+class Player:
+    """A simulator that plays an execution again, whatever the policy does."""
+
+    def __init__(self, buffer_set: BufferSet):
+        self.query, live = buffer_set.query(EPISODE), buffer_set.datasets[EXECUTIONS]
+        count = live.record(0).length
+        frames = {name: list(map(np.copy, live.iter_frames(0, name, 0, count))) for name in CAMERAS}
+        states = live.read_vectors(0, STATE, 0, count)
+        self.seen = [
+            Observation({name: frames[name][step] for name in CAMERAS}, states[step])
+            for step in range(count)
+        ]
+
+    def reset(
+        self, episode_id: str, demonstration: bool = True
+    ) -> tuple[Demonstration, Observation, EpisodeInfo]:
+        record, self.steps = self.query.record, 0
+        info = EpisodeInfo(record.goals, str(record.difficulty), record.seed or 0, "sample")
+        lesson = Demonstration(
+            {}, np.zeros((self.query.lesson_frames, 8), np.float32), np.zeros((0, 8), np.float32)
+        )
+        return lesson, self.seen[0], info
+
+    def step(self, action: NDArray[np.float32], observe: bool = True) -> tuple[Observation, Status]:
+        self.steps += 1
+        last = self.steps == len(self.seen) - 1
+        return self.seen[self.steps], Status.FAIL if last else Status.ONGOING
+
+    def close(self) -> None:
+        pass
+
+
+class Watching(Policy):
+    """Keeps everything, and notes what its memory rule selects at each action."""
+
+    cameras = history_cameras = CAMERAS
+    every_frame = True
+
+    def __init__(self, memory: str):
+        self.memory, self.moments = Memory.parse(memory), {}  # type: ignore[var-annotated]
+
+    def reset(self, info: RolloutInfo) -> None:
+        self.frames: dict[str, list[NDArray[Any]]] = {name: [] for name in CAMERAS}
+        self.states: list[NDArray[Any]] = []
+        self.history = info.history_frames
+
+    def add_history(
+        self, frames: Mapping[str, NDArray[np.uint8]], states: NDArray[np.float32], start: int
+    ) -> None:
+        self.observe(frames, states)
+
+    def observe(self, frames: Mapping[str, NDArray[np.uint8]], states: NDArray[np.float32]) -> None:
+        for name in CAMERAS:
+            self.frames[name] += map(np.copy, frames[name])
+        self.states += map(np.copy, states)
+
+    def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
+        live = len(self.states) - 1
+        kept = [*self.memory.earlier(live), live]
+        frames = {name: np.stack([self.frames[name][at] for at in kept]) for name in CAMERAS}
+        self.moments[live - self.history] = kept, frames, np.stack([self.states[at] for at in kept])
+        return np.zeros((16, 8), np.float32)
+
+    def metadata(self) -> dict[str, Any]:
+        return {}
+
+
+@pytest.mark.parametrize("memory", ["framesamp:8", "window:5", "full"])
+@pytest.mark.parametrize(
+    "condition, retrieval",
+    [("no-history", None), ("k0", None), ("before-k3", None), ("before-k3", "thumbnail")],
+)
+def test_same_frames_states_and_positions(
+    memory: str,
+    condition: str,
+    retrieval: str | None,
+    buffers: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv(BUFFER_SET, str(buffers))
+    buffer_set, policy = load_buffer_set(buffers), Watching(memory)
+    run_rollout(
+        Run(config(), "mine", buffer_set.name, buffer_set.revision),
+        WorkItem(condition, EPISODE),
+        simulator=Player(buffer_set),  # type: ignore[arg-type]
+        policy=policy,
+        buffer_set=buffer_set,
+        selector=Selector(retrieval) if retrieval else None,
+    )
+    data = HistoryDataset(
+        buffer_set,
+        [condition],
+        memory=memory,
+        cameras=CAMERAS,
+        image_size=24,
+        retrieval=retrieval,
+        store=tmp_path_factory.getbasetemp() / "store",
+        quiet=True,
+    )
+    assert len(policy.moments) == 14 and max(policy.moments) == 208
+    for moment, (kept, frames, states) in policy.moments.items():
+        item, count = data[data.index_of(EPISODE, moment)], len(kept) - 1
+        assert (~item["memory.is_pad"]).sum() == count
+        assert [*item["memory.position"][:count], item["position"]] == kept
+        assert torch.equal(item["memory.state"][:count], torch.from_numpy(states[:-1]))
+        assert torch.equal(item["observation.state"], torch.from_numpy(states[-1]))
+        for name in CAMERAS:
+            small = torch.from_numpy(resize(frames[name], 24))
+            assert torch.equal(item[f"memory.images.{name}"][:count], small[:-1])
+            assert torch.equal(item[f"observation.images.{name}"], small[-1])
+
+
+def test_actions_are_those_of_the_recording(buffers: Path, tmp_path: Path) -> None:
+    data = HistoryDataset(buffers, ["k0"], chunk=20, image_size=8, store=tmp_path, quiet=True)
+    actions = load_buffer_set(buffers).datasets[EXECUTIONS].read_vectors(0, ACTION, 0, 212)
+    item = data[data.index_of(EPISODE, 200)]
+    np.testing.assert_array_equal(item["action"][:12], actions[200:])
+    np.testing.assert_array_equal(item["action"][12:], np.repeat(actions[-1:], 8, 0))
+    assert item["action_is_pad"].tolist() == [False] * 12 + [True] * 8
