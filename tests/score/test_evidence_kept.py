@@ -114,3 +114,9 @@ def test_without_a_control_the_table_names_the_command(tmp_path: Path) -> None:
     assert (one["n"], one["failures"]) == (9, pytest.approx(4 / 9))
     assert one["execution"] is one["use"] is None and one["control"] == ""
     assert "--policy oracle" in found.tables["evidence_use"].note
+
+
+def test_answers_are_not_executed(tmp_path: Path) -> None:
+    asked = made.changed(rows({"MoveCube": ("ssf", "333")}), chance=0.5, steps=0)
+    found = scored(tmp_path, asked)
+    assert "by_evidence_kept" in found.tables and "evidence_use" not in found.tables

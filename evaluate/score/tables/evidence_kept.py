@@ -75,8 +75,8 @@ def _rates(cells: _Cells) -> Table:
         "at the first step. Rates over the n episodes for which that is known, with 95% Wilson "
         "intervals. The levels have different episodes, and often different families: the table "
         "evidence_effects compares them within families. If all evidence was kept, a failure is "
-        "one of use or of execution: see the table evidence_use. If none was, a success is luck "
-        "or needs no memory.",
+        "one of use or, of a rollout, of execution: see the table evidence_use. If none was, a "
+        "success is luck or needs no memory.",
     )
 
 
@@ -137,6 +137,8 @@ def _use(cells: _Cells) -> Table:
     for outcomes, cell, levels in cells:
         kept = levels.get("all")
         system, condition = cell[1:]
+        if (outcomes.chance >= 0).any():
+            continue  # answers to questions are not executed
         if (
             kept is None
             or is_reference(system)
