@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.schema.conditions import in_order, parse_condition
-from robomme_interference_data.viz.figure import GREY, INK, Hue, open_figure, save_figure, tidy
+from robomme_interference_data.viz.figure import GRAY, INK, Hue, open_figure, save_figure, tidy
 
 from .calibrate import Calibration
 from .grade import ALL, PASS_MARK, Cell
@@ -57,7 +57,7 @@ def draw_calibration(found: Calibration, title: str, out: Path) -> None:
             left.step(values, shares, where="post", color=color, linewidth=1.5, label=name)
         for label, value, color in (
             ("fitted", found.threshold, Hue.BLUE),
-            ("in use", found.in_use, GREY),
+            ("in use", found.in_use, GRAY),
         ):
             name = f"{label}: {value:.3f}"
             left.axvline(value, color=color, linewidth=1.1, linestyle="-.", label=name)
@@ -106,6 +106,6 @@ def _draw_line(
 
 def _percent(axes: Any) -> None:
     label = f"pass mark, {PASS_MARK:.0%}"
-    axes.axhline(100 * PASS_MARK, color=GREY, linewidth=0.9, linestyle=":", zorder=0, label=label)
+    axes.axhline(100 * PASS_MARK, color=GRAY, linewidth=0.9, linestyle=":", zorder=0, label=label)
     axes.set_ylim(-4, 104)
     tidy(axes)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.data.buffer import Buffer
-from robomme_interference_data.viz.figure import GREY, INK, Page, ink_on, open_page, tidy, tint
+from robomme_interference_data.viz.figure import GRAY, INK, Page, ink_on, open_page, tidy, tint
 from robomme_interference_data.viz.filmstrip import LESSON_COLOR, mark_evidence, session_colors
 
 from .explain import Explanation, frames_text
@@ -59,7 +59,7 @@ def draw_retrieval(
         top += _BAR
         _draw_similarity(_axes(page, measured, top + 0.14), measured, choice, explanation)
         top += 0.14 + _CURVE + 0.36
-        page.text((_LEFT + _RIGHT) / 2, top - 0.19, "frame in the buffer", 6.5, color=GREY)
+        page.text((_LEFT + _RIGHT) / 2, top - 0.19, "frame in the buffer", 6.5, color=GRAY)
         _draw_compared(page, buffer, colors, explanation, live, top)
 
 
@@ -68,7 +68,7 @@ def _draw_head(page: Page, buffer: Buffer, choice: Choice, explanation: Explanat
     title = f"{grade.episode_id}   {grade.condition}"
     page.text(0.1, 0.06, title, 10, align="left", bold=True, width=0.55 * _WIDTH)
     settings = f"{explanation.encoder}, {explanation.camera} camera, rule {grade.rule}"
-    page.text(_RIGHT, 0.1, settings, 6.5, align="right", color=GREY, width=0.4 * _WIDTH)
+    page.text(_RIGHT, 0.1, settings, 6.5, align="right", color=GRAY, width=0.4 * _WIDTH)
     page.text(0.1, 0.27, f"Goal: {buffer.goal}", 7.5, align="left", width=_WIDTH - 0.2)
     frames = f"frames {frames_text(choice.spans)} of {grade.history_frames}"
     result = f"chosen: {frames};  {explanation.graded()}"
@@ -85,7 +85,7 @@ def _draw_strip(page: Page, buffer: Buffer, choice: Choice, camera: str, top: fl
         height = page.picture(buffer.frame(frame, camera), x, top, size)
         if frame in choice.frames:
             page.box(x, top, size, height, fill="none", edge=_CHOSEN, line=2)
-        page.text(x + size / 2, top + height + 0.02, str(frame), 5.5, color=GREY)
+        page.text(x + size / 2, top + height + 0.02, str(frame), 5.5, color=GRAY)
     return top + height + 0.17
 
 
@@ -114,7 +114,7 @@ def _draw_bar(
     """Draw a span of frames to scale, with the first name that fits."""
     scale = _SPAN / len(buffer)
     x, width = _LEFT + span[0] * scale, (span[1] - span[0]) * scale
-    edge = GREY if fill == "white" else "white"
+    edge = GRAY if fill == "white" else "white"
     page.box(x, top, width, _BAR, fill=fill, edge=edge, line=0.6)
     if name := next((n for n in names if page.text_width(n, 5.5, bold=True) < width - 0.05), None):
         page.text(x + width / 2, top + 0.045, name, 5.5, bold=True, color=ink_on(fill))
@@ -122,7 +122,7 @@ def _draw_bar(
 
 def _label(page: Page, top: float, *lines: str) -> None:
     for number, line in enumerate(lines):
-        page.text(_LEFT - 0.05, top + 0.09 * number, line, 6, align="right", color=GREY)
+        page.text(_LEFT - 0.05, top + 0.09 * number, line, 6, align="right", color=GRAY)
 
 
 def _axes(page: Page, measured: Similarities, top: float) -> Any:
@@ -160,11 +160,11 @@ def _draw_similarity(
     for span in choice.spans:
         axes.axvspan(*span, facecolor="none", edgecolor=_CHOSEN, linewidth=1.2, zorder=3)
     for segment, score in choice.scores.items():
-        color = _CHOSEN if segment[0] in choice.frames else GREY
+        color = _CHOSEN if segment[0] in choice.frames else GRAY
         axes.plot(segment, (score, score), color=color, linewidth=1.2)
     for name, frame, cosine, color, marker in (
         ("closest frame", explanation.closest, explanation.cosine, _CHOSEN, "*"),
-        ("closest outside", explanation.other, explanation.other_cosine, GREY, "o"),
+        ("closest outside", explanation.other, explanation.other_cosine, GRAY, "o"),
     ):
         if frame is not None:
             style = {"color": color, "markersize": 7, "label": f"{name}, {frame}"}
@@ -200,7 +200,7 @@ def _draw_compared(
         page.box(x - _LARGE / 2, top + 0.14, _LARGE, height, fill="none", edge=color, line=2)
         for row, line in enumerate(lines):
             y = top + 0.18 + height + 0.11 * row
-            page.text(x, y, line, 6, width=step - 0.05, color=GREY)
+            page.text(x, y, line, 6, width=step - 0.05, color=GRAY)
 
 
 def _title(axes: Any, title: str) -> None:

@@ -193,7 +193,7 @@ def power(
     }
     for look, level in enumerate(found.looks, start=1):
         at = round(episodes * look / looks)
-        lines[f"look {look} after {at:,} episodes: significant if p_holm is below"] = f"{level:.2g}"
+        lines[f"look {look} after {at:,} episodes: significant if p holm is below"] = f"{level:.2g}"
     corrected = f", corrected for {tests:,} tests" * (tests > 1)
     echo(f"{episodes:,} episodes, of which {100 * flips:g}% flip by chance{corrected}\n")
     width = max(map(len, lines))

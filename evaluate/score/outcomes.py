@@ -43,6 +43,7 @@ class Outcomes:
     model_seeds: tuple[int, ...]  # ascending
     status: Statuses  # index into STATUSES, −1 without a rollout, (S, C, E, M) int8
     evidence: NDArray[np.float64]  # share of the evidence kept, NaN if unknown, (S, C, E, M)
+    steps: NDArray[np.float64]  # executed, NaN if unknown, (S, C, E, M)
     difficulty: NDArray[np.int64]  # index into DIFFICULTIES, −1 if unknown, (E,)
     chance: NDArray[np.float64]  # success of guessing, NaN unless a question, (E,)
     expected: Flags  # the episodes of a complete cell, (E,)
@@ -119,6 +120,13 @@ def success(status: Statuses) -> NDArray[np.float64]:
         return np.asarray((status == _SUCCESS).sum(-1) / counting(status).sum(-1))
 
 
+def steps_to_success(status: Statuses, steps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mean steps of an episode's successes, the last axis, NaN where there are none."""
+    won = (status == _SUCCESS) & ~np.isnan(steps)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(won, steps, 0).sum(-1) / won.sum(-1))
+
+
 class Rate(NamedTuple):
     """A success rate."""
 
@@ -180,9 +188,11 @@ def _outcomes(
         for place, column in zip(places, zip(*keys, strict=True), strict=True)
     )
     shape = tuple(map(len, axes))
-    status, evidence = np.full(shape, -1, np.int8), np.full(shape, np.nan)
+    status = np.full(shape, -1, np.int8)
+    evidence, steps = np.full(shape, np.nan), np.full(shape, np.nan)
     status[at] = [STATUSES.index(row.status) for row in rows]
     evidence[at] = np.array([row.evidence_kept for row in rows], float)  # None becomes NaN
+    steps[at] = np.array([row.steps for row in rows], float)
     difficulty, chance = np.full(len(episodes), -1), np.full(len(episodes), np.nan)
     for row, place in zip(rows, at[2].tolist(), strict=True):
         if row.difficulty is not None:
@@ -199,6 +209,7 @@ def _outcomes(
         model_seeds,
         status,
         evidence,
+        steps,
         difficulty,
         chance,
         expected=np.array([key in expected for key in axes[2]]),

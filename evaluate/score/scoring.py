@@ -2,25 +2,25 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.stats.bootstrap import DRAWS
 from robomme_interference_data.viz.tables import Table
 
-from .comparisons import effects, families, ranks
+from .comparisons import effects, families, ranks, slopes
 from .comparisons.contrast import Contrast
 from .comparisons.tables import SPECS, comparison_table
 from .config import Against, Expected, Settings
 from .outcomes import Outcomes, outcomes_of
 from .rows.reading import Rows, read_rows
-from .tables import action_error, cells, chance, equivalence, evidence_kept, paper
+from .tables import action_error, cells, chance, equivalence, evidence_kept, model, paper, steps
 
 TABLES = (
     *("main", "chance", "systems", "ranks", "family", "difficulty", "lift", "effects"),
-    *("interaction", "equivalence", "interference", "by_evidence_kept", "ceiling", "decay"),
-    *("noise", "families", "family_effects", "matrix", "coverage", "paper", "paper_family"),
+    *("interaction", "equivalence", "interference", "by_evidence_kept", "evidence_effects"),
+    *("evidence_use", "ceiling", "decay", "model", "steps", "noise", "families", "family_effects"),
+    *("matrix", "coverage", "paper", "paper_family"),
     *action_error.ERROR_TABLES,
 )
 """Every table that a score may have, in order."""
@@ -72,7 +72,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         )
     outcomes = outcomes_of(rows, settings.expected)
     every = tuple(outcomes.values())
-    compared, decays, notes = _compared(rows, every, draws)
+    compared, notes = _compared(rows, every, draws)
     by_family = [one for outcome in every for one in families.family_effects(outcome, compared)]
     found = cells.cells_of(every)
     published = paper.published() if settings.against is Against.PAPER else ()
@@ -82,15 +82,18 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         ranks.rank_table(every),
         *(comparison_table(name, [*compared, *by_family]) for name in SPECS),
         families.families_table(every, compared),
-        evidence_kept.evidence_table(every),
-        effects.decay_table(decays),
+        *evidence_kept.evidence_tables(every),
+        slopes.decay_table(every, draws),
         effects.noise_table(every),
+        steps.steps_table(every, draws),
         cells.coverage_table(found),
         *action_error.error_tables(rows, draws),
     ]
     if settings.margin is not None:
         margin = settings.margin
         tables.append(equivalence.equivalence_table(compared, found, published, margin))
+    if settings.model:
+        tables.append(model.model_table(every))
     if published:
         # The paper's rates are over the benchmark's grid.
         whole = cells.cells_of(outcomes_of(rows, Expected.BENCHMARK).values())
@@ -113,9 +116,9 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
 
 def _compared(
     rows: Rows, every: Sequence[Outcomes], draws: int
-) -> tuple[list[Contrast], list[tuple[Any, ...]], list[str]]:
-    """Return all comparisons, the rows of `decay`, and notes on systems that are not paired."""
-    compared, decays, notes = list[Contrast](), list[tuple[Any, ...]](), list[str]()
+) -> tuple[list[Contrast], list[str]]:
+    """Return all comparisons, and notes on systems that are not paired."""
+    compared, notes = list[Contrast](), list[str]()
     for outcomes in every:
         for system in outcomes.systems:
             beside = {"base": base_of(system), "ceiling": evidence_kept.ceiling_of(system)}
@@ -126,11 +129,9 @@ def _compared(
                     beside[role] = None
                     simulator = outcomes.simulator
                     notes.append(f"{system} and {other} in {simulator} are not paired: {why}.")
-            found, decay = effects.effects_of(outcomes, system, **beside, draws=draws)
-            compared += found
-            decays += decay
-        compared += ranks.systems_of(outcomes) + ranks.interactions_of(outcomes, draws)
-    return compared, decays, notes
+            compared += effects.effects_of(outcomes, system, **beside)
+        compared += ranks.systems_of(outcomes) + slopes.interactions_of(outcomes, draws)
+    return compared, notes
 
 
 def _unpaired(rows: Rows, outcomes: Outcomes, system: str, other: str) -> str:

@@ -18,7 +18,8 @@ DRAWS = 10_000
 MIN_EPISODES = 10
 """Episodes that must differ from the most common value for an interval."""
 
-_CHUNK = 2**15  # values at a time: they fit the CPU cache, and BLAS starts no threads
+_CHUNK = 2**15  # values at a time: they fit the CPU cache
+_ALONE = 2**18  # multiplications at a time: BLAS starts no threads, which would wait for each other
 _NORMAL = NormalDist()
 
 
@@ -42,8 +43,18 @@ def slope_weights(ks: Sequence[int]) -> Floats:
     double the sessions.
     """
     x = np.log2(np.asarray(ks, float) + 1)
-    centred = x - x.mean()
-    return np.asarray(centred / (centred**2).sum())
+    centered = x - x.mean()
+    return np.asarray(centered / (centered**2).sum())
+
+
+def departures(ks: Sequence[int]) -> Floats:
+    """Return the matrix that takes rates at each k to their departures from the log-linear line.
+
+    With X = (1, log₂(k + 1)): I − X (XᵀX)⁻¹ Xᵀ, `(K, K)`, of rank K − 2.
+    """
+    x = np.log2(np.asarray(ks, float) + 1)
+    line = np.stack([np.ones_like(x), x], axis=1)
+    return np.asarray(np.eye(len(x)) - line @ np.linalg.pinv(line))
 
 
 def varies_enough(values: Floats) -> bool:
@@ -98,7 +109,7 @@ def _drawn_means(values: Floats, key: str, draws: int = DRAWS) -> Floats:
 
 def summed(drawn: NDArray[np.uint8], columns: Floats) -> Floats:
     """Return the sums of the columns, `(E, K)`, in draws of episodes, `(draws, E)`."""
-    step = max(1, _CHUNK // len(columns))
+    step = max(1, min(_CHUNK, _ALONE // max(1, columns.shape[1])) // len(columns))
     parts = range(0, len(drawn), step)
     return np.concatenate([drawn[at : at + step].astype(float) @ columns for at in parts])
 

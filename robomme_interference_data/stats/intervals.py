@@ -5,7 +5,6 @@ takes seconds. The tests compare them with SciPy's.
 """
 
 import math
-from collections.abc import Sequence
 from statistics import NormalDist
 
 LEVEL = 0.95
@@ -51,25 +50,6 @@ def effective_n(rate: float, variance: float, episodes: int, rollouts: int) -> f
     if variance <= 0:
         return episodes
     return min(rollouts, max(episodes, rate * (1 - rate) * episodes / variance))
-
-
-def stratified_n(successes: Sequence[float], trials: Sequence[float]) -> float:
-    """Return the number of independent trials that a rate over fixed strata is worth.
-
-    Strata with xᶠ of nᶠ successes add the variance Σ nᶠ p̃ᶠ (1 − p̃ᶠ) / n² with p̃ᶠ = (xᶠ + 1) / (nᶠ
-    + 2), which is less than p (1 − p) / n where their rates differ: the trials are p (1 − p) / that
-    variance, and at least n. Wilson's interval then is for these strata alone.
-
-    Source: effective sample size, Kish (1965), Survey Sampling, chapter 8; Wilson's interval over
-    strata, Yan and Su (2010), Statistics in Biopharmaceutical Research 2, 329–335.
-    """
-    n = math.fsum(trials)
-    rate = math.fsum(successes) / n
-    variance = 0.0
-    for won, of in zip(successes, trials, strict=True):
-        near = (won + 1) / (of + 2)
-        variance += of * near * (1 - near) / n**2
-    return max(n, rate * (1 - rate) / variance)
 
 
 def mover_interval(

@@ -1,6 +1,7 @@
 """Sign-flip tests of means over episodes, with the intervals that these tests define."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -76,6 +77,40 @@ def sign_flips(values: Floats, key: str, draws: int = DRAWS) -> list[SignFlips]:
         )
         for k in range(count)
     ]
+
+
+def vector_sign_flips(parts: Sequence[Floats], key: str, draws: int = DRAWS) -> list[float]:
+    """Test whether all column means of a part are 0, for each part; from the same draws.
+
+    Parts are `(E, K) float64`; an episode with NaN takes no part. With the sum s of the episodes'
+    vectors d, the statistic is sᵀ (Σ d dᵀ)⁻¹ s, on the space that they span. Flips keep Σ d dᵀ, so
+    the test is also that of Hotelling's T²: exact for symmetric vectors and asymptotically for any
+    others. p is (1 + number of draws with at least the observed value) / (1 + draws), NaN without
+    episodes and 1 if all vectors are 0.
+
+    Source: Chung and Fraser (1958), Randomization tests for a multivariate two-sample problem, JASA
+    53, 729–735, with signs instead of permutations; Janssen (1999), as for `sign_flips`.
+    """
+    if not parts:
+        return []
+    whitened, empty = [], []
+    for values in parts:
+        known = ~np.isnan(values).any(axis=1, keepdims=True)
+        vectors = np.where(known, values, 0.0)
+        sizes, axes = np.linalg.eigh(vectors.T @ vectors)
+        kept = sizes > 1e-9 * max(1.0, float(sizes.max(initial=0.0)))
+        whitened.append(vectors @ (axes[:, kept] / np.sqrt(sizes[kept])))
+        empty.append(not known.any())
+    columns = np.concatenate(whitened, axis=1)
+    flipped = summed(_flips(key, len(columns), draws), columns)
+    squares = np.square(columns.sum(axis=0) - 2 * flipped)
+    observed = np.square(columns.sum(axis=0))
+    found, at = list[float](), 0
+    for part, nothing in zip(whitened, empty, strict=True):
+        here = slice(at, at := at + part.shape[1])
+        reached = squares[:, here].sum(axis=1) >= observed[here].sum() - 1e-9
+        found.append(math.nan if nothing else float((1 + reached.sum()) / (1 + draws)))
+    return found
 
 
 @lru_cache(maxsize=2)

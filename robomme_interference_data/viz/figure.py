@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.errors import InvalidOptionError, MissingExtraError
 from robomme_interference_data.storage.files import atomic_path
 
-INK, GREY = "#222222", "#767676"
+INK, GRAY = "#222222", "#767676"
 
 
 class Hue:
@@ -210,7 +210,7 @@ def _printable(text: str) -> str:
 def tidy(axes: Any) -> None:
     """Remove the decoration of axes, and add horizontal grid lines."""
     axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(GREY)
+    axes.spines[["left", "bottom"]].set_color(GRAY)
     axes.tick_params(colors=INK, labelsize=8, length=3)
     axes.grid(axis="y", color="#dddddd", linewidth=0.6)
     axes.set_axisbelow(True)

@@ -36,7 +36,7 @@ from robomme_interference_data.simulators.tabletop.episodes import difficulty_of
 from robomme_interference_data.simulators.tabletop.family import Family
 from robomme_interference_data.storage.encode import decode_image
 
-GREY = np.full((SIZE, SIZE, 3), 128, np.uint8)
+GRAY = np.full((SIZE, SIZE, 3), 128, np.uint8)
 EPISODES = [
     EpisodeId(family, split, number)
     for family in FAMILIES
@@ -47,7 +47,7 @@ MANY = ("InsertPeg", "PatternLock", "RouteStick")
 """Families of whose possible answers some are options; of the others all are."""
 
 
-def buffer_set_of(*episodes: EpisodeId, view: Any = GREY, **changes: Any) -> Any:
+def buffer_set_of(*episodes: EpisodeId, view: Any = GRAY, **changes: Any) -> Any:
     """A stand-in for a buffer set, with episodes of the suite that were not recorded."""
 
     def query(episode: EpisodeId) -> Any:

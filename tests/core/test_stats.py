@@ -17,7 +17,6 @@ from robomme_interference_data.stats.intervals import (
     fieller,
     newcombe,
     newcombe_paired,
-    stratified_n,
     wilson,
 )
 from robomme_interference_data.stats.significance import (
@@ -27,7 +26,7 @@ from robomme_interference_data.stats.significance import (
     sign_flip,
     two_proportions,
 )
-from robomme_interference_data.stats.signs import sign_flips
+from robomme_interference_data.stats.signs import sign_flips, vector_sign_flips
 
 COUNTS = st.tuples(*[st.integers(0, 300)] * 4).filter(any)
 
@@ -108,13 +107,6 @@ def test_what_repeats_are_worth_by_hand() -> None:
     assert effective_n(1.0, 0.0, 10, 30) == 10
 
 
-def test_what_fixed_strata_are_worth_by_hand() -> None:
-    # p̃ 11/12 and 1/12: 2 · 10 · 11/144 / 400 = 0.0038194, and 0.25 / 0.0038194.
-    assert stratified_n([10, 0], [10, 10]) == pytest.approx(65.4545, abs=1e-4)
-    # Strata of one rate are worth no more than their trials, and neither is certainty.
-    assert stratified_n([5, 5], [10, 10]) == stratified_n([10, 10], [10, 10]) == 20
-
-
 def test_two_proportions_by_hand() -> None:
     # Published GroundSG and the next without history: z = 0.024444 / √(p(1−p) 2/450), p = 175/900
     assert two_proportions(93, 450, 82, 450) == pytest.approx(0.354208, abs=1e-6)
@@ -183,6 +175,24 @@ def test_the_interval_of_sign_flips_agrees_with_its_test(values: list[int], leve
     # A shift of all values shifts the interval.
     (moved,) = sign_flips(np.array(values, float)[:, None] + 5, "key", 400)
     assert moved.at(level)[1:] == pytest.approx([b + 5 for b in interval[1:]], nan_ok=True)
+
+
+def test_sign_flips_of_vectors_by_hand() -> None:
+    # Of equal vectors, two of sixteen draws are as far from zero: no flip, or all.
+    equal = np.array([[1.0, 2.0]] * 4 + [[np.nan, 1.0]])
+    # A and −A cancel out.
+    none = np.array([[1.0, 2.0], [-1.0, -2.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    found = vector_sign_flips([equal, none, 0 * none, np.nan * none], "key", 20_000)
+    assert found[:3] == pytest.approx([2 / 16, 1, 1], abs=0.01)
+    assert math.isnan(found[3]) and vector_sign_flips([], "key") == []
+    # Of one column, it is the test of the mean; of a normal sample, Hotelling's.
+    values = np.random.default_rng(4).normal(0.3, 1, (60, 2)) @ [[1, 0.5], [0, 1]]
+    (one,) = vector_sign_flips([values[:, :1]], "key", 20_000)
+    assert one == sign_flips(values[:, :1], "key", 20_000)[0].p
+    mean = values.mean(axis=0)
+    statistic = 60 * mean @ np.linalg.solve(np.cov(values.T), mean) * 58 / (2 * 59)
+    (two,) = vector_sign_flips([values], "key", 20_000)
+    assert two == pytest.approx(scipy.stats.f.sf(statistic, 2, 58), abs=0.01)
 
 
 @given(st.integers(0, 200), st.integers(0, 200), st.integers(0, 50))

@@ -138,6 +138,6 @@ def test_a_planned_look_has_a_level_and_intervals_of_its_own(tmp_path: Path) -> 
     assert (overall["joint_low"], overall["joint_high"]) == bounds  # one row of all families
     done = run("compare", path, "--conditions", "k0,k7", "--looks", "2/5")
     text = " ".join(done.stdout.split())
-    assert "Look 2 of 5" in text and f"p_holm is below {level:.2g}" in text
+    assert "Look 2 of 5" in text and f"p holm is below {level:.2g}" in text
     wrong = run("compare", path, "--conditions", "k0,k7", "--looks", "6/5")
     assert isinstance(wrong.exception, InvalidOptionError) and "6/5" in str(wrong.exception)

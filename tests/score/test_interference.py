@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support import scoring as made
@@ -14,7 +13,6 @@ from robomme_interference_data.evaluate.score.plots.data import Data
 from robomme_interference_data.evaluate.score.plots.figures import draw_figure
 from robomme_interference_data.evaluate.score.report.headline import headline
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.score.tables.evidence_kept import ceiling_of
 from robomme_interference_data.schema.conditions import KINDS, NO_HISTORY, in_order, parse_condition
 from robomme_interference_data.viz.figure import open_figure
 
@@ -50,25 +48,7 @@ def test_whatever_is_compared_differs_in_kind_alone(names: set[str], floor: bool
         assert (name in found) == there
 
 
-# --- access against use ------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("system", "ceiling"),
-    [
-        ("replay-framesamp", "recall-framesamp"),
-        ("replay-full", "recall-full"),
-        ("retrieval-replay-window-joined", "retrieval-recall-window-joined"),
-        ("retrieval-replay-full-extrapolate-joined", "retrieval-recall-full-joined"),
-        ("retrieval-framesamp-modul", "retrieval-recall-framesamp"),
-        ("perceptual-tokendrop-modul", None),  # it keeps parts of frames
-        ("oracle", None),
-        ("recall-framesamp", None),
-        ("mine", None),
-    ],
-)
-def test_a_ceiling_keeps_the_same_frames(system: str, ceiling: str | None) -> None:
-    assert ceiling_of(system) == ceiling
+# --- the ceiling -------------------------------------------------------------------------------
 
 
 def test_a_ceiling_is_behind_the_same_retrieval_step(tmp_path: Path) -> None:

@@ -3,25 +3,32 @@
 The numbers are those of docs/explanation/statistics.md.
 """
 
+import json
 import math
 from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from support import scoring as made
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.comparisons.families import over_families
 from robomme_interference_data.evaluate.score.comparisons.pairs import pair
-from robomme_interference_data.evaluate.score.comparisons.ranks import (
-    interactions_of,
-    rank_table,
-    systems_of,
-)
+from robomme_interference_data.evaluate.score.comparisons.ranks import rank_table, systems_of
+from robomme_interference_data.evaluate.score.comparisons.slopes import decay_table, interactions_of
 from robomme_interference_data.evaluate.score.comparisons.tables import comparison_table
 from robomme_interference_data.evaluate.score.outcomes import Outcomes
+from robomme_interference_data.evaluate.score.plots import figures
+from robomme_interference_data.evaluate.score.tables.equivalence import tost
+from robomme_interference_data.evaluate.score.tables.evidence_kept import evidence_tables
+from robomme_interference_data.evaluate.score.tables.steps import steps_table
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.stats.bootstrap import generator_of
 from robomme_interference_data.stats.sequential import look_levels
 from robomme_interference_data.stats.significance import mcnemar
@@ -38,21 +45,31 @@ PAGE = Path(__file__).parents[2] / "docs" / "explanation" / "statistics.md"
 CASES = {"6 systems": (6, 0.5), "12 systems": (12, 0.5), "12 systems, independent": (12, 0.0)}
 
 
-def made_up(systems: int, shared: float, key: str) -> Outcomes:
+def made_up(
+    systems: int, shared: float, key: str, conditions: Sequence[str] = CONDITIONS
+) -> Outcomes:
     """Outcomes of systems whose rates are all 30%, under all conditions."""
     generator = generator_of(key)
     common = generator.normal(size=(1, 1, len(EPISODES)))
-    own = generator.normal(size=(systems, len(CONDITIONS), len(EPISODES)))
+    own = generator.normal(size=(systems, len(conditions), len(EPISODES)))
     hard = math.sqrt(shared) * common + math.sqrt(1 - shared) * own
     status = (hard > -0.524401).astype(np.int8)[..., None]  # the normal quantile of 30%
+    # Lognormal steps to success, of which an episode's part is shared.
+    steps = np.exp(5 + 0.5 * generator.normal(size=status.shape) + 0.5 * common[..., None])
     every = np.ones(len(EPISODES), bool)
     names = tuple(f"system-{number:02}" for number in range(systems))
-    shape = (systems, len(CONDITIONS))
+    shape = (systems, len(conditions))
     return Outcomes(
-        *("made-up", names, CONDITIONS, EPISODES, (0,), status, np.full(status.shape, np.nan)),
+        *("made-up", names, tuple(conditions), EPISODES, (0,), status),
+        *(np.full(status.shape, np.nan), steps),
         *(np.zeros(len(EPISODES), int), np.full(len(EPISODES), np.nan), every),
         *(np.ones(shape, bool), np.zeros(systems, bool)),
     )
+
+
+def found_any(rows: list[dict[str, Any]], p: str = "p_holm") -> bool:
+    """Whether a table has a finding."""
+    return any(row[p] is not None and row[p] < 0.05 for row in rows)
 
 
 @cache
@@ -66,13 +83,19 @@ def simulated(case: str) -> dict[str, float]:
             rows = comparison_table(name, contrasts).records()
             if name != "interaction":
                 rows = [row for row in rows if row["condition"] == "k0"]
-            counts[name].append(any(row["p_holm"] < 0.05 for row in rows))
+            counts[name].append(found_any(rows))
             counts[f"{name}, pointwise"] += [row["low"] <= 0 <= row["high"] for row in rows]
             joint = [row["joint_low"] <= 0 <= row["joint_high"] for row in rows]
             counts[f"{name}, joint"].append(all(joint))
         leader = outcomes.status[:, 0, :, 0].mean(axis=1).argmin()  # 0 is success
         change = pair(*outcomes.status[leader, [0, 3]]).at(simultaneous(len(outcomes.systems)))
         counts["headline"].append(change.low <= 0 <= change.high)
+        rows = comparison_table("interaction", contrasts).records()
+        counts["interaction, fit"].append(found_any(rows, "p_fit_holm"))
+        rows = decay_table([outcomes], 2000).records()
+        counts["decay"].append(found_any(rows))
+        counts["decay, fit"].append(found_any(rows, "p_fit_holm"))
+        counts["steps"].append(found_any(steps_table([outcomes], 2000).records()))
         ranks = [row for row in rank_table([outcomes]).records() if row["condition"] == "k0"]
         counts["ranks"].append(
             all((r["rank_low"], r["rank_high"]) == (1, len(ranks)) for r in ranks)
@@ -97,6 +120,58 @@ def test_no_table_of_systems_finds_more_than_5_percent(case: str) -> None:
         if name != "systems":  # its intervals are all joint
             assert abs(found[f"{name}, pointwise"] - 0.95) <= 0.015
     assert min(found["ranks"], found["headline"]) >= 0.95 - bound(0.05)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_no_table_of_trends_or_steps_finds_more_than_5_percent(case: str) -> None:
+    found = simulated(case)
+    names = ("decay", "decay, fit", "interaction, fit", "steps")
+    line = " | ".join([case, *(f"{100 * found[name]:.1f}%" for name in names)])
+    assert f"| {line} |" in PAGE.read_text(encoding="utf-8")
+    assert max(found[name] for name in names) <= 0.05 + bound(0.05)
+
+
+@cache
+def unequal_families() -> float:
+    """Share of grids with an effect of evidence, where easy families keep more of it."""
+    found = []
+    family = np.repeat(np.arange(9), 50)
+    for grid in range(GRIDS):
+        outcomes = made_up(1, 0.0, f"evidence, {grid}")
+        generator = generator_of(f"evidence, {grid}, kept")
+        shape = outcomes.status.shape
+        easy = (0.1 + 0.075 * family)[:, None]
+        status = (generator.random(shape) > easy).astype(np.int8)
+        kept = generator.binomial(2, np.broadcast_to(easy, shape)) / 2
+        one = replace(outcomes, status=status, evidence=kept)
+        tables = {table.name: table for table in evidence_tables([one])}
+        found.append(found_any(tables["evidence_effects"].records()))
+    return sum(found) / GRIDS
+
+
+def test_easy_families_that_keep_more_evidence_are_no_effect() -> None:
+    share = unequal_families()
+    assert f"{100 * share:.1f}% of grids in `evidence_effects`" in PAGE.read_text(encoding="utf-8")
+    assert share <= 0.05 + bound(0.05)
+
+
+@cache
+def at_the_margin() -> float:
+    """Share of 2,000 differences of 5 points that are claimed to be within 5 points."""
+    generator = generator_of("margin")
+    counts = generator.multinomial(450, [0.2, 0.1, 0.05, 0.65], 2000).tolist()
+    found = []
+    for both, lost, gained, neither in counts:
+        pairs = [(0, 0)] * both + [(0, 1)] * lost + [(1, 0)] * gained + [(1, 1)] * neither
+        first, second = np.array(pairs, np.int8)[:, :, None].transpose(1, 0, 2)
+        found.append(tost(pair(first, second), 5) < 0.05)
+    return sum(found) / len(found)
+
+
+def test_a_difference_at_the_margin_is_seldom_equivalent() -> None:
+    share = at_the_margin()
+    assert f"equivalent in {100 * share:.1f}%" in PAGE.read_text(encoding="utf-8")
+    assert share <= 0.05 + bound(0.05, 2000)
 
 
 FLIPS = {"all 10%": [0.1] * 9, "one 40%, others 2%": [0.4] + [0.02] * 8}
@@ -129,3 +204,40 @@ def looking(levels: tuple[float, ...]) -> float:
 def test_planned_looks_find_no_more_than_5_percent() -> None:
     assert looking((0.05,) * 10) > 0.09
     assert looking(look_levels(10)) <= 0.05 + bound(0.05, 2000)
+
+
+FILES = 20
+
+
+def test_no_table_of_the_command_finds_too_much(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From files of rows to what is printed, with all tables that have a corrected p-value."""
+    monkeypatch.setattr(figures, "draw_figures", lambda score, folder, suffixes: {})
+    conditions = (NO_HISTORY, *CONDITIONS)
+    counts = defaultdict[str, int](int)
+    for grid in range(FILES):
+        outcomes = made_up(3, 0.5, f"files, {grid}", conditions)
+        generator = generator_of(f"files, {grid}, kept")
+        kept = (generator.integers(0, 3, outcomes.status.shape) / 2).tolist()
+        rows = [
+            replace(
+                made.row(outcomes.systems[s], conditions[c], "MoveCube", at.index, letter),
+                family=at.family,
+                seed=e,
+                steps=min(1300, int(outcomes.steps[s, c, e, 0])),
+                evidence_kept=kept[s][c][e][0],
+            )
+            for s, c, e, _ in np.ndindex(outcomes.status.shape)
+            for at, letter in [(EPISODES[e], "sf"[outcomes.status[s, c, e, 0]])]
+        ]
+        path = made.write_csv(tmp_path / "rows.csv", rows)
+        done = made.run("score", path, "--out", tmp_path / "out", "--margin", 1, "--json")
+        assert done.exit_code == 0, done.output
+        for name, table in json.loads(done.stdout)["tables"].items():
+            for column in [one for one in (table or [{}])[0] if one.endswith("_holm")]:
+                counts[f"{name}, {column}"] += found_any(table, column)
+    assert {"lift, p_holm", "matrix, p_holm", "families, p_families_holm"} <= counts.keys()
+    assert {"decay, p_fit_holm", "evidence_effects, p_holm", "steps, p_holm"} <= counts.keys()
+    most = FILES * (0.05 + bound(0.05, FILES))
+    assert {name: count for name, count in counts.items() if count > most} == {}

@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from statistics import NormalDist
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,9 +14,17 @@ from support import scoring as made
 from support.scoring import BASE, RETRIEVAL, cells, record, records, run
 
 from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.evaluate.score.comparisons.pairs import NO_PAIRS, Pairs, pair
 from robomme_interference_data.evaluate.score.config import Expected, Settings
 from robomme_interference_data.evaluate.score.power import needed, plan, power, smallest
 from robomme_interference_data.evaluate.score.report.headline import headline
+from robomme_interference_data.evaluate.score.tables.equivalence import (
+    BEYOND,
+    EQUIVALENT,
+    OPEN,
+    tost,
+    verdict,
+)
 from robomme_interference_data.stats.intervals import newcombe, newcombe_paired
 from robomme_interference_data.stats.sequential import look_levels
 
@@ -52,6 +61,8 @@ def test_retrieval_is_set_against_the_rows_without_it(tmp_path: Path) -> None:
         (r["system"], r["condition"], r["against_system"], r["against_condition"]): r["verdict"]
         for r in records(found, "equivalence")
     }
+    held = [r for r in records(found, "equivalence") if r["p_holm"] < 0.05]
+    assert {r["verdict"] for r in held} == {"equivalent", "equivalent†"}
     assert verdicts == {
         (BASE, "k7", BASE, "k0"): "beyond",
         (RETRIEVAL, "k7", RETRIEVAL, "k0"): "equivalent†",
@@ -59,6 +70,34 @@ def test_retrieval_is_set_against_the_rows_without_it(tmp_path: Path) -> None:
         (RETRIEVAL, "k7", BASE, "k7"): "beyond†",
         (RETRIEVAL, "k7", BASE, "k0"): "equivalent†",
     }
+
+
+def counted(both: int, lost: int, gained: int, neither: int) -> Pairs:
+    outcomes = [(0, 0)] * both + [(0, 1)] * lost + [(1, 0)] * gained + [(1, 1)] * neither
+    return pair(*np.array(outcomes, np.int8).reshape(-1, 2, 1).transpose(1, 0, 2))
+
+
+def test_p_of_equivalence_by_hand() -> None:
+    # The bound nearer to the margin reaches it at the level 1 − 2p.
+    pairs = counted(20, 6, 5, 29)  # a fall of 1/60
+    p = tost(pairs, 10)
+    assert pairs.at(1 - 2 * p).low == pytest.approx(-0.1, abs=1e-6) and 0.05 < p < 0.5
+    # Of a gain of a sixth, beyond the margin, it is the other bound, and p is above a half.
+    pairs = counted(20, 0, 10, 30)
+    p = tost(pairs, 5)
+    assert pairs.at(1 - 2 * (1 - p)).low == pytest.approx(0.05, abs=1e-6) and p > 0.5
+    assert math.isnan(tost(NO_PAIRS, 5))
+
+
+@given(st.tuples(*[st.integers(0, 99)] * 4).filter(any), st.integers(1, 40))
+def test_p_of_equivalence_agrees_with_the_verdict(
+    counts: tuple[int, int, int, int], margin: int
+) -> None:
+    pairs = counted(*counts)
+    p, found = tost(pairs, margin), verdict(pairs, margin)
+    if min(abs(p - 0.05), abs(p - 0.95)) > 1e-6:
+        assert found == (EQUIVALENT if p < 0.05 else BEYOND if p > 0.95 else OPEN)
+    assert tost(pairs, margin + 1) <= p + 1e-9
 
 
 @pytest.mark.parametrize("margin", [0, -1, 101, math.nan])
@@ -72,9 +111,9 @@ def test_a_margin_is_in_points(margin: float) -> None:
 
 def test_power_by_hand() -> None:
     # Of 6 episodes each flips one way or another with 0.5; six flips alike are found: 2/64 ≤ 0.05.
-    # All six against the difference of 0.5 have 0; in its favour 0.5⁶.
+    # All six against the difference of 0.5 have 0; in its favor 0.5⁶.
     assert power(0.5, 6, 0.0) == pytest.approx(0.5**6)
-    # With flips of 0.2: six of 0.6 in favour, or six of 0.1 against it.
+    # With flips of 0.2: six of 0.6 in favor, or six of 0.1 against it.
     assert power(0.5, 6, 0.2) == pytest.approx(0.6**6 + 0.1**6)
     # Five alike are not enough: 2/32.
     assert power(1.0, 5, 0.0) == 0.0 and smallest(5, 0.0) is None
@@ -158,6 +197,6 @@ def test_looks_spend_the_level() -> None:
     assert often.looks == levels and alone.looks == ()
     assert alone.power - 0.06 < often.power < alone.power + 0.02
     done = run("power", "--looks", "5")
-    assert "look 5 after 450 episodes: significant if p_holm is below  0.042" in done.stdout
+    assert "look 5 after 450 episodes: significant if p holm is below  0.042" in done.stdout
     with pytest.raises(InvalidOptionError, match="looks 21"):
         plan(0.05, 450, 0.06, looks=21)

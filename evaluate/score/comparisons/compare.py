@@ -112,7 +112,7 @@ def compare(
     table = comparison_table("compare", found, spec)
     looked = (
         f" Look {look[0]} of {look[1]} (alpha spending like O'Brien and Fleming's boundaries): a "
-        f"difference is significant if p_holm is below {alpha:.2g}, and intervals have the level "
+        f"difference is significant if p holm is below {alpha:.2g}, and intervals have the level "
         f"{1 - alpha:.4%}."
     )
     unplanned = [

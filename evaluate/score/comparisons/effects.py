@@ -1,26 +1,17 @@
-"""Effects of conditions on a system: lift, decay, retention, kinds of interference, and noise.
+"""Effects of conditions on a system: lift, retention, kinds of interference, and noise.
 
-All comparisons are paired over the episodes that count under both conditions; the bootstrap draws
-episodes.
+All comparisons are paired over the episodes that count under both conditions.
 """
 
 import math
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from robomme_interference_data.evaluate.score.outcomes import Outcomes, counting, success
 from robomme_interference_data.schema.conditions import NO_HISTORY, parse_condition
-from robomme_interference_data.stats.bootstrap import (
-    MIN_EPISODES,
-    Floats,
-    Interval,
-    bootstrap,
-    slope_weights,
-    varies_enough,
-)
+from robomme_interference_data.stats.bootstrap import Floats, Interval
 from robomme_interference_data.stats.intervals import fieller, wilson
 from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.viz.tables import Table
@@ -30,14 +21,13 @@ from .pairs import pair
 
 
 def effects_of(
-    outcomes: Outcomes, system: str, base: str | None, ceiling: str | None, draws: int
-) -> tuple[list[Contrast], list[tuple[Any, ...]]]:
-    """Compare a system's conditions, all bootstrap intervals from the same draws.
+    outcomes: Outcomes, system: str, base: str | None, ceiling: str | None
+) -> list[Contrast]:
+    """Compare a system's conditions.
 
     Each `k<n>` is compared with `no-history` and with k0, kinds of conditions as in `COMPARISONS`,
     and under each condition the system with its `base` (the one without retrieval, whose
-    `no-history` serves both) and with its `ceiling` (the ideal observer). Returns the comparisons,
-    and the row of `decay_table` if there are at least two `k<n>`.
+    `no-history` serves both) and with its `ceiling` (the ideal observer).
     """
     cells = [(name, c) for name in (system, base, ceiling) if name for c in outcomes.ran(name)]
     at = {cell: place for place, cell in enumerate(cells)}
@@ -73,16 +63,7 @@ def effects_of(
             none, start = found[c, floor], found[c, (system, START)].pairs
             kept = retained(three, none.pairs.change, start.change)
             found[c, floor] = replace(none, retention=kept, retention_n=len(three))
-    decays = []
-    if len(ks) > 1:
-        falling = [at[system, c] for c in ks]
-        each = values[:, falling] @ slope_weights([parse_condition(c).k for c in ks])
-        [fall] = bootstrap(each[:, None], outcomes.simulator, draws)
-        changing = each[~np.isnan(each)]
-        known = fall if varies_enough(changing) else Interval(fall.value)
-        whole = all(complete[place] for place in falling)
-        decays.append((outcomes.simulator, system, " ".join(ks), len(changing), *known, whole))
-    return list(found.values()), decays
+    return list(found.values())
 
 
 def retained(values: Floats, lift: Interval, fall: Interval) -> Interval:
@@ -113,19 +94,6 @@ def retained(values: Floats, lift: Interval, fall: Interval) -> Interval:
 
 
 # --- tables ------------------------------------------------------------------------------------
-
-
-def decay_table(rows: Iterable[tuple[Any, ...]]) -> Table:
-    """Return each system's log-linear decay over the sessions in the buffer."""
-    return Table.make(
-        "decay",
-        "Decay over sessions",
-        "simulator system conditions n:count slope:points low:points high:points complete:flag",
-        rows,
-        "slope: change of the success rate per doubling of the sessions in the buffer, the lesson "
-        "included (least-squares line over log2(k + 1)). 95% BCa bootstrap interval over episodes, "
-        f"if at least {MIN_EPISODES} episodes contribute to the slope.",
-    )
 
 
 def noise_table(every: Iterable[Outcomes]) -> Table:

@@ -48,15 +48,15 @@ _SPEC = TableSpec(
     "without_low:points without_high:points spread:points sample_low:points sample_high:points "
     "p_families:p p_families_holm:p complete",
     "difference: over all episodes, as in the other tables. alike: the mean of the families' own "
-    "differences. alike_low to alike_high: its 95% bootstrap interval for these families, with "
-    "episodes drawn within each. without_low to without_high: the lowest and the highest mean if "
+    "differences. alike low to alike high: its 95% bootstrap interval for these families, with "
+    "episodes drawn within each. without low to without high: the lowest and the highest mean if "
     "one family is left out. spread: the standard deviation of the true differences of families, "
-    "estimated without the noise of their episodes. sample_low to sample_high: as alike_low and "
-    "alike_high, with families drawn too, as a sample of such families: for tasks beyond these, "
+    "estimated without the noise of their episodes. sample low to sample high: as alike low and "
+    "alike high, with families drawn too, as a sample of such families: for tasks beyond these, "
     "much wider, and with so few families still "
     f"too narrow. Both from {DRAWS:,} draws, if at least {MIN_EPISODES} episodes differ. "
-    "p_families: a test of whether the difference varies between families, by "
-    f"{DRAWS:,} random sign flips of the differences from their family's mean; p_families_holm: "
+    "p families: a test of whether the difference varies between families, by "
+    f"{DRAWS:,} random sign flips of the differences from their family's mean; p families holm: "
     "after Holm's correction within a simulator.",
     power=False,
 )

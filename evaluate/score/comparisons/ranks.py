@@ -1,17 +1,14 @@
-"""Systems compared: all pairs, the best ones, ranks, and which of them falls faster over k."""
+"""Systems compared: all pairs, the best ones, and ranks."""
 
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
 
-from robomme_interference_data.evaluate.score.outcomes import Flags, Outcomes, rate_of, success
+from robomme_interference_data.evaluate.score.outcomes import Flags, Outcomes, rate_of
 from robomme_interference_data.evaluate.systems import is_reference
-from robomme_interference_data.schema.conditions import parse_condition
-from robomme_interference_data.stats.bootstrap import DRAWS, slope_weights
 from robomme_interference_data.stats.significance import ALPHA, holm
-from robomme_interference_data.stats.signs import sign_flips, simultaneous
+from robomme_interference_data.stats.signs import simultaneous
 from robomme_interference_data.viz.tables import Table
 
 from .contrast import Contrast
@@ -117,51 +114,8 @@ def rank_table(every: Iterable[Outcomes]) -> Table:
         "Ranks of systems",
         "simulator condition system rate:rate rank:count rank_low:count rank_high:count",
         rows,
-        "Complete cells only; rank 1 is the highest rate, and equal rates share a rank. rank_low "
-        "to rank_high: the ranks that the system can have, from the significant differences of the "
-        "table matrix (p_holm below 0.05): 1 + the systems that are better, to the number of "
+        "Complete cells only; rank 1 is the highest rate, and equal rates share a rank. rank low "
+        "to rank high: the ranks that the system can have, from the significant differences of the "
+        "table matrix (p holm below 0.05): 1 + the systems that are better, to the number of "
         "systems less those that are worse. All of a condition hold at once with 95% confidence.",
     )
-
-
-# --- differences of slopes ---------------------------------------------------------------------
-
-
-def interactions_of(outcomes: Outcomes, draws: int = DRAWS) -> list[Contrast]:
-    """Compare how fast each pair of systems falls over all `k<n>` that both have.
-
-    Each pair is tested once. Systems whose histories may differ are left out, and so are
-    references.
-    """
-    values = success(outcomes.status)
-    systems = [name for name in outcomes.systems if not is_reference(name)]
-    pairs, slopes = list[tuple[str, str, list[str]]](), []
-    for one, other in combinations(systems, 2):
-        conditions = [c for c in outcomes.ran(one) if c in outcomes.ran(other)]
-        conditions = [c for c in conditions if parse_condition(c).kind.name == "k"]
-        if len(conditions) < 2 or not outcomes.pairable(one, other):
-            continue
-        weights = slope_weights([parse_condition(c).k for c in conditions])
-        cells = [[outcomes.cell(name, c) for c in conditions] for name in (other, one)]
-        sides = np.stack([weights @ [values[cell] for cell in side] for side in cells])
-        pairs.append((one, other, conditions))
-        slopes.append(sides)
-    if not pairs:
-        return []
-    changes = np.stack([(after - before).round(12) for before, after in slopes], axis=1)
-    found = []
-    for (one, other, conditions), sides, step, test in zip(
-        pairs, slopes, changes.T, sign_flips(changes, outcomes.simulator, draws), strict=True
-    ):
-        known = ~np.isnan(step)
-        n = int(known.sum())
-        old, new = (float(side[known].mean()) if n else math.nan for side in sides)
-        counts = (n, int((step > 0).sum()), int((step < 0).sum()))
-        kind = "sign-flip" if n else ""
-        every = [outcomes.cell(name, c) for name in (one, other) for c in conditions]
-        compared = Pairs(n, old, new, test.at, kind, *counts, test.p, math.nan)
-        names = (outcomes.simulator, one, conditions[-1], (other, conditions[-1]), "interaction")
-        complete = all(bool(outcomes.complete[cell]) for cell in every)
-        more = {"conditions": " ".join(conditions)}
-        found.append(Contrast(*names, compared, complete, more=more))
-    return found

@@ -88,7 +88,7 @@ SPECS = {
         f"no_history_rate=against_rate lift=difference {TEST} retention retention_low "
         "retention_high retention_n complete",
         f"{_BOTH} retention: lift divided by the lift at k0, with Fieller's interval, computed "
-        f"only if the lift at k0 is above zero with p < {ALPHA}; over the retention_n episodes "
+        f"only if the lift at k0 is above zero with p < {ALPHA}; over the retention n episodes "
         "that count under no-history, k0 and the condition, which can be fewer than n in "
         "incomplete cells. Without history, a system with retrieval is the system without it.",
     ),
@@ -109,8 +109,8 @@ SPECS = {
         "Difference to the best system",
         _EFFECT,
         "Within each condition, each complete cell against the one with the highest rate (the "
-        "first of equal ones). Since that one is chosen by its rate, p_holm and all intervals are "
-        f"corrected over all pairs of systems; p and p_mid are not. {_BOTH}",
+        "first of equal ones). Since that one is chosen by its rate, p holm and all intervals are "
+        f"corrected over all pairs of systems; p and p mid are not. {_BOTH}",
         *_WITHIN,
     ),
     "matrix": TableSpec(
@@ -120,14 +120,16 @@ SPECS = {
         "Which system falls faster",
         "simulator system against_system conditions:text n slope:points=rate "
         "against_slope:points=against_rate difference low high gained lost p p_holm:p "
-        "joint_low:points joint_high:points complete",
+        "joint_low:points joint_high:points p_fit:p p_fit_holm:p complete",
         "slope: change of the success rate per doubling of the sessions (least-squares line over "
         "log2(k + 1) of all conditions listed); difference: between the two slopes, positive if "
         "the system falls more slowly than the other one. Each pair of systems once; those whose "
         "histories may differ are left out. Over the n episodes that count in all cells; gained "
         "and lost: episodes whose own slope is higher or lower than the other system's. p: "
         "sign-flip test of the episodes' differences; low to high: the 95% interval of all "
-        "differences that this test does not reject, if at least ten episodes differ. {correct}",
+        "differences that this test does not reject, if at least ten episodes differ. {correct} "
+        "p fit: whether the difference between the two rates departs from a line over log2(k + 1), "
+        "by sign flips; p fit holm: after the same correction.",
         power=False,
     ),
     "family_effects": TableSpec(
@@ -190,7 +192,7 @@ def corrected(p_values: Sequence[float], groups: Sequence[Hashable]) -> list[flo
 
 
 _CORRECT = (
-    "p_holm: p after Holm's correction among {among}; joint_low to joint_high: intervals that hold "
+    "p holm: p after Holm's correction among {among}; joint low to joint high: intervals that hold "
     "for all of these at once with 95% (Bonferroni)."
 )
 
@@ -201,7 +203,7 @@ def _how_to_read(found: Sequence[Contrast], correct: str) -> str:
     note = (
         "95% confidence intervals; interval names the method: newcombe is Newcombe's paired score "
         "interval. p: McNemar's exact test, which is conservative: where an interval excludes 0 "
-        f"and p is not below 0.05, see p_mid, its mid-p. {correct} pairs: one per episode; gained "
+        f"and p is not below 0.05, see p mid, its mid-p. {correct} pairs: one per episode; gained "
         "and lost: pairs whose outcome changes; flips: their share."
     )
     if "clusters" in kinds:

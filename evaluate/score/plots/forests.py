@@ -14,7 +14,7 @@ from robomme_interference_data.evaluate.score.comparisons.contrast import (
 from robomme_interference_data.schema.conditions import KINDS, parse_condition
 from robomme_interference_data.stats.bootstrap import Interval
 from robomme_interference_data.stats.significance import ALPHA
-from robomme_interference_data.viz.figure import GREY, INK, Hue, tidy
+from robomme_interference_data.viz.figure import GRAY, INK, Hue, tidy
 
 from .curves import draw_points, label_ends, legend, mark, panel_grid, set_axes, short
 from .data import Data
@@ -59,9 +59,9 @@ def _forest(
     places = {key: place for place, key in enumerate(rows)}
     for axes, (name, group) in zip(grid, panels.items(), strict=True):
         if band:
-            axes.axvspan(-band, band, color=GREY, alpha=0.2, linewidth=0, zorder=0)
+            axes.axvspan(-band, band, color=GRAY, alpha=0.2, linewidth=0, zorder=0)
         for guide, line in zip(guides, ("-", "--"), strict=False):
-            axes.axvline(guide, color=GREY, linewidth=0.8, linestyle=line, zorder=0)
+            axes.axvline(guide, color=GRAY, linewidth=0.8, linestyle=line, zorder=0)
         for key, one in group.items():
             point = (places[key], *(scale * number for number in value(one)))
             style = data.styles[one.system]

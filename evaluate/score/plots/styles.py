@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from robomme_interference_data.evaluate.systems import SYSTEMS, known_system
-from robomme_interference_data.viz.figure import GREY, INK, Hue
+from robomme_interference_data.viz.figure import GRAY, INK, Hue
 
 # By what the memory holds.
 _COLORS = {
-    "none": GREY,
+    "none": GRAY,
     "frames": Hue.BLUE,
     "tokens": Hue.SKY,
     "hidden state": Hue.GREEN,

@@ -39,7 +39,8 @@ _SHOWN_IN = {
     **{"families": ("family", "paper_family"), "heatmap": ("family",)},
     **{"difficulty": ("difficulty",), "retention": ("lift",)},
     **{"retrieval": ("effects", "family"), "kinds": ("main",), "interference": ("interference",)},
-    **{"by_evidence_kept": ("by_evidence_kept",), "ceiling": ("ceiling",)},
+    "by_evidence_kept": ("by_evidence_kept", "evidence_effects", "evidence_use"),
+    "ceiling": ("ceiling",),
     **{"matrix": ("matrix", "systems", "ranks")},
 }
 """Figure to the tables with its numbers."""

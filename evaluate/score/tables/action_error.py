@@ -73,7 +73,7 @@ def error_tables(rows: Iterable[Row], draws: int) -> list[Table]:
             [(*change, p) for change, p in zip(changes, corrected, strict=True)],
             "difference: error under the condition minus that under the other one, over the n "
             "episodes that have both; negative is better. p: sign-flip test of the differences, "
-            f"rounded to twentieths of the largest; p_holm: corrected for this table. {_INTERVALS}",
+            f"rounded to twentieths of the largest; p holm: corrected for this table. {_INTERVALS}",
         ),
     ]
 

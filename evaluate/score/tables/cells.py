@@ -21,21 +21,26 @@ from robomme_interference_data.evaluate.systems import display_name, is_referenc
 from robomme_interference_data.ids import EpisodeId, format_numbers
 from robomme_interference_data.schema.conditions import in_order
 from robomme_interference_data.schema.rollouts import Status
-from robomme_interference_data.stats.intervals import stratified_n, wilson
+from robomme_interference_data.stats.intervals import wilson
+from robomme_interference_data.stats.strata import stratified_n
 from robomme_interference_data.viz.tables import Table, percent
 
-_ERROR = STATUSES.index(Status.ERROR)
+_FAIL, _ERROR = (np.int8(STATUSES.index(one)) for one in (Status.FAIL, Status.ERROR))
 _NOTE = (
     "Rates with 95% Wilson intervals. n: episodes that count; an error is neither success nor "
     "failure. †: the cell lacks episodes, or has episodes outside the grid, and is not ranked; a "
     "cell without any rollout is missing."
+)
+_ERRORS = (
+    " if errors fail: the rate if every error were a failure, the least that it can be if errors "
+    "depend on the outcome."
 )
 _BEST = (
     " Best (bold): above zero, and no other system is significantly better, by p after Holm's "
     "correction over all pairs of systems."
 )
 _FIXED = (
-    " fixed_low to fixed_high: Wilson's interval for other episodes of the same families in the "
+    " fixed low to fixed high: Wilson's interval for other episodes of the same families in the "
     "same numbers, narrower because the families' rates differ."
 )
 
@@ -53,6 +58,7 @@ class Cell:
     interval: tuple[float, float]  # 95% Wilson; (0, 1) if n is 0
     trials: float  # effective number of independent trials: n, and more with repeats
     fixed: tuple[float, float] = (math.nan, math.nan)  # interval for just these families
+    if_errors_fail: float = math.nan  # rate if every error were a failure; NaN without rollouts
     counts: tuple[int, ...] = (0,) * len(STATUSES)  # rollouts by status
     chance: float = math.nan  # mean success of guessing; NaN unless all episodes are questions
     expected: int = 0  # number of expected episodes
@@ -100,12 +106,14 @@ def _cells(outcomes: Outcomes) -> list[Cell]:
             if not ((here & outcomes.has_episode[s]) | (due & outcomes.expected)).any():
                 continue
             counted, counts = here & outcomes.counted[s, c], outcomes.counts[s, c]
-            rate = rate_of(outcomes.status[s, c, here])
+            status = outcomes.status[s, c, here]
+            rate = rate_of(status)
             names = (outcomes.simulator, outcomes.systems[s], outcomes.conditions[c], name)
             cells.append(
                 Cell(
                     *(*names, rate.n, rate.value, rate.interval, rate.trials),
                     fixed=(math.nan, math.nan) if name else _fixed(outcomes, s, c, rate),
+                    if_errors_fail=rate_of(np.where(status == _ERROR, _FAIL, status)).value,
                     counts=tuple(counts[here].sum(axis=0).tolist()),
                     chance=float(outcomes.chance[counted].mean()) if rate.n else math.nan,
                     expected=int((due & outcomes.expected).sum()),
@@ -124,7 +132,8 @@ def _fixed(outcomes: Outcomes, system: int, condition: int, rate: Rate) -> tuple
     parts = [part for part in parts if part.n]
     if len(parts) < 2:
         return math.nan, math.nan
-    trials = stratified_n([p.value * p.n for p in parts], [p.n for p in parts])
+    n = np.array([part.n for part in parts], float)
+    trials = stratified_n(n * [part.value for part in parts], n)
     trials *= rate.trials / rate.n
     return wilson(rate.value * trials, trials)
 
@@ -154,17 +163,18 @@ def rate_table(cells: Sequence[Cell], name: str) -> Table:
         if cell.part in (parts or ("",)) and not (parts and key not in ran):
             key += (cell.part,) if parts else ()
             bounds = cell.interval if cell.n else (math.nan, math.nan)
-            fixed = () if parts else cell.fixed
+            fixed = () if parts else (*cell.fixed, cell.if_errors_fail)
             more = (cell.complete, len(cell.missing), cell.rank, cell.best)
             rows.append((*key, cell.n, cell.rate, *bounds, *fixed, *cell.counts, *more))
     return Table.make(
         name,
         f"Success by {name if parts else 'system and condition'}",
         f"simulator system condition {name if parts else ''} n:count rate:rate low:rate high:rate "
-        f"{'' if parts else 'fixed_low:rate fixed_high:rate '}successes:count fails:count "
-        "timeouts:count errors:count complete:flag missing:count rank:count best:flag",
+        f"{'' if parts else 'fixed_low:rate fixed_high:rate if_errors_fail:rate '}"
+        "successes:count fails:count timeouts:count errors:count complete:flag missing:count "
+        "rank:count best:flag",
         rows,
-        _NOTE + _BEST + _FIXED * (not parts),
+        _NOTE + _BEST + (_FIXED + _ERRORS) * (not parts),
     )
 
 

@@ -16,10 +16,10 @@ _NOTE = (
     "mean over the n episodes; above: (rate − chance) / (1 − chance), which is 1 if all answers "
     "are right and 0 for guessing; low and high: the same for the rate's 95% Wilson interval. p: "
     "exact one-sided probability of at least as many right answers by guessing "
-    "(Poisson-binomial); p_holm: after Holm's correction among the tests of this table in one "
+    "(Poisson-binomial); p holm: after Holm's correction among the tests of this table in one "
     "simulator. An answer that names no option is wrong, so frequent refusals fall below chance. "
     "Systems that see nothing of the past (the controls blank and text, and any under no-history) "
-    f"must be at chance: p_holm below {ALPHA} there means that questions can be answered without "
+    f"must be at chance: p holm below {ALPHA} there means that questions can be answered without "
     "memory; a larger one does not prove the opposite."
 )
 _REPEATS = (
