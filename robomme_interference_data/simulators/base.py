@@ -151,6 +151,11 @@ class Simulator(ABC):
         return []
 
     @classmethod
+    def further_episodes(cls) -> list[EpisodeId]:
+        """Return episodes, in canonical order, that are built only if their numbers are given."""
+        return []
+
+    @classmethod
     def other_answer(cls, episode: EpisodeId) -> int | None:
         """Return the number of another answer that an episode's scene allows.
 

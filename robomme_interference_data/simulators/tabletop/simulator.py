@@ -22,7 +22,7 @@ from robomme_interference_data.simulators.base import (
 )
 
 from . import SUITE_VERSION
-from .episodes import episode_ids, seed_of
+from .episodes import episode_ids, further_ids, seed_of
 from .families import known_scene, other_answer
 from .family import Family
 
@@ -68,6 +68,11 @@ class TabletopSimulator(Simulator):
     def episodes(cls) -> list[EpisodeId]:
         """Return the suite's episodes."""
         return episode_ids()
+
+    @classmethod
+    def further_episodes(cls) -> list[EpisodeId]:
+        """Return the suite's further train episodes."""
+        return further_ids()
 
     @classmethod
     def other_answer(cls, episode: EpisodeId) -> int:
