@@ -114,10 +114,11 @@ class TabletopSimulator(Simulator):
         super().close()
         self.env.close()
 
-    def _begin(self, episode: EpisodeId, demonstration: bool) -> Begun:
+    def _begin(self, episode: EpisodeId, every: int) -> Begun:
         seed = seed_of(episode)
         self.env.family = episode.family
-        self.env.demonstrated = self._cameras if demonstration else ()
+        self.env.demonstrated = self._cameras if every else ()
+        self.env.every = every or 1
         options = {} if episode.answer is None else {"answer": episode.answer}
         _, info = self.env.reset(seed=seed, options=options)
         about = EpisodeInfo(info["goals"], info["difficulty"], seed, self.name)
