@@ -54,7 +54,10 @@ class BuildConfig(WorkersConfig):
         None, help="train, val or test.", shown="all; for units train", group="Episodes"
     )
     episodes: str | None = setting(
-        None, help="Episode indices, such as 0-49 or 0,3,10-12; default: all.", group="Episodes"
+        None,
+        help="Episode indices, such as 0-49 or 0,3,10-12; default: all, of tabletop's 900 train "
+        "episodes a family 0-99.",
+        group="Episodes",
     )
     cameras: tuple[str, ...] = setting(
         (), help="Cameras to store, such as front; default: all.", group="Encoding"
@@ -329,7 +332,7 @@ def list_episodes(
             for number, one in listed
             if one.id.family in chosen_families
             and split in (None, one.id.split)
-            and (chosen_indices is None or one.id.index in chosen_indices)
+            and (not one.further if chosen_indices is None else one.id.index in chosen_indices)
         ),
         key=lambda item: item[1].id.sort_key,
     )

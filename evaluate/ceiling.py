@@ -1,8 +1,8 @@
-"""The ceiling of a memory rule: the maximum success of any policy with it, without a rollout.
+"""The ceiling of a memory rule: success of an observer that uses marked evidence only.
 
 The ideal observer (`recall`) knows the parts of the answer of whose evidence its memory keeps a
 frame, and draws one of the answers that agree. Its expected success is 1 / (agreeing answers), a
-function of manifests and records: nothing is decoded or simulated.
+function of manifests and records: nothing is decoded or simulated, and there is no rollout.
 """
 
 from collections.abc import Iterable, Iterator, Sequence

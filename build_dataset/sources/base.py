@@ -46,11 +46,13 @@ class SourceEpisode:
         key: How the source finds the episode; changes with the recording (it holds, for example,
             the file's time and size). Must be picklable.
         marked: False if the source knows that it cannot tell where the demonstration ends.
+        further: Whether it is built only if its number is given.
     """
 
     id: EpisodeId
     key: Any = field(default=None, compare=False)
     marked: bool = field(default=True, compare=False)
+    further: bool = field(default=False, compare=False)
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,10 @@ class SimulatorSource(Source):
 
     @override
     def episodes(self) -> list[SourceEpisode]:
-        return [SourceEpisode(one, self.provenance) for one in sorted(self._class.episodes())]
+        usual, further = self._class.episodes(), self._class.further_episodes()
+        listed = [SourceEpisode(one, self.provenance) for one in usual]
+        listed += [SourceEpisode(one, self.provenance, further=True) for one in further]
+        return sorted(listed, key=lambda one: one.id)
 
     @override
     def contradict(self, episode: SourceEpisode) -> SourceEpisode:

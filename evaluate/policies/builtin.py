@@ -181,7 +181,7 @@ class FollowSubgoals(Privileged):
 
 
 class Recall(Privileged):
-    """`recall`: the ideal observer, the ceiling of every policy with its memory rule.
+    """`recall`: the ideal observer, which uses marked evidence only, with some memory rule.
 
     It knows the parts of the hidden answer of whose evidence its memory keeps a frame; of two
     lessons that show the same part, the newer one counts. It draws one of the answers that agree

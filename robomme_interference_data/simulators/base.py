@@ -49,7 +49,8 @@ class Demonstration:
     """The lesson of an episode: T time steps, without the first live observation.
 
     Attributes:
-        images: Camera name to frames, `(T, H, W, 3) uint8` RGB; empty if not requested.
+        images: Camera name to frames, `(T, H, W, 3) uint8` RGB; only every n-th frame if these were
+            requested, empty if none were.
         states: `(T, 8) float32`, as `Observation.state`; `states[t]` belongs to frame t.
         actions: `(T, 8) float32`, executed after frame t: 7 absolute joint targets in rad, then
             the gripper, −1 closed to 1 open. `(0, 8)` if unknown.
@@ -153,6 +154,11 @@ class Simulator(ABC):
         return []
 
     @classmethod
+    def further_episodes(cls) -> list[EpisodeId]:
+        """Return episodes, in canonical order, that are built only if their numbers are given."""
+        return []
+
+    @classmethod
     def other_answer(cls, episode: EpisodeId) -> int | None:
         """Return the number of another answer that an episode's scene allows.
 
@@ -192,28 +198,33 @@ class Simulator(ABC):
         """
         raise UnknownNameError(f"the simulator {type(self).__name__} does not support shifts")
 
-    def reset(self, episode_id: str, demonstration: bool = True) -> Begun:
+    def reset(self, episode_id: str, demonstration: int = True) -> Begun:
         """Start an episode: play its demonstration, then set up the live scene.
 
         The same id gives the same frames, states and first observation, bit for bit.
 
         Args:
             episode_id: `<Family>/<split>/<index>`, such as `MoveCube/test/3`.
-            demonstration: Whether to return the frames of the demonstration. It is played in any
-                case, but `False` lets a simulator skip rendering and leave `images` empty.
+            demonstration: Whether to return the frames of the demonstration; a number n for every
+                n-th of them, as in `states[::n]`. It is played in any case, but a simulator may
+                skip rendering the others.
 
         Returns:
             The demonstration; the first live observation; the public facts about the episode.
 
         Raises:
             InvalidIdError: The text is not an episode id.
+            InvalidOptionError: `demonstration` is negative.
             UnknownNameError: The family or episode does not exist.
             SimulatorCrashError: The simulator failed, or is closed.
         """
         self._check_open()
         self._episode = None
         episode = EpisodeId.parse(str(episode_id))
-        begun = self._begin(episode, demonstration)
+        if demonstration < 0:
+            expected = "True, False, or n for every n-th frame"
+            raise InvalidOptionError.expected("demonstration", demonstration, expected)
+        begun = self._begin(episode, int(demonstration))
         self._episode, self._steps = episode, 0
         return begun
 
@@ -323,8 +334,8 @@ class Simulator(ABC):
         return self._episode
 
     @abstractmethod
-    def _begin(self, episode: EpisodeId, demonstration: bool) -> Begun:
-        """Start an episode; see `reset`."""
+    def _begin(self, episode: EpisodeId, every: int) -> Begun:
+        """Start an episode, and return every n-th frame of its demonstration, none if 0."""
 
     @abstractmethod
     def _execute(

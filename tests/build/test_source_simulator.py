@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 from support.simulator_doubles import Double
 
+from robomme_interference_data.build_dataset.config import list_episodes
 from robomme_interference_data.build_dataset.frame_selection import select_demonstration
 from robomme_interference_data.build_dataset.sources import Recording, open_source, simulator
 from robomme_interference_data.constants import FAMILIES
@@ -99,6 +100,10 @@ def test_one_simulator_is_kept_for_the_same_cameras(made: list[Double]) -> None:
 
 @pytest.mark.parametrize("name", ["tabletop", "robomme"])
 def test_episodes(name: str) -> None:
-    ids = [episode.id for episode in open_source(name).episodes()]
-    assert len(set(ids)) == len(ids) == len(FAMILIES) * (100 + 50 + 50)
-    assert ids == sorted(ids)
+    source = open_source(name)
+    ids = [episode.id for episode in source.episodes()]
+    assert ids == sorted({*ids})
+    assert len(list_episodes([source])) == len(FAMILIES) * (100 + 50 + 50)
+    named = [one.id.index for _, one in list_episodes([source], numbers=(99, 100, 899, 900))]
+    assert sorted({*named}) == ([99, 100, 899] if name == "tabletop" else [99])
+    assert len(named) == len(FAMILIES) * len({*named})

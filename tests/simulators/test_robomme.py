@@ -64,6 +64,9 @@ def test_an_episode_is_what_robomme_returns(simulator: RoboMMESimulator) -> None
     assert info.goal == info.goals[0]
     # One wording may come as a text instead of a list.
     assert simulator.reset("RouteStick/test/0")[2].goals == ("move the cube as before",)
+    fewer, _, _ = simulator.reset("MoveCube/test/3", demonstration=2)
+    assert fewer.images["front"][:, 0, 0, 0].tolist() == [0, 2, 4]
+    assert np.array_equal(fewer.states, lesson.states)
     assert (info.difficulty, info.seed, info.simulator) == ("easy", 640_003, "robomme")
     # Seeds: 640000 + 1000 times the rank of test, val, train + index.
     seeds = [simulator.reset(f"MoveCube/{split}/1")[2].seed for split in ("val", "train")]

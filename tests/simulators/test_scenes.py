@@ -21,6 +21,7 @@ from robomme_interference_data.simulators.tabletop.camera import to_pixels
 from robomme_interference_data.simulators.tabletop.episodes import (
     difficulty_of,
     episode_ids,
+    further_ids,
     seed_of,
     turn_of,
 )
@@ -50,8 +51,8 @@ def scenes(family: str, split: str | None = None, difficulty: str | None = None)
 
 
 def test_every_episode_has_a_seed_of_its_own() -> None:
-    seeds = [seed_of(episode) for episode in episode_ids()]
-    assert len(seeds) == len(set(seeds)) == 9 * 200
+    seeds = [seed_of(episode) for episode in (*episode_ids(), *further_ids())]
+    assert len(seeds) == len(set(seeds)) == 9 * (900 + 50 + 50)
     for family in FAMILIES:
         counts = [len(seeds_of(family, "test", difficulty)) for difficulty in DIFFICULTIES]
         assert counts == [17, 17, 16]
@@ -60,6 +61,7 @@ def test_every_episode_has_a_seed_of_its_own() -> None:
 def test_seeds_and_difficulties_are_fixed() -> None:
     for text, seed, difficulty in (
         ("VideoRepick/train/99", 3099, "easy"),
+        ("VideoRepick/train/899", 3899, "hard"),
         ("VideoRepick/val/1", 3901, "medium"),
         ("RouteStick/test/49", 28849, "medium"),
     ):

@@ -84,6 +84,16 @@ def test_reset_serves_what_it_says_the_same_each_time(tabletop: TabletopSimulato
         assert np.array_equal(one, other)
 
 
+def test_every_fourth_frame_of_a_lesson(tabletop: TabletopSimulator) -> None:
+    lesson, first, _ = tabletop.reset(SHORT)
+    fewer, again, _ = tabletop.reset(SHORT, demonstration=4)
+    for name, frames in lesson.images.items():
+        assert np.array_equal(fewer.images[name], frames[::4])
+        assert np.array_equal(first.images[name], again.images[name])
+    assert np.array_equal(fewer.states, lesson.states)
+    assert fewer.evidence == lesson.evidence
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("tabletop")  # skips where nothing can be drawn
 def test_another_process_gives_the_same_bits() -> None:
@@ -248,6 +258,8 @@ def test_invalid_input(blind: TabletopSimulator) -> None:
         blind.act("orakle")
     with pytest.raises(UnknownNameError):
         blind.reset("MoveCube/test/999")
+    with pytest.raises(InvalidOptionError, match="every n-th"):
+        blind.reset(SHORT, demonstration=-1)
     with pytest.raises(SimulatorCrashError, match="no episode is running"):
         blind.act("oracle")
     with pytest.raises(InvalidOptionError, match="Did you mean 'front'"):

@@ -54,7 +54,7 @@ class Double(Simulator):
         super().close()
         self.closed = True
 
-    def _begin(self, episode: EpisodeId, demonstration: bool) -> Begun:
+    def _begin(self, episode: EpisodeId, every: int) -> Begun:
         if episode.index == UNKNOWN:
             raise UnknownNameError("no such episode", "Take another.")
         lesson = Demonstration(

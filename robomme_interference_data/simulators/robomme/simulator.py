@@ -134,7 +134,7 @@ class RoboMMESimulator(Simulator):
         super().close()
         self._process.end()
 
-    def _begin(self, episode: EpisodeId, demonstration: bool) -> Begun:
+    def _begin(self, episode: EpisodeId, every: int) -> Begun:
         if episode.answer is not None:
             raise UnknownNameError(
                 f"{episode}: RoboMME cannot combine a scene with another answer",
@@ -154,12 +154,12 @@ class RoboMMESimulator(Simulator):
             index=episode.index,
             max_steps=MAX_STEPS,
             cameras=self._cameras,
-            demonstration=demonstration,
+            demonstration=every > 0,
             subgoals=self._subgoals,
         )
         self._subgoal = facts["subgoal"]
         first = self._observation(arrays, self._cameras)
-        images = {camera: arrays[camera][:-1] for camera in self._cameras if demonstration}
+        images = {camera: arrays[camera][:-1:every] for camera in self._cameras if every}
         no_actions = np.empty((0, ACTION_SIZE), np.float32)
         lesson = Demonstration(images, arrays["states"][:-1], no_actions)
         info = EpisodeInfo(tuple(facts["goals"]), facts["difficulty"], facts["seed"], self.name)

@@ -59,6 +59,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
 
     Attributes:
         demonstrated: Cameras that render the demonstration.
+        every: They render every n-th frame of it.
         demonstrating: Whether a reset plays the demonstration at all.
         shift: Shift of the live scene.
     """
@@ -70,6 +71,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         self.family = family
         self.drawing = render
         self.demonstrated: Sequence[str] = CAMERAS
+        self.every = 1
         self.demonstrating = False
         self.shift: Shift | None = None
         for name, values in (_POSSIBLE if render else _POSSIBLE_BLIND).items():
@@ -222,15 +224,18 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
 
     def _demonstrate(self) -> Demonstration:
         seen, actions, shown = [], [], []
-        for _ in self.episode.demonstrate(self.arm, self.answer):
+        for number, _ in enumerate(self.episode.demonstrate(self.arm, self.answer)):
             shown.append(self.episode.showing)
-            seen.append(self.observe(self.demonstrated))
+            seen.append(self.observe(() if number % self.every else self.demonstrated))
             actions.append(self.arm.action.copy())
             super()._step_action(actions[-1])
         self.builder.restore()
         self._rest()
         return Demonstration(
-            {name: np.stack([one.images[name] for one in seen]) for name in seen[0].images},
+            {
+                name: np.stack([one.images[name] for one in seen[:: self.every]])
+                for name in seen[0].images
+            },
             np.stack([one.state for one in seen]),
             np.stack(actions),
             spans_of_parts(shown, self.episode.parts(self.answer)),

@@ -7,10 +7,13 @@ from robomme_interference_data.errors import UnknownNameError
 from robomme_interference_data.ids import EpisodeId
 
 EPISODES = {"train": 100, "val": 50, "test": 50}
-"""Episodes per family in each split."""
+"""Episodes per family in each split; RoboMME has as many."""
+
+TRAIN = 900
+"""Train episodes per family with those that are built only if their numbers are given."""
 
 _FAMILY_SPAN = 3000
-_SPLIT_SPAN = 900  # a multiple of 3, see difficulty_of
+_SPLIT_SPAN = 900  # a multiple of 3, see difficulty_of; at least TRAIN
 _SPLIT_START = {"train": 0, "val": _SPLIT_SPAN, "test": 2 * _SPLIT_SPAN}
 
 
@@ -18,10 +21,10 @@ def seed_of(episode: EpisodeId) -> int:
     """Return the seed of an episode; no two episodes share one."""
     if episode.family not in FAMILIES:
         raise UnknownNameError.among("family", episode.family, "tabletop", FAMILIES)
-    if episode.index >= EPISODES[episode.split]:
+    count = TRAIN if episode.split == "train" else EPISODES[episode.split]
+    if episode.index >= count:
         raise UnknownNameError(
-            f"{episode} does not exist: split {episode.split!r} has episodes 0 to "
-            f"{EPISODES[episode.split] - 1}"
+            f"{episode} does not exist: split {episode.split!r} has episodes 0 to {count - 1}"
         )
     family = _FAMILY_SPAN * (1 + FAMILIES.index(episode.family))
     return family + _SPLIT_START[episode.split] + episode.index
@@ -55,3 +58,9 @@ def episode_ids() -> list[EpisodeId]:
         for split in SPLITS
         for index in range(EPISODES[split])
     ]
+
+
+def further_ids() -> list[EpisodeId]:
+    """List the train episodes beyond those of `episode_ids`, in canonical order."""
+    numbers = range(EPISODES["train"], TRAIN)
+    return [EpisodeId(family, "train", index) for family in FAMILIES for index in numbers]

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from typing import Any, ClassVar
 
 from numpy.random import RandomState
@@ -153,6 +154,13 @@ class Family(ABC):
     @abstractmethod
     def demonstrate(self, arm: Arm, answer: Any) -> Script:
         """Show the answer, and keep `showing` current."""
+
+    def go_home(self, arm: Arm, steps: int) -> Script:
+        """Return to the home pose in a number of time steps; the last one shows nothing more."""
+        script = arm.lasting(steps, arm.go_home())
+        yield from islice(script, steps - 1)
+        self.showing = ()
+        yield from script
 
     def react(self, arm: Arm) -> None:
         """Update the scene after a step: lamps, the cap of a button."""

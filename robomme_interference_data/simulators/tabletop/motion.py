@@ -100,7 +100,7 @@ class Arm:
     def lasting(self, steps: int, script: Script) -> Script:
         """Run a script, then hold its last pose until `steps` time steps have passed.
 
-        So a phase of a demonstration lasts equally long whatever the answer is.
+        So a phase of a demonstration lasts equally long for every answer.
 
         Raises:
             RunError: The script takes longer.

@@ -22,7 +22,7 @@ from robomme_interference_data.simulators.base import (
 )
 
 from . import SUITE_VERSION
-from .episodes import episode_ids, seed_of
+from .episodes import episode_ids, further_ids, seed_of
 from .families import known_scene, other_answer
 from .family import Family
 
@@ -70,6 +70,11 @@ class TabletopSimulator(Simulator):
         return episode_ids()
 
     @classmethod
+    def further_episodes(cls) -> list[EpisodeId]:
+        """Return the suite's further train episodes."""
+        return further_ids()
+
+    @classmethod
     def other_answer(cls, episode: EpisodeId) -> int:
         """Return the number of another answer; over the episodes they occur equally often."""
         return other_answer(episode)
@@ -109,10 +114,11 @@ class TabletopSimulator(Simulator):
         super().close()
         self.env.close()
 
-    def _begin(self, episode: EpisodeId, demonstration: bool) -> Begun:
+    def _begin(self, episode: EpisodeId, every: int) -> Begun:
         seed = seed_of(episode)
         self.env.family = episode.family
-        self.env.demonstrated = self._cameras if demonstration else ()
+        self.env.demonstrated = self._cameras if every else ()
+        self.env.every = every or 1
         options = {} if episode.answer is None else {"answer": episode.answer}
         _, info = self.env.reset(seed=seed, options=options)
         about = EpisodeInfo(info["goals"], info["difficulty"], seed, self.name)

@@ -68,9 +68,9 @@ class MoveCube(Family):
         yield from arm.wait(20)
         self.showing = (0,)
         yield from arm.lasting(move, self.solve(arm, answer))
-        yield from arm.lasting(home, self.go_home(arm, answer))
+        yield from arm.lasting(home, self.release(arm, answer))
 
-    def go_home(self, arm: Arm, answer: str) -> Script:
+    def release(self, arm: Arm, answer: str) -> Script:
         """Release the hook, and return."""
         if answer == "hook":
             yield from arm.grip(close=False)

@@ -29,6 +29,7 @@ class StickFamily(Family):
         spots: Positions of the things, in m.
         flat: Their radius and height, in m.
         high: Height of the tip before the path, in m.
+        shows_start: Whether the way to a thing shows the part of the one before.
         pause: Time steps for which the tip stays on a thing.
         frames: Time steps of the ways of a demonstration: to the first thing, to each later one,
             and back home.
@@ -38,6 +39,7 @@ class StickFamily(Family):
 
     flat: ClassVar[Spot]
     high: ClassVar[float]
+    shows_start: ClassVar[bool]
     pause: ClassVar[int]
     frames: ClassVar[tuple[int, int, int]]
     spots: list[Spot]
@@ -50,11 +52,11 @@ class StickFamily(Family):
         for number in range(self.steps):
             way = later if number else first
             step = arm.lasting(way + self.pause, self.step(answer, number).do(arm))
-            self.showing = (number - 1, number) if number else (0,)  # the way shows from where, too
+            self.showing = (number - 1, number) if number and self.shows_start else (number,)
             yield from islice(step, way)
             self.showing = (number,)
             yield from step
-        yield from arm.lasting(home, arm.go_home())
+        yield from self.go_home(arm, home)
 
     def trace(self, arm: Arm, number: int, points: list[Point]) -> Script:
         """Do a step: lower the tip for the first, then move through points."""
@@ -87,6 +89,7 @@ class PatternLock(StickFamily):
     side_buttons, spacing = 4, 0.075  # buttons in a row; m
     flat = (0.02, 0.010)
     high = 0.10
+    shows_start = True
     pause = 8
     frames = (57, 18, 60)
     length = (4, 5, 6)
@@ -162,6 +165,7 @@ class RouteStick(StickFamily):
     count, spacing = 5, 0.105  # targets; m from one to the next, with a post in the middle
     flat = (0.024, 0.003)
     high = 0.13
+    shows_start = False  # but not on which side of a post it came there
     pause = 3
     frames = (59, 28, 57)
     post, tall = 0.010, 0.07  # m, radius and height of a post

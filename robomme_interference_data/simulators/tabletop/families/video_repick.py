@@ -56,8 +56,7 @@ class VideoRepick(SwapFamily):
         self.showing = (0,)
         yield from arm.lasting(PICK, self.pick_up(arm, answer))
         yield from self.put_down(arm)
-        yield from arm.lasting(RETURN, arm.go_home())
-        self.showing = ()
+        yield from self.go_home(arm, RETURN)
         for cube in self.cubes:
             cube.restore()
             cube.hold(True)
