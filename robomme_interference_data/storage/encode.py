@@ -3,7 +3,7 @@
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -80,6 +80,10 @@ CLIP = Codec(
     exact=False,
 )
 """Clips of rollouts for any player: H.264 in MP4, for even heights and widths."""
+
+MODEL_VIDEO = replace(CLIP, name="model-video", options={"crf": "25", "preset": "medium"})
+"""Videos for models, as RoboMME's client encodes them (the defaults of imageio), for heights and
+widths that are multiples of 16."""
 
 
 def get_codec(name: str) -> Codec:
