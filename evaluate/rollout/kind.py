@@ -64,7 +64,7 @@ class Rollouts(RunKind[RunConfig]):
         )
         check_settings(config, self.system, self.buffer_set, self._policy)
         self._system = name_system(self.system)
-        self.config, self._subgoal_metadata = describe_subgoals(config, self._system)
+        self.config, self._subgoal_metadata = describe_subgoals(config)
         self.metadata = self._policy_metadata | self._subgoal_metadata
         self.versions = simulator_versions(config.simulator, config.robomme_python)
 

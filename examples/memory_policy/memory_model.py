@@ -49,7 +49,9 @@ class FrameEncoder(nn.Module):
     def __init__(self, width: int):
         super().__init__()
         self.patches = nn.Sequential(
-            nn.Conv2d(3, CHANNELS, 4, stride=4), nn.GELU(), nn.Conv2d(CHANNELS, CHANNELS, 3, padding=1)
+            nn.Conv2d(3, CHANNELS, 4, stride=4),
+            nn.GELU(),
+            nn.Conv2d(CHANNELS, CHANNELS, 3, padding=1),
         )
         self.whole = nn.Sequential(
             nn.GELU(), nn.AdaptiveAvgPool2d(4), nn.Flatten(), nn.Linear(16 * CHANNELS, width)

@@ -32,7 +32,11 @@ COLUMNS = {
 
 def question(**changes: Any) -> Question:
     known = {"options": ("", "", ""), "answers": (4, 0, 9), "right": 1}
-    fields = {"revision": "r", "text": "Which?", "picture": b"", "points": ((), (), ())} | known | changes
+    fields = (
+        {"revision": "r", "text": "Which?", "picture": b"", "points": ((), (), ())}
+        | known
+        | changes
+    )
     return Question(episode_id=MOVE, **fields)
 
 
