@@ -43,6 +43,7 @@ from robomme_interference_data.evaluate.subgoals.model_writer import ModelWriter
 from robomme_interference_data.evaluate.subgoals.prompt import load_prompt
 from robomme_interference_data.evaluate.subgoals.registry import make_writer
 from robomme_interference_data.evaluate.subgoals.writer import History, OracleWriter
+from robomme_interference_data.runtime.executor import Executor, Processes, Serial
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Observation
 
@@ -238,6 +239,17 @@ def test_an_answer_that_never_ends_is_an_error_row(tmp_path: Path) -> None:
     with ChatServer(faults=[DRIPS]) as server:
         [row] = run_one(tmp_path, **behind(server, subgoal_options=options)).rows
     assert row.status == "error" and "no answer in time" in str(row.error)
+
+
+@pytest.mark.parametrize("executor", [Serial(), Processes(1)], ids=["serial", "processes"])
+def test_an_error_row_has_the_steps_and_calls_before_it(tmp_path: Path, executor: Executor) -> None:
+    options = ("repeats=0", "frames=4")
+    with ChatServer(faults=["", REFUSED, BROKEN]) as server:
+        given = behind(server, subgoal_options=options, conditions=("k0",), families=("MoveCube",))
+        [row] = run(tmp_path, executor, **given).rows
+    assert row.status == "error" and "500" in str(row.error)
+    # Two answers, of which one is empty; the third question, after 32 steps, broke.
+    assert (row.steps, row.model_calls, row.model_tokens, row.model_faults) == (32, 2, 210, 1)
 
 
 def test_the_prompt_and_the_model_identify_the_run(tmp_path: Path) -> None:
