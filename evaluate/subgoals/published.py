@@ -53,16 +53,22 @@ class Published:
     def check(self, name: str, prompt: Prompt, options: Mapping[str, Any]) -> None:
         """Raise an `InvalidOptionError` if a prompt, or one of all options, is another one."""
         own = "Or set `system` to a name of your own: see docs/how-to/paper-systems.md."
+        command = (
+            f"evaluate BUFFER_SET --system {name} --policy websocket://HOST:PORT --out RUN "
+            f"--subgoals openai:URL#MODEL --subgoal-prompt CLONE/{FOLDER}/{self.file}"
+        )
         if prompt.sha256 != self.sha256:
             raise InvalidOptionError(
                 f"`subgoal_prompt` is not the prompt of {name}",
-                f"Set it to {FOLDER}/{self.file} in a clone of {CLIENT}. {own}",
+                f"Set it to the file of a clone of {CLIENT}. {own}",
+                command,
             )
         for option, value in self.options.items():
             if options[option] != value:
                 raise InvalidOptionError(
                     f"the option {option} of subgoals is {options[option]}; {name} has {value}",
                     f"Leave it out. {own}",
+                    command,
                 )
 
 

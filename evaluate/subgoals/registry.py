@@ -63,14 +63,13 @@ def with_published(config: RunConfig) -> RunConfig:
     return config
 
 
-def describe_subgoals(config: RunConfig) -> tuple[RunConfig, dict[str, Any]]:
-    """Return the settings, see `with_published`, and the metadata of the writer, empty without."""
-    config = with_published(config)
+def describe_subgoals(config: RunConfig) -> dict[str, Any]:
+    """Return the metadata of the writer, empty without one."""
     writer = make_writer(config)
     if writer is None:
-        return config, {}
+        return {}
     with closing(writer):
-        return config, {"subgoals": writer.metadata()}
+        return {"subgoals": writer.metadata()}
 
 
 def subgoals_identity(config: RunConfig, metadata: Mapping[str, Any]) -> Any:
