@@ -21,7 +21,7 @@ from robomme_interference_data.constants import (
     UNITS,
     Unit,
 )
-from robomme_interference_data.errors import InvalidOptionError, SourceError
+from robomme_interference_data.errors import InvalidOptionError, SourceError, counted
 
 from .sources.base import Frame, Recording
 
@@ -87,7 +87,7 @@ def select_execution(frames: Iterable[Frame]) -> Iterator[Frame]:
         live += 1
         yield frame
     if live < 2:
-        raise NothingToStore(f"{live} live frame{'s' * (live != 1)}; an execution needs 2")
+        raise NothingToStore(f"{counted(live, 'live frame')}; an execution needs 2")
 
 
 FRAME_SELECTORS: dict[str, Callable[[Iterable[Frame]], Iterator[Frame]]] = {

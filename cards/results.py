@@ -11,6 +11,7 @@ from robomme_interference_data.constants import PROTOCOL_VERSION, RUN_HEADER, RU
 from robomme_interference_data.errors import InvalidOptionError, PublishError, counted
 from robomme_interference_data.evaluate.run.log import RunHeader, read_record
 from robomme_interference_data.evaluate.score.config import Expected, Settings
+from robomme_interference_data.evaluate.score.outcomes import STATUSES
 from robomme_interference_data.evaluate.score.plots.data import Data
 from robomme_interference_data.evaluate.score.plots.figures import draw_figure
 from robomme_interference_data.evaluate.score.report.headline import headline
@@ -18,7 +19,7 @@ from robomme_interference_data.evaluate.score.scoring import Score, score
 from robomme_interference_data.evaluate.score.writing import write_score
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.schema.codec import to_dict
-from robomme_interference_data.schema.rollouts import FINAL, TIMING_COLUMNS, Rollout
+from robomme_interference_data.schema.rollouts import TIMING_COLUMNS, Rollout
 from robomme_interference_data.storage.files import sha256_file
 from robomme_interference_data.viz.figure import open_figure, save_figure
 from robomme_interference_data.viz.tables import Table
@@ -46,6 +47,10 @@ def results_facts(results: Score | Path) -> Facts:
         results: The folder of a run, a file of rows, or the score of either.
     """
     found = results if isinstance(results, Score) else score(Settings(rows=(results,)))
+    if not found.outcomes:
+        raise InvalidOptionError(
+            "the rows are of an offline run", "Publish the results of rollouts or questions."
+        )
     if len(found.rows.sources) != 1:
         raise InvalidOptionError(
             f"the score is of {len(found.rows.sources)} files of rows; expected one run",
@@ -99,7 +104,7 @@ def results_facts(results: Score | Path) -> Facts:
             "cells": _cells(found),
             "rows": len(found.rows),
             "rows_file": rows.path,
-            "statuses": ", ".join(f"{statuses[one]:,} {one}" for one in FINAL),
+            "statuses": ", ".join(f"{statuses[one]:,} {one}" for one in STATUSES),
             "refused": found.rows.refused,
         },
         base_kind="buffer set",

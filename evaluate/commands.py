@@ -59,9 +59,14 @@ def evaluate(config: RunConfig, as_json: AsJson = False) -> None:
     rollout, OUT/run.json the settings; tables are exported when the run ends. To resume an
     interrupted run, re-run the same command: it skips finished rollouts and repeats errors.
 
+    With --offline there is no simulator: the policy acts along recorded executions, and rows have
+    the difference of its actions to the recorded ones.
+
     Examples:
     ```
     robomme-interference evaluate my-buffers --policy replay:window --out runs/window
+
+    robomme-interference evaluate my-buffers --policy replay --offline --out runs/offline
 
     robomme-interference evaluate my-buffers --policy websocket://localhost:8000 \
       --system perceptual-framesamp-modul --conditions k0,k7 --out runs/framesamp \
@@ -98,9 +103,10 @@ def _run(config: RunConfig | AskConfig, kept: str, unit: str, *, as_json: bool) 
     from robomme_interference_data.schema.codec import to_dict
 
     from .run.evaluation import run_evaluation
-    from .run.progress import RunProgress, rate_table
+    from .run.progress import RunProgress, error_table, rate_table
 
     check_output(config.out)
+    offline = isinstance(config, RunConfig) and config.offline
     with (
         graceful_interrupt(f"{kept} are in {config.out}", config.out),
         RunProgress(quiet=as_json, unit=unit) as shown,
@@ -109,7 +115,7 @@ def _run(config: RunConfig | AskConfig, kept: str, unit: str, *, as_json: bool) 
     if as_json:
         print_json([to_dict(row) for row in result.rows])
     else:
-        echo(rate_table(result.rows).text())
+        echo((error_table if offline else rate_table)(result.rows).text())
         chances = [row.chance for row in result.rows if row.chance is not None]
         chance = f"; chance is {sum(chances) / len(chances):.1%}" if chances else ""
         echo(f"{len(result.rows)} of {result.planned} {unit} in {result.folder}{chance}")

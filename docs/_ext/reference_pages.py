@@ -17,6 +17,7 @@ OUT = Path(__file__).parent.parent / "reference" / "generated"
 PUBLIC_MODULES = {
     "robomme_interference_data": "Load buffers, buffer sets and datasets.",
     "robomme_interference_data.evaluate": "Evaluate policies; write a policy.",
+    "robomme_interference_data.training": "Train on history buffers.",
     "robomme_interference_data.simulators": "Run a simulator; write a simulator.",
     "robomme_interference_data.errors": "Errors that this package raises.",
 }

@@ -11,8 +11,9 @@ from matplotlib import pyplot  # noqa: E402
 BOXES = {
     "cli": (4.0, 7, "the command line"),
     "cards": (4.0, 6, "publish data and results, with cards"),
-    "build_dataset": (1.6, 5, "recordings to datasets and manifests"),
-    "evaluate": (6.4, 5, "buffers into rollouts, rows into scores"),
+    "build_dataset": (0.9, 5, "recordings to datasets and manifests"),
+    "training": (8.1, 5, "buffers into training items"),
+    "evaluate": (4.6, 5, "buffers into rollouts, rows into scores"),
     "retrieval": (5.2, 4, "select the relevant session"),
     "simulators": (4.0, 3, "tabletop and RoboMME"),
     "data": (4.0, 2, "datasets, queries, buffers"),
@@ -27,6 +28,7 @@ BOXES = {
 ARROWS = (
     *(("cli", "cards"), ("cards", "build_dataset"), ("cards", "evaluate")),
     *(("build_dataset", "simulators"), ("evaluate", "retrieval"), ("retrieval", "simulators")),
+    ("training", "retrieval"),
     *(("evaluate", "stats"), ("simulators", "data"), ("data", "viz"), ("data", "runtime")),
     *(("viz", "storage"), ("runtime", "storage"), ("storage", "schema")),
 )
@@ -35,7 +37,7 @@ ARROWS = (
 def main() -> None:
     """Write the picture beside this script."""
     figure, axes = pyplot.subplots(figsize=(9, 6.6))
-    width, height = {"stats": 1.7, "viz": 2.0}, 0.56
+    width, height = {"stats": 1.7, "viz": 2.0, "training": 2.8}, 0.56
     for source, target in ARROWS:
         (x0, y0, _), (x1, y1, _) = BOXES[source], BOXES[target]
         arrow = {"arrowstyle": "-|>", "color": "#777777", "lw": 1.2, "shrinkA": 0, "shrinkB": 0}
@@ -55,7 +57,7 @@ def main() -> None:
         axes.add_patch(box)
         axes.text(x, y + 0.1, name, ha="center", va="center", weight="bold", size=10, zorder=3)
         axes.text(x, y - 0.13, text, ha="center", va="center", size=7.5, color="#333", zorder=3)
-    axes.set(xlim=(-0.3, 9.2), ylim=(-1.45, 7.45))
+    axes.set(xlim=(-1.0, 9.7), ylim=(-1.45, 7.45))
     axes.axis("off")
     path = Path(__file__).parent / "architecture.svg"
     figure.savefig(path, bbox_inches="tight", metadata={"Date": None})

@@ -26,6 +26,7 @@ from robomme_interference_data.evaluate.systems import (
 from robomme_interference_data.retrieval.select import Rule
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.simulators.registry import (
+    RECORDINGS,
     SIMULATORS,
     check_shift,
     find_simulator,
@@ -62,6 +63,10 @@ def default_system(config: RunConfig) -> str:
 
 def check_settings(config: RunConfig, system: str, buffer_set: BufferSet, policy: Policy) -> None:
     """Check the settings against each other, the buffer set and the policy."""
+    if config.simulator == RECORDINGS and not config.offline:
+        raise InvalidOptionError(
+            "recordings are no simulator to choose", "Set `offline` for an offline evaluation."
+        )
     find_simulator(config.simulator)
     check_shift(config.simulator, config.shift)
     check_shared(config)
@@ -69,7 +74,9 @@ def check_settings(config: RunConfig, system: str, buffer_set: BufferSet, policy
         raise InvalidOptionError(
             f"the policy {config.policy} needs scripts of the simulator, and {config.simulator} "
             "has none",
-            "Set another simulator, such as tabletop, or another policy.",
+            "Leave out `offline`, or set another policy."
+            if config.offline
+            else "Set another simulator, such as tabletop, or another policy.",
         )
     retrieval = [] if config.retrieval is None else [config.retrieval_camera]
     for camera in (*policy.history_cameras, *retrieval):
@@ -143,7 +150,8 @@ def check_plan(
                 "Build the demonstrations from a source with evidence; see "
                 "docs/reference/sources.md.",
             )
-        if ":" in config.simulator:  # a simulator of the user may play any episode
+        # A simulator of the user may play any episode, and so may a recording.
+        if ":" in config.simulator or config.offline:
             continue
         recorded = record.simulator
         if recorded not in (None, config.simulator):

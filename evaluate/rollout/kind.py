@@ -101,7 +101,7 @@ class Rollouts(RunKind[RunConfig]):
                 check_memory_kind(keeps, self._policy_metadata["server"], self._system)
             self.metadata = self._policy_metadata | self._subgoal_metadata
         if todo:
-            if config.simulator in SIMULATORS:
+            if config.offline or config.simulator in SIMULATORS:
                 _opened(session, "simulator", config.simulator_timeout_s)
             check_servers_memory(config.policy, config.policy_options, self._system)
 

@@ -135,6 +135,7 @@ def run_rollout(
         **history_columns(buffer, given, selector),
         evidence_kept=_evidence_kept(run.system, buffer, given),
         **_model_columns(writer),
+        **(simulator.columns() if isinstance(simulator, Simulator) else {}),
         **times,
         wall_s=round(time.perf_counter() - began, 4),
     )
@@ -197,13 +198,14 @@ class _Live:
                 name: np.stack([one.images[name] for one in watched]) for name in policy.cameras
             }
             policy.observe(frames, np.stack([one.state for one in watched]))
-            return _checked(policy.act(seen[-1], goal))
+            size = getattr(self.simulator, "action_size", ACTION_SIZE)
+            return _checked(policy.act(seen[-1], goal), size)
 
 
-def _checked(actions: Any) -> NDArray[np.float32]:
-    """Return the actions of a chunk that are executed, `(n, 8) float32`, n from 1 to 16."""
+def _checked(actions: Any, size: int) -> NDArray[np.float32]:
+    """Return the actions of a chunk that are executed, `(n, size) float32`, n from 1 to 16."""
     try:
-        return action_array(actions, chunk=True)[:ACTION_CHUNK]
+        return action_array(actions, chunk=True, size=size)[:ACTION_CHUNK]
     except InvalidOptionError as error:
         raise PolicyError(f"the policy's answer: {error.message}", error.hint) from None
 

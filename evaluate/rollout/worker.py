@@ -217,10 +217,11 @@ def simulator_options(config: RunConfig, policy_cameras: Iterable[str]) -> dict[
     if config.videos or config.check_lesson:
         used |= {*CAMERAS}
     settings = {
-        "cameras": tuple(name for name in CAMERAS if name in used),
+        "cameras": tuple(name for name in sorted(used) if config.offline or name in CAMERAS),
         "shift": config.shift,
         "python": config.robomme_python,
         "subgoals": config.subgoals == ORACLE,
+        "buffer_set": config.buffer_set,
         # Its own limit ends a little before the worker's: its error shows its output.
         "answer_s": 0.9 * config.simulator_timeout_s,
     }

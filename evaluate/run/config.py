@@ -86,6 +86,11 @@ class RunConfig(WorkConfig):
         group=_POLICY,
         help="Options of the policy, such as device=cpu; see docs/reference/policies.md.",
     )
+    offline: bool = setting(
+        False,
+        group=_SIMULATOR,
+        help="Compare actions with those of the buffer set's executions, without a simulator.",
+    )
     simulator: str = setting(
         "tabletop", group=_SIMULATOR, help="tabletop, robomme or module:function."
     )

@@ -146,6 +146,10 @@ def _kind(config: RunConfig | AskConfig, buffer_set: BufferSet) -> RunKind[Any]:
         from robomme_interference_data.evaluate.questions.kind import Questions
 
         return Questions(config, buffer_set)
+    if config.offline:
+        from robomme_interference_data.evaluate.offline.kind import Offline
+
+        return Offline(config, buffer_set)
     from robomme_interference_data.evaluate.rollout.kind import Rollouts
 
     return Rollouts(config, buffer_set)

@@ -16,7 +16,7 @@ from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.runtime.executor import Session, Worker
-from robomme_interference_data.schema.rollouts import Rollout, Status
+from robomme_interference_data.schema.rollouts import Rollout, Status, success_of
 from robomme_interference_data.schema.sampling import even_sample, lesson_frames, lesson_share
 from robomme_interference_data.simulators.registry import simulator_class
 
@@ -67,7 +67,7 @@ class Run[C: RunConfig | AskConfig]:
             model_seed=self.config.model_seed,
             protocol_version=PROTOCOL_VERSION,
             status=str(status),
-            success=None if status is Status.ERROR else status is Status.SUCCESS,
+            success=success_of(status),
             **values,
         )
 

@@ -282,4 +282,8 @@ def is_done(row: Rollout) -> bool:
 def count_statuses(rows: Iterable[Rollout]) -> dict[str, int]:
     """Count rows by status."""
     counts = Counter(row.status for row in rows)
-    return {str(status): counts[status] for status in FINAL}
+    return {
+        str(status): counts[status]
+        for status in FINAL
+        if counts[status] or status is not Status.MEASURED  # of offline runs alone
+    }

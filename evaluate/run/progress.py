@@ -2,7 +2,8 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Self
+from statistics import fmean
+from typing import Any, Self
 
 from robomme_interference_data.errors import visible
 from robomme_interference_data.ids import EpisodeId
@@ -75,6 +76,32 @@ def rate_table(rows: Iterable[Rollout]) -> Table:
     return _table(_count(rows))
 
 
+def error_table(rows: Iterable[Rollout]) -> Table:
+    """Return the mean action error of an offline run by family and condition."""
+    errors: dict[Cell, list[float]] = {}
+    for row in rows:
+        if row.action_l1 is not None:
+            errors.setdefault((row.family, row.condition), []).append(row.action_l1)
+            errors.setdefault(("all", row.condition), []).append(row.action_l1)
+    families = sorted({name for name, _ in errors} - {"all"}, key=_family_order)
+    names = [*families, "all"] if len(families) > 1 else families
+    conditions = sorted({one for _, one in errors}, key=lambda one: parse_condition(one).sort_key)
+    cells = [[errors.get((name, one)) for one in conditions] for name in names]
+    return Table.make(
+        "errors",
+        "Mean absolute action error by family and condition",
+        " ".join(["family", *(f"{one}:number" for one in conditions)]),
+        (
+            (name, *(fmean(cell) if cell else None for cell in line))
+            for name, line in zip(names, cells, strict=True)
+        ),
+    )
+
+
+def _family_order(name: str) -> Any:
+    return EpisodeId(name, "test", 0)
+
+
 def _count(rows: Iterable[Rollout]) -> dict[Cell, Counter[str]]:
     """Count rows by status, in each cell."""
     cells: dict[Cell, Counter[str]] = {}
@@ -84,7 +111,7 @@ def _count(rows: Iterable[Rollout]) -> dict[Cell, Counter[str]]:
 
 
 def _table(ended: Mapping[Cell, Counter[str]]) -> Table:
-    families = sorted({family for family, _ in ended}, key=lambda one: EpisodeId(one, "test", 0))
+    families = sorted({family for family, _ in ended}, key=_family_order)
     conditions = sorted({name for _, name in ended}, key=lambda one: parse_condition(one).sort_key)
     lines = [[ended.get((family, name), Counter()) for name in conditions] for family in families]
     names = [*families, "all"] if len(families) > 1 else families
@@ -98,10 +125,12 @@ def _table(ended: Mapping[Cell, Counter[str]]) -> Table:
 
 
 def _rate(counts: Counter[str]) -> str:
-    """Return `3/5 60%`, or of 100 and more `60%`, and the number of errors."""
+    """Return `3/5 60%`, or of 100 and more `60%`, or offline `5 measured`; and the errors."""
     broken, won = counts[Status.ERROR], counts[Status.SUCCESS]
-    scored = counts.total() - broken
+    measured = counts[Status.MEASURED]
+    scored = counts.total() - broken - measured
     # Nine families by five conditions fit into 80 columns.
     number = f"{won}/{scored} " if scored < 100 else ""
     rate = f"{number}{won / scored:.0%}" if scored else ""
-    return ", ".join(filter(None, (rate, f"{broken} broke" if broken else "")))
+    others = (f"{n} {what}" for n, what in ((measured, "measured"), (broken, "broke")) if n)
+    return ", ".join(filter(None, (rate, *others)))

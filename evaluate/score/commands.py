@@ -66,6 +66,7 @@ def score(
 
     from .report.headline import headline
     from .scoring import score as compute
+    from .tables.action_error import ERROR_TABLES
     from .writing import write_score
 
     check_output(out, export_to)
@@ -90,7 +91,8 @@ def score(
             }
         )
     else:
-        echo(f"{tables_text(found.grids)}\n")
+        errors = [table for name, table in found.tables.items() if name in ERROR_TABLES[:2]]
+        echo(f"{tables_text([*found.grids, *errors])}\n")
     print_status(f"Report: {out / 'report.html'}")
 
 

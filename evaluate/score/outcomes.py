@@ -15,6 +15,7 @@ from robomme_interference_data.evaluate.systems import SYSTEMS, known_system, na
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, in_order
 from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.simulators.registry import RECORDINGS
 from robomme_interference_data.stats.intervals import effective_n, wilson
 
 from .config import Expected
@@ -147,10 +148,11 @@ def rate_of(status: Statuses) -> Rate:
 
 
 def outcomes_of(rows: Rows, expected: Expected) -> dict[str, Outcomes]:
-    """Return the outcomes of each simulator, by its name."""
+    """Return the outcomes of each simulator, by its name; recordings have none."""
     return {
         name: _outcomes([r for r in rows if r.simulator == name], name, expected, rows.unpinned)
         for name in rows.names("simulator")
+        if name != RECORDINGS
     }
 
 

@@ -15,12 +15,13 @@ from .comparisons.tables import SPECS, comparison_table
 from .config import Against, Expected, Settings
 from .outcomes import Outcomes, outcomes_of
 from .rows.reading import Rows, read_rows
-from .tables import cells, chance, equivalence, evidence_kept, paper
+from .tables import action_error, cells, chance, equivalence, evidence_kept, paper
 
 TABLES = (
     *("main", "chance", "systems", "ranks", "family", "difficulty", "lift", "effects"),
     *("interaction", "equivalence", "interference", "by_evidence_kept", "ceiling", "decay"),
     *("noise", "families", "family_effects", "matrix", "coverage", "paper", "paper_family"),
+    *action_error.ERROR_TABLES,
 )
 """Every table that a score may have, in order."""
 
@@ -85,6 +86,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         effects.decay_table(decays),
         effects.noise_table(every),
         cells.coverage_table(found),
+        *action_error.error_tables(rows, draws),
     ]
     if settings.margin is not None:
         margin = settings.margin

@@ -22,8 +22,6 @@ from torch.utils.data import DataLoader, Subset
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.training import HistoryDataset
 
-SAVE_EVERY = 100  # steps
-
 
 def arguments() -> argparse.Namespace:
     """Parse the command line."""
@@ -48,6 +46,7 @@ def arguments() -> argparse.Namespace:
     add("--chunk", type=int, default=16, help="actions per chunk (--task act)")
     add("--steps", type=int, default=1000)
     add("--batch", type=int, default=32)
+    add("--save-every", type=int, default=100, help="steps between checkpoints")
     add("--learning-rate", type=float, default=1e-3)
     add("--workers", type=int, default=0, help="processes that load items")
     add("--seed", type=int, default=0)
@@ -58,12 +57,10 @@ def arguments() -> argparse.Namespace:
 def main() -> None:
     """Train, from the beginning or from the last checkpoint."""
     args = arguments()
+    named = (text.partition("=") for text in args.conditions)
     data = HistoryDataset(
         args.buffer_set,
-        dict(
-            (name, float(weight or 1))
-            for name, _, weight in (c.partition("=") for c in args.conditions)
-        ),
+        {name: float(weight or 1) for name, _, weight in named},
         memory=args.memory,
         cameras=args.cameras,
         image_size=args.image_size,
@@ -77,7 +74,9 @@ def main() -> None:
         seed=args.seed,
     )
     print(data)
-    settings = {k: v for k, v in vars(args).items() if k not in ("out", "device", "workers")}
+    settings = {
+        k: v for k, v in vars(args).items() if k not in ("out", "device", "workers", "save_every")
+    }
     settings |= {"data": data.buffer_set.revision}
     args.out.mkdir(parents=True, exist_ok=True)
     state = resume(args.out, settings)
@@ -102,27 +101,25 @@ def main() -> None:
     parts = {"model": model, "optimizer": optimizer, "schedule": schedule}
     for name, part in parts.items() if state else ():
         part.load_state_dict(state[name])
-    step = state["step"] if state else 0
+    step, log = (state["step"], state["log"]) if state else (0, [])
+    if state:
+        torch.set_rng_state(state["random"])
     print(f"{sum(p.numel() for p in model.parameters()):,} parameters; step {step} of {args.steps}")
-    with (args.out / "log.csv").open("a", newline="") as file:
-        log = csv.writer(file)
-        if not state:
-            log.writerow(["step", "loss", "accuracy", "seconds"])
-        began = time.perf_counter()
-        model.train()
-        for batch in batches(data, args, step):
-            loss, accuracy = train_step(model, batch, optimizer)
-            schedule.step()
-            step += 1
-            if step % 20 == 0 or step == args.steps:
-                seconds = round(time.perf_counter() - began, 2)
-                log.writerow([step, round(loss, 5), round(accuracy, 4), seconds])
-                print(f"step {step}: loss {loss:.4f}, accuracy {accuracy:.2f}, {seconds:.0f} s")
-            if step % SAVE_EVERY == 0 or step == args.steps:
-                file.flush()
-                kept = {name: part.state_dict() for name, part in parts.items()}
-                save_state(args.out, kept | {"step": step, "settings": settings})
-                save_checkpoint(model, args.out)
+    began = time.perf_counter()
+    model.train()
+    for batch in batches(data, args, step):
+        loss, accuracy = train_step(model, batch, optimizer)
+        schedule.step()
+        step += 1
+        if step % 20 == 0 or step == args.steps:
+            seconds = time.perf_counter() - began
+            log.append([step, round(loss, 5), round(accuracy, 4), round(seconds, 2)])
+            print(f"step {step}: loss {loss:.4f}, accuracy {accuracy:.2f}, {seconds:.0f} s")
+        if step % args.save_every == 0 or step == args.steps:
+            kept = {name: part.state_dict() for name, part in parts.items()}
+            kept |= {"step": step, "log": log, "random": torch.get_rng_state()}
+            save_state(args.out, kept | {"settings": settings})
+            save_checkpoint(model, args.out)
 
 
 def batches(data: HistoryDataset, args: argparse.Namespace, step: int) -> Iterator[dict[str, Any]]:
@@ -134,7 +131,10 @@ def batches(data: HistoryDataset, args: argparse.Namespace, step: int) -> Iterat
         generator = torch.Generator().manual_seed(args.seed * 1_000_003 + epoch)
         order = torch.randperm(len(data), generator=generator)
         rest = order[done * args.batch : per_epoch * args.batch].tolist()
-        loader = DataLoader(Subset(data, rest), args.batch, num_workers=args.workers)
+        # With its own generator, the loader does not change what dropout draws.
+        loader = DataLoader(
+            Subset(data, rest), args.batch, num_workers=args.workers, generator=generator
+        )
         for batch in loader:
             if step == args.steps:
                 return
@@ -181,9 +181,11 @@ def resume(out: Path, settings: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def save_state(out: Path, state: dict[str, Any]) -> None:
-    """Write what `resume` reads, whole or not at all."""
+    """Write what `resume` reads, whole or not at all, and the log."""
     torch.save(state, out / "state.partial")
     (out / "state.partial").replace(out / "state.pt")
+    with (out / "log.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([["step", "loss", "accuracy", "seconds"], *state["log"]])
 
 
 if __name__ == "__main__":

@@ -12,16 +12,21 @@ from .shifts import parse_shift
 
 
 class Status(StrEnum):
-    """Status of an episode after a step; `error` does not count as a failure of the policy."""
+    """Status of an episode after a step.
+
+    `error` does not count as a failure of the policy. `measured` is the end of a recording, along
+    which nothing succeeds or fails.
+    """
 
     ONGOING = "ongoing"
     SUCCESS = "success"
     FAIL = "fail"
     TIMEOUT = "timeout"
     ERROR = "error"
+    MEASURED = "measured"
 
 
-FINAL = (Status.SUCCESS, Status.FAIL, Status.TIMEOUT, Status.ERROR)
+FINAL = (Status.SUCCESS, Status.FAIL, Status.TIMEOUT, Status.ERROR, Status.MEASURED)
 
 KEY_COLUMNS = (
     "system",
@@ -45,12 +50,19 @@ TIMING_COLUMNS = (
 """The only columns that differ between repetitions of a run."""
 
 
+def success_of(status: str) -> bool | None:
+    """Return whether a final status is a success; None if it is neither success nor failure."""
+    return None if status in (Status.ERROR, Status.MEASURED) else status == Status.SUCCESS
+
+
 @dataclass(frozen=True, slots=True)
 class Rollout:
-    """One rollout, or one answered question about the past."""
+    """One rollout, one answered question about the past, or one recording of an offline run."""
 
     system: Annotated[str, "Label of the system: a policy with its memory mechanism."]
-    simulator: Annotated[str, "`tabletop`, `robomme`, …; `questions` for an answered question."]
+    simulator: Annotated[
+        str, "`tabletop`, `robomme`, …; `questions` for answers, `recordings` offline."
+    ]
     buffer_set: Annotated[str, "Name of the buffer set."]
     revision: Annotated[str, "Identity of the buffer set, `BufferSet.revision`."]
     family: Annotated[str, "Task family of the query episode."]
@@ -63,9 +75,13 @@ class Rollout:
     seed: Annotated[int | None, "Seed of the scene, or None."]
     difficulty: Annotated[str | None, "`easy`, `medium`, `hard`, or None."]
     goal: Annotated[str | None, "The goal that the policy received."]
-    status: Annotated[str, "`success`, `fail`, `timeout` (after 1300 steps) or `error`."]
-    success: Annotated[bool | None, "Whether the status is `success`; None for an error."]
-    steps: Annotated[int, "Executed steps."]
+    status: Annotated[
+        str, "`success`, `fail`, `timeout` (after 1300 steps), `error`, or offline `measured`."
+    ]
+    success: Annotated[
+        bool | None, "Whether the status is `success`; None for `error` and `measured`."
+    ]
+    steps: Annotated[int, "Executed steps; offline, compared actions."]
     history_frames: Annotated[int, "History frames that the policy received."]
     lesson_frames: Annotated[int, "Lesson frames among them."]
     lesson_share: Annotated[
@@ -100,6 +116,14 @@ class Rollout:
     chance: Annotated[
         float | None, "Expected share of right answers from random guesses; None for a rollout."
     ] = None
+    action_l1: Annotated[
+        float | None,
+        "Offline: mean absolute difference of the actions to the recorded ones, over all steps and "
+        "values, in the actions' units.",
+    ] = None
+    action_l1_values: Annotated[
+        str | None, "The same for each value of the action, in their order, separated by spaces."
+    ] = None
     model_calls: Annotated[
         int | None, "Calls of the vision-language model, with retries; None without a model."
     ] = None
@@ -120,7 +144,7 @@ class Rollout:
         parse_shift(self.shift)
         if self.status not in FINAL:
             raise FormatError(f"status {self.status!r} is none of {', '.join(FINAL)}")
-        expected = None if self.status == Status.ERROR else self.status == Status.SUCCESS
+        expected = success_of(self.status)
         if self.success is not expected:
             raise FormatError(
                 f"success {self.success} contradicts status {self.status!r}; expected {expected}"

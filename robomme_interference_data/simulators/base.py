@@ -76,14 +76,14 @@ class EpisodeInfo:
 
     Attributes:
         goals: All wordings of the goal, at least one.
-        difficulty: `easy`, `medium` or `hard`.
-        seed: Seed of the scene.
+        difficulty: `easy`, `medium` or `hard`; None if a recording names none.
+        seed: Seed of the scene; None if a recording names none.
         simulator: Registered name of the simulator.
     """
 
     goals: tuple[str, ...]
-    difficulty: str
-    seed: int
+    difficulty: str | None
+    seed: int | None
     simulator: str
 
     @property
@@ -112,12 +112,13 @@ class Simulator(ABC):
             simulator begins the episode.
         settings: Settings of a run that its constructor accepts: `cameras` (to render), `shift`,
             `python` (path of another interpreter), `subgoals` (whether `subgoal` will be called),
-            `answer_s` (seconds that a call may take).
+            `answer_s` (seconds that a call may take), `buffer_set` (its location).
         scripted: Whether `act` has built-in policies.
         shifts: Whether it supports shifts of the live scene.
         suite_version: Version of its episodes; None if they have none.
         packages: Distributions of this environment that it uses.
         episode_s: Seconds that recording one episode may take.
+        action_size: Length of an action; an instance may set another one.
     """
 
     name: ClassVar[str] = ""
@@ -129,6 +130,7 @@ class Simulator(ABC):
     suite_version: ClassVar[int | None] = None
     packages: ClassVar[tuple[str, ...]] = ()
     episode_s: ClassVar[float] = 300.0
+    action_size: int = ACTION_SIZE
     _episode: EpisodeId | None = None
     _steps = 0
     _closed = False
@@ -233,7 +235,7 @@ class Simulator(ABC):
             SimulatorCrashError: The simulator failed, no episode is running, or it is closed.
         """
         episode = self._running()
-        action = action_array(action)
+        action = action_array(action, size=self.action_size)
         self._episode = None
         self._steps += 1
         observation, status = self._execute(episode, action, observe)
@@ -293,6 +295,10 @@ class Simulator(ABC):
         """
         raise UnknownNameError(f"the simulator {type(self).__name__} cannot follow subgoals")
 
+    def columns(self) -> dict[str, Any]:
+        """Return further columns of the row of the episode that has ended, by name."""
+        return {}
+
     def close(self) -> None:
         """Release all resources; afterwards, every method except `close` raises."""
         self._episode, self._closed = None, True
@@ -337,21 +343,25 @@ def choose_cameras(
     return tuple(sorted(available if names is None else set(names)))
 
 
-def action_array(action: ArrayLike, *, chunk: bool = False) -> NDArray[np.float32]:
-    """Check an action, and return it as `(8,) float32`; a chunk of n ≥ 1 actions as `(n, 8)`."""
+def action_array(
+    action: ArrayLike, *, chunk: bool = False, size: int = ACTION_SIZE
+) -> NDArray[np.float32]:
+    """Check an action, and return it as `(size,) float32`; a chunk of n ≥ 1 as `(n, size)`."""
     try:
         array = np.asarray(action)
     except ValueError:  # rows of several lengths
         array = np.empty(0)
     shape = array.shape[1:] if chunk else array.shape
-    if shape == (ACTION_SIZE,) and array.dtype.kind in "fiu":
+    if shape == (size,) and array.dtype.kind in "fiu":
         with np.errstate(over="ignore"):
             converted = array.astype(np.float32)
         if len(converted) and np.isfinite(converted).all():
             return converted
-    expected = f"(n, {ACTION_SIZE}) actions, n at least 1" if chunk else f"({ACTION_SIZE},) action"
+    expected = f"(n, {size}) actions, n at least 1" if chunk else f"({size},) action"
     raise InvalidOptionError(
-        f"got {array.dtype} {array.shape} {np.array2string(array, threshold=2 * ACTION_SIZE)}; "
+        f"got {array.dtype} {array.shape} {np.array2string(array, threshold=2 * size)}; "
         f"expected {expected}, of finite numbers",
-        "An action is 7 absolute joint targets in rad, then the gripper, −1 closed to 1 open.",
+        "An action is 7 absolute joint targets in rad, then the gripper, −1 closed to 1 open."
+        if size == ACTION_SIZE
+        else "The recordings have actions of this size.",
     )

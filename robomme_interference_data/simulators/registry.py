@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 OFFICIAL = "robomme"
 """The benchmark's own simulator, the source of the published recordings and results."""
 
+RECORDINGS = "recordings"
+"""Plays back executions for offline evaluation; a simulator in rows only, not one to choose."""
+
 SIMULATORS: dict[str, str | Callable[..., Simulator]] = {
     "tabletop": f"{__package__}.tabletop.simulator:TabletopSimulator",
     "robomme": f"{__package__}.robomme.simulator:RoboMMESimulator",
@@ -42,9 +45,10 @@ def make_simulator(name: str, **options: Any) -> Simulator:
 
 def find_simulator(name: str) -> Callable[..., Simulator]:
     """Return the class or function that makes a simulator."""
-    if name not in SIMULATORS and ":" not in name:
+    known = SIMULATORS | {RECORDINGS: f"{__package__}.recordings:Recordings"}
+    if name not in known and ":" not in name:
         raise UnknownNameError.none("simulator", name, SIMULATORS)
-    factory = SIMULATORS.get(name, name)
+    factory = known.get(name, name)
     return import_factory("simulator", factory) if isinstance(factory, str) else factory
 
 

@@ -16,7 +16,7 @@ import pyarrow as pa
 from robomme_interference_data.errors import visible
 from robomme_interference_data.schema.codec import arrow_schema, to_dict
 
-Kind = Literal["text", "count", "rate", "points", "ratio", "p", "flag"]
+Kind = Literal["text", "count", "rate", "points", "ratio", "number", "p", "flag"]
 
 
 class Provisional(float):
@@ -233,7 +233,7 @@ def _plain(value: Any, kind: Kind) -> str:
         return ""
     if kind == "flag":
         return "yes" if value else "no"
-    if kind in ("rate", "points", "ratio"):
+    if kind in ("rate", "points", "ratio", "number"):
         text = f"{value:.6f}"
         return "0.000000" if text == "-0.000000" else text
     return f"{value:.6g}" if kind == "p" else str(value)
@@ -247,6 +247,7 @@ def _shown(value: Any, kind: Kind) -> str:
         "rate": percent,
         "points": points,
         "ratio": lambda v: f"{round(v, 2) + 0.0:.2f}".replace("-", "−"),
+        "number": lambda v: f"{round(v, 4) + 0.0:.4f}".replace("-", "−"),
         "p": p_text,
         "count": lambda v: f"{v:,}",
     }

@@ -31,7 +31,7 @@ IDENTITY = {
     RunConfig: {
         *("policy", "policy_options"),  # in policy_identity
         *("subgoals", "subgoal_prompt", "subgoal_options"),  # in subgoals_identity
-        *("simulator", "buffer_set", "shift"),
+        *("simulator", "buffer_set", "shift", "offline"),  # offline sets the simulator
     },
     AskConfig: {
         *("model", "model_options", "prompt"),  # in model_identity, and the prompt's digest

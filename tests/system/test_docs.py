@@ -75,6 +75,7 @@ ELSEWHERE = (
     "--source lerobot",  # a dataset on the Hub
     "--source frames",  # recordings
     "--shift ",  # a renderer
+    "runs/offline",  # executions
     "k31",  # more units than the golden buffer set has
     "stale-k7",  # contradicting lessons, which a renderer plays
     "retrieval_rollouts.csv",  # the released rows
@@ -84,6 +85,8 @@ ELSEWHERE = (
     "lerobot:",  # a checkpoint
     "theirs/",  # published results
     "python:retrace",  # has a test of its own
+    "python:memory_policy",  # has a test of its own
+    "k0.csv",  # rows of that policy
 )
 """What marks command lines of the pages that need what is not available: they are parsed only."""
 
@@ -123,7 +126,7 @@ def test_the_commands_of_the_pages_run(
     buffer_set = copy_tabletop(tmp_path / "tabletop") if asked else own_buffers
     (tmp_path / "docs").symlink_to(ROOT / "docs")  # rows that a page scores
     (tmp_path / "demo").mkdir()
-    for name in ("my-buffers", "demo/buffers"):
+    for name in ("my-buffers", "my-training", "demo/buffers"):
         (tmp_path / name).symlink_to(buffer_set)
     monkeypatch.chdir(tmp_path)
     world = buffer_set if asked else tiny_buffers

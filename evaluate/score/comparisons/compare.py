@@ -14,6 +14,7 @@ from robomme_interference_data.evaluate.score.rows.reading import Rows, read_row
 from robomme_interference_data.evaluate.score.rows.values import unshifted
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import parse_condition
+from robomme_interference_data.simulators.registry import RECORDINGS
 from robomme_interference_data.stats.intervals import wilson
 from robomme_interference_data.stats.sequential import look_levels
 from robomme_interference_data.stats.significance import ALPHA
@@ -59,6 +60,11 @@ def compare(
     alpha = look_levels(look[1])[look[0] - 1] if look[1] > 1 else ALPHA
     one = read_rows([first], systems[0], lenient)
     other = one if second is None else read_rows([second], systems[1], lenient)
+    if not any(row.simulator != RECORDINGS for rows in (one, other) for row in rows):
+        raise InvalidOptionError(
+            "rows of offline runs have no outcomes to compare",
+            f"See the table action_error_changes: score {shlex.quote(str(first))} --out SCORE",
+        )
     _check_scenes(one, other)
     sides = [_sides(rows) for rows in (one, other)]
     matched = list(_matched((one, other), sides))

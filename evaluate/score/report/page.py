@@ -55,7 +55,7 @@ def write_report(
 ) -> None:
     """Write the page: the same bytes for the same rows, options and command."""
     names = {name for one in score.outcomes.values() for name in one.conditions}
-    conditions = [one.name for one in in_order(names)]
+    conditions = [one.name for one in in_order(names)] if names else []
     values = {
         "headlines": {simulator: headline(score, simulator) for simulator in score.outcomes},
         "grids": score.grids,

@@ -6,8 +6,9 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import InvalidOptionError, counted
 from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.simulators.registry import RECORDINGS
 from robomme_interference_data.storage.files import atomic_path
 
 from .reading import Rows
@@ -31,11 +32,13 @@ def export(rows: Rows, folder: Path) -> list[Path]:
     other = sum(row.split != "test" for row in rows)
     wrong = [f"{seeds} model seeds"] * (seeds > 1)
     wrong += [f"{other:,} rows of train or val episodes"] * (other > 0)
+    offline = sum(row.simulator == RECORDINGS for row in rows)
+    wrong += [f"{counted(offline, 'row')} of offline runs"] * (offline > 0)
     wrong += [f"{rows.refused:,} bad rows"] * (rows.refused > 0)
     if wrong:
         raise InvalidOptionError(
-            f"rows to export: {', '.join(wrong)}; expected valid rows of test episodes and of one "
-            "model seed",
+            f"rows to export: {', '.join(wrong)}; expected valid rows of rollouts of test "
+            "episodes and of one model seed",
             "The released layout has no columns for these: export other rows.",
         )
     files = defaultdict[Path, list[Row]](list)

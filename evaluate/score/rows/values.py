@@ -2,19 +2,15 @@
 
 import math
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
 
-from robomme_interference_data.constants import (
-    DIFFICULTIES,
-    FAMILIES,
-    MAX_STEPS,
-    PROTOCOL_VERSION,
-    SPLITS,
-)
+from robomme_interference_data.constants import DIFFICULTIES, MAX_STEPS, PROTOCOL_VERSION, SPLITS
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.systems import name_system
+from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.schema.rollouts import FINAL, Status
 from robomme_interference_data.schema.shifts import NO_SHIFT, parse_shift
@@ -52,6 +48,8 @@ class Row(NamedTuple):
     retrieval_selected_filler_fraction: float | None
     retrieval_selected_query_fraction: float | None
     chance: float | None
+    action_l1: float | None
+    action_l1_values: str | None
     video: Path | None
 
 
@@ -67,8 +65,11 @@ _SIMULATOR = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._:-]{0,127}")
 _WHOLE = re.compile(r"([0-9]{1,18})(?:\.0+)?")  # some programs save whole numbers as floats
 _TRUTH = dict.fromkeys(("1", "true", "1.0"), True) | dict.fromkeys(("0", "false", "0.0"), False)
 _RANGES = {"steps": (0, MAX_STEPS), "protocol_version": (PROTOCOL_VERSION, PROTOCOL_VERSION)}
-_NAMES = {"family": FAMILIES, "split": SPLITS, "difficulty": DIFFICULTIES, "status": FINAL}
-_FRACTIONS = {"evidence_kept", "chance", *(f for f in Row._fields if f.endswith("_fraction"))}
+_NAMES = {"split": SPLITS, "difficulty": DIFFICULTIES, "status": FINAL}
+_LARGEST = sys.float_info.max
+_MOST = {name: 1.0 for name in ("evidence_kept", "chance")}
+_MOST |= {name: 1.0 for name in Row._fields if name.endswith("_fraction")}
+_MOST |= {"action_l1": _LARGEST}
 _OPTIONAL = {name for name, hint in get_type_hints(Row).items() if isinstance(None, hint)}
 _OPTIONAL -= {"revision"}  # a file that has the column states it in each row
 
@@ -79,13 +80,13 @@ def parse(name: str, value: Any) -> Any:
     if name in _OPTIONAL and text.lower() in ("", "nan", "none"):
         return None
     match name:
-        case "system" | "condition" | "shift" | "simulator":
+        case _ if name in _CHECKS:
             _CHECKS[name](text)
         case "revision" if not text:
             raise ValueError("the revision of a buffer set")
         case "status" if text == Status.ONGOING:
             return str(Status.TIMEOUT)  # the released rows record a timeout as ongoing
-        case "family" | "split" | "difficulty" | "status":
+        case "split" | "difficulty" | "status":
             if text not in _NAMES[name]:
                 raise InvalidOptionError.one_of(name, text, _NAMES[name])
         case "success":
@@ -94,8 +95,8 @@ def parse(name: str, value: Any) -> Any:
             return _TRUTH[text.lower()]
         case "episode" | "model_seed" | "seed" | "steps" | "protocol_version":
             return _whole(text, *_RANGES.get(name, (0, 10**18 - 1)))  # as in episode ids
-        case _ if name in _FRACTIONS:
-            return _fraction(text)
+        case _ if name in _MOST:
+            return _number(text, _MOST[name])
     return text
 
 
@@ -106,13 +107,13 @@ def _whole(text: str, low: int, high: int) -> int:
     return int(match[1])
 
 
-def _fraction(text: str) -> float:
+def _number(text: str, most: float) -> float:
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not 0 <= value <= 1:
-        raise ValueError("a fraction from 0 to 1")
+    if not 0 <= value <= most:
+        raise ValueError("a fraction from 0 to 1" if most == 1 else "a number from 0")
     return value
 
 
@@ -127,6 +128,9 @@ def _check_simulator(text: str) -> None:
 _CHECKS: dict[str, Callable[[str], object]] = {
     **{"system": name_system, "condition": parse_condition},
     **{"shift": parse_shift, "simulator": _check_simulator},
+    # Any robot's: recordings are not of the benchmark's families alone.
+    "family": lambda text: EpisodeId(text, "test", 0),
+    "action_l1_values": lambda text: [_number(one, _LARGEST) for one in text.split()],
 }
 
 

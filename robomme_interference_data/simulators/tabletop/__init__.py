@@ -8,7 +8,7 @@ Importing this package registers a Gymnasium environment per family, such as
 
 from robomme_interference_data.constants import FAMILIES, MAX_STEPS
 
-SUITE_VERSION = 2
+SUITE_VERSION = 3
 """Version of the episodes: every change to scenes, shifts, motions, goals or judgments raises it.
 
 Datasets and runs of different versions are incompatible; see `docs/reference/tabletop.md`.

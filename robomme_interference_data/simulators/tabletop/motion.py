@@ -97,6 +97,24 @@ class Arm:
         for _ in range(steps):
             yield
 
+    def lasting(self, steps: int, script: Script) -> Script:
+        """Run a script, then hold its last pose until `steps` time steps have passed.
+
+        So a phase of a demonstration lasts equally long whatever the answer is.
+
+        Raises:
+            RunError: The script takes longer.
+        """
+        used = 0
+        for _ in script:
+            used += 1
+            yield
+        if used > steps:
+            raise RunError(
+                f"a phase of the demonstration took {used} time steps, more than {steps}"
+            )
+        yield from self.wait(steps - used)
+
     def move(self, to: Point, yaw: float | None = None, speed: float = SPEED) -> Script:
         """Move in a straight line, slower at both ends; `speed` in m/s is that of the middle."""
         start, turn = self._goal, 0.0 if yaw is None else yaw - self._yaw
@@ -141,10 +159,14 @@ class Arm:
 
     def put(self, at: Point, yaw: float | None = None) -> Script:
         """Bring the held object to a point, release it there, and move up."""
+        yield from self.carry(at, yaw)
+        yield from self.lower(at)
+        yield from self.carry(at)
+
+    def carry(self, at: Point, yaw: float | None = None) -> Script:
+        """Move above a point, to where `lower` begins."""
         x, y, z = at
         yield from self.move((x, y, z + CLEARANCE), yaw)
-        yield from self.lower(at)
-        yield from self.move((x, y, z + CLEARANCE))
 
     def lower(self, at: Point) -> Script:
         """Lower the held object to a point and release it."""
@@ -170,6 +192,8 @@ class Arm:
         """Move up, then to the home pose, and open the gripper."""
         yield from self.rise(0.18)
         yield from self.move(HOME, 0.0)
+        self._qpos = self.home_qpos  # without the elbow's angle, which depends on the way
+        self._command()
         if not self._stick and self._gripper < 0:
             yield from self.grip(close=False)
         yield from self.wait(SETTLE)

@@ -15,6 +15,7 @@ from robomme_interference_data.simulators.tabletop.motion import SLOW, Arm, Scri
 
 LENGTH, GRIP = 0.14, 0.04  # m: a peg, and from its middle to where it is grasped
 HOLE, DEPTH = 0.036, 0.08  # m, of the box
+TAKE, INSERT, RETURN = 103, 114, 52  # time steps of the phases of a demonstration
 LIFTED = 0.03  # m, height of the peg's middle
 HEAD, TAIL = 1, -1
 LEFT, RIGHT = 1, -1
@@ -69,10 +70,14 @@ class InsertPeg(Family):
         return Option(words, ((x + end * GRIP, y, 0.02), mouth))
 
     def demonstrate(self, arm: Arm, answer: tuple[int, int, int]) -> Script:
+        peg, end, side = answer
         yield from arm.wait(5)
-        yield from self.solve(arm, answer)
+        self.showing = (0, 1)
+        yield from arm.lasting(TAKE, self.take(arm, peg, end))
+        self.showing = (0, 1, 2)  # the peg stays visible in the box
+        yield from arm.lasting(INSERT, self.insert(arm, end, side))
         yield from arm.grip(close=False)
-        yield from arm.go_home()
+        yield from arm.lasting(RETURN, arm.go_home())
 
     def step(self, answer: tuple[int, int, int], number: int) -> Step:
         peg, end, side = answer
@@ -89,9 +94,7 @@ class InsertPeg(Family):
 
     def take(self, arm: Arm, number: int, end: int) -> Script:
         at = self.pegs[number].point(end * GRIP, 0, 0)
-        yield from arm.go_above(at)
-        self.showing = (0, 1)
-        yield from arm.take(at, lift=0.15)
+        yield from arm.pick(at, lift=0.15)
 
     def insert(self, arm: Arm, end: int, side: int) -> Script:
         x, y, _ = self.box.p
@@ -99,7 +102,6 @@ class InsertPeg(Family):
         yaw = math.copysign(math.pi / 2, end * side)
         ready = y + side * (DEPTH / 2 + 0.03 + free)
         yield from arm.move((x, ready, 0.16), yaw)
-        self.showing = (0, 1, 2)  # the peg stays visible in the box
         yield from arm.move((x, ready, self.box.size), speed=SLOW)
         yield from arm.wait(3)
         yield from arm.move((x, y + side * (DEPTH / 2 - 0.05 + free), self.box.size), speed=0.06)

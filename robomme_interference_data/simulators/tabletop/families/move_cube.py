@@ -37,6 +37,7 @@ class MoveCube(Family):
     steps = 1
     table = (0.86, 0.83, 0.76)
     spread = (0.02, 0.05, 0.08)  # m, how far cube and target may lie from the middle
+    frames = ((207, 67), (217, 75), (229, 80))  # time steps, enough for every manner
 
     def draw(self, rng: RandomState) -> None:
         wide = self.spread[self.level]
@@ -63,12 +64,16 @@ class MoveCube(Family):
         return Option(_WORDS[choice])
 
     def demonstrate(self, arm: Arm, answer: str) -> Script:
+        move, home = self.frames[self.level]
         yield from arm.wait(20)
-        yield from self.solve(arm, answer)
+        self.showing = (0,)
+        yield from arm.lasting(move, self.solve(arm, answer))
+        yield from arm.lasting(home, self.go_home(arm, answer))
+
+    def go_home(self, arm: Arm, answer: str) -> Script:
+        """Release the hook, and return."""
         if answer == "hook":
-            yield from arm.grip(close=False)  # the hook stays visible on the table
-        else:
-            self.showing = ()
+            yield from arm.grip(close=False)
         yield from arm.go_home()
 
     def step(self, answer: str, number: int) -> Step:
@@ -81,23 +86,18 @@ class MoveCube(Family):
         behind = start - 0.055 * self.way
         yield from arm.move((behind[0], behind[1], 0.12), self.turn)
         yield from arm.grip(close=True)
-        self.showing = (0,)
         yield from arm.move(behind, speed=SLOW)
         yield from arm.move(end - 0.031 * self.way + (0, 0, CUBE / 2), speed=SLOW)
         yield from arm.wait(6)
 
     def grasp(self, arm: Arm, start: Vector, end: Vector) -> Script:
-        yield from arm.go_above(start, self.turn)
-        self.showing = (0,)
-        yield from arm.take(start, self.turn)
+        yield from arm.pick(start, self.turn)
         yield from arm.put((end[0], end[1], CUBE / 2 + 0.002))
 
     def use_hook(self, arm: Arm, start: Vector, end: Vector) -> Script:
         grip = 0.025  # m from the handle's end
         at = self.hook.point(grip, 0, 0.004)
-        yield from arm.go_above(at)
-        self.showing = (0,)
-        yield from arm.take(at)
+        yield from arm.pick(at)
         left = np.array([math.sin(self.turn), -math.cos(self.turn), 0.0])
         reach = HANDLE - 0.018 - grip - CUBE / 2  # from the grip to the cube's middle
         hold = (BESIDE * left) + (0, 0, at[2] + 0.003)

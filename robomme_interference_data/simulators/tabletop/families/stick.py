@@ -2,7 +2,7 @@
 
 import math
 from functools import cache
-from itertools import pairwise, product
+from itertools import islice, pairwise, product
 from typing import Any, ClassVar
 
 import numpy as np
@@ -28,34 +28,42 @@ class StickFamily(Family):
     Attributes:
         spots: Positions of the things, in m.
         flat: Their radius and height, in m.
-        high: Height of the tip before and after the path, in m.
+        high: Height of the tip before the path, in m.
+        pause: Time steps for which the tip stays on a thing.
+        frames: Time steps of the ways of a demonstration: to the first thing, to each later one,
+            and back home.
         lamp: Body that lights one.
         now: Number of the one that is lit, or None.
     """
 
     flat: ClassVar[Spot]
     high: ClassVar[float]
+    pause: ClassVar[int]
+    frames: ClassVar[tuple[int, int, int]]
     spots: list[Spot]
     lamp: Body
     now: int | None
 
     def demonstrate(self, arm: Arm, answer: Any) -> Script:
         yield from arm.wait(10)
-        yield from self.solve(arm, answer)
-        yield from arm.go_home()
+        first, later, home = self.frames
+        for number in range(self.steps):
+            way = later if number else first
+            step = arm.lasting(way + self.pause, self.step(answer, number).do(arm))
+            self.showing = (number - 1, number) if number else (0,)  # the way shows from where, too
+            yield from islice(step, way)
+            self.showing = (number,)
+            yield from step
+        yield from arm.lasting(home, arm.go_home())
 
-    def trace(self, arm: Arm, number: int, points: list[Point], pause: int) -> Script:
-        """Do a step: lower the tip for the first, move through points, rise after the last."""
-        x, y, _ = points[-1]
+    def trace(self, arm: Arm, number: int, points: list[Point]) -> Script:
+        """Do a step: lower the tip for the first, then move through points."""
         if number == 0:
+            x, y, _ = points[-1]
             yield from arm.move((x, y, self.high))
-        self.showing = (number,)
         for point in points:
             yield from arm.move(point, speed=FAST)
-        yield from arm.wait(pause)
-        if number == self.steps - 1:
-            self.showing = ()
-            yield from arm.move((x, y, self.high))
+        yield from arm.wait(self.pause)
 
     def react(self, arm: Arm) -> None:
         radius, height = self.flat
@@ -79,6 +87,8 @@ class PatternLock(StickFamily):
     side_buttons, spacing = 4, 0.075  # buttons in a row; m
     flat = (0.02, 0.010)
     high = 0.10
+    pause = 8
+    frames = (57, 18, 60)
     length = (4, 5, 6)
 
     def draw(self, rng: RandomState) -> None:
@@ -110,7 +120,7 @@ class PatternLock(StickFamily):
         x, y = self.spots[answer[number]]
         height = self.flat[1]
         points: list[Point] = [(x, y, height + ABOVE)]
-        script = lambda arm: self.trace(arm, number, points, pause=8)  # noqa: E731
+        script = lambda arm: self.trace(arm, number, points)  # noqa: E731
         return Step("go to the button at <point>", ((x, y, height),), script)
 
     def progress(self) -> int:
@@ -152,6 +162,8 @@ class RouteStick(StickFamily):
     count, spacing = 5, 0.105  # targets; m from one to the next, with a post in the middle
     flat = (0.024, 0.003)
     high = 0.13
+    pause = 3
+    frames = (59, 28, 57)
     post, tall = 0.010, 0.07  # m, radius and height of a post
     aside = 0.06  # m, distance at which the stick passes a post
     sides: ClassVar = {1: "far", -1: "near"}  # as seen from the arm
@@ -210,7 +222,7 @@ class RouteStick(StickFamily):
             text = f"go round the post at <point> on the {side} side to the target at <point>"
             at = (post, *at)
         points = self.leg(answer, number, ABOVE)
-        return Step(text, at, lambda arm: self.trace(arm, number, points, pause=3))
+        return Step(text, at, lambda arm: self.trace(arm, number, points))
 
     def progress(self) -> int:
         return len(self.reached)

@@ -11,9 +11,11 @@ from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.tabletop.bodies import CUBE, SceneBuilder
 from robomme_interference_data.simulators.tabletop.family import Option, Step
 from robomme_interference_data.simulators.tabletop.layout import is_near, push_down, row, shuffled
-from robomme_interference_data.simulators.tabletop.motion import HELD, Arm, Script
+from robomme_interference_data.simulators.tabletop.motion import HELD, Arm, Point, Script
 from robomme_interference_data.simulators.tabletop.swaps import SwapFamily
 
+# Time steps of the phases of a demonstration, enough for every cube and target.
+REACH, CARRY, PRESS, RETURN = 21, 17, 42, 28
 RADIUS = 0.035  # m, of a target
 WHEN = ("before", "after")
 ORDINALS = ("first", "second", "third")
@@ -79,21 +81,32 @@ class PlaceFamily(SwapFamily):
         orders = permutations(range(self.count), len(self.times))
         return ((visits[self.asked], self.visit_texts(visits)) for visits in orders)
 
-    def place(self, arm: Arm, cube: int, target: int, part: int) -> Script:
-        """Move a cube to a target; the first cube shows a part of the answer there."""
+    def reach(self, arm: Arm, cube: int) -> Script:
+        """Move above a cube."""
+        yield from arm.lasting(REACH, arm.go_above(self.cubes[cube].p))
+
+    def place(self, arm: Arm, cube: int, target: int, parts: tuple[int, ...] = ()) -> Script:
+        """Move the cube below to a target, which shows parts of the answer, or no new ones."""
         yield from arm.pick(self.cubes[cube].p)
-        if cube == 0:
-            self.showing = (part,)
-        yield from self.put(arm, target)
+        at = self.above(target)
+        if parts:  # the way there shows from where, too
+            self.showing = tuple(range(max(parts[-1] - 1, 0), parts[-1] + 1))
+        yield from arm.lasting(CARRY, arm.carry(at))
+        self.showing = parts or self.showing
+        yield from arm.put(at)
 
     def put(self, arm: Arm, target: int) -> Script:
         """Put the held cube on a target."""
+        yield from arm.put(self.above(target))
+
+    def above(self, target: int) -> Point:
+        """Return where a cube is released on a target."""
         x, y, _ = self.targets[target].p
-        yield from arm.put((x, y, CUBE / 2 + 0.004))
+        return x, y, CUBE / 2 + 0.004
 
     def swap_targets(self, arm: Arm) -> Script:
         """Return the cubes to their first positions, then swap the targets."""
-        yield from arm.go_home()
+        yield from arm.lasting(RETURN, arm.go_home())
         for cube in self.cubes:
             cube.restore()
         self.showing = ()
@@ -149,11 +162,15 @@ class VideoPlaceButton(PlaceFamily):
         others = [number for number in self.order if number not in (before, after)]
         yield from arm.wait(15)
         for cube, number in enumerate([before, *others][: len(self.cubes)]):
-            yield from self.place(arm, cube, number, 0)
-        yield from arm.press(self.button.home.p)
-        # The second cube moves to the target that the first one left; a third one stays.
-        for cube, number in enumerate([after, before][: len(self.cubes)]):
-            yield from self.place(arm, cube, number, 1)
+            yield from self.reach(arm, cube)
+            yield from self.place(arm, cube, number, () if cube else (0,))
+        yield from arm.lasting(PRESS, arm.press(self.button.home.p))
+        yield from self.reach(arm, 0)
+        alone = len(self.cubes) == 1
+        yield from self.place(arm, 0, after, (1,) if alone else (0, 1))
+        if not alone:  # the second cube moves to the target that the first one left
+            yield from self.reach(arm, 1)
+            yield from self.place(arm, 1, before)
         yield from self.swap_targets(arm)
 
     def react(self, arm: Arm) -> None:
@@ -173,6 +190,7 @@ class VideoPlaceOrder(PlaceFamily):
     def draw(self, rng: RandomState) -> None:
         super().draw(rng)
         self.asked = int(rng.randint(3))
+        self.second = shuffled(rng, self.count)
         cube, ordinal = self.colors[0], ORDINALS[self.asked]
         self.goal = f"put the {cube} cube on the {ordinal} target it was placed on"
 
@@ -187,10 +205,12 @@ class VideoPlaceOrder(PlaceFamily):
 
     def demonstrate(self, arm: Arm, answer: int) -> Script:
         first = self.visits(answer)
-        # A second cube visits other targets, clear of where the first one stays.
-        second = [number for number in self.order if number != first[-1]][:3]
+        # A second cube visits other targets, clear of where the first one stays; the first one's
+        # earlier targets have no influence.
+        second = [number for number in self.second if number != first[-1]][:3]
         yield from arm.wait(10)
         for cube, visits in zip(range(len(self.cubes)), (first, second), strict=False):
+            yield from self.reach(arm, cube)
             for part, number in enumerate(visits):
-                yield from self.place(arm, cube, number, part)
+                yield from self.place(arm, cube, number, () if cube else (part,))
         yield from self.swap_targets(arm)

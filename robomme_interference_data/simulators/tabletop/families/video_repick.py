@@ -9,6 +9,7 @@ from robomme_interference_data.simulators.tabletop.layout import push_down, row
 from robomme_interference_data.simulators.tabletop.motion import HELD, Arm, Script
 from robomme_interference_data.simulators.tabletop.swaps import SwapFamily
 
+PICK, RETURN = 98, 44  # time steps of these phases of a demonstration, enough for every cube
 LIFTED = 0.06  # m, height of the cube's middle
 TIMES = ("once", "twice, putting it down in between", "three times, putting it down in between")
 
@@ -52,9 +53,11 @@ class VideoRepick(SwapFamily):
 
     def demonstrate(self, arm: Arm, answer: int) -> Script:
         yield from arm.wait(5)
-        yield from self.pick_up(arm, answer)
+        self.showing = (0,)
+        yield from arm.lasting(PICK, self.pick_up(arm, answer))
         yield from self.put_down(arm)
-        yield from arm.go_home()
+        yield from arm.lasting(RETURN, arm.go_home())
+        self.showing = ()
         for cube in self.cubes:
             cube.restore()
             cube.hold(True)
@@ -62,14 +65,11 @@ class VideoRepick(SwapFamily):
 
     def pick_up(self, arm: Arm, number: int) -> Script:
         self.taken = self.cubes[number].p
-        yield from arm.go_above(self.taken)
-        self.showing = (0,)
-        yield from arm.take(self.taken)
+        yield from arm.pick(self.taken)
         yield from arm.wait(5)
 
     def put_down(self, arm: Arm) -> Script:
         yield from arm.put((self.taken[0], self.taken[1], CUBE / 2 + 0.002))
-        self.showing = ()
 
     def react(self, arm: Arm) -> None:
         self.pressed = push_down(self.button, arm)

@@ -1,0 +1,121 @@
+"""Recorded executions, played back, to compare a policy's actions with those of a recording."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, override
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import ACTION, EXECUTIONS, MAX_STEPS, STATE
+from robomme_interference_data.data.buffer_set import BufferSet
+from robomme_interference_data.data.dataset import Dataset, camera_feature
+from robomme_interference_data.data.loading import load_buffer_set
+from robomme_interference_data.errors import HashMismatchError, MissingFileError, UnknownNameError
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.storage.arrays import FeatureDigests
+
+from .base import Begun, Demonstration, EpisodeInfo, Observation, Simulator, choose_cameras
+from .registry import RECORDINGS
+
+
+class Recordings(Simulator):
+    """Plays back the executions of a buffer set; actions change nothing but the measured error.
+
+    An episode ends as `measured` after its last recorded action, or after 1300 steps.
+
+    Args:
+        buffer_set: Folder or repository of the buffer set.
+        cameras: Cameras to decode, any of the recordings'.
+    """
+
+    name = RECORDINGS
+    about = "recordings, played back"
+    settings = ("cameras", "buffer_set")
+    scripted = False
+
+    def __init__(self, buffer_set: str, cameras: Sequence[str] = ()):
+        self._buffer_set = load_buffer_set(buffer_set, threads=1)
+        self._executions = executions_of(self._buffer_set)
+        self._cameras = choose_cameras(cameras, self._executions.cameras)
+        (self.action_size,) = self._executions.features[ACTION]
+
+    @override
+    def act(self, policy: str, known: Mapping[int, str] | None = None) -> NDArray[np.float32]:
+        raise UnknownNameError(f"recordings have no policy {policy}")
+
+    @override
+    def columns(self) -> dict[str, Any]:
+        by_value = np.mean(self._errors, axis=0)
+        return {
+            "action_l1": round(float(by_value.mean()), 9),
+            "action_l1_values": " ".join(f"{value:.9f}" for value in by_value),
+        }
+
+    @override
+    def _begin(self, episode: EpisodeId, demonstration: bool) -> Begun:
+        query, executions = self._buffer_set.query(episode), self._executions
+        index = executions.index_of(episode)
+        record = executions.record(index)
+        self._actions = executions.read_vectors(index, ACTION, 0, min(record.length, MAX_STEPS))
+        self._errors: list[NDArray[np.float64]] = []
+        self._observations = self._observed(record, len(self._actions))
+        self._seen = next(self._observations)
+        states = query.dataset.read_vectors(
+            query.record.episode_index, STATE, 0, query.lesson_frames
+        )
+        lesson = Demonstration({}, states, np.empty((0, self.action_size), np.float32))
+        info = EpisodeInfo(record.goals, record.difficulty, record.seed, RECORDINGS)
+        return lesson, self._seen, info
+
+    @override
+    def _execute(
+        self, episode: EpisodeId, action: NDArray[np.float32], observe: bool
+    ) -> tuple[Observation, Status]:
+        recorded = self._actions[len(self._errors)].astype(float)
+        self._errors.append(np.abs(action - recorded))
+        seen = next(self._observations, None)
+        if seen is None:
+            return self._seen, Status.MEASURED
+        self._seen = seen
+        return seen, Status.ONGOING
+
+    def _observed(self, record: EpisodeRecord, length: int) -> Iterator[Observation]:
+        """Yield the observations, and compare whole recordings with their SHA-256."""
+        index, digests = record.episode_index, FeatureDigests()
+        states = self._executions.read_vectors(index, STATE, 0, length)
+        digests.update(STATE, states)
+        digests.update(ACTION, self._actions)
+        streams = {
+            camera: self._executions.iter_frames(index, camera, 0, length)
+            for camera in self._cameras
+        }
+        for state in states:
+            images = {camera: np.array(next(stream)) for camera, stream in streams.items()}
+            for camera, image in images.items():
+                digests.update(camera_feature(camera), image)
+            yield Observation(images, state)
+        recorded, found = record.feature_sha256, digests.current()
+        if length == record.length and not found.items() <= recorded.items():
+            raise HashMismatchError(
+                f"the execution {record.episode_id} in {self._executions.files.describe()} differs "
+                "from its recorded SHA-256",
+                "Download or build it again.",
+                "verify BUFFER_SET",
+            )
+
+
+def executions_of(buffer_set: BufferSet) -> Dataset:
+    """Return the executions of a buffer set.
+
+    Raises:
+        MissingFileError: It has none.
+    """
+    if EXECUTIONS not in buffer_set.datasets:
+        raise MissingFileError(
+            f"{buffer_set.location} has no executions",
+            "Build them from the recordings of its demonstrations, and then its manifests.",
+            f"build {EXECUTIONS} {buffer_set.location} --source KIND:PATH",
+        )
+    return buffer_set.datasets[EXECUTIONS]

@@ -1,0 +1,253 @@
+"""Offline evaluation: the policy acts along a recording, and its actions are compared."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.buffer_sets import build, plan_again
+from support.made_up import MadeUpSource
+
+from robomme_interference_data import load_buffer_set
+from robomme_interference_data.build_dataset.sources import Frame
+from robomme_interference_data.errors import HashMismatchError, InterferenceError, PolicyError
+from robomme_interference_data.evaluate import Policy, RolloutInfo, RunConfig, run_evaluation
+from robomme_interference_data.evaluate.rollout.rollout import run_rollout
+from robomme_interference_data.evaluate.run.kind import Run
+from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.runtime.executor import Serial
+from robomme_interference_data.schema.rollouts import Rollout
+from robomme_interference_data.simulators import recordings
+from robomme_interference_data.simulators.recordings import Recordings
+
+DRAWER, CUPS = "OpenDrawer/test/0", "StackCups/test/0"
+QUERIES = {DRAWER: (25, 5), CUPS: (7, 5)}
+UNITS = {"OpenDrawer/train/0": (249, None), "StackCups/train/0": (249, None)}
+
+
+class Arm(MadeUpSource):
+    """Frame n has a state of two values, and the action (n, 2n, 0)."""
+
+    def frame(self, name: str, number: int, *rest: Any) -> Frame:
+        made = super().frame(name, number, *rest)
+        action = np.array([number, 2 * number, 0], np.float32)
+        return Frame(made.images, made.state[:2], action, made.is_demonstration)
+
+
+def buffer_set(root: Path, source: type[MadeUpSource] = MadeUpSource, **executions: Any) -> Path:
+    build(root, "demonstrations", source(QUERIES))
+    build(root, "distractors", source(UNITS))
+    build(root, "executions", source(QUERIES), **executions)
+    plan_again(root, ("no-history", "k0", "k1"))
+    return root
+
+
+@pytest.fixture(scope="module")
+def buffers(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Frame n has a state of eight n, and an action of eight −n."""
+    return buffer_set(tmp_path_factory.mktemp("offline"))
+
+
+class Constant(Policy):
+    """Returns the same actions, and keeps the first state value of all that it is given."""
+
+    cameras = history_cameras = ("front",)
+
+    def __init__(self, actions: Any, every_frame: bool = False):
+        self.actions, self.every_frame = actions, every_frame
+        self.info: RolloutInfo | None = None
+        self.history: list[float] = []
+        self.live: list[list[float]] = []
+
+    def reset(self, info: RolloutInfo) -> None:
+        self.info = info
+
+    def add_history(self, frames: Any, states: Any, exec_start_idx: int) -> None:
+        self.history += states[:, 0].tolist()
+
+    def observe(self, frames: Any, states: Any) -> None:
+        assert len(frames["front"]) == len(states)
+        self.live.append(states[:, 0].tolist())
+
+    def act(self, observation: Any, goal: str) -> Any:
+        assert observation.state[0] == self.live[-1][-1] and goal == f"do {DRAWER}"
+        return self.actions
+
+    def metadata(self) -> dict[str, Any]:
+        return {}
+
+
+def walk(root: Path, policy: Policy, condition: str = "k1") -> Rollout:
+    opened = load_buffer_set(root)
+    config = RunConfig(policy="mine", buffer_set=str(root), out=Path("nowhere"), offline=True)
+    return run_rollout(
+        Run(config, "mine", opened.name, opened.revision),
+        WorkItem(condition, EpisodeId.parse(DRAWER)),
+        simulator=Recordings(str(root), policy.cameras),
+        policy=policy,
+        buffer_set=opened,
+    )
+
+
+def test_actions_are_compared_along_the_recording(buffers: Path) -> None:
+    """Its 20 live frames, 5 to 24, have actions of −5 to −24: zeros are 14.5 away on average."""
+    policy = Constant(np.zeros((16, 8), np.float32))
+    row = walk(buffers, policy)
+    assert (row.status, row.success, row.steps) == ("measured", None, 20)
+    assert row.action_l1 == 14.5
+    assert row.action_l1_values == " ".join(["14.500000000"] * 8)
+    assert (row.history_frames, row.lesson_frames, row.seed, row.goal) == (37, 5, 7, f"do {DRAWER}")
+    assert policy.info == RolloutInfo(f"do {DRAWER}", 37, 0)
+    assert policy.history == [*range(5), *range(0, 249, 8)]
+    assert policy.live == [[5], [21]]
+
+
+@pytest.mark.parametrize(
+    ("chunk", "every_frame", "live"),
+    [
+        (20, True, [[5], [*range(6, 22)]]),  # at most 16 actions are executed
+        (6, False, [[5], [11], [17], [23]]),
+        (6, True, [[5], [*range(6, 12)], [*range(12, 18)], [*range(18, 24)]]),
+        (1, False, [[number] for number in range(5, 25)]),
+    ],
+)
+def test_observations_come_as_in_a_rollout(
+    buffers: Path, chunk: int, every_frame: bool, live: list[list[float]]
+) -> None:
+    policy = Constant(np.full((chunk, 8), -5.0), every_frame)
+    assert walk(buffers, policy, "no-history").action_l1 == 9.5
+    assert (policy.live, policy.history) == (live, [])
+
+
+def test_recorded_images_are_shown(buffers: Path) -> None:
+    simulator, frames = Recordings(str(buffers), ["front"]), MadeUpSource(QUERIES)
+    lesson, seen, info = simulator.reset(DRAWER)
+    assert (len(lesson), info.seed, info.difficulty) == (5, 7, "easy")
+    for number in range(5, 25):
+        expected = frames.frame(DRAWER, number, 5)
+        assert np.array_equal(seen.images["front"], expected.images["front"])
+        assert np.array_equal(seen.state, expected.state)
+        assert expected.action is not None
+        seen, status = simulator.step(expected.action)
+    assert (status, simulator.columns()["action_l1"]) == ("measured", 0.0)
+    simulator.reset(CUPS)  # again from its beginning
+    assert simulator.step(np.full(8, -6.0))[1] == "ongoing"
+    assert simulator.step(np.full(8, -6.0))[1] == "measured"
+    assert simulator.columns()["action_l1"] == 0.5
+
+
+def test_damaged_recordings_are_an_error(buffers: Path, tmp_path: Path) -> None:
+    """The video of another recording, of the same length."""
+    root = Path(shutil.copytree(buffers, tmp_path / "damaged"))
+    other = tmp_path / "other"
+    build(other, "executions", MadeUpSource({"OpenDrawer/test/1": (25, 5)}))
+    [video] = other.rglob("*.mp4")
+    made = load_buffer_set(root).datasets["executions"]
+    index = made.index_of(EpisodeId.parse(DRAWER))
+    shutil.copyfile(video, root / "executions" / made.files_of(index, ["front"])[1])
+    with pytest.raises(HashMismatchError, match=DRAWER):
+        walk(root, Constant(np.zeros((16, 8))))
+
+
+def test_long_recordings_end_like_rollouts(buffers: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recordings, "MAX_STEPS", 10)
+    row = walk(buffers, Constant(np.zeros((16, 8))))
+    assert (row.status, row.steps, row.action_l1) == ("measured", 10, 9.5)
+
+
+def test_robots_with_other_actions(tmp_path: Path) -> None:
+    """Over n from 5 to 24: |1 − n| is 13.5 on average, |1 − 2n| is 28, and |1 − 0| is 1."""
+    root = buffer_set(tmp_path, Arm)
+    row = walk(root, Constant(np.ones((4, 3))))
+    assert row.action_l1_values == "13.500000000 28.000000000 1.000000000"
+    assert row.action_l1 == round(42.5 / 3, 9)
+    with pytest.raises(PolicyError, match=r"\(4, 8\)(.|\n)*expected \(n, 3\) actions"):
+        walk(root, Constant(np.ones((4, 8))))
+
+
+@pytest.mark.parametrize("actions", [np.full((16, 8), np.nan), np.zeros((16, 7)), None])
+def test_actions_that_cannot_be_compared(buffers: Path, actions: Any) -> None:
+    with pytest.raises(PolicyError, match=r"(?s)the policy's answer.*expected \(n, 8\) actions"):
+        walk(buffers, Constant(actions))
+
+
+def evaluate(root: Path, out: Path, **changes: Any) -> Any:
+    settings: dict[str, Any] = {"policy": "noop", "conditions": ("no-history", "k0")}
+    config = RunConfig(buffer_set=str(root), out=out, offline=True, **settings | changes)
+    return run_evaluation(config, executor=Serial())
+
+
+def test_a_run_resumes(buffers: Path, tmp_path: Path) -> None:
+    first = evaluate(buffers, tmp_path, conditions=("k0",))
+    assert first.counts == {"success": 0, "fail": 0, "timeout": 0, "error": 0, "measured": 2}
+    whole = evaluate(buffers, tmp_path, conditions=("no-history", "k0"))
+    assert whole.counts["measured"] == whole.planned == 4
+    assert {row.simulator for row in whole.rows} == {"recordings"}
+    assert [row for row in whole.rows if row.condition == "k0"] == list(first.rows)
+
+
+def test_errors_are_rows_and_run_again(
+    buffers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The policy returns NaN once."""
+    from support import own_policies
+
+    given = [np.full((1, 8), np.nan)]
+    monkeypatch.setattr(
+        own_policies.Still, "act", lambda self, *_: given.pop() if given else self.action
+    )
+    still = {"policy": "python:support.own_policies:Still", "conditions": ("no-history",)}
+    broken = evaluate(buffers, tmp_path, **still)
+    assert (broken.counts["error"], broken.counts["measured"]) == (1, 1)
+    [error] = [row for row in broken.rows if row.status == "error"]
+    assert error.action_l1 is None and "expected (n, 8) actions" in str(error.error)
+    again = evaluate(buffers, tmp_path, **still)
+    assert (again.counts["error"], again.counts["measured"]) == (0, 2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"policy": "oracle"}, "needs scripts of the simulator.*\nLeave out `offline`"),
+        ({"policy": "follow-subgoals"}, "needs scripts of the simulator"),
+        ({"simulator": "robomme"}, "`simulator` has no effect"),
+        ({"shift": "light:1"}, "`shift` has no effect"),
+        ({"videos": True}, "`videos` has no effect"),
+        ({"check_lesson": True}, "`check_lesson` has no effect"),
+        ({"subgoals": "oracle"}, "need a simulator"),
+        ({"offline": False, "simulator": "recordings"}, "no simulator to choose"),
+    ],
+)
+def test_settings_that_do_not_fit(
+    buffers: Path, tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    usual: dict[str, Any] = {"policy": "noop", "offline": True}
+    config = RunConfig(buffer_set=str(buffers), out=tmp_path / "run", **usual | changes)
+    with pytest.raises(InterferenceError, match=message):
+        run_evaluation(config, executor=Serial())
+    assert not (tmp_path / "run").exists()
+
+
+def test_buffer_sets_without_executions(tmp_path: Path, own_buffers: Path) -> None:
+    with pytest.raises(InterferenceError, match="has no executions"):
+        evaluate(own_buffers, tmp_path / "run")
+    root = buffer_set(tmp_path / "some", families=("OpenDrawer",))
+    with pytest.raises(InterferenceError, match="StackCups/test/0"):
+        evaluate(root, tmp_path / "run")
+    assert evaluate(root, tmp_path / "run", families=("OpenDrawer",)).planned == 2
+
+
+def test_the_command(buffers: Path, tmp_path: Path, run: Callable[..., Any]) -> None:
+    """Holding the first live state (5) is 19.5 from −5 to −24; 10.5 from −5 and −6."""
+    words = ("--policy", "noop", "--offline", "--conditions", "no-history", "--workers", "1")
+    code, out, err = run("evaluate", buffers, *words, "--out", tmp_path / "run")
+    assert code == 0, err
+    lines = [line.split() for line in out.splitlines() if line]
+    assert ["family", "no-history"] in lines
+    assert [one for one in lines if one[0] in ("OpenDrawer", "StackCups", "all")]
+    code, _, err = run("score", tmp_path / "run", "--out", tmp_path / "score")
+    assert code == 0, err
+    assert (tmp_path / "score/tables/action_error.csv").is_file()

@@ -1,0 +1,171 @@
+"""The example `examples/memory_policy`: it trains, resumes, answers, and acts in rollouts."""
+
+import csv
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from support.buffer_sets import build, copy_buffer_set, plan_again
+from support.tabletop import TABLETOP
+from support.worlds import BUFFER_SET
+
+from robomme_interference_data import load_buffer_set
+from robomme_interference_data.build_dataset.sources.sample import SampleSource
+from robomme_interference_data.constants import EXECUTIONS
+from robomme_interference_data.evaluate import RunConfig, run_evaluation
+from robomme_interference_data.evaluate.score.rows.reading import read_rows
+from robomme_interference_data.runtime.executor import Serial
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "memory_policy"
+SMALL = ("--image-size", "16", "--batch", "4", "--device", "cpu")
+
+
+@pytest.fixture(autouse=True)
+def example(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Make the example's modules importable, as if one stood in its folder."""
+    monkeypatch.syspath_prepend(str(EXAMPLE))
+    yield
+    for name in ("train", "answer", "memory_model", "memory_policy"):
+        sys.modules.pop(name, None)
+
+
+@pytest.fixture
+def program(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Run one of the example's programs in this process."""
+
+    def call(name: str, *arguments: object) -> None:
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *map(str, arguments)])
+        __import__(name)
+        sys.modules[name].main()
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def acting(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The golden buffer set with executions."""
+    root = copy_buffer_set(tmp_path_factory.mktemp("acting") / "buffers")
+    families = ("VideoRepick", "MoveCube", "PatternLock")
+    build(root, EXECUTIONS, SampleSource(size=32), families=families, split="test")
+    plan_again(root)
+    return root
+
+
+def weights(run: Path) -> dict[str, torch.Tensor]:
+    from safetensors.torch import load_file
+
+    return load_file(run / "model.safetensors")
+
+
+def test_it_learns_to_answer_and_writes_rows(program: Any, tmp_path: Path) -> None:
+    """Six golden lessons are learned by heart."""
+    run, families = tmp_path / "run", ("VideoRepick", "MoveCube", "InsertPeg")
+    options = (
+        "--conditions",
+        "k0",
+        "--steps",
+        80,
+        "--learning-rate",
+        3e-3,
+        "--families",
+        *families,
+    )
+    program("train", TABLETOP, "--out", run, *options, *SMALL)
+    with (run / "log.csv").open() as file:
+        log = [*csv.DictReader(file)]
+    assert [line["step"] for line in log] == ["20", "40", "60", "80"]
+    out = tmp_path / "rows.csv"
+    program("answer", run, TABLETOP, "--system", "learned-k0", "--out", out, "--seed", 3)
+    rows = read_rows([out]).rows
+    assert len(rows) == 3 * 18 and {row.model_seed for row in rows} == {3}
+    assert {row.condition for row in rows} == {"no-history", "k0", "k1"}
+    assert {row.revision for row in rows} == {load_buffer_set(TABLETOP).revision}
+    seen = [row.success for row in rows if row.condition == "k0" and row.family in families]
+    assert sum(map(bool, seen)) >= 5  # by chance about 2 of 6
+
+
+def test_an_interrupted_run_ends_like_another(
+    program: Any, acting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = ("--task", "act", "--conditions", "k0=2", "k3", "--steps", 6, "--save-every", 2)
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    program("train", acting, "--out", whole, *settings, *SMALL)
+    step, taken = sys.modules["train"].train_step, []
+
+    def interrupted(*given: Any) -> Any:
+        if len(taken) == 3:
+            raise KeyboardInterrupt
+        taken.append(1)
+        return step(*given)
+
+    monkeypatch.setattr(sys.modules["train"], "train_step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        program("train", acting, "--out", parts, *settings, *SMALL)
+    monkeypatch.setattr(sys.modules["train"], "train_step", step)
+    with pytest.raises(SystemExit, match="another seed"):
+        program("train", acting, "--out", parts, *settings, *SMALL, "--seed", 1)
+    program("train", acting, "--out", parts, *settings, *SMALL)
+    expected, found = weights(whole), weights(parts)
+    assert all(torch.equal(expected[name], found[name]) for name in expected)
+
+
+@pytest.mark.parametrize("trunk, memory", [("transformer", "framesamp:8"), ("gru", "full")])
+def test_the_trained_policy_in_rollouts(
+    trunk: str,
+    memory: str,
+    program: Any,
+    acting: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    run = tmp_path / "run"
+    options = ("--task", "act", "--trunk", trunk, "--memory", memory, "--steps", 2, "--chunk", 8)
+    program("train", acting, "--out", run, "--conditions", "k1", *options, *SMALL)
+    monkeypatch.setenv(BUFFER_SET, str(acting))
+    config = RunConfig(
+        policy="python:memory_policy:MemoryPolicy",
+        policy_options=(f"checkpoint={run}", "device=cpu"),
+        buffer_set=acting,
+        out=tmp_path / "results",
+        simulator="support.worlds:World",
+        system="learned",
+        conditions=("no-history", "k1"),
+        families=("MoveCube",),
+    )
+    result = run_evaluation(config, executor=Serial())
+    assert result.counts == {"success": 0, "fail": 2, "timeout": 0, "error": 0}
+
+
+def test_a_checkpoint_of_the_other_task(program: Any, acting: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    program("train", acting, "--out", run, "--task", "act", "--steps", 1, *SMALL)
+    with pytest.raises(SystemExit, match="expected --task answer"):
+        program("answer", run, TABLETOP, "--system", "x", "--out", tmp_path / "rows.csv")
+    with pytest.raises(SystemExit, match="is not a checkpoint"):
+        program("answer", tmp_path, TABLETOP, "--system", "x", "--out", tmp_path / "rows.csv")
+
+
+PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "train-a-policy.md"
+
+
+def test_the_pages_commands_and_its_example(
+    acting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = PAGE.read_text()
+    lines = re.findall(r"^python examples/memory_policy/(\w+)\.py (.*)$", text, flags=re.M)
+    assert {name for name, _ in lines} == {"train", "answer"}
+    for name, line in lines:
+        monkeypatch.setattr(sys, "argv", [name, *line.split()])
+        __import__(name)
+        assert sys.modules[name].arguments().out
+    [code] = re.findall(r"<!-- example: train -->\n```python\n(.*?)```", text, flags=re.S)
+    (tmp_path / "my-training").symlink_to(acting)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(code.replace("image_size=96", "image_size=16"), names)  # of 32 pixels
+    item = names["item"]
+    assert item["memory.images.front"].shape == (31, 3, 16, 16) and item["action"].shape == (16, 8)
