@@ -56,13 +56,6 @@ class System:
         """Whether its released server keeps frames; None if no server was released."""
         return self.position_limit is not None if self.paper else None
 
-    @property
-    def prompt(self) -> str:
-        """Default prompt of the model in front of it."""
-        if self.subgoals == "simple_subgoal":
-            return "simple"
-        return "memer" if self.name == "memer" else "grounded"
-
     def applies(self, condition: str) -> bool:
         """Whether a condition applies: retrieval needs a history, a system without memory none."""
         return not self.retrieval if condition == NO_HISTORY else self.with_history

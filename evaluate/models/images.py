@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from robomme_interference_data.schema.sampling import spread
-from robomme_interference_data.storage.encode import CLIP, VideoEncoder
+from robomme_interference_data.storage.encode import CLIP, MODEL_VIDEO, VideoEncoder
 
 from .model import Message, Part, Video
 
@@ -50,7 +50,8 @@ def mp4(video: Video) -> bytes:
     height, width = (side // 2 * 2 for side in video.frames.shape[1:3])
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "video.mp4"
-        encoder = VideoEncoder(path, CLIP, max(1, round(video.fps)), height, width)
+        codec = CLIP if height % 16 or width % 16 else MODEL_VIDEO
+        encoder = VideoEncoder(path, codec, max(1, round(video.fps)), height, width)
         for frame in video.frames:
             encoder.add(np.ascontiguousarray(frame[:height, :width]))
         encoder.close()

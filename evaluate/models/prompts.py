@@ -17,19 +17,27 @@ _MOST_BYTES = 1 << 16
 
 
 def fill(
-    text: str, words: Mapping[str, str], views: Mapping[str, Sequence[Part]]
+    text: str,
+    words: Mapping[str, str],
+    views: Mapping[str, Sequence[Part]],
+    *,
+    separator: str = "",
+    no_images: str = "none",
 ) -> tuple[Part, ...]:
     """Return the parts of a text whose placeholders, `{goal}` or `<history>`, are replaced.
 
-    A placeholder without images becomes the word `none`.
+    Images of one placeholder have the separator between them; one without images becomes
+    `no_images`.
     """
     parts: list[Part] = []
     rest = 0
     for match in re.finditer("|".join(map(re.escape, (*words, *views))), text):
         name = match.group()
-        values = [words[name]] if name in words else views[name] or ["none"]
-        for part in (text[rest : match.start()], *values):
-            _add(parts, part)
+        _add(parts, text[rest : match.start()])
+        values = [words[name]] if name in words else views[name] or [no_images]
+        for place, value in enumerate(values):
+            _add(parts, separator if place else "")
+            _add(parts, value)
         rest = match.end()
     _add(parts, text[rest:])
     return tuple(parts)

@@ -15,7 +15,6 @@ from robomme_interference_data.evaluate.run.config import (
     with_retrieval,
 )
 from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
-from robomme_interference_data.evaluate.subgoals.prompt import load_prompt
 from robomme_interference_data.evaluate.subgoals.writer import ORACLE
 from robomme_interference_data.evaluate.systems import (
     System,
@@ -83,7 +82,7 @@ def check_settings(config: RunConfig, system: str, buffer_set: BufferSet, policy
     for camera in (*policy.history_cameras, *retrieval):
         buffer_set.datasets[DEMONSTRATIONS].shape(camera)  # raises for an unknown camera
     _check_name(config, name_system(system))
-    _check_subgoals(config, name_system(system))
+    _check_subgoals(config)
     if config.videos:
         from .clips import check_drawing
 
@@ -119,7 +118,7 @@ def _check_name(config: RunConfig, system: System) -> None:
         )
 
 
-def _check_subgoals(config: RunConfig, system: System) -> None:
+def _check_subgoals(config: RunConfig) -> None:
     """Reject subgoals that no policy reads, and settings of them without effect."""
     for name in ("subgoal_prompt", "subgoal_options"):
         if getattr(config, name) and config.subgoals in (None, ORACLE):
@@ -134,15 +133,6 @@ def _check_subgoals(config: RunConfig, system: System) -> None:
             f"the policy {config.policy} reads no subgoals",
             f"Set `policy` to {', '.join(READS_SUBGOALS)}, or leave out `subgoals`.",
         )
-    if config.subgoals != ORACLE:
-        watches = load_prompt(config.subgoal_prompt or system.prompt)[0].watches
-        if system.subgoals is not None and watches is not (system.prompt == "memer"):
-            raise InvalidOptionError(
-                f"the prompt {config.subgoal_prompt} shows the model "
-                f"{'' if watches else 'no '}recent frames; that of {system.name} "
-                f"{'does not' if watches else 'does'}",
-                "Set that system's prompt, or set `system` to a name of your own.",
-            )
 
 
 def check_plan(

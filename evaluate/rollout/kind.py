@@ -32,6 +32,7 @@ from robomme_interference_data.evaluate.subgoals.registry import (
     describe_subgoals,
     pin_subgoals,
     subgoals_identity,
+    with_published,
 )
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.runtime.executor import Session
@@ -58,13 +59,13 @@ class Rollouts(RunKind[RunConfig]):
 
     def prepare(self) -> None:
         """Check the settings, and identify the policy and the writer of its subgoals."""
-        config = self.config
+        config = self.config = with_published(self.config)
         self._policy, self._policy_metadata = describe_policy(
             config.policy, config.policy_options, workers=config.workers
         )
         check_settings(config, self.system, self.buffer_set, self._policy)
         self._system = name_system(self.system)
-        self.config, self._subgoal_metadata = describe_subgoals(config, self._system)
+        self._subgoal_metadata = describe_subgoals(config)
         self.metadata = self._policy_metadata | self._subgoal_metadata
         self.versions = simulator_versions(config.simulator, config.robomme_python)
 

@@ -115,9 +115,15 @@ def run_rollout(
             with clock.part("model_s"):
                 writer.start(History(buffer, given, reader), rollout_info, simulator)
     live = _Live(run.config, policy, simulator, writer, clock, clip, worker)
-    status, steps = live.run(first, info.goal)
-    if status is Status.ERROR:
-        raise RunError(f"the {config.simulator} simulator reported an error at step {steps}")
+    try:
+        status = live.run(first, info.goal)
+        if status is Status.ERROR:
+            raise RunError(
+                f"the {config.simulator} simulator reported an error at step {live.steps}"
+            )
+    except Exception as error:
+        vars(error)["progress"] = {"steps": live.steps, **_model_columns(writer)}
+        raise
     times: dict[str, Any] = {name: round(value, 4) for name, value in clock.items()}
     return run.row(
         item,
@@ -125,7 +131,7 @@ def run_rollout(
         seed=info.seed,
         difficulty=info.difficulty,
         goal=info.goal,
-        steps=steps,
+        steps=live.steps,
         **history_columns(buffer, given, selector),
         evidence_kept=_evidence_kept(run.system, buffer, given),
         **_model_columns(writer),
@@ -135,9 +141,9 @@ def run_rollout(
     )
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Live:
-    """The live loop of one rollout."""
+    """The live loop of one rollout; `steps` counts the executed ones."""
 
     config: RunConfig
     policy: Policy
@@ -146,10 +152,11 @@ class _Live:
     clock: _Clock
     clip: "Clip | None"
     worker: Worker
+    steps: int = 0
 
-    def run(self, first: Observation, goal: str) -> tuple[Status, int]:
-        """Return the final status, and the number of executed steps."""
-        seen, steps = [first], 0
+    def run(self, first: Observation, goal: str) -> Status:
+        """Return the final status."""
+        seen = [first]
         written: int | None = None  # steps before the current subgoal was written
         subgoal: Subgoal | None = None
         watches = self.writer is not None and self.writer.every_frame
@@ -157,14 +164,14 @@ class _Live:
         actions: NDArray[np.float32] = np.empty((0, ACTION_SIZE), np.float32)
         while True:
             # A policy of single actions gets subgoals as often as one of whole chunks.
-            due = written is None or len(actions) > 1 or steps - written >= ACTION_CHUNK
+            due = written is None or len(actions) > 1 or self.steps - written >= ACTION_CHUNK
             if self.writer is not None:
                 with self.clock.part("model_s"):
                     self.writer.watch(seen)
                     if due:
-                        subgoal, written = self.writer.next(seen[-1], steps), steps
+                        subgoal, written = self.writer.next(seen[-1], self.steps), self.steps
                 seen[-1] = replace(seen[-1], subgoal=subgoal)
-            actions = self._decide(seen, goal)[: MAX_STEPS - steps]
+            actions = self._decide(seen, goal)[: MAX_STEPS - self.steps]
             seen = []
             with self.worker.limit(self.config.simulator_timeout_s, "the simulator's steps"):
                 for number, action in enumerate(actions, 1):
@@ -172,13 +179,13 @@ class _Live:
                     drawn = needed or self.clip is not None
                     with self.clock.part("simulator_s"):
                         observed, status = self.simulator.step(action, observe=drawn)
-                    steps += 1
+                    self.steps += 1
                     if self.clip is not None:
                         self.clip.step(observed, status, subgoal)
                     if status is not Status.ONGOING:
-                        return status, steps
-                    if steps >= MAX_STEPS:
-                        return Status.TIMEOUT, steps
+                        return status
+                    if self.steps >= MAX_STEPS:
+                        return Status.TIMEOUT
                     if needed:
                         seen.append(observed)
 

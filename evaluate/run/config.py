@@ -111,7 +111,7 @@ class RunConfig(WorkConfig):
         metavar="NAME|FILE",
         group=_SUBGOALS,
         help="Prompt of a model: simple, grounded, memer or a file; see docs/reference/prompts.md.",
-        shown="as the system's",
+        shown="grounded",
     )
     subgoal_options: tuple[str, ...] = setting(
         (),

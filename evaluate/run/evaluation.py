@@ -230,11 +230,11 @@ def _row(
             seed=query.seed,
             difficulty=query.difficulty,
             goal=None,
-            steps=0,
             history_frames=0,
             lesson_frames=0,
             lesson_share=None,
             error=_error_text(error),
+            **{"steps": 0, **outcome.progress},
         )
     (log.folder / item.clip).unlink(missing_ok=True)  # of an earlier attempt
     # Rows matter more than clips: a full disk costs a clip only.

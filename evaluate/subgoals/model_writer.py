@@ -15,7 +15,7 @@ from robomme_interference_data.schema.sampling import spread
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Observation, Simulator
 
-from .prompt import Answer, load_prompt, merge_near
+from .prompt import Answer, Prompt, merge_near
 from .writer import CAMERA, History, SubgoalWriter, Turn
 
 
@@ -28,8 +28,9 @@ class ModelWriter(SubgoalWriter):
 
     Args:
         model: The model.
-        prompt: The prompt: see `load_prompt`.
+        prompt: The prompt.
         frames: Number of history frames that the model sees, evenly spread.
+        fps: Frames per second of their video; None for the pace at which they were recorded.
         recent: Number of live frames that it sees, if the prompt shows them.
         stride: Steps from one of them to the next.
         near: Maximum distance of frames near each other.
@@ -38,9 +39,10 @@ class ModelWriter(SubgoalWriter):
     def __init__(
         self,
         model: ChatModel,
-        prompt: str = "grounded",
+        prompt: Prompt,
         *,
         frames: int = 32,
+        fps: float | None = None,
         recent: int = 8,
         stride: int = 2,
         near: int = 8,
@@ -51,9 +53,10 @@ class ModelWriter(SubgoalWriter):
                 raise InvalidOptionError.expected(
                     f"the option {name} of subgoals", value, "1 or more"
                 )
-        self._model, self._frames, self._near = model, frames, near
-        self.prompt, self._sha256 = load_prompt(prompt)
-        self.every_frame = self.prompt.watches
+        if fps is not None and not 1 <= fps <= 120:
+            raise InvalidOptionError.expected("the option fps of subgoals", fps, "1 to 120")
+        self._model, self._frames, self._fps, self._near = model, frames, fps, near
+        self.prompt, self.every_frame = prompt, prompt.watches
         self._recent, self._stride = recent, stride
         self._seen: deque[NDArray[np.uint8]] = deque(maxlen=(recent - 1) * stride + 1)
 
@@ -61,7 +64,7 @@ class ModelWriter(SubgoalWriter):
         """Decode the history frames that the model sees."""
         super().start(history, info, simulator)
         places = spread(0, len(history), self._frames)
-        self._history: list[Part] = [history.video(places)] if places else []
+        self._history: list[Part] = [history.video(places, self._fps)] if places else []
         self._goal = info.goal
         self._subgoal = Subgoal(info.goal)
         self._earlier: list[Subgoal] = []
@@ -94,7 +97,7 @@ class ModelWriter(SubgoalWriter):
         answer, fault = self._read(reply, size, len(recent))
         if answer is not None:
             self._subgoal = answer.subgoal
-            if answer.subgoal.simple not in [one.simple for one in self._earlier[-1:]]:
+            if answer.subgoal.text not in [one.text for one in self._earlier[-1:]]:
                 self._earlier.append(answer.subgoal)  # not if only its points moved
             self._keep(images, [recent[place] for place in answer.keyframes])
         self.turns.append(
@@ -113,8 +116,8 @@ class ModelWriter(SubgoalWriter):
         return self._subgoal
 
     def metadata(self) -> dict[str, Any]:
-        """Return the model's metadata, and the SHA-256 of the prompt's file."""
-        return {"model": self._model.metadata(), "prompt_sha256": self._sha256}
+        """Return the model's metadata, and the SHA-256 of the prompt."""
+        return {"model": self._model.metadata(), "prompt_sha256": self.prompt.sha256}
 
     def close(self) -> None:
         """Close the model."""

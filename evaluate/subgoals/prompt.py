@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
@@ -11,9 +11,12 @@ from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.models.model import Part
 from robomme_interference_data.evaluate.models.prompts import check_places, fill, read_prompt
 from robomme_interference_data.schema.subgoal import Pixel, Subgoal, read_points, write_points
+from robomme_interference_data.storage.files import digest_json
 
 PROMPTS = ("simple", "grounded", "memer")
-"""The prompts that come with the package: for SimpleSG, GroundSG and MemER."""
+"""The prompts of this package, for policies as those of SimpleSG, GroundSG and MemER."""
+
+DEFAULT_PROMPT = "grounded"
 
 VIEWS = ("<history>", "<keyframes>", "<recent>", "<image>")
 """Placeholders of images: the history, the selected key frames, the last live frames (`MemER`), and
@@ -47,6 +50,10 @@ class Prompt:
         point: Format of a point, with `{y}` and `{x}`.
         box: Format of a box, with `{y0}`, `{x0}`, `{y1}` and `{x1}`; its center counts.
         grid: Maximum of `{y}` and `{x}` over the whole image; 0 if they are pixels.
+        history: What `<history>` becomes; contains `<history>` once, for the video.
+        no_history: What it becomes without a history.
+        separator: Text between the images of a placeholder.
+        no_images: What another placeholder of images becomes without any.
     """
 
     system: str
@@ -58,13 +65,19 @@ class Prompt:
     point: str = "<{y}, {x}>"
     box: str = ""
     grid: int = 1000
+    history: str = "<history>"
+    no_history: str = "none"
+    separator: str = ""
+    no_images: str = "none"
 
     def __post_init__(self) -> None:
         for name in ("system", "first", "then", "point"):
             if not getattr(self, name).strip():
                 raise InvalidOptionError(f"{name} is empty", "Expected text.")
-        for name in ("first", "then"):
+        for name in ("first", "then", "history", "no_history"):
             check_places(name, getattr(self, name), (*VIEWS, "{goal}", "{subgoals}"))
+        if self.history.count("<history>") != 1:
+            raise InvalidOptionError.expected("history", self.history, "<history> once")
         if self.answer not in ("text", "json"):
             raise InvalidOptionError.one_of("answer", self.answer, ("text", "json"))
         if not 0 <= self.grid <= 10_000:
@@ -74,6 +87,11 @@ class Prompt:
             if text and any(text.count(f"{{{part}}}") != 1 for part in parts):
                 needed = " and ".join(f"{{{part}}}" for part in parts)
                 raise InvalidOptionError.expected(name, text, f"{needed}, each once")
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of its content: the keys and values, defaults included."""
+        return digest_json([asdict(self)])
 
     @property
     def watches(self) -> bool:
@@ -90,10 +108,13 @@ class Prompt:
         """Return the question, text and images in order, for images of `size`, (H, W) px."""
         numbered = [f"{n}. {self.write(subgoal, size)}" for n, subgoal in enumerate(earlier, 1)]
         words = {"{goal}": goal, "{subgoals}": "; ".join(numbered)}
+        text = self.then if earlier else self.first
         return fill(
-            self.then if earlier else self.first,
+            text.replace("<history>", self.history if views.get("<history>") else self.no_history),
             words,
             {place: views.get(place, ()) for place in VIEWS},
+            separator=self.separator,
+            no_images=self.no_images,
         )
 
     def write(self, subgoal: Subgoal, size: tuple[int, int]) -> str:
@@ -148,12 +169,13 @@ class Prompt:
 
 
 def _to_pixel(value: int, side: int, grid: int) -> int:
-    return min(value * side // grid, side - 1) if grid else value
+    """Return a pixel as RoboMME's client does: the end of the grid is one beyond the last pixel."""
+    return value * side // grid if grid else value
 
 
 def _to_grid(pixel: int, side: int, grid: int) -> int:
-    """Return the smallest number on the grid that stands for a pixel."""
-    return -(-pixel * grid // side) if grid else pixel
+    """Return a number on the grid as ms-swift does: nearest, and half to even."""
+    return round(pixel / side * grid) if grid else pixel
 
 
 def _json_object(text: str) -> dict[str, Any]:
@@ -193,6 +215,6 @@ def merge_near(frames: Sequence[int], distance: int) -> list[int]:
     return [group[len(group) // 2] for group in groups]
 
 
-def load_prompt(name: str) -> tuple[Prompt, str]:
-    """Read one of `PROMPTS`, or a TOML file; return it with the SHA-256 of its file."""
-    return read_prompt(Prompt, __package__, PROMPTS, name, "docs/reference/prompts.md")
+def load_prompt(name: str) -> Prompt:
+    """Read one of `PROMPTS`, or a TOML file."""
+    return read_prompt(Prompt, __package__, PROMPTS, name, "docs/reference/prompts.md")[0]

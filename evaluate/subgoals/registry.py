@@ -6,12 +6,14 @@ from contextlib import closing
 from dataclasses import replace
 from typing import Any
 
+from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.models.registry import MODELS, model_identity
 from robomme_interference_data.evaluate.run.config import RunConfig
-from robomme_interference_data.evaluate.systems import System
 from robomme_interference_data.runtime.specs import bind_options
 
 from .model_writer import ModelWriter
+from .prompt import DEFAULT_PROMPT
+from .published import PUBLISHED, load_published
 from .writer import ORACLE, OracleWriter, SubgoalWriter
 
 _WRITER_OPTIONS = [
@@ -32,18 +34,42 @@ def make_writer(config: RunConfig) -> SubgoalWriter | None:
         return None if config.subgoals is None else OracleWriter()
     writer_options, model_options = _split(config)
     model = MODELS.make(str(config.subgoals), model_options, _WRITER_OPTIONS)
-    return ModelWriter(model, str(config.subgoal_prompt), **writer_options)
+    prompt = load_published(config.subgoal_prompt or DEFAULT_PROMPT, config.system)
+    return ModelWriter(model, prompt, **writer_options)
 
 
-def describe_subgoals(config: RunConfig, system: System) -> tuple[RunConfig, dict[str, Any]]:
-    """Return the settings with the prompt, and the metadata of the writer, empty without one."""
-    if config.subgoals not in (None, ORACLE):
-        config = replace(config, subgoal_prompt=config.subgoal_prompt or system.prompt)
+def with_published(config: RunConfig) -> RunConfig:
+    """Return the settings with the options of a published system, and check its prompt.
+
+    Raises:
+        InvalidOptionError: The prompt, or an option that is set, is another one.
+    """
+    published = PUBLISHED.get(config.system or "")
+    if published is None or config.subgoals in (None, ORACLE):
+        return config
+    text = str(config.subgoals)
+    if MODELS.parse(text).kind != "openai":
+        raise InvalidOptionError(
+            f"{config.system} sends its history as a video, and {text} takes images",
+            "Serve the model behind an endpoint: see docs/how-to/paper-systems.md.",
+        )
+    given = {one.partition("=")[0] for one in config.subgoal_options}
+    added = [f"{name}={value}" for name, value in published.options.items() if name not in given]
+    config = replace(config, subgoal_options=(*config.subgoal_options, *added))
+    writer_options, model_options = _split(config)
+    options = writer_options | MODELS.options(text, model_options, _WRITER_OPTIONS)
+    prompt = load_published(config.subgoal_prompt or DEFAULT_PROMPT, config.system)
+    published.check(str(config.system), prompt, options)
+    return config
+
+
+def describe_subgoals(config: RunConfig) -> dict[str, Any]:
+    """Return the metadata of the writer, empty without one."""
     writer = make_writer(config)
     if writer is None:
-        return config, {}
+        return {}
     with closing(writer):
-        return config, {"subgoals": writer.metadata()}
+        return {"subgoals": writer.metadata()}
 
 
 def subgoals_identity(config: RunConfig, metadata: Mapping[str, Any]) -> Any:

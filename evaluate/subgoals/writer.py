@@ -36,10 +36,12 @@ class History:
         chunks = self._reader.stream(self._buffer, 64, (CAMERA,), indices)
         return np.concatenate([chunk.frames[CAMERA] for chunk in chunks])
 
-    def video(self, places: Sequence[int]) -> Video:
-        """Decode frames as a video in real time."""
-        rate, steps = self._buffer.query.dataset.fps, places[-1] - places[0]
-        return Video(self.frames(places), (len(places) - 1) * rate / steps if steps else rate)
+    def video(self, places: Sequence[int], fps: float | None = None) -> Video:
+        """Decode frames as a video with so many frames per second, or in real time."""
+        if fps is None:
+            fps, steps = self._buffer.query.dataset.fps, places[-1] - places[0]
+            fps *= (len(places) - 1) / steps if steps else 1
+        return Video(self.frames(places), fps)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -145,6 +145,7 @@ class Outcome:
         error: Why there is no value, or None. Errors of this package are unchanged; any other
             error, or the worker's death, is a `RuntimeError`; an exceeded limit is a
             `TimeoutError`.
+        progress: What the function attached to the error, `error.progress`: plain values by name.
         trace: Traceback of the error, or of the worker that exceeded a limit; None if unknown.
         attempts: How often the task was started.
         files: Files that the task sent (see `Worker.send_file`), by path.
@@ -155,6 +156,7 @@ class Outcome:
     task: Any = None
     value: Any = None
     error: BaseException | None = None
+    progress: Mapping[str, Any] = field(default_factory=dict)
     trace: str | None = None
     attempts: int = 1
     files: dict[str, bytes] = field(default_factory=dict)
@@ -166,12 +168,12 @@ def attempt(function: Task, task: Any, worker: Worker) -> Outcome:
     """Call the function on a task once."""
     try:
         return Outcome(task, function(task, worker))
-    except InterferenceError as error:
-        return Outcome(task, error=error, trace=traceback.format_exc())
     except Exception as error:
         # Foreign exceptions may not survive pickling; their text does.
-        described = RuntimeError(f"{type(error).__name__}: {error}")
-        return Outcome(task, error=described, trace=traceback.format_exc())
+        known = isinstance(error, InterferenceError)
+        described = error if known else RuntimeError(f"{type(error).__name__}: {error}")
+        progress = getattr(error, "progress", {})
+        return Outcome(task, error=described, progress=progress, trace=traceback.format_exc())
 
 
 def unpickle_outcome(data: bytes, files: dict[str, bytes], node: str | None = None) -> Outcome:

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ class Codec:
 
     `settings` are further arguments of `RGBEncoderConfig`, and `options` the same for FFmpeg; a
     test compares them. `exact` codecs are lossless. `min_side` is the smallest height and width in
-    pixels.
+    pixels; `interpolation` is that of subsampled colors, None for PyAV's.
     """
 
     name: str
@@ -37,6 +37,7 @@ class Codec:
     options: Mapping[str, str]
     exact: bool
     min_side: int = 1
+    interpolation: str | None = None
 
 
 _AOM_LOSSLESS = {"usage": 1, "cpu-used": 8, "row-mt": 1, "aom-params": "lossless=1"}
@@ -81,6 +82,12 @@ CLIP = Codec(
 )
 """Clips of rollouts for any player: H.264 in MP4, for even heights and widths."""
 
+MODEL_VIDEO = replace(
+    CLIP, name="model-video", options={"crf": "23", "preset": "medium"}, interpolation="BICUBIC"
+)
+"""Videos for models, as RoboMME's client encodes them: with the defaults of x264 and ffmpeg. For
+heights and widths that are multiples of 16."""
+
 
 def get_codec(name: str) -> Codec:
     """Return a codec by name."""
@@ -110,7 +117,7 @@ class VideoEncoder:
                 f"which needs at least {codec.min_side}×{codec.min_side}",
                 "Use the codec 'av1-lossless'.",
             )
-        self._path = path
+        self._path, self._codec = path, codec
         self._container: Any = None
         os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 prints its settings otherwise
         with self._errors():
@@ -132,6 +139,10 @@ class VideoEncoder:
     def add(self, image: NDArray[np.uint8]) -> None:
         """Encode the next frame, `(H, W, 3) uint8` RGB."""
         frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+        if self._codec.interpolation is not None:
+            frame = frame.reformat(
+                format=self._codec.pix_fmt, interpolation=self._codec.interpolation
+            )
         frame.pts = self._count
         frame.time_base = self._time_base
         with self._errors():

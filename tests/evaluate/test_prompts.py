@@ -112,7 +112,7 @@ def test_long_answers_are_parsed_in_linear_time(piece: str) -> None:
 
 @given(
     st.lists(st.tuples(st.integers(0, 255), st.integers(0, 255)), max_size=3),
-    st.sampled_from([0, 256, 1000]),
+    st.sampled_from([0, 256]),
     st.sampled_from(["<{y}, {x}>", "({x},{y})", BOXES, "[{y} {x}]"]),
 )
 def test_points_are_parsed_as_the_same_pixels(
@@ -123,11 +123,22 @@ def test_points_are_parsed_as_the_same_pixels(
     assert written.read(written.write(subgoal, SIZE), SIZE).subgoal == subgoal
 
 
+def test_points_are_on_the_grid_of_a_thousand_as_in_the_released_client() -> None:
+    """Down to the pixel above on the way in, to the nearest and half to even on the way out."""
+    for value in range(1001):
+        read = prompt().read(f"go <{value}, 0>", SIZE).subgoal.points[0][0]
+        assert read == int(value / 1000 * 256)
+    written = [prompt().write(Subgoal("go <point>", ((p, 0),)), SIZE) for p in range(257)]
+    # 1 / 256 is 3.9 thousandths, 16 / 256 is 62.5, 48 / 256 is 187.5, 255 / 256 is 996.1.
+    expected = {0: 0, 1: 4, 16: 62, 48: 188, 128: 500, 255: 996, 256: 1000}
+    assert {p: int(written[p][4:-4]) for p in expected} == expected
+
+
 @pytest.mark.parametrize(
     ("changes", "text", "expected"),
     [
-        # The end of the grid is the last pixel; 3 · 256 / 1000 = 0.77, 4 · 256 / 1000 = 1.02.
-        ({}, "go <500, 1000> <3,  4>", Subgoal("go <point> <point>", ((128, 255), (0, 1)))),
+        # The end of the grid is the end of the image; 3 · 256 / 1000 = 0.77, 4 · 256 / 1000 = 1.02.
+        ({}, "go <500, 1000> <3,  4>", Subgoal("go <point> <point>", ((128, 256), (0, 1)))),
         (
             {"grid": 0, "box": "[{x0}, {y0}, {x1}, {y1}]", "point": "({x}, {y})"},
             "pick up [10, 20, 30, 60], not (1, 2)",  # the center of a box counts
@@ -180,7 +191,7 @@ def test_any_text_is_a_subgoal_or_a_clear_error(text: str) -> None:
             answer = prompt(answer=kind, box="[{y0},{x0},{y1},{x1}]").read(text, SIZE)
         except InvalidOptionError:
             continue
-        assert all(0 <= side < 256 for point in answer.subgoal.points for side in point)
+        assert all(0 <= side <= 256 for point in answer.subgoal.points for side in point)
 
 
 def test_near_key_frames_become_their_median() -> None:
@@ -233,6 +244,23 @@ def test_a_subgoal_prompt_is_filled_in_order() -> None:
     assert text == "so far: 1. pick up <|box_start|>(500,0)<|box_end|>; 2. wait; kept: none"
 
 
+def test_lists_of_images_and_a_sentence_about_the_history() -> None:
+    history, one, other = (np.full((1, 1, 3), value, np.uint8) for value in range(3))
+    filled = prompt(
+        first="<history>{goal}, kept: [<keyframes>], now: [<recent>]",
+        history="Before: <history>.\n",
+        no_history="",
+        separator=", ",
+        no_images="",
+    )
+    views: dict[str, Any] = {"<history>": [history], "<recent>": [one, other]}
+    parts = filled.fill("do <history>", [], SIZE, views)
+    assert parts[::2] == ("Before: ", ".\ndo <history>, kept: [], now: [", ", ", "]")
+    assert parts[1] is history and parts[3] is one and parts[5] is other
+    parts = filled.fill("do it", [], SIZE, {"<keyframes>": [one]})
+    assert parts == ("do it, kept: [", one, "], now: []")
+
+
 # --- files -------------------------------------------------------------------------------------
 
 
@@ -249,8 +277,8 @@ def test_the_questions_prompt_of_the_package() -> None:
 
 @pytest.mark.parametrize("name", subgoals.PROMPTS)
 def test_subgoal_prompts_of_the_package_parse_their_own_examples(name: str) -> None:
-    loaded, digest = subgoals.load_prompt(name)
-    assert len(digest) == 64
+    loaded = subgoals.load_prompt(name)
+    assert len(loaded.sha256) == 64
     now = "<recent>" if name == "memer" else "<image>"
     for text in (loaded.first, loaded.then):
         assert "<history>" in text and now in text and "{goal}" in text
@@ -283,6 +311,7 @@ SUBGOAL = "system = 'a'\nfirst = 'b'\nthen = 'c'"
         (subgoals.load_prompt, f"{SUBGOAL}\npoint = '{{y}}'", "{x}"),
         (subgoals.load_prompt, SUBGOAL.replace("'a'", "' '"), "system is empty"),
         (subgoals.load_prompt, SUBGOAL.replace("'b'", "'<histroy>'"), "mean '<history>'?"),
+        (subgoals.load_prompt, f"{SUBGOAL}\nhistory = 'x'", "<history> once"),
         (subgoals.load_prompt, SUBGOAL.replace("'c'", "'{goals}'"), "placeholder {goals}"),
         (subgoals.load_prompt, "nonsense", "no prompt"),
         (subgoals.load_prompt, "\udcff\udcfe", "no prompt"),  # no UTF-8

@@ -117,15 +117,15 @@ def test_the_header_states_the_status_from_the_start_and_after_ctrl_c(tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("kind", "error", "attempts"),
+    ("kind", "error", "attempts", "steps"),
     [
         # A simulator that crashed is tried again; an error that it reports itself is final.
-        ("raise", "SimulatorCrashError: the world fell apart (Pick it up.)", 2),
-        ("error", "RunError: the support.worlds:World simulator reported an error at step", 1),
+        ("raise", "SimulatorCrashError: the world fell apart (Pick it up.)", 2, 4),
+        ("error", "RunError: the support.worlds:World simulator reported an error at step", 1, 7),
     ],
 )
 def test_a_rollout_that_breaks_is_an_error_row_and_runs_again_on_resume(
-    tmp_path: Path, trouble: Path, kind: str, error: str, attempts: int
+    tmp_path: Path, trouble: Path, kind: str, error: str, attempts: int, steps: int
 ) -> None:
     (trouble / "MoveCube-0").write_text(kind)
     result = run(tmp_path / "run")
@@ -134,6 +134,7 @@ def test_a_rollout_that_breaks_is_an_error_row_and_runs_again_on_resume(
     assert (broken.family, broken.condition) == ("MoveCube", "no-history")
     assert broken.error is not None and broken.error.startswith(error)
     assert (broken.success, broken.attempt, broken.difficulty) == (None, attempts, "easy")
+    assert (broken.steps, broken.model_calls) == (steps, None)
     assert broken.seed == result.rows[-1].seed
     assert header(tmp_path / "run")["status"] == "incomplete"
     log = (tmp_path / "run" / "errors.log").read_text()

@@ -32,6 +32,7 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     ModelError,
     RunError,
+    UnknownNameError,
 )
 from robomme_interference_data.evaluate.models.model import ChatModel, Message, Part, Reply, Video
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
@@ -39,8 +40,10 @@ from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.rollout.checks import check_settings, default_system
 from robomme_interference_data.evaluate.run.history import HistoryReader
 from robomme_interference_data.evaluate.subgoals.model_writer import ModelWriter
+from robomme_interference_data.evaluate.subgoals.prompt import load_prompt
 from robomme_interference_data.evaluate.subgoals.registry import make_writer
 from robomme_interference_data.evaluate.subgoals.writer import History, OracleWriter
+from robomme_interference_data.runtime.executor import Executor, Processes, Serial
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Observation
 
@@ -76,7 +79,7 @@ def seen(number: int) -> Observation:
 def begun(model: ChatModel, condition: str = "k0", prompt: str = "grounded", **o: int) -> Any:
     buffer = buffer_set_here().load("MoveCube/test/0", condition)
     history = History(buffer, range(len(buffer)), HistoryReader(buffer_set_here().datasets))
-    writer = ModelWriter(model, prompt, **o)
+    writer = ModelWriter(model, load_prompt(prompt), **o)
     writer.start(history, RolloutInfo("move it", len(buffer), 0), None)  # type: ignore[arg-type]
     return writer
 
@@ -116,6 +119,13 @@ def test_the_history_has_the_pace_of_its_recordings(monkeypatch: pytest.MonkeyPa
         assert video.fps == pytest.approx(pace)
 
 
+def test_the_history_may_have_another_pace() -> None:
+    model = Scripted("go")
+    written(begun(model, frames=5, fps=30), 0, 0)
+    [video] = [part for part in model.asked[0] if isinstance(part, Video)]
+    assert (len(video.frames), video.fps) == (5, 30)
+
+
 def test_without_history_the_prompt_has_the_word_none() -> None:
     model = Scripted("go")
     written(begun(model, "no-history"), 0, 0)
@@ -125,15 +135,17 @@ def test_without_history_the_prompt_has_the_word_none() -> None:
 
 
 def test_earlier_subgoals_are_listed_once_each() -> None:
-    model = Scripted("first at <0, 0>", "first at <500, 0>", "second", "second")
+    model = Scripted("first at <0, 0>", "first at <500, 0>", "first", "second", "second")
     writer = begun(model)
-    subgoals = [written(writer, number, 16 * number) for number in range(4)]
-    assert [one.points for one in subgoals] == [((0, 0),), ((128, 0),), (), ()]  # moved, not listed
+    subgoals = [written(writer, number, 16 * number) for number in range(5)]
+    # Listed again if a point is new, but not if it has moved.
+    assert [one.points for one in subgoals] == [((0, 0),), ((128, 0),), (), (), ()]
     words = [str(parts[-1]) for parts in model.asked]
     assert "Steps so far" not in words[0]
     assert "Steps so far: 1. first at <0, 0>\n" in words[1]
     assert "Steps so far: 1. first at <0, 0>\n" in words[2]
-    assert "Steps so far: 1. first at <0, 0>; 2. second\n" in words[3]
+    assert "Steps so far: 1. first at <0, 0>; 2. first\n" in words[3]
+    assert "Steps so far: 1. first at <0, 0>; 2. first; 3. second\n" in words[4]
 
 
 @pytest.mark.parametrize("text", ["", "at <1001, 0>"])
@@ -168,7 +180,7 @@ def test_key_frames_are_kept_near_ones_merged_and_shown_again() -> None:
     assert [turn.keyframes for turn in writer.turns] == [(0,), (2, 16), (2, 16), (2, 16, 48)]
 
 
-@pytest.mark.parametrize("option", ["frames", "recent", "stride"])
+@pytest.mark.parametrize("option", ["frames", "fps", "recent", "stride"])
 def test_numbers_below_one_are_errors(option: str) -> None:
     with pytest.raises(InvalidOptionError, match=option):
         begun(Scripted(), **{option: 0})
@@ -229,6 +241,17 @@ def test_an_answer_that_never_ends_is_an_error_row(tmp_path: Path) -> None:
     assert row.status == "error" and "no answer in time" in str(row.error)
 
 
+@pytest.mark.parametrize("executor", [Serial(), Processes(1)], ids=["serial", "processes"])
+def test_an_error_row_has_the_steps_and_calls_before_it(tmp_path: Path, executor: Executor) -> None:
+    options = ("repeats=0", "frames=4")
+    with ChatServer(faults=["", REFUSED, BROKEN]) as server:
+        given = behind(server, subgoal_options=options, conditions=("k0",), families=("MoveCube",))
+        [row] = run(tmp_path, executor, **given).rows
+    assert row.status == "error" and "500" in str(row.error)
+    # Two answers, of which one is empty; the third question, after 32 steps, broke.
+    assert (row.steps, row.model_calls, row.model_tokens, row.model_faults) == (32, 2, 210, 1)
+
+
 def test_the_prompt_and_the_model_identify_the_run(tmp_path: Path) -> None:
     with ChatServer() as server, ChatServer() as other:
         run_one(tmp_path / "run", **behind(server))
@@ -273,18 +296,14 @@ MODEL = {"subgoals": "openai:http://h/v1#m"}
         ("symbolic-groundsg", MODEL, None),
         ("symbolic-simplesg", MODEL, None),
         ("memer", MODEL, None),
-        ("memer", {**MODEL, "subgoal_prompt": "memer"}, None),
         ("mine", {"subgoals": "oracle"}, None),
         ("mine", {**MODEL, "policy": TOLD}, None),
         ("symbolic-groundsg", {}, "acts on subgoals of a model"),
         ("symbolic-groundsg", {"subgoals": "oracle"}, "knows the answer"),
-        ("symbolic-groundsg", {**MODEL, "subgoal_prompt": "memer"}, "recent frames"),
-        ("memer", {**MODEL, "subgoal_prompt": "grounded"}, "no recent frames"),
         ("perceptual-framesamp-modul", MODEL, "acts on no subgoals"),
         ("mine", {**MODEL, "policy": "replay"}, "replay reads no subgoals"),
         ("mine", {"subgoal_prompt": "simple"}, "has no effect without a model"),
         ("mine", {"subgoals": "oracle", "subgoal_options": ("frames=3",)}, "`subgoal_options` has"),
-        ("mine", {**MODEL, "subgoal_prompt": "nowhere.toml"}, "no prompt"),
     ],
 )
 def test_settings_that_fit_together_and_others(
@@ -300,12 +319,18 @@ def test_settings_that_fit_together_and_others(
         assert words in raised.value.message
 
 
+def test_an_unknown_prompt() -> None:
+    settings = config(policy=TOLD, subgoal_prompt="nowhere.toml", **MODEL)
+    with pytest.raises(UnknownNameError, match="no prompt"):
+        make_writer(settings)
+
+
 def test_an_unknown_option_lists_those_of_model_and_prompt() -> None:
     settings = config(policy=TOLD, subgoal_prompt="simple", **MODEL, subgoal_options=("framse=3",))
     with pytest.raises(InvalidOptionError, match="framse") as raised:
         make_writer(settings)
     hint = str(raised.value.hint)
-    assert "max_tokens" in hint and "frames, recent, stride, near" in hint
+    assert "max_tokens" in hint and "frames, fps, recent, stride, near" in hint
 
 
 def test_rows_behind_a_model_need_a_name() -> None:

@@ -1,0 +1,158 @@
+"""The published systems' prompts and options; prompts are read from the released client's code.
+
+The texts of these prompts are RoboMME's. This package has the digest of each prompt, and its form:
+how points are written, what separates images, what an answer is.
+"""
+
+import ast
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from robomme_interference_data.constants import POSITION_LIMIT
+from robomme_interference_data.errors import FormatError, InvalidOptionError
+
+from .prompt import Prompt, load_prompt
+
+CLIENT = "RoboMME/robomme_policy_learning@3507f80ddc47a6c6363d4af9a51afaa1a3992944"
+"""The released client."""
+
+FOLDER = "examples/robomme/subgoal_prediction/qwenvl"
+"""Its folder with prompts."""
+
+_PLACES = {
+    "video_prefix": "<history>",
+    "self.task_goal": "{goal}",
+    "self._wrap_history_subgoals(self.history_simple_subgoals)": "{subgoals}",
+    "self._wrap_history_subgoals(self.history_grounded_subgoals)": "{subgoals}",
+    "self._wrap_images(key_frame_paths)": "[<keyframes>]",
+    "self._wrap_images(self.current_execution_frame_paths)": "[<recent>]",
+}
+"""Expressions in its texts, and the placeholders that stand for them."""
+
+
+@dataclass(frozen=True)
+class Published:
+    """How a published system questions its model.
+
+    Attributes:
+        file: File of the client that has its prompt.
+        number: Which prompt of that file it is, from 0.
+        sha256: `Prompt.sha256`.
+        form: Keys of its prompt that are not in the client's texts.
+        options: Options of subgoals and model.
+    """
+
+    file: str
+    number: int
+    sha256: str
+    form: Mapping[str, Any]
+    options: Mapping[str, Any]
+
+    def check(self, name: str, prompt: Prompt, options: Mapping[str, Any]) -> None:
+        """Raise an `InvalidOptionError` if a prompt, or one of all options, is another one."""
+        own = "Or set `system` to a name of your own: see docs/how-to/paper-systems.md."
+        command = (
+            f"evaluate BUFFER_SET --system {name} --policy websocket://HOST:PORT --out RUN "
+            f"--subgoals openai:URL#MODEL --subgoal-prompt CLONE/{FOLDER}/{self.file}"
+        )
+        if prompt.sha256 != self.sha256:
+            raise InvalidOptionError(
+                f"`subgoal_prompt` is not the prompt of {name}",
+                f"Set it to the file of a clone of {CLIENT}. {own}",
+                command,
+            )
+        for option, value in self.options.items():
+            if options[option] != value:
+                raise InvalidOptionError(
+                    f"the option {option} of subgoals is {options[option]}; {name} has {value}",
+                    f"Leave it out. {own}",
+                    command,
+                )
+
+
+_FORM = {"no_history": "", "point": "<|box_start|>({y},{x})<|box_end|>"}
+_MEMER = {
+    "answer": "json",
+    "subgoal_key": "current_subtask",
+    "keyframes_key": "keyframe_positions",
+    "separator": ", ",
+    "no_images": "",
+}
+_OPTIONS = {
+    "frames": POSITION_LIMIT,  # all
+    "fps": 30.0,
+    "video": "mp4",
+    "max_tokens": 128,
+    "temperature": 0.0,
+}
+
+PUBLISHED: Mapping[str, Published] = {
+    "symbolic-simplesg": Published(
+        *("api.py", 0, "c440b8a178cb83811dea9e0790e9b774fbf2fedcca8bfb40af2a16cdcf6a03c0"),
+        *(_FORM, _OPTIONS),
+    ),
+    "symbolic-groundsg": Published(
+        *("api.py", 1, "7bc8c70a505c11db5344a36767955b85b54389c5e6618c0a0a491370002403cc"),
+        *(_FORM, _OPTIONS),
+    ),
+    "memer": Published(
+        *("api_memer.py", 0, "27034c2257e44cd0b32519d1064f0ab8f23406306604af37e37dde71f7ec4b86"),
+        *(_FORM | _MEMER, _OPTIONS | {"recent": 8, "stride": 2, "near": 8}),
+    ),
+}
+"""The published systems with a model in front of the policy."""
+
+
+def load_published(name: str, system: str | None) -> Prompt:
+    """Read a prompt, see `load_prompt`; from a file of the client, that of a published system."""
+    published = PUBLISHED.get(system or "")
+    if published is None or not name.endswith(".py"):
+        return load_prompt(name)
+    try:
+        return read_client(Path(name).read_text(encoding="utf-8"), published)
+    except (ValueError, SyntaxError, OSError) as error:
+        raise FormatError(
+            f"{name} is not {published.file} of the released client: {error}",
+            f"Expected {FOLDER}/{published.file} in a clone of {CLIENT}.",
+        ) from None
+
+
+def read_client(code: str, published: Published) -> Prompt:
+    """Read the prompt of a system from the client's code, which is not run."""
+    texts: dict[str, list[str]] = {"self.system_prompt": [], "user_prompt": [], "video_prefix": []}
+    for name, value in _assignments(ast.parse(code)):
+        if name in texts:
+            texts[name].append(_text(value.body if isinstance(value, ast.IfExp) else value))
+    systems, questions, videos = texts.values()
+    of_each = len(questions) // max(1, len(systems))
+    first = published.number * of_each
+    if not videos or not of_each or published.number >= len(systems):
+        raise ValueError("it has no prompts")
+    return Prompt(
+        system=systems[published.number],
+        first=questions[first],
+        then=questions[first + of_each - 1],
+        history=videos[0].replace("<video>", "<history>"),
+        **published.form,
+    )
+
+
+def _assignments(tree: ast.AST) -> Iterator[tuple[str, ast.expr]]:
+    """Yield all assignments to one name, in their order in the text."""
+    found = [one for one in ast.walk(tree) if isinstance(one, ast.Assign)]
+    for one in sorted(found, key=lambda one: one.lineno):
+        yield ast.unparse(one.targets[0]), one.value
+
+
+def _text(value: ast.expr) -> str:
+    """Return a text of the code, with placeholders for its expressions."""
+    if isinstance(value, ast.Constant) and isinstance(value.value, str):
+        return value.value
+    if isinstance(value, ast.JoinedStr):
+        return "".join(map(_text, value.values))
+    place = isinstance(value, ast.FormattedValue) and _PLACES.get(ast.unparse(value.value))
+    if not place:
+        raise ValueError(f"line {value.lineno} has {ast.unparse(value)[:60]}")
+    return place
