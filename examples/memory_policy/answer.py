@@ -16,6 +16,7 @@ from torch.utils.data import DataLoader
 
 from robomme_interference_data import EpisodeId, Rollout, load_buffer_set
 from robomme_interference_data.constants import PROTOCOL_VERSION
+from robomme_interference_data.data.questions import LETTERS
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.training import HistoryDataset
@@ -44,14 +45,11 @@ def main() -> None:
     model = load_checkpoint(args.checkpoint, args.device)
     if model.config.task != "answer":
         raise SystemExit(f"{args.checkpoint} was trained to act; expected --task answer")
+    answered = [to_dict(row) for row in rows(model, args)]
     with args.out.open("w", newline="") as file:
-        writer = None
-        for row in rows(model, args):
-            values = to_dict(row)
-            if writer is None:
-                writer = csv.DictWriter(file, values)
-                writer.writeheader()
-            writer.writerow(values)
+        writer = csv.DictWriter(file, answered[0])
+        writer.writeheader()
+        writer.writerows(answered)
 
 
 def rows(model: MemoryModel, args: argparse.Namespace) -> Iterator[Rollout]:
@@ -103,7 +101,7 @@ def rows(model: MemoryModel, args: argparse.Namespace) -> Iterator[Rollout]:
                     history_frames=int(batch["position"][number]),
                     lesson_frames=0,
                     lesson_share=None,
-                    answer="ABCDEFGH"[option],
+                    answer=LETTERS[option],
                     chance=1 / int((~batch["question.option_is_pad"][number]).sum()),
                 )
         print(f"{args.system}, {condition}: {right} of {len(data)} right")

@@ -20,7 +20,7 @@ from robomme_interference_data.training import Memory, resize
 
 
 class MemoryPolicy(Policy):
-    """Keeps all frames in small, and acts on those that its memory rule selects.
+    """Keeps all frames, resized, and acts on those that its memory rule selects.
 
     Args:
         checkpoint: Folder of a run of `train.py --task act`.
