@@ -144,6 +144,12 @@ class HashMismatchError(InterferenceError, ValueError):
     Fix: download or build the data again; `verify` lists every mismatch.
     """
 
+    @classmethod
+    def damaged(cls, what: str) -> Self:
+        """Return the error for data of a buffer set that differ from what is recorded."""
+        hint = "The data is damaged or belongs to another version: download or build it again."
+        return cls(what, hint, "verify BUFFER_SET")
+
 
 class HubError(InterferenceError, OSError):
     """The Hub does not know a repository, denies access to it, or cannot be reached.

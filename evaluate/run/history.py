@@ -76,9 +76,7 @@ class HistoryReader:
         features = wrong or [*digests]
         files = dataset.files_of(entry.episode_index, [one for one in features if one != STATE])
         files = files if STATE in features else files[1:]  # the first one holds the vectors
-        raise HashMismatchError(
+        raise HashMismatchError.damaged(
             f"{', '.join(files)} in {dataset.files.describe()}: {', '.join(features)} of the "
-            f"{entry.role} {entry.source} differ from the SHA-256 that the buffer set records",
-            "The file is damaged: download or build it again.",
-            "verify BUFFER_SET",
+            f"{entry.role} {entry.source} differ from the SHA-256 that the buffer set records"
         )

@@ -32,9 +32,6 @@ if TYPE_CHECKING:
 
     from .embeddings import BufferSetIndex
 
-_DAMAGED = "The data is damaged or belongs to another version: download or build it again."
-_VERIFY = "verify BUFFER_SET"
-
 
 @dataclass(frozen=True)
 class Chunk:
@@ -328,7 +325,7 @@ class Buffer:
         for name, value in vars(planned).items():
             if getattr(manifest, name) != value:
                 what = f"{name} of {manifest} does not fit its query and sessions"
-                raise HashMismatchError(what, _DAMAGED, _VERIFY)
+                raise HashMismatchError.damaged(what)
         for entry in manifest.sessions:
             span = entry.start, entry.stop
             what = f"{entry.role} {entry.source}"
@@ -347,11 +344,9 @@ class Buffer:
             return
         recorded = dataset.record(index).digests(*span)
         differing = [name for name in digests if recorded and digests[name] != recorded.get(name)]
-        raise HashMismatchError(
+        raise HashMismatchError.damaged(
             f"{self.manifest}: {what} ({name} episode {index}, frames {span[0]} to {span[1] - 1}) "
-            f"does not have the recorded SHA-256{': ' * bool(differing)}{', '.join(differing)}",
-            _DAMAGED,
-            _VERIFY,
+            f"does not have the recorded SHA-256{': ' * bool(differing)}{', '.join(differing)}"
         )
 
     def _chosen(self, indices: Sequence[int] | None) -> NDArray[np.int64]:

@@ -172,10 +172,8 @@ class Dataset:
             HashMismatchError: They differ.
         """
         if not self._checked and revision_of(self.records()) != self.revision:
-            raise HashMismatchError(
-                f"the episode records of {self._name} are not those of its revision",
-                "The data is damaged: download or build it again.",
-                "verify BUFFER_SET",
+            raise HashMismatchError.damaged(
+                f"the episode records of {self._name} are not those of its revision"
             )
         self._checked = True
 

@@ -98,11 +98,9 @@ class Recordings(Simulator):
             yield Observation(images, state)
         recorded, found = record.feature_sha256, digests.current()
         if length == record.length and not found.items() <= recorded.items():
-            raise HashMismatchError(
+            raise HashMismatchError.damaged(
                 f"the execution {record.episode_id} in {self._executions.files.describe()} differs "
-                "from its recorded SHA-256",
-                "Download or build it again.",
-                "verify BUFFER_SET",
+                "from its recorded SHA-256"
             )
 
 

@@ -118,9 +118,7 @@ def _read(
         target[...] = dataset.read_vectors(episode, feature, 0, record.length)
         digests.update(feature, target[start:stop])
     if digests.current()[feature] != record.feature_sha256.get(feature):
-        raise HashMismatchError(
+        raise HashMismatchError.damaged(
             f"{dataset.files.describe()}: {feature} of {record.episode_id} does not have the "
-            "recorded SHA-256",
-            "The data is damaged: download or build it again.",
-            "verify BUFFER_SET",
+            "recorded SHA-256"
         )
