@@ -3,13 +3,14 @@
 import dataclasses
 from collections.abc import Sequence
 
+from robomme_interference_data.constants import EXECUTIONS
 from robomme_interference_data.data.buffer_set import BufferSet
+from robomme_interference_data.data.loading import open_dataset
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.rollout.kind import Rollouts
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
 from robomme_interference_data.evaluate.subgoals.writer import ORACLE
-from robomme_interference_data.simulators.recordings import executions_of
 from robomme_interference_data.simulators.registry import RECORDINGS
 
 _UNUSED = ("simulator", "shift", "check_lesson", "videos")
@@ -34,6 +35,6 @@ class Offline(Rollouts):
     def check(self, plan: Plan, items: Sequence[WorkItem]) -> None:
         """Check every item, and that its episode has an execution."""
         super().check(plan, items)
-        executions = executions_of(self.buffer_set)
+        executions = open_dataset(self.buffer_set, EXECUTIONS)
         for episode in dict.fromkeys(item.episode for item in items):
             executions.index_of(episode)  # raises

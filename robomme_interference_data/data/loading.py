@@ -9,10 +9,12 @@ from robomme_interference_data.constants import MANIFEST_PATH
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.ids import EpisodeId, whole_number
 from robomme_interference_data.schema.conditions import Condition
+from robomme_interference_data.storage.files import LocalFiles
 from robomme_interference_data.storage.hub import locate
 
 from .buffer import Buffer
 from .buffer_set import BufferSet
+from .dataset import Dataset
 
 if TYPE_CHECKING:
     from robomme_interference_data.storage.cache import DecodedCache
@@ -103,6 +105,28 @@ def load_buffer(
     if not isinstance(buffer_set, BufferSet):
         buffer_set = load_buffer_set(buffer_set, revision=revision, cache=cache, threads=threads)
     return buffer_set.load(episode_id, condition, k=k, verify=verify, cameras=cameras)
+
+
+def open_dataset(buffer_set: BufferSet, name: str, more: str = "") -> Dataset:
+    """Return a dataset of a buffer set by its kind, such as `executions`.
+
+    Args:
+        buffer_set: The buffer set.
+        name: Kind of the dataset.
+        more: What else the error suggests if there is none.
+
+    Raises:
+        MissingFileError: The buffer set has none.
+    """
+    if name in buffer_set.datasets:
+        return buffer_set.datasets[name]
+    hint, command = "Ask its publisher to add them.", None
+    if isinstance(buffer_set.files, LocalFiles):
+        hint = "Build them from the source of its demonstrations, then run build manifests again."
+        command = f"build {name} {buffer_set.location} --source KIND:PATH"
+    raise MissingFileError(
+        f"{buffer_set.location} has no {name}", f"{hint} {more}".strip(), command
+    )
 
 
 def _cache(cache: "bool | str | os.PathLike[str] | DecodedCache") -> "DecodedCache | None":

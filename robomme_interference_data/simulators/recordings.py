@@ -7,10 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import ACTION, EXECUTIONS, MAX_STEPS, STATE
-from robomme_interference_data.data.buffer_set import BufferSet
-from robomme_interference_data.data.dataset import Dataset, camera_feature
-from robomme_interference_data.data.loading import load_buffer_set
-from robomme_interference_data.errors import HashMismatchError, MissingFileError, UnknownNameError
+from robomme_interference_data.data.dataset import camera_feature
+from robomme_interference_data.data.loading import load_buffer_set, open_dataset
+from robomme_interference_data.errors import HashMismatchError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.schema.rollouts import Status
@@ -37,7 +36,7 @@ class Recordings(Simulator):
 
     def __init__(self, buffer_set: str, cameras: Sequence[str] = ()):
         self._buffer_set = load_buffer_set(buffer_set, threads=1)
-        self._executions = executions_of(self._buffer_set)
+        self._executions = open_dataset(self._buffer_set, EXECUTIONS)
         self._cameras = choose_cameras(cameras, self._executions.cameras)
         (self.action_size,) = self._executions.features[ACTION]
 
@@ -102,18 +101,3 @@ class Recordings(Simulator):
                 f"the execution {record.episode_id} in {self._executions.files.describe()} differs "
                 "from its recorded SHA-256"
             )
-
-
-def executions_of(buffer_set: BufferSet) -> Dataset:
-    """Return the executions of a buffer set.
-
-    Raises:
-        MissingFileError: It has none.
-    """
-    if EXECUTIONS not in buffer_set.datasets:
-        raise MissingFileError(
-            f"{buffer_set.location} has no executions",
-            "Build them from the recordings of its demonstrations, and then its manifests.",
-            f"build {EXECUTIONS} {buffer_set.location} --source KIND:PATH",
-        )
-    return buffer_set.datasets[EXECUTIONS]

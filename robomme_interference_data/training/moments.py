@@ -9,11 +9,14 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import DEMONSTRATIONS, EXECUTIONS, SHIFTED
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.errors import InvalidOptionError, MissingFileError, UnknownNameError
+from robomme_interference_data.data.loading import open_dataset
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId, parse_numbers, whole_number
 from robomme_interference_data.schema.conditions import datasets_of, parse_condition
 
 from .histories import Rows
+
+_NO_ACTIONS = "Items without actions (chunk=0) need no executions."
 
 
 def needed_datasets(
@@ -21,20 +24,14 @@ def needed_datasets(
 ) -> dict[str, Dataset]:
     """Return the datasets whose frames items can have, by name."""
     parsed = [parse_condition(name) for name in conditions]
-    for name in (*datasets_of(parsed), *[EXECUTIONS] * actions, *[SHIFTED] * shifts):
-        if name not in buffer_set.datasets:
-            without = " Items without actions (chunk=0) need no executions." * (name == EXECUTIONS)
-            raise MissingFileError(
-                f"{buffer_set.location} has no {name}, which these items need",
-                "Build them from the source of its demonstrations, then run build manifests again."
-                + without,
-                f"build {name} {buffer_set.location} --source KIND:PATH",
-            )
+    found = {
+        name: open_dataset(buffer_set, name, _NO_ACTIONS * (name == EXECUTIONS))
+        for name in (*datasets_of(parsed), *[EXECUTIONS] * actions, *[SHIFTED] * shifts)
+    }
     if planned:
         for condition in parsed:
             buffer_set.planned(condition)
-    needed = [*datasets_of(parsed), *[EXECUTIONS] * actions, *[SHIFTED] * shifts]
-    return {name: buffer_set.datasets[name] for name in needed}
+    return found
 
 
 def check_size(buffer_set: BufferSet, cameras: Sequence[str], size: int | None) -> int | None:
