@@ -17,7 +17,7 @@ from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.ids import EpisodeId, parse_numbers, whole_number
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.sampling import Memory
-from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFTS, parse_shift
+from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFTS, Shift, parse_shift
 from robomme_interference_data.storage.cache import default_cache_folder
 
 from .histories import Histories, History, Retrieval, Rows, Weights, number_from
@@ -133,6 +133,7 @@ class HistoryDataset:
         self.cameras = tuple(camera_feature(one) for one in cameras)
         self._conditions = Weights.parse("conditions", conditions)
         self._shifts = Weights.parse("shifts", shifts or {NO_SHIFT: 1})
+        self._shift_of = {name: parse_shift(name) for name in self._shifts.names}
         self._redraw, shifted = redraw, self._shifts.names != (NO_SHIFT,)
         self._units = None if unit_episodes is None else frozenset(parse_numbers(unit_episodes))
         self._check(unit_episodes, shifted=shifted)
@@ -231,9 +232,8 @@ class HistoryDataset:
         history = self._history(epoch, episode, condition, shift)
         live = len(history.rows) + moment
         kept = np.asarray(self.memory.earlier(live), np.int64)
-        current = first + moment
-        if shift != NO_SHIFT:
-            current = self._shifted_row(episode, shift)
+        changed = self._shift_of[shift]
+        current = first + moment if changed is None else self._shifted_row(episode, changed)
         earlier = kept < len(history.rows)
         rows = np.concatenate(
             [history.rows[kept[earlier]], first + kept[~earlier] - len(history.rows)]
@@ -288,7 +288,7 @@ class HistoryDataset:
         _, source, drawn = self._redrawn
         key = episode, condition, shift
         if key not in drawn:
-            drawn[key] = self._histories.draw(source, episode, condition, parse_shift(shift))
+            drawn[key] = self._histories.draw(source, episode, condition, self._shift_of[shift])
         return drawn[key]
 
     def _check(self, unit_episodes: str | None, *, shifted: bool) -> None:
@@ -314,17 +314,15 @@ class HistoryDataset:
         used = frozenset(self.episode_ids)
         return {
             (episode, name, shift): history
-            for shift in self._shifts.names
+            for shift, changed in self._shift_of.items()
             for (episode, name), history in self._histories.planned(
-                self._conditions.names, used, parse_shift(shift)
+                self._conditions.names, used, changed
             )
         }
 
-    def _shifted_row(self, episode: EpisodeId, shift: str) -> int:
+    def _shifted_row(self, episode: EpisodeId, shift: Shift) -> int:
         views = self.buffer_set.datasets[SHIFTED]
-        parsed = parse_shift(shift)
-        assert parsed is not None
-        return self._rows.first(SHIFTED, views.index_of(episode)) + SHIFTS.index(parsed)
+        return self._rows.first(SHIFTED, views.index_of(episode)) + SHIFTS.index(shift)
 
 
 def _padded(values: NDArray[np.int64], size: int) -> "torch.Tensor":
