@@ -67,6 +67,11 @@ def varies_enough(values: Floats) -> bool:
     return len(values) - int(counts.max(initial=0)) >= MIN_EPISODES
 
 
+def known_interval(interval: Interval, values: Floats) -> Interval:
+    """Return the interval without its bounds if the episodes' values do not vary enough."""
+    return interval if varies_enough(values) else Interval(interval.value)
+
+
 def bootstrap(values: Floats, key: str, draws: int = DRAWS) -> list[Interval]:
     """Return the mean of each column with its 95% BCa interval, all from the same draws.
 

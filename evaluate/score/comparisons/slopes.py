@@ -13,18 +13,17 @@ from robomme_interference_data.stats.bootstrap import (
     DRAWS,
     MIN_EPISODES,
     Floats,
-    Interval,
     bootstrap,
     departures,
+    known_interval,
     slope_weights,
-    varies_enough,
 )
 from robomme_interference_data.stats.signs import sign_flips, vector_sign_flips
 from robomme_interference_data.viz.tables import Table
 
 from .contrast import Contrast
 from .pairs import Pairs
-from .tables import corrected, provisional
+from .tables import corrected, provisional, provisional_note
 
 
 def _falling(outcomes: Outcomes, *systems: str) -> list[str]:
@@ -59,8 +58,7 @@ def decay_table(every: Iterable[Outcomes], draws: int = DRAWS) -> Table:
         "trend. p fit: whether the rates depart from the line, by sign flips of the episodes' "
         "departures; if they do, the slope describes the fall only on average. p holm and "
         "p fit holm: after Holm's correction among the systems of a simulator."
-        + " p†: provisional, because a cell is incomplete."
-        * any(not row[-1] for row in rows),
+        + provisional_note(row[-1] for row in rows),
     )
 
 
@@ -80,7 +78,7 @@ def _decays(outcomes: Outcomes, draws: int) -> list[tuple[object, ...]]:
         here = outcomes.has_episode[outcomes.systems.index(system)]
         [fall] = bootstrap(each[here, None], key, draws)
         changing = each[~np.isnan(each)]
-        known = fall if varies_enough(changing) else Interval(fall.value)
+        known = known_interval(fall, changing)
         whole = all(bool(outcomes.complete[outcomes.cell(system, c)]) for c in conditions)
         names = (key, system, " ".join(conditions), len(changing))
         rows.append((*names, *known, *(provisional(p, whole) for p in four), whole))

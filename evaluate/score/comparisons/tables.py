@@ -181,6 +181,11 @@ def provisional(p: float, complete: bool) -> float:
     return p if complete else Provisional(p)
 
 
+def provisional_note(complete: Iterable[object]) -> str:
+    """Return the end of a note if some rows are not complete, else nothing."""
+    return "" if all(complete) else " p†: provisional, because a cell is incomplete."
+
+
 def corrected(p_values: Sequence[float], groups: Sequence[Hashable]) -> list[float]:
     """Return p-values after Holm's correction within each group."""
     adjusted = [math.nan] * len(p_values)

@@ -16,7 +16,7 @@ from robomme_interference_data.stats.bootstrap import (
     Floats,
     Interval,
     bootstrap,
-    varies_enough,
+    known_interval,
 )
 from robomme_interference_data.stats.significance import holm, sign_flip
 from robomme_interference_data.viz.tables import Table
@@ -109,7 +109,7 @@ def _means(
     ):
         known = column[~np.isnan(column)]
         if len(known):
-            yield name, interval if varies_enough(known) else Interval(interval.value), len(known)
+            yield name, known_interval(interval, known), len(known)
 
 
 def _changes(system: str, conditions: Sequence[str], errors: Floats, draws: int) -> Iterator[_Line]:
@@ -128,8 +128,7 @@ def _changes(system: str, conditions: Sequence[str], errors: Floats, draws: int)
         if not len(both):
             continue
         changes = both[:, 0] - both[:, 1]
-        [change] = bootstrap(changes[:, None], RECORDINGS, draws)
-        change = change if varies_enough(changes) else Interval(change.value)
+        change = known_interval(bootstrap(changes[:, None], RECORDINGS, draws)[0], changes)
         largest = float(np.abs(changes).max())
         p, _ = sign_flip(changes / largest) if largest else (1.0, math.nan)
         yield system, name, other, len(both), *both.mean(axis=0).tolist(), *change, p

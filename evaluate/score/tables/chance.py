@@ -3,7 +3,11 @@
 import math
 from collections.abc import Iterable, Mapping
 
-from robomme_interference_data.evaluate.score.comparisons.tables import corrected, provisional
+from robomme_interference_data.evaluate.score.comparisons.tables import (
+    corrected,
+    provisional,
+    provisional_note,
+)
 from robomme_interference_data.evaluate.score.outcomes import Outcomes
 from robomme_interference_data.stats.intervals import above_chance
 from robomme_interference_data.stats.significance import ALPHA, poisson_binomial
@@ -26,7 +30,6 @@ _REPEATS = (
     " With repeats, a question counts as one guess: right answers are the sum of the episodes' "
     "means, rounded down."
 )
-_EARLY = " p†: provisional, because a cell is incomplete."
 
 
 def chance_table(outcomes: Mapping[str, Outcomes], cells: Iterable[Cell]) -> Table:
@@ -44,14 +47,13 @@ def chance_table(outcomes: Mapping[str, Outcomes], cells: Iterable[Cell]) -> Tab
         for cell, *p in tests
     ]
     repeated = any(sum(cell.counts) - cell.errors > cell.n for cell in found)
-    early = any(not cell.complete for cell in found)
     return Table.make(
         "chance",
         "Against chance",
         "simulator system condition n:count rate:rate chance:rate above:ratio low:ratio high:ratio "
         "p:p p_holm:p complete:flag",
         rows,
-        _NOTE + _REPEATS * repeated + _EARLY * early,
+        _NOTE + _REPEATS * repeated + provisional_note(cell.complete for cell in found),
     )
 
 

@@ -8,7 +8,11 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.comparisons.pairs import pair
-from robomme_interference_data.evaluate.score.comparisons.tables import corrected, provisional
+from robomme_interference_data.evaluate.score.comparisons.tables import (
+    corrected,
+    provisional,
+    provisional_note,
+)
 from robomme_interference_data.evaluate.score.outcomes import Outcomes, Statuses, counting, rate_of
 from robomme_interference_data.evaluate.systems import is_reference, known_system
 from robomme_interference_data.stats.strata import mantel_haenszel
@@ -119,8 +123,7 @@ def _effects(cells: _Cells) -> Table:
         "high: 95% interval, from Wilson's stratified intervals of both rates. p: Cochran-Mantel-"
         "Haenszel test; p holm: after Holm's correction among the tests of this table in one "
         "simulator. Within a family, episodes that keep less may still be harder."
-        + " p†: provisional, because a cell is incomplete."
-        * any(not row[-1] for row in rows),
+        + provisional_note(row[-1] for row in rows),
     )
 
 

@@ -11,7 +11,11 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.errors import MissingExtraError
-from robomme_interference_data.evaluate.score.comparisons.tables import corrected, provisional
+from robomme_interference_data.evaluate.score.comparisons.tables import (
+    corrected,
+    provisional,
+    provisional_note,
+)
 from robomme_interference_data.evaluate.score.outcomes import Outcomes, counting
 from robomme_interference_data.evaluate.systems import is_reference
 from robomme_interference_data.schema.conditions import NO_HISTORY, parse_condition
@@ -154,9 +158,7 @@ def model_table(every: Iterable[Outcomes]) -> Table:
         "table in one simulator. sample low to sample high: 95%, for tasks of which these families "
         "are a sample (jackknife over families, Student's t). spread: standard deviation of the "
         "families' log odds ratios. Empty: no finite estimate, because no outcome contradicts the "
-        "effect."
-        + " p†: provisional, because a cell is incomplete."
-        * any(not r[-1] for r in rows),
+        "effect." + provisional_note(row[-1] for row in rows),
     )
 
 

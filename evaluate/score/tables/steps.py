@@ -6,7 +6,11 @@ from collections.abc import Iterable
 import numpy as np
 
 from robomme_interference_data.evaluate.score.comparisons.contrast import START
-from robomme_interference_data.evaluate.score.comparisons.tables import corrected, provisional
+from robomme_interference_data.evaluate.score.comparisons.tables import (
+    corrected,
+    provisional,
+    provisional_note,
+)
 from robomme_interference_data.evaluate.score.outcomes import Outcomes, steps_to_success
 from robomme_interference_data.stats.bootstrap import DRAWS, Interval
 from robomme_interference_data.stats.signs import SignFlips, sign_flips
@@ -27,8 +31,7 @@ def steps_table(every: Iterable[Outcomes], draws: int = DRAWS) -> Table:
         "solves are not compared, so an effect on them shows in the rates alone. low to high and "
         "p: sign flips of the episodes' differences, if at least ten differ; p holm: after Holm's "
         "correction among the tests of this table in one simulator."
-        + " p†: provisional, because a cell is incomplete."
-        * any(not row[-1] for row in rows),
+        + provisional_note(row[-1] for row in rows),
     )
 
 
