@@ -37,7 +37,7 @@ class History:
         return np.concatenate([chunk.frames[CAMERA] for chunk in chunks])
 
     def video(self, places: Sequence[int], fps: float | None = None) -> Video:
-        """Decode frames as a video with so many frames per second, or in real time."""
+        """Decode frames as a video of `fps` frames per second; None for the recorded pace."""
         if fps is None:
             fps, steps = self._buffer.query.dataset.fps, places[-1] - places[0]
             fps *= (len(places) - 1) / steps if steps else 1

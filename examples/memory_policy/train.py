@@ -170,7 +170,7 @@ def resume(out: Path, settings: dict[str, Any]) -> dict[str, Any] | None:
     path = out / "state.pt"
     if not path.is_file():
         return None
-    state: dict[str, Any] = torch.load(path, weights_only=True)
+    state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
     different = [name for name, value in settings.items() if state["settings"].get(name) != value]
     if different:
         raise SystemExit(
