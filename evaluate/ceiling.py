@@ -16,7 +16,7 @@ from robomme_interference_data.retrieval.grade import ALL
 from robomme_interference_data.retrieval.selector import select_stored
 from robomme_interference_data.schema.conditions import NO_HISTORY, in_order
 from robomme_interference_data.schema.evidence import known_parts
-from robomme_interference_data.schema.sampling import MEMORIES, check_memory, evidence_kept
+from robomme_interference_data.schema.sampling import Memory, check_memory, evidence_kept
 from robomme_interference_data.schema.shifts import NO_SHIFT, parse_shift
 from robomme_interference_data.simulators.registry import recorded_scene
 from robomme_interference_data.viz.tables import Table
@@ -93,7 +93,7 @@ def left_in_memory(buffer: Buffer, memory: str, frames: Sequence[int]) -> Left:
     cell = buffer.episode_id.family, buffer.condition
     if buffer.evidence is None:
         return Left(*cell, None, None)
-    kept = [frames[place] for place in MEMORIES[memory](len(frames))]
+    kept = Memory(memory).kept(frames)
     success = chance(buffer.query, known_parts(buffer.evidence, kept))
     return Left(*cell, evidence_kept(buffer.evidence, kept), success)
 

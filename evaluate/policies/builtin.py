@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import ACTION_CHUNK
 from robomme_interference_data.errors import PolicyError
 from robomme_interference_data.schema.evidence import known_parts
-from robomme_interference_data.schema.sampling import MEMORIES, check_memory
+from robomme_interference_data.schema.sampling import Memory, check_memory
 from robomme_interference_data.simulators.base import Observation, Simulator
 
 from .policy import Frames, Policy, RolloutInfo
@@ -73,7 +73,7 @@ class ReplayPolicy(Policy):
 
     def _start_plan(self, observation: Observation) -> NDArray[np.float32]:
         live = sum(len(states) for states in self._states)
-        kept = np.array(MEMORIES[self.memory](live), np.int64)
+        kept = np.array(Memory(self.memory).earlier(live), np.int64)
         if not len(kept):
             return follow(observation.state, kept, observation.state[None][:0])
         views = np.concatenate(self._views)[kept]
@@ -204,7 +204,7 @@ class Recall(Privileged):
                 "recall needs to know which frames show the answer, which is unknown here",
                 "Build the buffer set from a source with evidence: see docs/reference/sources.md.",
             )
-        self._known = known_parts(info.evidence, MEMORIES[self.memory](info.history_frames))
+        self._known = known_parts(info.evidence, Memory(self.memory).earlier(info.history_frames))
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the script's next action, `(1, 8) float32`; see `Privileged.act`."""

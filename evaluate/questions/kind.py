@@ -23,7 +23,7 @@ from robomme_interference_data.evaluate.run.kind import Run, RunKind
 from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
 from robomme_interference_data.evaluate.systems import known_system, name_system
 from robomme_interference_data.schema.conditions import NO_HISTORY
-from robomme_interference_data.schema.sampling import MEMORIES
+from robomme_interference_data.schema.sampling import MEMORIES, Memory
 from robomme_interference_data.simulators.registry import recorded_scene
 
 from .responders import CONTROLS, OWN, ModelResponder
@@ -67,7 +67,7 @@ class Questions(RunKind[AskConfig]):
             return
         for item in items:
             history = self.buffer_set.manifest(item.episode, item.condition).history_frames
-            kept = len(MEMORIES[config.sampling](history, config.frames))
+            kept = len(Memory(config.sampling, config.frames).earlier(history))
             if kept + 1 > self._images:
                 raise InvalidOptionError(
                     f"{item.episode}, {item.condition}: {kept} history frames and the picture; "

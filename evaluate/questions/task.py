@@ -22,7 +22,7 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.evidence import known_parts
 from robomme_interference_data.schema.rollouts import Rollout, Status
-from robomme_interference_data.schema.sampling import MEMORIES, evidence_kept
+from robomme_interference_data.schema.sampling import Memory, evidence_kept
 
 from .responders import CAMERA, OWN, Answer, ModelResponder, Prompted
 
@@ -61,7 +61,7 @@ class AskTask(RunTask[AskConfig]):
         given: Sequence[int] = range(len(buffer))
         if self.selector is not None and len(buffer):
             given = self.selector.select(buffer, query.frame(self.selector.camera)).tolist()
-        kept = [given[place] for place in MEMORIES[config.sampling](len(given), config.frames)]
+        kept = Memory(config.sampling, config.frames).kept(given)
 
         def frames() -> NDArray[np.uint8]:
             if not kept:

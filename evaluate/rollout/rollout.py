@@ -25,7 +25,7 @@ from robomme_interference_data.evaluate.systems import check_history, name_syste
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.evidence import among
 from robomme_interference_data.schema.rollouts import Rollout, Status
-from robomme_interference_data.schema.sampling import MEMORIES, evidence_kept
+from robomme_interference_data.schema.sampling import Memory, evidence_kept
 from robomme_interference_data.schema.shifts import NO_SHIFT
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import (
@@ -226,8 +226,7 @@ def _evidence_kept(system: str, buffer: Buffer, given: Sequence[int]) -> float |
     memory = name_system(system).sampling
     if memory is None or buffer.evidence is None:
         return None
-    kept = [given[place] for place in MEMORIES[memory](len(given))]
-    return evidence_kept(buffer.evidence, kept)
+    return evidence_kept(buffer.evidence, Memory(memory).kept(given))
 
 
 def _decode(

@@ -82,6 +82,10 @@ class Memory:
         """
         return MEMORIES[self.rule](live, self.frames)
 
+    def kept(self, given: Sequence[int]) -> list[int]:
+        """Return which of the frames of a history are in memory at the first live observation."""
+        return [given[place] for place in self.earlier(len(given))]
+
     def __str__(self) -> str:
         return self.rule if self.rule == "full" else f"{self.rule}:{self.frames}"
 
