@@ -20,7 +20,7 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.evidence import map_evidence
 from robomme_interference_data.schema.manifest import SessionEntry, layout_sessions
 from robomme_interference_data.schema.records import EvidenceSpan
-from robomme_interference_data.schema.sampling import MEMORIES
+from robomme_interference_data.schema.sampling import MEMORIES, Memory
 from robomme_interference_data.simulators.base import Observation
 
 Vector = NDArray[np.float32]
@@ -41,6 +41,7 @@ def test_the_frames_that_a_memory_keeps() -> None:
     assert list(MEMORIES["framesamp"](30)) == list(range(30))
     # numpy truncates linspace(0, 310, 32) to 0, 10, …, 310; the last one is the live frame.
     assert list(MEMORIES["framesamp"](310)) == list(range(0, 310, 10))
+    assert Memory("window", 3).kept([5, 6, 8, 9]) == [8, 9]  # two, and the live one
     with pytest.raises(UnknownNameError, match="Did you mean 'window'"):
         ReplayPolicy("windw")
 
