@@ -54,7 +54,7 @@ class Recordings(Simulator):
         }
 
     @override
-    def _begin(self, episode: EpisodeId, demonstration: bool) -> Begun:
+    def _begin(self, episode: EpisodeId, every: int) -> Begun:
         query, executions = self._buffer_set.query(episode), self._executions
         index = executions.index_of(episode)
         record = executions.record(index)
