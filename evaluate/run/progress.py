@@ -82,24 +82,13 @@ def error_table(rows: Iterable[Rollout]) -> Table:
     for row in rows:
         if row.action_l1 is not None:
             errors.setdefault((row.family, row.condition), []).append(row.action_l1)
-            errors.setdefault(("all", row.condition), []).append(row.action_l1)
-    families = sorted({name for name, _ in errors} - {"all"}, key=_family_order)
-    names = [*families, "all"] if len(families) > 1 else families
-    conditions = sorted({one for _, one in errors}, key=lambda one: parse_condition(one).sort_key)
-    cells = [[errors.get((name, one)) for one in conditions] for name in names]
+    conditions, lines = _lines(errors, [])
     return Table.make(
         "errors",
         "Mean absolute action error by family and condition",
         " ".join(["family", *(f"{one}:number" for one in conditions)]),
-        (
-            (name, *(fmean(cell) if cell else None for cell in line))
-            for name, line in zip(names, cells, strict=True)
-        ),
+        ((name, *(fmean(cell) if cell else None for cell in line)) for name, line in lines),
     )
-
-
-def _family_order(name: str) -> Any:
-    return EpisodeId(name, "test", 0)
 
 
 def _count(rows: Iterable[Rollout]) -> dict[Cell, Counter[str]]:
@@ -111,17 +100,24 @@ def _count(rows: Iterable[Rollout]) -> dict[Cell, Counter[str]]:
 
 
 def _table(ended: Mapping[Cell, Counter[str]]) -> Table:
-    families = sorted({family for family, _ in ended}, key=_family_order)
-    conditions = sorted({name for _, name in ended}, key=lambda one: parse_condition(one).sort_key)
-    lines = [[ended.get((family, name), Counter()) for name in conditions] for family in families]
-    names = [*families, "all"] if len(families) > 1 else families
-    lines.append([sum(column, Counter()) for column in zip(*lines, strict=True)])
+    conditions, lines = _lines(ended, Counter())
     return Table.make(
         "rates",
         "Successes by family and condition",
         " ".join(["family", *conditions]),
-        ((name, *map(_rate, line)) for name, line in zip(names, lines, strict=False)),
+        ((name, *map(_rate, line)) for name, line in lines),
     )
+
+
+def _lines(cells: Mapping[Cell, Any], empty: Any) -> tuple[list[str], list[tuple[str, list[Any]]]]:
+    """Return the conditions, and each family with its cells; of several families, also all."""
+    families = sorted({family for family, _ in cells}, key=lambda one: EpisodeId(one, "test", 0))
+    conditions = sorted({name for _, name in cells}, key=lambda one: parse_condition(one).sort_key)
+    lines = [(one, [cells.get((one, name), empty) for name in conditions]) for one in families]
+    if len(lines) > 1:
+        columns = zip(*(line for _, line in lines), strict=True)
+        lines.append(("all", [sum(column, empty) for column in columns]))
+    return conditions, lines
 
 
 def _rate(counts: Counter[str]) -> str:
