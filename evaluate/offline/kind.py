@@ -8,7 +8,7 @@ from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import open_dataset
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.rollout.kind import Rollouts
-from robomme_interference_data.evaluate.run.config import RunConfig
+from robomme_interference_data.evaluate.run.config import RunConfig, check_unused
 from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
 from robomme_interference_data.evaluate.subgoals.writer import ORACLE
 from robomme_interference_data.simulators.registry import RECORDINGS
@@ -21,11 +21,7 @@ class Offline(Rollouts):
     """Rollouts along recorded executions: the policy acts, and the recording goes on."""
 
     def __init__(self, config: RunConfig, buffer_set: BufferSet):
-        for name in _UNUSED:
-            if getattr(config, name) != type(config).__dataclass_fields__[name].default:
-                raise InvalidOptionError(
-                    f"`{name}` has no effect on an offline evaluation", "Leave it out."
-                )
+        check_unused(config, _UNUSED, "an offline evaluation", "Leave it out.")
         if config.subgoals == ORACLE:
             raise InvalidOptionError(
                 f"subgoals of {ORACLE} need a simulator", "Set a model, or leave out `offline`."

@@ -16,6 +16,7 @@ from robomme_interference_data.evaluate.models.registry import MODELS, model_ide
 from robomme_interference_data.evaluate.run.config import (
     AskConfig,
     check_shared,
+    check_unused,
     nothing_to_retrieve,
     with_retrieval,
 )
@@ -106,11 +107,7 @@ def _check_settings(config: AskConfig) -> None:
         unused = ["model_options", "control", "prompt"]
         if config.model == "guess":
             unused += ["frames", "sampling", "retrieval"]
-        for name in unused:
-            if getattr(config, name) != type(config).__dataclass_fields__[name].default:
-                raise InvalidOptionError(
-                    f"`{name}` has no effect on {config.model}", "Leave it out, or ask a model."
-                )
+        check_unused(config, unused, config.model, "Leave it out, or ask a model.")
     elif ":" not in config.model:
         raise UnknownNameError(
             f"there is no model {config.model!r}; expected recall, guess, openai:URL#MODEL, "

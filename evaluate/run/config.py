@@ -1,6 +1,7 @@
 """The settings of a run: the Python API, and the options of `evaluate`, `ask` and `ceiling`."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import ClassVar
@@ -201,6 +202,14 @@ def check_shared(config: WorkConfig) -> None:
         raise InvalidOptionError.one_of("split", config.split, SPLITS)
     Rule.parse(config.retrieval_rule)
     non_default_retrieval(config)
+
+
+def check_unused(config: WorkConfig, names: Iterable[str], on: str, hint: str) -> None:
+    """Raise an error if one of some settings, which have no effect on a run, is set."""
+    defaults = {one.name: one.default for one in fields(config)}
+    for name in names:
+        if getattr(config, name) != defaults[name]:
+            raise InvalidOptionError(f"`{name}` has no effect on {on}", hint)
 
 
 def non_default_retrieval(config: RetrievalConfig) -> dict[str, str]:
