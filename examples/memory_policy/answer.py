@@ -18,6 +18,8 @@ from robomme_interference_data import EpisodeId, Rollout, load_buffer_set
 from robomme_interference_data.constants import PROTOCOL_VERSION
 from robomme_interference_data.data.questions import LETTERS
 from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.evaluate.run.kind import history_columns
+from robomme_interference_data.retrieval.selector import Selector
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.training import HistoryDataset
 
@@ -55,6 +57,7 @@ def main() -> None:
 def rows(model: MemoryModel, args: argparse.Namespace) -> Iterator[Rollout]:
     """Yield a row for each query episode under each condition."""
     config, buffer_set = model.config, load_buffer_set(args.buffer_set)
+    selector = Selector(args.retrieval) if args.retrieval else None
     for condition in args.conditions or buffer_set.conditions:
         data = HistoryDataset(
             buffer_set,
@@ -77,7 +80,10 @@ def rows(model: MemoryModel, args: argparse.Namespace) -> Iterator[Rollout]:
                 chosen = model(on_device).argmax(1).tolist()
             for number, option in enumerate(chosen):
                 episode = EpisodeId.parse(batch["episode_id"][number])
-                record = buffer_set.query(episode).record
+                buffer = buffer_set.load(episode, condition)
+                record, given = buffer.query.record, [*range(len(buffer))]
+                if selector is not None and given:
+                    given = selector.select(buffer, buffer.query.frame(selector.camera)).tolist()
                 success = option == int(batch["question.answer"][number])
                 right += success
                 yield Rollout(
@@ -98,9 +104,7 @@ def rows(model: MemoryModel, args: argparse.Namespace) -> Iterator[Rollout]:
                     status="success" if success else "fail",
                     success=success,
                     steps=0,
-                    history_frames=int(batch["position"][number]),
-                    lesson_frames=0,
-                    lesson_share=None,
+                    **history_columns(buffer, given, selector),
                     answer=LETTERS[option],
                     chance=1 / int((~batch["question.option_is_pad"][number]).sum()),
                 )

@@ -116,18 +116,12 @@ class HistoryDataset:
     ):
         opened = isinstance(buffer_set, BufferSet)
         self.buffer_set: BufferSet = buffer_set if opened else load_buffer_set(buffer_set)  # type: ignore[assignment,arg-type]
-        self._arguments = {
-            **{
-                "conditions": conditions,
-                "memory": memory,
-                "cameras": tuple(cameras),
-                "image_size": image_size,
-            },
-            **{"chunk": chunk, "families": tuple(families), "episodes": episodes},
-            **{"retrieval": retrieval, "retrieval_rule": retrieval_rule},
-            **{"retrieval_camera": retrieval_camera, "shifts": shifts, "questions": questions},
-            **{"redraw": redraw, "unit_episodes": unit_episodes, "seed": seed, "store": store},
-        }
+        self._arguments = dict(
+            conditions=conditions, memory=memory, cameras=tuple(cameras), image_size=image_size,
+            chunk=chunk, families=tuple(families), episodes=episodes, retrieval=retrieval,
+            retrieval_rule=retrieval_rule, retrieval_camera=retrieval_camera, shifts=shifts,
+            questions=questions, redraw=redraw, unit_episodes=unit_episodes, seed=seed, store=store,
+        )  # fmt: skip
         self.memory, self.seed = Memory.parse(memory), seed
         self.chunk = whole_number("chunk", chunk, "an integer from 0, such as 16")
         self.cameras = tuple(camera_feature(one) for one in cameras)
@@ -144,6 +138,7 @@ class HistoryDataset:
             shifts=shifted,
             planned=not redraw,
         )
+        self.buffer_set.check_tables(self._conditions.names)
         size = check_size(self.buffer_set, self.cameras, image_size)
         self._rows, actions = Rows(datasets), self.chunk > 0
         self._moments = choose_moments(

@@ -11,7 +11,7 @@ from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.loading import open_dataset
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
-from robomme_interference_data.ids import EpisodeId, parse_numbers, whole_number
+from robomme_interference_data.ids import EpisodeId, format_numbers, parse_numbers, whole_number
 from robomme_interference_data.schema.conditions import datasets_of, parse_condition
 
 from .histories import Rows
@@ -112,9 +112,11 @@ def choose_moments(
         and (numbers is None or one.index in numbers)
         and one in recorded
     )
-    if not chosen:
-        expected = f"episodes of the {live.kind} of {buffer_set.location}"
-        raise InvalidOptionError.expected("episodes", episodes, expected)
+    missing = (numbers or frozenset()) - {one.index for one in chosen}
+    if missing or not chosen:
+        expected = f"indices of episodes in the {live.kind} of {buffer_set.location}"
+        hint = f"They lack {format_numbers(sorted(missing))}." if missing else None
+        raise InvalidOptionError.expected("episodes", episodes, expected, hint)
     records = [recorded[one] for one in chosen]
     counts = tuple(one.length if actions else 0 for one in records)
     first = (
