@@ -1,0 +1,71 @@
+"""The tables of docs/results/training.md are those of its rows."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+RESULTS = Path(__file__).parents[2] / "docs" / "results"
+Rows = dict[tuple[str, str, str], list[bool]]
+
+
+@pytest.fixture(scope="module")
+def rows() -> Rows:
+    """Outcomes by system, condition and family."""
+    outcomes: Rows = {}
+    for path in sorted((RESULTS / "training").glob("*.parquet")):
+        for row in pq.read_table(path).to_pylist():
+            key = row["system"], row["condition"], row["family"]
+            outcomes.setdefault(key, []).append(row["success"])
+    return outcomes
+
+
+def percent(rows: Rows, system: str, condition: str, family: str | None = None) -> str:
+    """Return the rate of successes as the page prints it; empty without rows."""
+    chosen = [
+        one
+        for (name, under, of), outcomes in rows.items()
+        if (name, under) == (system, condition) and family in (None, of)
+        for one in outcomes
+    ]
+    return f"{100 * sum(chosen) / len(chosen):.1f}" if chosen else ""
+
+
+def table(first: str) -> Iterator[dict[str, str]]:
+    """Yield the rows of the table whose first column has this title."""
+    blocks = (RESULTS / "training.md").read_text().split("\n\n")
+    head, _, *lines = next(one for one in blocks if one.startswith(f"| {first} |")).splitlines()
+    names = [cell.strip() for cell in head.strip("| ").split(" | ")]
+    for line in lines:
+        cells = [cell.strip() for cell in line.removeprefix("|").removesuffix("|").split("|")]
+        yield dict(zip(names, cells, strict=True))
+
+
+def test_rates_by_condition(rows: Rows) -> None:
+    listed = list(table("system"))
+    assert len(listed) >= 10
+    for line in listed:
+        system = line.pop("system").strip("`")
+        line.pop("seeds")
+        for condition, rate in line.items():
+            assert rate == percent(rows, system, condition), (system, condition)
+
+
+def test_rates_by_family(rows: Rows) -> None:
+    for line in table("family"):
+        family = line.pop("family")
+        for title, rate in line.items():
+            system, condition = title.split()
+            assert rate == percent(rows, system.strip("`"), condition, family), (title, family)
+
+
+def test_what_training_with_interference_changes(rows: Rows) -> None:
+    for line in table("condition"):
+        with_, without = (
+            float(percent(rows, system, line["condition"]))
+            for system in ("learned-mixture", "learned-k0")
+        )
+        assert float(line["mixture − k0"].split()[0].replace("−", "-")) == pytest.approx(
+            with_ - without, abs=0.11
+        )
