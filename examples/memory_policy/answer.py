@@ -44,6 +44,7 @@ def arguments() -> argparse.Namespace:
 def main() -> None:
     """Answer, and write the rows."""
     args = arguments()
+    args.out.parent.mkdir(parents=True, exist_ok=True)
     model = load_checkpoint(args.checkpoint, args.device)
     if model.config.task != "answer":
         raise SystemExit(f"{args.checkpoint} was trained to act; expected --task answer")
@@ -114,5 +115,5 @@ def rows(model: MemoryModel, args: argparse.Namespace) -> Iterator[Rollout]:
 if __name__ == "__main__":
     try:
         main()
-    except InterferenceError as error:
+    except (InterferenceError, OSError) as error:
         raise SystemExit(f"error: {error}") from None

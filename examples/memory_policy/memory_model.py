@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -173,9 +174,11 @@ def _with_current(batch: dict[str, Any], name: str) -> Tensor:
 
 
 def save_checkpoint(model: MemoryModel, folder: Path) -> None:
-    """Write `model.safetensors` and `config.json`."""
-    save_file(model.state_dict(), folder / "model.safetensors")
+    """Write `config.json` and, whole or not at all, `model.safetensors`."""
     (folder / "config.json").write_text(json.dumps(asdict(model.config), indent=2) + "\n")
+    partial = folder / "model.partial"
+    partial.write_bytes(save(model.state_dict()))
+    partial.replace(folder / "model.safetensors")
 
 
 def load_checkpoint(folder: Path, device: str = "cpu") -> MemoryModel:
@@ -186,4 +189,6 @@ def load_checkpoint(folder: Path, device: str = "cpu") -> MemoryModel:
         model.load_state_dict(load_file(folder / "model.safetensors"))
     except FileNotFoundError as error:
         raise SystemExit(f"{folder} is not a checkpoint: {error.filename} is missing") from None
+    except (ValueError, KeyError, TypeError, RuntimeError, SafetensorError) as error:
+        raise SystemExit(f"{folder} is not a checkpoint, or is damaged: {error}") from None
     return model.to(device).eval()

@@ -35,7 +35,7 @@ class MemoryPolicy(Policy):
         self._model = load_checkpoint(self._folder, self._device)
         self.config = self._model.config
         if self.config.task != "act":
-            raise ValueError(f"{checkpoint} was trained to answer; expected --task act")
+            raise SystemExit(f"{checkpoint} was trained to answer; expected --task act")
         self.cameras = self.history_cameras = self.config.cameras
         self._memory = Memory.parse(self.config.memory)
 

@@ -12,6 +12,7 @@ import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import torch
@@ -23,6 +24,29 @@ from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.training import HistoryDataset
 
 
+def positive(text: str) -> int:
+    """Read a whole number from 1."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r}; expected a whole number from 1")
+    return int(text)
+
+
+def patches(text: str) -> int:
+    """Read an image size, which patches of 4 pixels must fill."""
+    if positive(text) % 4:
+        raise argparse.ArgumentTypeError(f"{text}; expected a multiple of 4 pixels, the patch")
+    return int(text)
+
+
+def weighted(text: str) -> tuple[str, float]:
+    """Read `NAME` or `NAME=WEIGHT`."""
+    name, _, weight = text.partition("=")
+    try:
+        return name, float(weight or 1)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}; expected NAME or NAME=WEIGHT") from None
+
+
 def arguments() -> argparse.Namespace:
     """Parse the command line."""
     parser = argparse.ArgumentParser(
@@ -32,21 +56,22 @@ def arguments() -> argparse.Namespace:
     add("buffer_set", help="folder, or namespace/name on the Hub, with train episodes")
     add("--out", type=Path, required=True, help="folder of the run")
     add("--task", choices=("answer", "act"), default="answer", help="answer questions, or act")
-    add("--conditions", nargs="+", default=["k0", "k1", "k3", "k7"], help="NAME or NAME=WEIGHT")
+    every = [(name, 1.0) for name in ("k0", "k1", "k3", "k7")]
+    add("--conditions", nargs="+", type=weighted, default=every, help="NAME or NAME=WEIGHT")
     add("--memory", default="framesamp:32", help="framesamp:N, window:N or full")
     add("--retrieval", help="encoder of a retrieval step before the memory, such as thumbnail")
     add("--cameras", nargs="+", default=["front"])
-    add("--image-size", type=int, default=64, help="side of the images in pixels")
+    add("--image-size", type=patches, default=64, help="side of the images in pixels")
     add("--families", nargs="+", default=[], help="default: all")
     add("--episodes", help="indices of the train episodes to use, such as 0-79; default: all")
     add("--redraw", action="store_true", help="draw the sessions anew in every epoch")
     add("--unit-episodes", help="with --redraw, train episodes whose units may be drawn")
     add("--trunk", choices=("transformer", "gru"), default="transformer")
     add("--no-pictures", action="store_true", help="the control: positions and lengths only")
-    add("--chunk", type=int, default=16, help="actions per chunk (--task act)")
-    add("--steps", type=int, default=1000)
-    add("--batch", type=int, default=32)
-    add("--save-every", type=int, default=100, help="steps between checkpoints")
+    add("--chunk", type=positive, default=16, help="actions per chunk (--task act)")
+    add("--steps", type=positive, default=1000)
+    add("--batch", type=positive, default=32)
+    add("--save-every", type=positive, default=100, help="steps between checkpoints")
     add("--learning-rate", type=float, default=1e-3)
     add("--workers", type=int, default=0, help="processes that load items")
     add("--seed", type=int, default=0)
@@ -57,10 +82,11 @@ def arguments() -> argparse.Namespace:
 def main() -> None:
     """Train, from the beginning or from the last checkpoint."""
     args = arguments()
-    named = (text.partition("=") for text in args.conditions)
+    if args.device.startswith("cuda") and not torch.cuda.is_available():
+        raise SystemExit("error: no GPU is available here; leave --device out, or use cpu")
     data = HistoryDataset(
         args.buffer_set,
-        {name: float(weight or 1) for name, _, weight in named},
+        dict(args.conditions),
         memory=args.memory,
         cameras=args.cameras,
         image_size=args.image_size,
@@ -74,6 +100,8 @@ def main() -> None:
         seed=args.seed,
     )
     print(data)
+    if other := [str(one) for one in data.episode_ids if one.split != "train"]:
+        print(f"warning: {other[0]} and others are not train episodes: do not test on them")
     settings = {
         k: v for k, v in vars(args).items() if k not in ("out", "device", "workers", "save_every")
     }
@@ -118,8 +146,8 @@ def main() -> None:
         if step % args.save_every == 0 or step == args.steps:
             kept = {name: part.state_dict() for name, part in parts.items()}
             kept |= {"step": step, "log": log, "random": torch.get_rng_state()}
+            save_checkpoint(model, args.out)  # first: a finished state means a finished model
             save_state(args.out, kept | {"settings": settings})
-            save_checkpoint(model, args.out)
 
 
 def batches(data: HistoryDataset, args: argparse.Namespace, step: int) -> Iterator[dict[str, Any]]:
@@ -170,7 +198,10 @@ def resume(out: Path, settings: dict[str, Any]) -> dict[str, Any] | None:
     path = out / "state.pt"
     if not path.is_file():
         return None
-    state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+    try:
+        state: dict[str, Any] = torch.load(path, weights_only=True, map_location="cpu")
+    except (RuntimeError, EOFError, UnpicklingError) as error:
+        raise SystemExit(f"error: {path} is damaged ({error}): delete it to begin again") from None
     different = [name for name, value in settings.items() if state["settings"].get(name) != value]
     if different:
         raise SystemExit(
@@ -191,5 +222,5 @@ def save_state(out: Path, state: dict[str, Any]) -> None:
 if __name__ == "__main__":
     try:
         main()
-    except InterferenceError as error:
+    except (InterferenceError, OSError) as error:
         raise SystemExit(f"error: {error}") from None

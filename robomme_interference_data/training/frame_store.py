@@ -5,6 +5,7 @@ decoded once, compared with their SHA-256, resized, and stored in
 `FOLDER/<kind>-<revision>/<feature>-<size>px/values.npy`, beside the states and actions.
 """
 
+import math
 import os
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import CAMERA_PREFIX
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.errors import HashMismatchError
+from robomme_interference_data.errors import FormatError, HashMismatchError
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.storage.arrays import FeatureDigests, allocate_array, map_array
 from robomme_interference_data.storage.staging import replace_folder, staging_dir
@@ -59,7 +60,11 @@ def stored_values(
         with staging_dir(out) as work:
             _store(dataset, feature, size, work, progress)
             replace_folder(work / "values", out)
-    return map_array(out / _VALUES, dtype, shape)
+    try:
+        return map_array(out / _VALUES, dtype, shape)
+    except FormatError as error:
+        hint = f"It is a copy of stored frames: delete {out}, and the next use makes it again."
+        raise FormatError(error.message, hint) from None
 
 
 def _layout(dataset: Dataset, feature: str, size: int | None) -> tuple[tuple[int, ...], Any]:
@@ -80,7 +85,12 @@ def _store(
         values = np.lib.format.open_memmap(path, "r+")  # type: ignore[no-untyped-call]
     else:
         path.parent.mkdir(exist_ok=True)
-        values = allocate_array(path, dtype, shape)
+        try:
+            values = allocate_array(path, dtype, shape)
+        except OSError as error:
+            size = math.prod(shape) * np.dtype(dtype).itemsize
+            what = f"{error.strerror}: {size / 1e6:,.0f} MB of {feature} in {work.parent}"
+            raise OSError(error.errno, f"{what}; free space, or set another `store`") from None
         done.mkdir()
     rows = first_rows(dataset)
     missing = [one for one in range(len(dataset)) if not (done / str(one)).exists()]

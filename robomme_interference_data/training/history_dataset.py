@@ -123,7 +123,7 @@ class HistoryDataset:
             questions=questions, redraw=redraw, unit_episodes=unit_episodes, seed=seed, store=store,
         )  # fmt: skip
         self.memory, self.seed = Memory.parse(memory), seed
-        self.chunk = whole_number("chunk", chunk, "an integer from 0, such as 16")
+        self.chunk = _from_zero("chunk", chunk)
         self.cameras = tuple(camera_feature(one) for one in cameras)
         self._conditions = Weights.parse("conditions", conditions)
         self._shifts = Weights.parse("shifts", shifts or {NO_SHIFT: 1})
@@ -202,7 +202,7 @@ class HistoryDataset:
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch, on which all draws depend, in this process and in those of its loaders."""
-        self._epoch.fill_(epoch)
+        self._epoch.fill_(_from_zero("epoch", epoch))
 
     def index_of(self, episode_id: EpisodeId | str, frame_index: int = 0) -> int:
         """Return the index of the item of an episode's moment.
@@ -288,8 +288,6 @@ class HistoryDataset:
 
     def _check(self, unit_episodes: str | None, *, shifted: bool) -> None:
         """Check arguments against each other."""
-        if self.chunk < 0:
-            raise InvalidOptionError.expected("chunk", self.chunk, "an integer from 0, such as 16")
         if unit_episodes is not None and not self._redraw:
             raise InvalidOptionError(
                 f"unit_episodes {unit_episodes!r} has no effect on planned buffers",
@@ -326,6 +324,14 @@ def _padded(values: NDArray[np.int64], size: int) -> "torch.Tensor":
     out = torch.zeros(size, dtype=torch.int64)
     out[: len(values)] = torch.from_numpy(values)
     return out
+
+
+def _from_zero(option: str, given: int) -> int:
+    expected = "an integer from 0"
+    number = whole_number(option, given, expected)
+    if number < 0:
+        raise InvalidOptionError.expected(option, given, expected)
+    return number
 
 
 def _open_again(location: str, arguments: dict[str, Any], epoch: "torch.Tensor") -> HistoryDataset:

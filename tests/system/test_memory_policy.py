@@ -62,22 +62,15 @@ def weights(run: Path) -> dict[str, torch.Tensor]:
 
 
 def test_it_learns_to_answer_and_writes_rows(program: Any, tmp_path: Path) -> None:
-    """Six golden lessons are learned by heart."""
+    """Of six golden lessons: their frames are of one color each, so not all can be told apart."""
     run, families = tmp_path / "run", ("VideoRepick", "MoveCube", "InsertPeg")
-    options = (
-        "--conditions",
-        "k0",
-        "--steps",
-        80,
-        "--learning-rate",
-        3e-3,
-        "--families",
-        *families,
-    )
-    program("train", TABLETOP, "--out", run, *options, *SMALL)
+    options = ("--conditions", "k0", "--steps", 140, "--families", *families)
+    program("train", TABLETOP, "--out", run, *options, *SMALL, "--batch", 6)
     with (run / "log.csv").open() as file:
         log = [*csv.DictReader(file)]
-    assert [line["step"] for line in log] == ["20", "40", "60", "80"]
+    assert [line["step"] for line in log] == ["20", "40", "60", "80", "100", "120", "140"]
+    first, last = float(log[0]["loss"]), float(log[-1]["loss"])
+    assert last < 0.75 * first < 1.2  # guessing: about 1.3
     out = tmp_path / "rows.csv"
     program("answer", run, TABLETOP, "--system", "learned-k0", "--out", out, "--seed", 3)
     rows = read_rows([out]).rows
@@ -85,7 +78,7 @@ def test_it_learns_to_answer_and_writes_rows(program: Any, tmp_path: Path) -> No
     assert {row.condition for row in rows} == {"no-history", "k0", "k1"}
     assert {row.revision for row in rows} == {load_buffer_set(TABLETOP).revision}
     seen = [row.success for row in rows if row.condition == "k0" and row.family in families]
-    assert sum(map(bool, seen)) >= 5  # by chance about 2 of 6
+    assert sum(map(bool, seen)) >= 4  # by chance about 2 of 6
 
 
 def test_an_interrupted_run_ends_like_another(
@@ -169,3 +162,38 @@ def test_the_pages_commands_and_its_example(
     exec(code.replace("image_size=96", "image_size=16"), names)  # of 32 pixels
     item = names["item"]
     assert item["memory.images.front"].shape == (31, 3, 16, 16) and item["action"].shape == (16, 8)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--image-size", "65"),
+        ("--batch", "0"),
+        ("--steps", "0"),
+        ("--chunk", "0"),
+        ("--save-every", "x"),
+        ("--conditions", "k1=x"),
+    ],
+)
+def test_wrong_options_are_one_line(
+    options: tuple[str, ...], program: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        program("train", TABLETOP, "--out", tmp_path / "run", *options)
+    assert f"argument {options[0]}" in capsys.readouterr().err.splitlines()[-1]
+    assert not (tmp_path / "run").exists()
+
+
+def test_damaged_checkpoints(program: Any, tmp_path: Path) -> None:
+    run, out = tmp_path / "run", ("--system", "x", "--out", tmp_path / "rows.csv")
+    options = ("--conditions", "k0", "--families", "MoveCube", "--steps", 1, *SMALL)
+    program("train", TABLETOP, "--out", run, *options)
+    (run / "state.pt").write_bytes((run / "state.pt").read_bytes()[:100])
+    with pytest.raises(SystemExit, match="state.pt is damaged"):
+        program("train", TABLETOP, "--out", run, *options)
+    (run / "model.safetensors").write_bytes(b"x")
+    with pytest.raises(SystemExit, match="is damaged"):
+        program("answer", run, TABLETOP, *out)
+    (run / "config.json").write_text('{"task": "answer"}')
+    with pytest.raises(SystemExit, match="cameras"):
+        program("answer", run, TABLETOP, *out)
