@@ -192,5 +192,7 @@ def _read(answer: Any, calls: int, seconds: float) -> Reply:
     text = message.content
     if text is not None and not isinstance(text, str):
         raise TypeError(f"content is {text!r}")
+    # Half a surrogate pair is valid JSON, but cannot be sent back or written.
+    text = (text or "").encode(errors="replace").decode()
     tokens = getattr(answer.usage, "total_tokens", None)
-    return Reply(text or "", tokens if type(tokens) is int else None, calls, seconds)
+    return Reply(text, tokens if type(tokens) is int else None, calls, seconds)

@@ -61,7 +61,13 @@ def default_system(config: RunConfig) -> str:
     return with_retrieval(name, config)
 
 
-def check_settings(config: RunConfig, system: str, buffer_set: BufferSet, policy: Policy) -> None:
+def check_system(config: RunConfig, system: str) -> None:
+    """Check that policy and subgoals are those that a label of rows means, and fit each other."""
+    _check_name(config, name_system(system))
+    _check_subgoals(config)
+
+
+def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> None:
     """Check the settings against each other, the buffer set and the policy."""
     if config.simulator == RECORDINGS and not config.offline:
         raise InvalidOptionError(
@@ -81,8 +87,6 @@ def check_settings(config: RunConfig, system: str, buffer_set: BufferSet, policy
     retrieval = [] if config.retrieval is None else [config.retrieval_camera]
     for camera in (*policy.history_cameras, *retrieval):
         buffer_set.datasets[DEMONSTRATIONS].shape(camera)  # raises for an unknown camera
-    _check_name(config, name_system(system))
-    _check_subgoals(config)
     if config.videos:
         from .clips import check_drawing
 

@@ -38,7 +38,7 @@ from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.runtime.executor import Session
 from robomme_interference_data.simulators.registry import SIMULATORS, simulator_versions
 
-from .checks import check_plan, check_settings, condition_refusal, default_system
+from .checks import check_plan, check_settings, check_system, condition_refusal, default_system
 from .worker import Opening, RolloutTask
 
 
@@ -60,10 +60,11 @@ class Rollouts(RunKind[RunConfig]):
     def prepare(self) -> None:
         """Check the settings, and identify the policy and the writer of its subgoals."""
         config = self.config = with_published(self.config)
+        check_system(config, self.system)  # before a policy server is waited for
         self._policy, self._policy_metadata = describe_policy(
             config.policy, config.policy_options, workers=config.workers
         )
-        check_settings(config, self.system, self.buffer_set, self._policy)
+        check_settings(config, self.buffer_set, self._policy)
         self._system = name_system(self.system)
         self._subgoal_metadata = describe_subgoals(config)
         self.metadata = self._policy_metadata | self._subgoal_metadata

@@ -53,6 +53,8 @@ class ModelWriter(SubgoalWriter):
                 raise InvalidOptionError.expected(
                     f"the option {name} of subgoals", value, "1 or more"
                 )
+        if near < 0:
+            raise InvalidOptionError.expected("the option near of subgoals", near, "0 or more")
         if fps is not None and not 1 <= fps <= 120:
             raise InvalidOptionError.expected("the option fps of subgoals", fps, "1 to 120")
         self._model, self._frames, self._fps, self._near = model, frames, fps, near

@@ -35,6 +35,7 @@ from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.rollout.checks import (
     check_plan,
     check_settings,
+    check_system,
     default_system,
 )
 from robomme_interference_data.evaluate.rollout.worker import simulator_options
@@ -204,7 +205,8 @@ def test_recall_needs_evidence(tiny_buffers: Path, monkeypatch: pytest.MonkeyPat
 
 def check_name(tiny_buffers: Path, system: str, **changes: Any) -> None:
     settings = config(**{"simulator": "tabletop"} | changes)
-    check_settings(settings, system, load_buffer_set(tiny_buffers), make_policy("noop"))
+    check_system(settings, system)
+    check_settings(settings, load_buffer_set(tiny_buffers), make_policy("noop"))
 
 
 @pytest.mark.parametrize(

@@ -139,6 +139,12 @@ def test_an_answer_without_end(server: ChatServer, monkeypatch: pytest.MonkeyPat
     assert model_of(server).reply(ASKED).text == "1 images"
 
 
+def test_half_a_surrogate_pair_is_replaced() -> None:
+    """It is valid JSON, but cannot be written or sent back."""
+    with ChatServer(answer=lambda seen: "pick \ud800 <1, 2>") as server:
+        assert model_of(server).reply(ASKED).text == "pick ? <1, 2>"
+
+
 def test_a_refusal_is_an_empty_answer(server: ChatServer) -> None:
     server.faults = [REFUSED]
     reply = model_of(server).reply(ASKED)
