@@ -1,39 +1,34 @@
 """Families whose things look alike and change places at the end of a demonstration."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import pairwise, permutations
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.random import RandomState
 
+from robomme_interference_data.simulators.scene import Pair, SwapScene, swap_texts, swapped_places
+
 from .bodies import Body, Placement
-from .family import Family, consistent
+from .family import Family
 from .layout import Spot, shuffled
 from .motion import Arm, Script, eased
-
-Pair = tuple[int, int]
 
 STEPS = 30  # time steps of a swap
 
 
-class SwapFamily(Family):
-    """A family whose answer is the number of a thing, or the numbers of several.
-
-    Things may swap places in pairs after the answer was shown. Each swap is then a part to
-    remember: without it, one knows where a thing was, but not where it is.
+class SwapFamily(SwapScene, Family):
+    """A family whose things may swap places; see `SwapScene`.
 
     Attributes:
         gap: Distance in m from the row of things to the lanes beside it.
         count: How many things there are.
-        swaps: Pairs of things that swap places, one pair after the other.
     """
 
     gap: ClassVar[float]
     count: int
-    swaps: Sequence[Pair] = ()
 
     def draw_swaps(self, rng: RandomState) -> None:
         """Draw the pairs that swap places."""
@@ -58,22 +53,9 @@ class SwapFamily(Family):
             self.showing = ()
             yield from arm.wait(5)
 
-    def parts(self, answer: Any) -> tuple[str, ...]:
-        """Return the texts of the answer, then one text per swap; see `Family.parts`."""
-        return (*self.answer_texts(answer), *_texts(_swapped_places(self.swaps)))
-
-    def choice(self, answer: Any) -> int:
-        """Return the place where the thing ends that is asked for; of several, the first."""
-        return _final_places(answer, _swapped_places(self.swaps))[0]
-
-    def agreeing(self, known: Mapping[int, str]) -> list[Any]:
-        """Return the answers that may end where the right one does; see `Family.agreeing`."""
-        actual = _swapped_places(self.swaps)
-        possible = _all_swaps(self.count) if self.swaps else {actual: ()}
-        first = len(self.answer_texts(self.answers[0]))
-        fitting = consistent([*possible.items()], known, first)
-        ends = {_final_places(one, swaps) for one in super().agreeing(known) for swaps in fitting}
-        return [answer for answer in self.answers if _final_places(answer, actual) in ends]
+    def possible_swaps(self) -> Mapping[tuple[Pair, ...], tuple[str, ...]]:
+        """Return every possible series of swaps; see `SwapScene.possible_swaps`."""
+        return _all_swaps(self.count) if self.swaps else {(): ()}
 
 
 def swap_pairs(order: Sequence[int]) -> list[Pair]:
@@ -109,31 +91,8 @@ def lanes(spots: Sequence[Spot], pair: Pair, gap: float) -> list[list[Spot]]:
     return paths
 
 
-def _swapped_places(swaps: Iterable[Pair]) -> tuple[Pair, ...]:
-    """Return the pairs of places of the swaps: all that is visible when things look alike."""
-    at: dict[int, int] = {}
-    pairs = []
-    for one, other in swaps:
-        places = at.get(one, one), at.get(other, other)
-        at[other], at[one] = places
-        pairs.append((min(places), max(places)))
-    return tuple(pairs)
-
-
 @cache
 def _all_swaps(count: int) -> dict[tuple[Pair, ...], tuple[str, ...]]:
     """Return every possible series of swaps of `count` things, with its texts."""
-    all_pairs = (_swapped_places(swap_pairs(order)) for order in permutations(range(count)))
-    return {pairs: _texts(pairs) for pairs in all_pairs}
-
-
-def _final_places(answer: Any, pairs: Iterable[Pair]) -> tuple[int, ...]:
-    """Return the places where the things of an answer end."""
-    places = [answer] if isinstance(answer, int) else list(answer)
-    for one, other in pairs:
-        places = [other if at == one else one if at == other else at for at in places]
-    return tuple(places)
-
-
-def _texts(pairs: Iterable[Pair]) -> tuple[str, ...]:
-    return tuple(f"those at places {one} and {other} change places" for one, other in pairs)
+    all_pairs = (swapped_places(swap_pairs(order)) for order in permutations(range(count)))
+    return {pairs: swap_texts(pairs) for pairs in all_pairs}

@@ -7,8 +7,9 @@ from numpy.random import RandomState
 from numpy.typing import NDArray
 
 from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.simulators.scene import Option
 from robomme_interference_data.simulators.tabletop.bodies import CUBE, SceneBuilder
-from robomme_interference_data.simulators.tabletop.family import Family, Option, Step
+from robomme_interference_data.simulators.tabletop.family import Family, Step
 from robomme_interference_data.simulators.tabletop.layout import distance_to_segment, is_near
 from robomme_interference_data.simulators.tabletop.motion import SLOW, Arm, Script
 

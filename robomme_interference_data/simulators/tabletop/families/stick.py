@@ -10,8 +10,9 @@ from numpy.random import RandomState
 from numpy.typing import NDArray
 
 from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.simulators.scene import Option
 from robomme_interference_data.simulators.tabletop.bodies import Body, SceneBuilder
-from robomme_interference_data.simulators.tabletop.family import Family, Option, Step
+from robomme_interference_data.simulators.tabletop.family import Family, Step
 from robomme_interference_data.simulators.tabletop.layout import ABOVE, Spot, distance_to_segment
 from robomme_interference_data.simulators.tabletop.motion import ROD, Arm, Point, Script
 

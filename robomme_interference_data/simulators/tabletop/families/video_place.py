@@ -8,8 +8,9 @@ from typing import ClassVar
 from numpy.random import RandomState
 
 from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.simulators.scene import Option
 from robomme_interference_data.simulators.tabletop.bodies import CUBE, SceneBuilder
-from robomme_interference_data.simulators.tabletop.family import Option, Step
+from robomme_interference_data.simulators.tabletop.family import Step
 from robomme_interference_data.simulators.tabletop.layout import is_near, push_down, row, shuffled
 from robomme_interference_data.simulators.tabletop.motion import HELD, Arm, Point, Script
 from robomme_interference_data.simulators.tabletop.swaps import SwapFamily

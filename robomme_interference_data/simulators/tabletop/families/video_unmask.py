@@ -6,6 +6,7 @@ from itertools import chain, islice, permutations, product
 from numpy.random import RandomState
 
 from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.simulators.scene import Option
 from robomme_interference_data.simulators.tabletop.bodies import (
     CUBE,
     SIDE,
@@ -13,7 +14,7 @@ from robomme_interference_data.simulators.tabletop.bodies import (
     Placement,
     SceneBuilder,
 )
-from robomme_interference_data.simulators.tabletop.family import Family, Option, Step
+from robomme_interference_data.simulators.tabletop.family import Family, Step
 from robomme_interference_data.simulators.tabletop.layout import along, row, shuffled
 from robomme_interference_data.simulators.tabletop.motion import HELD, Arm, Script
 from robomme_interference_data.simulators.tabletop.swaps import SwapFamily
