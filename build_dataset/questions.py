@@ -33,7 +33,9 @@ def make_questions(buffer_set: BufferSet) -> Iterator[Question]:
     picture = load_extra(module, "picture", "build questions", "retrieval")
     for question, marks in planned_questions(buffer_set):
         view = buffer_set.query(question.episode_id).frame()
-        side = recorded_scene(buffer_set.query(question.episode_id)).side
+        scene = recorded_scene(buffer_set.query(question.episode_id))
+        assert scene is not None  # or no question was planned
+        side = scene.side
         if view.shape != (side, side, 3):
             raise BuildError(
                 f"the first live view of {question.episode_id} has {view.shape[1]}×{view.shape[0]} "

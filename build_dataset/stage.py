@@ -155,6 +155,7 @@ class StageTask:
             feature_sha256=session,
             span_sha256=SpanDigests(*map(combine, parts)) if parts else None,
             evidence=None if start is None else recording.evidence,
+            scene=None if start is None else recording.scene,
         )
         stats = {
             feature: {name: tuple(map(float, values)) for name, values in one.result().items()}

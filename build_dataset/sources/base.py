@@ -93,6 +93,7 @@ class Recording:
             releases the files.
         evidence: Which frames of the demonstration show the hidden answer, part by part; None
             if unknown.
+        scene: `Demonstration.scene`.
         robot: The robot.
         action_first: Whether the action of a frame was executed before its observation, instead of
             after it.
@@ -105,6 +106,7 @@ class Recording:
     exact: bool
     frames: Generator[Frame]
     evidence: tuple[EvidenceSpan, ...] | None = None
+    scene: str | None = None
     robot: Robot = Robot()
     action_first: bool = False
 

@@ -63,7 +63,7 @@ class SimulatorSource(Source):
         act = (lambda: simulator.act("oracle")) if self.whole else None
         frames = _play(simulator, lesson, first, act)
         known = info.goals, info.seed, info.difficulty, info.simulator
-        return Recording(*known, True, frames, lesson.evidence)
+        return Recording(*known, True, frames, lesson.evidence, lesson.scene)
 
     @override
     def close(self) -> None:

@@ -15,6 +15,7 @@ _MAX_FRAMES = 1 << 22  # of an episode: days at the recorded rate
 _MAX_GOAL = 1 << 16  # characters of all wordings of a goal
 _MAX_PARTS = 1 << 10  # of an answer; the embedded suite has at most six
 _MAX_SPANS = 1 << 12  # of evidence in a lesson
+_MAX_SCENE = 1 << 16  # characters
 _MAX_TEXT = 1 << 10  # characters of a part of an answer
 
 
@@ -76,6 +77,11 @@ class EpisodeRecord:
         tuple[EvidenceSpan, ...] | None,
         "Lesson frames that show parts of the hidden answer; None if unknown or without a lesson.",
     ] = None
+    scene: Annotated[
+        str | None,
+        "What the scene allows and hides, as JSON of the simulator; None if its seed tells, or if "
+        "unknown.",
+    ] = None
 
     def __post_init__(self) -> None:
         name, start, spans = self.episode_id, self.exec_start_idx, self.evidence or ()
@@ -88,6 +94,11 @@ class EpisodeRecord:
             raise FormatError(
                 f"{name} has {len(spans)} evidence spans; expected none in a unit, and at most "
                 f"{_MAX_SPANS} in a lesson"
+            )
+        if len(self.scene or "") > _MAX_SCENE:
+            raise FormatError(
+                f"{name} has a scene of {len(self.scene or '')} characters; expected at most "
+                f"{_MAX_SCENE}"
             )
         for span in spans:
             if start is None or span.stop > start:

@@ -20,6 +20,8 @@ from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.shifts import Shift
 from robomme_interference_data.schema.subgoal import Subgoal
 
+from .scene import Scene
+
 CAMERAS = ("front", "wrist")
 """The cameras of every simulator, in canonical order."""
 
@@ -56,12 +58,15 @@ class Demonstration:
             the gripper, −1 closed to 1 open. `(0, 8)` if unknown.
         evidence: Which frames show each part of the hidden answer; None if unknown. Policies never
             receive it.
+        scene: What the scene allows and hides, as JSON that `Simulator.scene` reads; None if it
+            follows from the seed, or is unknown. Policies never receive it.
     """
 
     images: dict[str, NDArray[np.uint8]]
     states: NDArray[np.float32]
     actions: NDArray[np.float32]
     evidence: tuple[EvidenceSpan, ...] | None = None
+    scene: str | None = None
 
     def __len__(self) -> int:
         return len(self.states)
@@ -171,18 +176,22 @@ class Simulator(ABC):
         return None
 
     @classmethod
-    def scene(cls, family: str, seed: int, difficulty: str) -> Any:
+    def scene(
+        cls, family: str, seed: int, difficulty: str, recorded: str | None = None
+    ) -> Scene | None:
         """Return the scene of a recorded episode, for questions about its answer.
 
         Args:
             family: Task family.
             seed: Seed of the scene.
             difficulty: `easy`, `medium` or `hard`.
+            recorded: `Demonstration.scene`.
 
         Returns:
-            An object with the attributes `answers`, `question` and `side`, and the methods
-            `agreeing`, `choice`, `option`, `own_answer` and `pixels` of `tabletop.family.Family`;
-            None if the possible answers are unknown.
+            The scene; None if the possible answers are unknown.
+
+        Raises:
+            FormatError: What was recorded is damaged.
         """
         return None
 

@@ -8,6 +8,7 @@ from robomme_interference_data.runtime.specs import import_factory
 from robomme_interference_data.schema.shifts import parse_shift
 
 from .base import Simulator
+from .scene import Scene
 
 if TYPE_CHECKING:
     from robomme_interference_data.data.query import Query
@@ -68,12 +69,13 @@ def check_shift(name: str, shift: str) -> None:
         )
 
 
-def recorded_scene(query: "Query") -> Any:
+def recorded_scene(query: "Query") -> Scene | None:
     """Return the scene of a recorded query (see `Simulator.scene`), or None if unknown."""
     name, seed, difficulty = query.simulator, query.seed, query.difficulty
     if name not in SIMULATORS or seed is None or difficulty is None or not 0 <= seed < _SEEDS:
         return None
-    return simulator_class(name).scene(query.episode_id.family, seed, difficulty)
+    scene = query.record.scene
+    return simulator_class(name).scene(query.episode_id.family, seed, difficulty, scene)
 
 
 def simulator_versions(name: str, python: str | None = None) -> dict[str, str]:

@@ -111,20 +111,13 @@ class SwapScene(Scene):
 
     swaps: Sequence[Pair] = ()
 
-    @property
-    def first_swap(self) -> int:
-        """Number of the part that the first swap is."""
-        return len(self.answer_texts(self.answers[0]))
-
     @abstractmethod
     def possible_swaps(self) -> Mapping[tuple[Pair, ...], tuple[str, ...]]:
         """Return every possible series of swaps, as pairs of places, with its texts."""
 
     def parts(self, answer: Any) -> tuple[str, ...]:
         """Return the texts of the answer, then one text per swap; see `Scene.parts`."""
-        texts = self.answer_texts(answer)
-        missing = ("",) * (self.first_swap - len(texts))
-        return (*texts, *missing, *swap_texts(swapped_places(self.swaps)))
+        return (*self.answer_texts(answer), *swap_texts(swapped_places(self.swaps)))
 
     def choice(self, answer: Any) -> int:
         """Return the place where the thing ends that is asked for; of several, the first."""
@@ -132,7 +125,8 @@ class SwapScene(Scene):
 
     def agreeing(self, known: Mapping[int, str]) -> list[Any]:
         """Return the answers that may end where the right one does; see `Scene.agreeing`."""
-        actual, first = swapped_places(self.swaps), self.first_swap
+        actual = swapped_places(self.swaps)
+        first = len(self.answer_texts(self.answers[0]))
         shown = {part: text for part, text in known.items() if part < first}
         fitting = consistent([*self.possible_swaps().items()], known, first)
         ends = {final_places(one, swaps) for one in super().agreeing(shown) for swaps in fitting}

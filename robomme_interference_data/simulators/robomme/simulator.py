@@ -1,7 +1,9 @@
 """The official simulator, RoboMME, in a separate Python environment."""
 
+import json
 import os
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +11,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.subgoal import Subgoal, read_grounded
 from robomme_interference_data.simulators.base import (
@@ -24,6 +27,9 @@ from robomme_interference_data.simulators.base import (
 from robomme_interference_data.simulators.tabletop.episodes import episode_ids
 
 from .process import Arrays, Process, find_python, installed_versions
+from .scenes import OfficialScene, evidence_of, read_scene
+
+POLICIES = ("oracle", "guess", "recall")
 
 ARMS = ("VideoUnmask", "PatternLock")
 """Families with a gripper and with a stick whose demonstrations are the shortest."""
@@ -31,10 +37,10 @@ ARMS = ("VideoUnmask", "PatternLock")
 FRAME_SHAPE = (256, 256, 3)
 
 EPISODES = 5
-"""Episodes that one process plays before a new one replaces it.
+"""Episodes that one process plays before a new one replaces it; five times as many without images.
 
-Its memory grows up to 2.6 GB, with a demonstration of 1077 frames, and hardly shrinks afterwards. A
-new process takes 1.5 GB, and at most a tenth of the time of an episode.
+Its memory grows up to 2.6 GB, with a demonstration of 1077 frames, and hardly shrinks afterwards;
+without images it stays at 2.3 GB. A new process takes 1.5 GB, and 10 s.
 """
 
 
@@ -44,7 +50,8 @@ class RoboMMESimulator(Simulator):
     RoboMME plays the demonstration at every reset, in a new environment: 5 to 125 s on two cores.
     It does not return the demonstration's actions, so `Demonstration.actions` is `(0, 8)`. In the
     families with a stick (`PatternLock`, `RouteStick`) the gripper's opening is always 0, and its
-    action has no effect.
+    action has no effect. Its built-in policies act with the motion planners that play the
+    demonstrations.
 
     A new process replaces the old one every few episodes, because RoboMME's memory grows; results
     do not depend on that. If the process dies or takes too long, it is ended and the call raises
@@ -69,7 +76,6 @@ class RoboMMESimulator(Simulator):
     about = "the official simulator, RoboMME"
     remote = True
     settings = ("cameras", "python", "subgoals", "answer_s")
-    scripted = False
     episode_s = 1800.0
 
     def __init__(
@@ -83,6 +89,8 @@ class RoboMMESimulator(Simulator):
         self._python, self._answer_s = find_python(python), answer_s
         self._process = Process(self._python, answer_s)
         self._subgoal: str | None = None
+        self._scene: OfficialScene | None = None
+        self._solution: tuple[Any] | None = None
 
     @property
     def patches(self) -> tuple[str, ...]:
@@ -103,12 +111,35 @@ class RoboMMESimulator(Simulator):
         """Return its episodes: the same ids as those of the embedded suite."""
         return episode_ids()
 
+    @classmethod
+    def scene(
+        cls, family: str, seed: int, difficulty: str, recorded: str | None = None
+    ) -> OfficialScene | None:
+        """Return the recorded scene; None if none was recorded. See `Simulator.scene`."""
+        return None if recorded is None else read_scene(family, recorded, difficulty)
+
     def act(self, policy: str, known: Mapping[int, str] | None = None) -> NDArray[np.float32]:
-        """Raise `UnknownNameError`: RoboMME has no built-in policies."""
-        raise UnknownNameError(
-            f"the robomme simulator has no built-in policy {policy!r}",
-            "oracle, guess and recall need the simulator tabletop.",
-        )
+        """Return the next action of RoboMME's motion planners for an answer; see `Simulator.act`.
+
+        Raises:
+            SimulatorCrashError: The planners find no motion, or this version of RoboMME has other
+                attributes than those that the answer is read from.
+        """
+        self._running()
+        if policy not in POLICIES:
+            raise UnknownNameError.among("built-in policy", policy, self.name, POLICIES)
+        if self._solution is None:
+            self._solution = self._solve(policy, known or {})
+        answer, _ = self._process.call("act", answer=self._solution[0])
+        return np.array(answer["action"], np.float32)
+
+    def _solve(self, policy: str, known: Mapping[int, str]) -> tuple[Any]:
+        """Return the answer that a policy acts out, alone in a tuple."""
+        if self._scene is None:
+            raise self._process.error(f"hides its answers: {self._unreadable}")
+        if policy == "oracle":
+            return (self._scene.own_answer(self._seed),)
+        return (self._scene.recalled(known if policy == "recall" else {}, self._seed),)
 
     def subgoal(self) -> Subgoal:
         """Return RoboMME's current subgoal; see `Simulator.subgoal`."""
@@ -143,7 +174,8 @@ class RoboMMESimulator(Simulator):
         families = self._process.families
         if episode.family not in families:
             raise UnknownNameError.among("family", episode.family, self.name, families)
-        if self._process.pid is None or self._process.played >= EPISODES:
+        most = EPISODES if self._cameras or self._subgoals else 5 * EPISODES
+        if self._process.pid is None or self._process.played >= most:
             self._process.end()
             self._process = Process(self._python, self._answer_s)
         self._process.played += 1
@@ -161,9 +193,24 @@ class RoboMMESimulator(Simulator):
         first = self._observation(arrays, self._cameras)
         images = {camera: arrays[camera][:-1:every] for camera in self._cameras if every}
         no_actions = np.empty((0, ACTION_SIZE), np.float32)
-        lesson = Demonstration(images, arrays["states"][:-1], no_actions)
+        evidence = self._read_facts(facts, episode.family, arrays)
+        lesson = Demonstration(images, arrays["states"][:-1], no_actions, *evidence)
         info = EpisodeInfo(tuple(facts["goals"]), facts["difficulty"], facts["seed"], self.name)
         return lesson, first, info
+
+    def _read_facts(
+        self, facts: dict[str, Any], family: str, arrays: Arrays
+    ) -> tuple[tuple[EvidenceSpan, ...] | None, str | None]:
+        """Keep the scene; return the lesson's evidence and the scene as JSON, None if unknown."""
+        self._scene, self._solution = None, None
+        self._seed, self._unreadable = facts["seed"], facts.get("unreadable", "")
+        if facts["scene"] is None:
+            return None, None
+        text = json.dumps(facts["scene"], separators=(",", ":"), sort_keys=True)
+        self._scene = read_scene(family, text, facts["difficulty"])
+        if self._scene is None:
+            return None, None
+        return evidence_of(self._scene, arrays["moments"][:-1]), text
 
     def _execute(
         self, episode: EpisodeId, action: NDArray[np.float32], observe: bool

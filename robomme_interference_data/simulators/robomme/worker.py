@@ -38,6 +38,7 @@ def _sibling(name: str) -> Any:
 
 
 _patches, _rendering = _sibling("maniskill_patches"), _sibling("render_on_demand")
+_facts, _solvers = _sibling("facts"), _sibling("solvers")
 
 
 def send(
@@ -128,6 +129,7 @@ class Episodes:
         self._env: Any = None
         self._cameras: list[str] = []
         self._subgoals = True
+        self._script: Any = None
         self._rendering = _rendering.RenderOnDemand()
 
     def reset(
@@ -143,7 +145,8 @@ class Episodes:
         """Play a demonstration; return the facts about the episode, its frames and its states.
 
         The last frame and state are the first live observation; without `demonstration`, it is the
-        only frame.
+        only frame. `scene` and `moments` are what `facts.py` reads, or `scene` is None and
+        `unreadable` says why.
         """
         self.close()
         builder = _builder()(
@@ -156,6 +159,7 @@ class Episodes:
         self._env = builder.make_env_for_episode(index)
         self._cameras, self._subgoals = cameras, subgoals
         self._select_cameras(demonstration)
+        log = _facts.LessonLog(self._env, family)
         observations, info = self._env.reset()
         goals = info["task_goal"]
         facts = {
@@ -163,20 +167,30 @@ class Episodes:
             "difficulty": str(difficulty),
             "goals": [goals] if isinstance(goals, str) else [str(goal) for goal in goals],
             "subgoal": self._subgoal(info),
+            "scene": None,
         }
+        arrays = {"states": _states(observations)}
+        try:  # another version of RoboMME may have other attributes; all else works without them
+            scene, moments = _facts.read_facts(self._env, family), log.moments(self._env)
+            self._script = _solvers.Script(self._env, family)
+            facts, arrays = {**facts, "scene": scene}, {**arrays, "moments": moments}
+        except Exception as error:
+            traceback.print_exc()
+            facts["unreadable"] = _text(error)
         if demonstration:
-            frames = self._frames(observations)
-        else:
-            images = self._rendering.images(self._env, cameras)
-            frames = {camera: [image] for camera, image in images.items()}
-        return facts, {"states": _states(observations), **frames}
+            return facts, {**arrays, **self._frames(observations)}
+        images = self._rendering.images(self._env, cameras)
+        return facts, {**arrays, **{camera: [image] for camera, image in images.items()}}
 
     def step(self, action: list[float], observe: bool) -> Answer:
         """Execute an action; return status and subgoal, the state and, if requested, the frames."""
         import numpy as np
 
         self._select_cameras(observe)
-        observations, _, _, _, info = self._env.step(np.array(action, np.float32))
+        result = self._env.step(np.array(action, np.float32))
+        observations, _, _, _, info = result
+        if self._script is not None:
+            self._script.stepped(result)
         if info["status"] == "error":
             self.close()
             return {"status": "error", "message": str(info.get("error_message"))}, {}
@@ -185,9 +199,16 @@ class Episodes:
         facts = {"status": str(info["status"]), "subgoal": self._subgoal(info)}
         return facts, {name: items[-1:] for name, items in arrays.items()}
 
+    def act(self, answer: Any) -> Answer:
+        """Return the next action of RoboMME's solvers for an answer; the same one throughout."""
+        return {"action": self._script.act(answer)}, {}
+
     def close(self) -> None:
         """Close the environment, if there is one."""
         env, self._env = self._env, None
+        script, self._script = self._script, None
+        if script is not None:
+            script.close()
         if env is not None:
             env.close()
         self._rendering.reset()
@@ -223,7 +244,7 @@ def serve(channel: Connection, folder: Path) -> None:
     episodes = Episodes()
     while True:
         head, _ = requests.get()
-        call = episodes.step if head.pop("call") == "step" else episodes.reset
+        call = getattr(episodes, head.pop("call"))
         try:
             answer, arrays = call(**head)
         except Exception as error:

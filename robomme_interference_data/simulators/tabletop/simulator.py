@@ -80,7 +80,9 @@ class TabletopSimulator(Simulator):
         return other_answer(episode)
 
     @classmethod
-    def scene(cls, family: str, seed: int, difficulty: str) -> Family | None:
+    def scene(
+        cls, family: str, seed: int, difficulty: str, recorded: str | None = None
+    ) -> Family | None:
         """Return the scene of a seed; see `Simulator.scene`."""
         return known_scene(family, seed, difficulty)
 

@@ -1,0 +1,160 @@
+"""What RoboMME hides in an episode, read from the attributes of its environment.
+
+Runs in RoboMME's interpreter, as `worker.py` does. `scenes.py` has the rules that use the facts.
+"""
+
+from typing import Any
+
+_THINGS = {
+    "VideoUnmask": "spawned_bins",
+    "VideoUnmaskSwap": "spawned_bins",
+    "VideoRepick": "spawned_cubes",
+    "VideoPlaceButton": "targets",
+    "VideoPlaceOrder": "targets",
+    "InsertPeg": "pegs",
+    "PatternLock": "buttons_grid",
+    "RouteStick": "buttons_grid",
+}
+"""Family to the attribute that lists the things an answer is about."""
+
+_GONE = 1.0
+"""Distance in m beyond which a container was moved out of sight, so that its cube is visible."""
+
+
+class LessonLog:
+    """Logs what RoboMME does at each step of a demonstration; made before the reset."""
+
+    def __init__(self, env: Any, family: str) -> None:
+        base = env.unwrapped
+        self._rows: dict[int, list[int]] = {}
+        execute, containers = base.step, family in ("VideoUnmask", "VideoUnmaskSwap")
+
+        def step(action: Any) -> Any:
+            result = execute(action)
+            revealed = containers and abs(float(base.spawned_bins[0].pose.p[0][0])) > _GONE
+            number = int(base.elapsed_steps[0])
+            self._rows[number] = [number, int(base.current_task_index), int(revealed)]
+            return result
+
+        base.step = step
+
+    def moments(self, env: Any) -> list[Any]:
+        """Return a row per recorded frame of the demonstration and for the first live view.
+
+        `(3,) int64` each: steps since the reset, number of the task, 1 if containers hide nothing.
+        """
+        import numpy as np
+
+        recorded = _demonstration(env)[4]["elapsed_steps"]
+        return [np.array(self._rows[int(number)], np.int64) for number in recorded]
+
+
+def read_facts(env: Any, family: str) -> dict[str, Any]:
+    """Return the facts about an episode whose demonstration has been played, as JSON values.
+
+    They are its tasks, the points of its things in the front image, the answer, and what else the
+    possible answers depend on.
+    """
+    base = env.unwrapped
+    things = list(getattr(base, _THINGS[family])) if family in _THINGS else []
+    if family == "RouteStick":
+        things = [things[number] for number in base.route_button_indices]
+    tasks = [[str(task["name"]), bool(task["demonstration"])] for task in base.task_list]
+    points = [_pixel(base, thing) for thing in things]
+    return {"tasks": tasks, "points": points, **_READ[family](base, things)}
+
+
+def _unmask(base: Any, bins: list[Any]) -> dict[str, Any]:
+    hiding = getattr(base, "selected_bins", bins)
+    picked = sum("pick up" in str(task["name"]) for task in base.task_list)
+    colors = [str(color) for color in base.color_names[:picked]]
+    answer = [_index(bins, one) for one in hiding[:picked]]
+    return {"answer": answer, "colors": colors, "swaps": _scheduled(base, bins)}
+
+
+def _repick(base: Any, cubes: list[Any]) -> dict[str, Any]:
+    return {"answer": _index(cubes, base.target_cube_1), "swaps": _scheduled(base, cubes)}
+
+
+def _place_button(base: Any, targets: list[Any]) -> dict[str, Any]:
+    answer = _index(targets, base.target_target)
+    visits = [_index(targets, base.target_0), _index(targets, base.target_1)]
+    asked = {"before": 0, "after": 1}[base.target_target_language]
+    return {"answer": answer, "visits": visits, "asked": asked, "swaps": _swapped(base, targets)}
+
+
+def _place_order(base: Any, targets: list[Any]) -> dict[str, Any]:
+    answer = _index(targets, base.target_target)
+    visits = [_index(targets, one) for one in base.which_targets_to_pick]
+    asked = int(base.which_in_subset) - 1
+    return {"answer": answer, "visits": visits, "asked": asked, "swaps": _swapped(base, targets)}
+
+
+def _move(base: Any, things: list[Any]) -> dict[str, Any]:
+    return {"answer": str(base.way)}
+
+
+def _insert(base: Any, pegs: list[Any]) -> dict[str, Any]:
+    end, side = str(base.grasp_target_distance), str(base.insert_way)
+    return {"answer": [_index(pegs, base.peg), end, side]}
+
+
+def _pattern(base: Any, buttons: list[Any]) -> dict[str, Any]:
+    return {"answer": [_index(buttons, one) for one in base.selected_buttons]}
+
+
+def _route(base: Any, targets: list[Any]) -> dict[str, Any]:
+    route = [_index(targets, one) for one in base.selected_buttons]
+    return {"answer": [route, [str(turn) for turn in base.swing_directions]]}
+
+
+_READ = {
+    "VideoUnmask": _unmask,
+    "VideoUnmaskSwap": _unmask,
+    "VideoRepick": _repick,
+    "VideoPlaceButton": _place_button,
+    "VideoPlaceOrder": _place_order,
+    "MoveCube": _move,
+    "InsertPeg": _insert,
+    "PatternLock": _pattern,
+    "RouteStick": _route,
+}
+
+
+def _scheduled(base: Any, things: list[Any]) -> list[Any]:
+    """Return the swaps of a schedule: two things, first step and last step each."""
+    return [
+        [_index(things, one), _index(things, other), int(start), int(stop)]
+        for one, other, start, stop in getattr(base, "swap_schedule", None) or []
+    ]
+
+
+def _swapped(base: Any, targets: list[Any]) -> list[Any]:
+    """Return the swap of two targets, if there is one."""
+    if base.swap_target_a is None:
+        return []
+    pair = [_index(targets, one) for one in (base.swap_target_a, base.swap_target_b)]
+    return [[*pair, int(base.start_step), int(base.end_step)]]
+
+
+def _index(things: list[Any], thing: Any) -> int:
+    """Return the number of a thing, by identity."""
+    return next(number for number, one in enumerate(things) if one is thing)
+
+
+def _pixel(base: Any, thing: Any) -> list[int]:
+    """Return where a thing is in the front image, (y, x)."""
+    import numpy as np
+
+    camera = base._sensors["base_camera"].get_params()
+    place = np.append(np.asarray(thing.pose.p, np.float64).reshape(-1)[:3], 1.0)
+    seen = np.asarray(camera["extrinsic_cv"], np.float64).reshape(-1, 4)[:3] @ place
+    x, y, depth = np.asarray(camera["intrinsic_cv"], np.float64).reshape(3, 3) @ seen
+    return [round(float(y / depth)), round(float(x / depth))]
+
+
+def _demonstration(env: Any) -> Any:
+    """Return what RoboMME's wrapper recorded: observations, …, infos, a list per key."""
+    while "demonstration_data" not in vars(env):
+        env = env.env
+    return env.demonstration_data

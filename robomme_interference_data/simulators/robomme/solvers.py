@@ -1,0 +1,216 @@
+"""Act out an answer with the motion planners that play RoboMME's own demonstrations.
+
+Runs in RoboMME's interpreter, as `worker.py` does. The solvers step an environment themselves; here
+they run in a thread that hands out one action at a time, so that an episode is stepped from outside
+as with any other policy.
+"""
+
+import importlib
+import queue
+import threading
+from typing import Any
+
+_STICK = ("PatternLock", "RouteStick")
+_TRIES = 3
+"""Attempts of each planner: a straight screw motion first, then a random search."""
+
+
+class NoPlanError(RuntimeError):
+    """The planners find no motion to a pose."""
+
+
+class _Abandoned(BaseException):
+    """The episode is over; raised in the solvers' thread to end it."""
+
+
+class _Handing:
+    """The environment for the solvers, in which a step hands out its action and waits."""
+
+    def __init__(self, env: Any, actions: Any, results: Any) -> None:
+        self._env, self._actions, self._results = env, actions, results
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._env, name)
+
+    def step(self, action: Any) -> Any:
+        self._actions.put(action)
+        result = self._results.get()
+        if result is None:
+            raise _Abandoned
+        return result
+
+
+class Script:
+    """The actions of RoboMME's solvers in one live episode.
+
+    Args:
+        env: The environment, after the reset.
+        family: Its family.
+    """
+
+    def __init__(self, env: Any, family: str) -> None:
+        self._actions: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._results: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._env, self._family = _Handing(env, self._actions, self._results), family
+        self._thread: threading.Thread | None = None
+        self._result: Any = None
+        self._last: list[float] | None = None
+        self._done = False
+
+    def act(self, answer: Any) -> list[float]:
+        """Return the next action for an answer, 8 numbers; the last one again when it is done.
+
+        Raises:
+            NoPlanError: The planners find no motion.
+        """
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._solve, args=(answer,), daemon=True)
+            self._thread.start()
+        elif not self._done:
+            self._results.put(self._result)
+        if not self._done:
+            made = self._actions.get()
+            if isinstance(made, Exception):
+                self._done = True
+                raise made
+            self._done = made is None
+            if made is not None:
+                self._last = [*map(float, made), -1.0][:8]
+        if self._last is None:
+            raise NoPlanError("the solvers moved nowhere")
+        return self._last
+
+    def stepped(self, result: Any) -> None:
+        """Keep what the environment returned for the last action, for the solvers."""
+        self._result = result
+
+    def close(self) -> None:
+        """End the thread."""
+        if self._thread is not None and not self._done:
+            self._done = True
+            while self._thread.is_alive():
+                self._results.put(None)
+                self._thread.join(0.2)
+
+    def _solve(self, answer: Any) -> None:
+        try:
+            solve: Any = _SOLVE[self._family]
+            solve(_Solver(self._env, self._family), self._env.unwrapped, answer)
+        except _Abandoned:
+            return
+        except Exception as error:
+            self._actions.put(error)
+            return
+        self._actions.put(None)
+
+
+class _Solver:
+    """RoboMME's solvers, by name, bound to an environment and its motion planner."""
+
+    def __init__(self, env: Any, family: str) -> None:
+        self._env, self._planner = env, _planner(env, stick=family in _STICK)
+        self._module = importlib.import_module("robomme.robomme_env.utils.subgoal_planner_func")
+
+    def __call__(self, name: str, *args: Any, **named: Any) -> None:
+        getattr(self._module, name)(self._env, self._planner, *args, **named)
+
+
+def _planner(env: Any, *, stick: bool) -> Any:
+    """Return RoboMME's planner, which tries again where a screw motion fails."""
+    module = importlib.import_module("robomme.robomme_env.utils.planner_fail_safe")
+    arm = "Stick" if stick else "Arm"
+    planner = getattr(module, f"FailAwarePanda{arm}MotionPlanningSolver")(
+        env,
+        debug=False,
+        vis=False,
+        base_pose=env.unwrapped.agent.robot.pose,
+        visualize_target_grasp_pose=False,
+        print_env_info=False,
+        **({"joint_vel_limits": 0.3} if stick else {}),
+    )
+    straight, search = planner.move_to_pose_with_screw, planner.move_to_pose_with_RRTStar
+
+    def move(*args: Any, **named: Any) -> Any:
+        for plan in [straight] * _TRIES + [search] * _TRIES:
+            try:
+                result = plan(*args, **named)
+            except module.ScrewPlanFailure:
+                continue
+            if not (isinstance(result, int) and result == -1):
+                return result
+        raise NoPlanError(f"no motion found in {2 * _TRIES} attempts")
+
+    planner.move_to_pose_with_screw = move
+    return planner
+
+
+def _unmask(solve: _Solver, base: Any, answer: list[int]) -> None:
+    for number, container in enumerate(answer):
+        if number:
+            solve("solve_putdown_whenhold")
+        solve("solve_pickup_bin", obj=base.spawned_bins[container])
+
+
+def _repick(solve: _Solver, base: Any, answer: int) -> None:
+    for _ in range(int(base.num_repeats)):
+        solve("solve_pickup", obj=base.spawned_cubes[answer])
+        solve("solve_putdown_whenhold", release_z=0.01)
+    solve("solve_button", obj=base.button_left)
+
+
+def _place(solve: _Solver, base: Any, answer: int) -> None:
+    solve("solve_pickup", obj=base.target_cube)
+    solve("solve_putonto_whenhold", target=base.targets[answer])
+
+
+def _move(solve: _Solver, base: Any, answer: str) -> None:
+    if answer == "peg_push":
+        solve("grasp_and_lift_peg_side", base.grasp_target)
+        side, end = base.direction2, base.obj_flag
+        solve("solve_push_to_target_with_peg", base.cube, base.goal_site, side, end)
+    elif answer == "gripper_push":
+        solve("solve_push_to_target", base.cube, base.goal_site)
+    else:
+        solve("solve_pickup", obj=base.cube)
+        solve("solve_putonto_whenhold", target=base.goal_site)
+
+
+def _insert(solve: _Solver, base: Any, answer: list[Any]) -> None:
+    number, end, side = answer
+    ends = [base.peg_heads[number], base.peg_tails[number]]
+    arm = float(base.agent.robot.pose.p[0][0])
+    ends.sort(key=lambda link: abs(float(link.pose.p[0][0]) - arm))  # the head if both are as near
+    grasped, inserted = ends if end == "near" else reversed(ends)
+    solve("grasp_and_lift_peg_side", grasped)
+    solve(
+        "insert_peg",
+        direction=-1 if side == "left" else 1,
+        obj=-1 if grasped is base.peg_heads[number] else 1,
+        insert_obj=inserted,
+        cut_retreat=True,
+    )
+
+
+def _pattern(solve: _Solver, base: Any, answer: list[int]) -> None:
+    for button in answer[1:]:
+        solve("solve_swingonto", target=base.buttons_grid[button])
+
+
+def _route(solve: _Solver, base: Any, answer: list[Any]) -> None:
+    route, turns = answer
+    for target, turn in zip(route[1:], turns, strict=True):
+        button = base.buttons_grid[base.route_button_indices[target]]
+        solve("solve_swingonto_withDirection", target=button, radius=0.2, direction=turn)
+
+
+_SOLVE = {
+    "VideoUnmask": _unmask,
+    "VideoUnmaskSwap": _unmask,
+    "VideoRepick": _repick,
+    "VideoPlaceButton": _place,
+    "VideoPlaceOrder": _place,
+    "MoveCube": _move,
+    "InsertPeg": _insert,
+    "PatternLock": _pattern,
+    "RouteStick": _route,
+}
