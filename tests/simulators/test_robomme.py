@@ -22,6 +22,7 @@ from robomme_interference_data.errors import (
     SimulatorCrashError,
     UnknownNameError,
 )
+from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators import Status, make_simulator
 from robomme_interference_data.simulators.registry import simulator_versions
@@ -166,8 +167,9 @@ def test_unknown_robomme_names(simulator: RoboMMESimulator) -> None:
     ):
         with pytest.raises(UnknownNameError, match=message):
             simulator.reset(episode)
-    with pytest.raises(UnknownNameError, match="no built-in policy"):
-        simulator.act("oracle")
+    simulator.reset("MoveCube/test/0")
+    with pytest.raises(UnknownNameError, match="expert"):
+        simulator.act("expert")
     with pytest.raises(InvalidOptionError, match=r"wrist camera .* \(512, 512, 3\) uint8"):
         simulator.reset(f"MoveCube/test/{LARGE_WRIST}")
     assert len(simulator.reset("MoveCube/test/0")[0]) == 2
@@ -351,3 +353,63 @@ def test_versions(robomme_python: Path, tmp_path: Path, monkeypatch: pytest.Monk
     assert installed_too == {**found, "robomme": "0.2+ab12"}
     assert simulator_versions("tabletop") == {"tabletop": str(SUITE_VERSION)}
     assert simulator_versions("support.worlds:World") == {}
+
+
+# --- answers -------------------------------------------------------------------------------------
+
+
+def act_out(simulator: RoboMMESimulator, policy: str, known: dict[int, str] | None = None) -> Status:
+    status = Status.ONGOING
+    while status is Status.ONGOING:
+        _, status = simulator.step(simulator.act(policy, known), observe=False)
+    return status
+
+
+def test_answers_are_acted_out_by_robommes_solvers(simulator: RoboMMESimulator) -> None:
+    # The stand-in hides a red cube under container 1 of three, and shows it for two frames. Its
+    # planner plans no screw motion, and reaches containers 0 and 1 by searching.
+    lesson, _, _ = simulator.reset("VideoUnmask/test/3")
+    text = "shows the red cube at place 1"
+    assert lesson.evidence == (EvidenceSpan(0, text, 0, 2),)
+    assert lesson.scene is not None
+    scene = RoboMMESimulator.scene("VideoUnmask", 0, "easy", lesson.scene)
+    assert scene is not None and scene.answers == [(0,), (1,), (2,)]
+    assert scene.pixels(scene.option(1).marks) == ((120, 110),)
+    # The solver searches a way with joint targets 1 and an open gripper, then closes it.
+    assert simulator.act("oracle").tolist() == [1.0] * 8
+    assert act_out(simulator, "oracle") is Status.SUCCESS
+    for policy, known in (("guess", None), ("recall", None), ("recall", {0: text})):
+        simulator.reset("VideoUnmask/test/3")
+        answer = scene.recalled(known or {}, 640_003)
+        if answer == (2,):
+            with pytest.raises(SimulatorCrashError, match="no motion found"):
+                simulator.act(policy, known)
+        else:
+            expected = Status.SUCCESS if answer == (1,) else Status.FAIL
+            assert act_out(simulator, policy, known) is expected
+    with pytest.raises(SimulatorCrashError, match="no episode is running"):
+        simulator.act("oracle")
+
+
+def test_a_solver_without_a_plan_is_an_error(simulator: RoboMMESimulator) -> None:
+    seeds = {index: 640_000 + index for index in range(0, 39)}
+    lesson, _, _ = simulator.reset("VideoUnmask/test/3")
+    scene = RoboMMESimulator.scene("VideoUnmask", 0, "easy", lesson.scene)
+    assert scene is not None
+    index = next(one for one, seed in seeds.items() if scene.recalled({}, seed) == (2,))
+    simulator.reset(f"VideoUnmask/test/{index}")
+    pid = simulator.pid
+    with pytest.raises(SimulatorCrashError, match="NoPlanError: no motion found in 6 attempts"):
+        simulator.act("guess")
+    simulator.reset("VideoUnmask/test/3")
+    assert act_out(simulator, "oracle") is Status.SUCCESS
+    assert simulator.pid == pid
+
+
+def test_another_robomme_without_known_attributes(simulator: RoboMMESimulator) -> None:
+    # Episodes still play; only what needs the answer is an error.
+    for episode in ("VideoUnmask/test/49", "MoveCube/test/3"):
+        lesson, _, _ = simulator.reset(episode)
+        assert (lesson.evidence, lesson.scene) == (None, None)
+        with pytest.raises(SimulatorCrashError, match="hides its answers: AttributeError"):
+            simulator.act("oracle")

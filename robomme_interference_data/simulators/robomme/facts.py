@@ -25,15 +25,19 @@ class LessonLog:
     """Logs what RoboMME does at each step of a demonstration; made before the reset."""
 
     def __init__(self, env: Any, family: str) -> None:
-        base = env.unwrapped
+        base = getattr(env, "unwrapped", env)
         self._rows: dict[int, list[int]] = {}
+        self._error: AttributeError | None = None
         execute, containers = base.step, family in ("VideoUnmask", "VideoUnmaskSwap")
 
         def step(action: Any) -> Any:
             result = execute(action)
-            revealed = containers and abs(float(base.spawned_bins[0].pose.p[0][0])) > _GONE
-            number = int(base.elapsed_steps[0])
-            self._rows[number] = [number, int(base.current_task_index), int(revealed)]
+            try:
+                revealed = containers and abs(float(base.spawned_bins[0].pose.p[0][0])) > _GONE
+                number = int(base.elapsed_steps[0])
+                self._rows[number] = [number, int(base.current_task_index), int(revealed)]
+            except AttributeError as error:  # another version of RoboMME
+                self._error = error
             return result
 
         base.step = step
@@ -45,6 +49,8 @@ class LessonLog:
         """
         import numpy as np
 
+        if self._error is not None:
+            raise self._error
         recorded = _demonstration(env)[4]["elapsed_steps"]
         return [np.array(self._rows[int(number)], np.int64) for number in recorded]
 

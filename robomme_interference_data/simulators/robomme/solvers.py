@@ -58,7 +58,9 @@ class Script:
         self._done = False
 
     def act(self, answer: Any) -> list[float]:
-        """Return the next action for an answer, 8 numbers; the last one again when it is done.
+        """Return the next action for an answer, 8 numbers.
+
+        It is the last one again until it was executed, and when all is done.
 
         Raises:
             NoPlanError: The planners find no motion.
@@ -66,8 +68,11 @@ class Script:
         if self._thread is None:
             self._thread = threading.Thread(target=self._solve, args=(answer,), daemon=True)
             self._thread.start()
-        elif not self._done:
+        elif self._result is not None and not self._done:
             self._results.put(self._result)
+        elif self._last is not None:
+            return self._last
+        self._result = None
         if not self._done:
             made = self._actions.get()
             if isinstance(made, Exception):

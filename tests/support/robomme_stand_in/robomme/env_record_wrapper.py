@@ -7,6 +7,7 @@ go on for one step more than it is told.
 
 import os
 import time
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -35,6 +36,8 @@ class Environment(BaseEnv):
         if index == 44:
             sizes["hand_camera"] = 512
         super().__init__({"base_camera": 256, **sizes})
+        if family == "VideoUnmask" and index != 49:
+            self._hide_a_cube()
         open_environments.add(self)
 
     def reset(self):
@@ -57,6 +60,12 @@ class Environment(BaseEnv):
         body = any(link.get("name") == "camera_link" for link in self.description.iter("link"))
         sway = 0 if body else 0.0007
         joints = [np.float32(t + sway + np.arange(7) / 8) for t in frames]
+        if hasattr(self, "spawned_bins"):  # the real one steps itself while it demonstrates
+            for t in frames:
+                self.spawned_bins[0].pose.p[0][0] = 10 if t < 2 else 0
+                self.current_task_index = int(t == frames[-1])
+                self.step([0.0] * 8)
+            self.steps = 0
         return self._lists(frames, joints, [t / 100 for t in frames]), self._info("ongoing")
 
     def step(self, action):
@@ -64,6 +73,8 @@ class Environment(BaseEnv):
         if self.index == 41:
             time.sleep(60)
         self.steps += 1
+        if hasattr(self, "elapsed_steps"):
+            self.elapsed_steps[0] += 1
         if self.index == 43 and self.steps == 2:
             info = {"status": "error", "error_message": "caught: no such joint"}
             return None, 0.0, True, False, info
@@ -73,12 +84,31 @@ class Environment(BaseEnv):
         status = "ongoing"
         if self.steps == 3:
             status = ENDS.get(self.index, status)
+            if self.family == "VideoUnmask":
+                status = "success" if action[0] == 1 else "fail"
         if self.steps > self.max_steps:
             status = "timeout"
         lists = self._lists([self.steps % 256], [np.float32(action[:7])], [(action[-1] + 1) / 50])
         if self.index == 48:
             lists["joint_state_list"][0][:2] = [*self.drawn.values()]
         return lists, 0.0, status != "ongoing", False, self._info(status)
+
+    def _hide_a_cube(self):
+        """Hide a cube under container 1 of 3; the last task is what the rollout has to do."""
+        self.elapsed_steps, self.current_task_index = [0], 0
+        self.spawned_bins = [Thing(number) for number in range(3)]
+        self.selected_bins, self.color_names = [self.spawned_bins[1]], ["red", "green"]
+        names = ("static", "pick up the container that hides the red cube")
+        self.task_list = [{"name": name, "demonstration": name == "static"} for name in names]
+        self.agent = SimpleNamespace(robot=SimpleNamespace(pose="pose"))
+        # Pixel (y, x) = (100 + 10 y, 100 + 10 x) of a thing at (x, y).
+        intrinsic = np.array([[[10.0, 0, 100], [0, 10, 100], [0, 0, 1]]])
+        extrinsic = np.array([[[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]])
+        sensor = Sensor(256)
+        sensor.get_params = lambda: {"intrinsic_cv": intrinsic, "extrinsic_cv": extrinsic}
+        self._sensors["base_camera"] = sensor
+        shown = range(1, self.index % 40 + 3 + 1)
+        self.demonstration_data = (None, None, None, None, {"elapsed_steps": [*shown]})
 
     def close(self):
         open_environments.remove(self)
@@ -114,6 +144,16 @@ class Environment(BaseEnv):
             "simple_subgoal_online": f"pick up the cube, step {step}",
             "grounded_subgoal_online": f"pick up the cube at <{self.place}, 200>, step {step}",
         }
+
+
+class Sensor(int):
+    pass
+
+
+class Thing:
+    def __init__(self, number):
+        self.number = number
+        self.pose = SimpleNamespace(p=np.array([[float(number), 2.0 * number, 0.0]]))
 
 
 class BenchmarkEnvBuilder:
