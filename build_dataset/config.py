@@ -36,6 +36,10 @@ if TYPE_CHECKING:
 _CPUS = os.cpu_count() or 1
 
 
+NO_CAMERAS = ("none",)
+"""Setting of `cameras` for a dataset without images: simulators then render nothing."""
+
+
 @dataclass(frozen=True)
 class BuildConfig(WorkersConfig):
     """Settings of a build of one dataset."""
@@ -60,7 +64,9 @@ class BuildConfig(WorkersConfig):
         group="Episodes",
     )
     cameras: tuple[str, ...] = setting(
-        (), help="Cameras to store, such as front; default: all.", group="Encoding"
+        (),
+        help="Cameras to store, such as front, or none for states alone; default: all.",
+        group="Encoding",
     )
     codec: str = setting(
         "av1-lossless",
@@ -149,7 +155,7 @@ class BuildPlan:
         kind: Name of the dataset in a buffer set, such as `demonstrations`.
         sources: The sources.
         tasks: The episodes to store: index of the source, and episode.
-        cameras: Cameras to store; None for all.
+        cameras: Cameras to store, possibly none of them; None for all.
         codec: Name of the video settings.
         version: Version of the dataset.
         time_limit_s: Limit in seconds for one episode; None for the sources' defaults.
@@ -198,7 +204,7 @@ def plan_new(config: NewConfig, plan: PlanConfig) -> "tuple[Dataset, BuildPlan]"
             "Choose another `buffer_set`, or remove the folder first.",
         )
     check_needs(in_order(plan.conditions), in_folder(config.buffer_set))
-    cameras = config.cameras or base.cameras
+    cameras = config.cameras or base.cameras or NO_CAMERAS
     units = plan_build(DISTRACTORS, dataclasses.replace(config, cameras=cameras))
     queries = (record.episode_id for record in base.records())
     _check_plans(queries, {DISTRACTORS: units}, config.buffer_set, plan)
@@ -285,7 +291,7 @@ def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
         kind=kind,
         sources=sources,
         tasks=tasks,
-        cameras=tuple(sorted(config.cameras)) or None,
+        cameras=() if config.cameras == NO_CAMERAS else tuple(sorted(config.cameras)) or None,
         codec=config.codec,
         version=config.version,
         time_limit_s=config.time_limit_s,

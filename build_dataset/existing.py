@@ -38,7 +38,12 @@ def open_existing(out: Path, plan: BuildPlan) -> ExistingDataset | None:
     dataset = Dataset(LocalFiles(out))
     identity = dataset.identity
     existing = (identity.kind, identity.version, identity.codec, identity.cameras)
-    planned = (plan.kind, plan.version, plan.codec, plan.cameras or identity.cameras)
+    planned = (
+        plan.kind,
+        plan.version,
+        plan.codec,
+        identity.cameras if plan.cameras is None else plan.cameras,
+    )
     if existing != planned:
         raise BuildError(
             f"{out} exists with other settings: kind, version, codec and cameras are {existing}, "

@@ -55,10 +55,11 @@ def select_demonstration(frames: Iterable[Frame]) -> Iterator[Frame]:
 
 def select_unit(frames: Iterable[Frame], unit: Unit) -> Iterator[Frame]:
     """Yield the frames of a unit."""
-    count, most = 0, (unit.frames - 1) * unit.stride + 1
+    count, most, actions = 0, (unit.frames - 1) * unit.stride + 1, True
     for frame in frames:
-        if count % unit.stride == 0:
-            yield frame
+        actions = actions and frame.action is not None
+        if count % unit.stride == 0:  # some simulators know the actions of live frames alone
+            yield frame if actions else replace(frame, action=None)
         count += 1
         if count == most:
             return

@@ -58,8 +58,9 @@ class SimulatorSource(Source):
 
     @override
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
-        simulator = self._open(choose_cameras(cameras))
-        lesson, first, info = simulator.reset(str(episode.id))
+        chosen = choose_cameras(cameras)
+        simulator = self._open(chosen)
+        lesson, first, info = simulator.reset(str(episode.id), demonstration=bool(chosen))
         act = (lambda: simulator.act("oracle")) if self.whole else None
         frames = _play(simulator, lesson, first, act)
         known = info.goals, info.seed, info.difficulty, info.simulator

@@ -358,7 +358,9 @@ def test_versions(robomme_python: Path, tmp_path: Path, monkeypatch: pytest.Monk
 # --- answers -------------------------------------------------------------------------------------
 
 
-def act_out(simulator: RoboMMESimulator, policy: str, known: dict[int, str] | None = None) -> Status:
+def act_out(
+    simulator: RoboMMESimulator, policy: str, known: dict[int, str] | None = None
+) -> Status:
     status = Status.ONGOING
     while status is Status.ONGOING:
         _, status = simulator.step(simulator.act(policy, known), observe=False)
