@@ -273,13 +273,6 @@ def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
         )
         for text in config.source
     )
-    for text, source in zip(config.source, sources, strict=True):
-        if kind in (*UNITS, EXECUTIONS) and not source.whole:
-            raise InvalidOptionError(
-                f"{text} plays demonstrations only, and {kind} need whole episodes",
-                f"Build the {kind} from RoboMME's recordings.",
-                f"build {kind} BUFFER_SET --source robomme-h5:FOLDER",
-            )
     split = config.split or ("train" if kind in UNITS else None)
     tasks = list_episodes(sources, families=config.families, split=split, numbers=numbers)
     unmarked = next((one for _, one in tasks if not one.marked), None)

@@ -55,11 +55,10 @@ def select_demonstration(frames: Iterable[Frame]) -> Iterator[Frame]:
 
 def select_unit(frames: Iterable[Frame], unit: Unit) -> Iterator[Frame]:
     """Yield the frames of a unit."""
-    count, most, actions = 0, (unit.frames - 1) * unit.stride + 1, True
+    count, most = 0, (unit.frames - 1) * unit.stride + 1
     for frame in frames:
-        actions = actions and frame.action is not None
-        if count % unit.stride == 0:  # some simulators know the actions of live frames alone
-            yield frame if actions else replace(frame, action=None)
+        if count % unit.stride == 0:
+            yield frame
         count += 1
         if count == most:
             return
@@ -108,6 +107,16 @@ def select_frames(kind: str, recording: Recording) -> Iterator[Frame]:
     trained and tested on it; an observation after the last action is left out.
     """
     frames = FRAME_SELECTORS[kind](recording.frames)
-    if kind != EXECUTIONS or not recording.action_first:
+    if kind != EXECUTIONS:
+        return _with_actions_of_all(frames)
+    if not recording.action_first:
         return frames
     return (replace(frame, action=after.action) for frame, after in pairwise(frames))
+
+
+def _with_actions_of_all(frames: Iterable[Frame]) -> Iterator[Frame]:
+    """Drop actions if the first frame has none: RoboMME tells those of live frames alone."""
+    known: bool | None = None
+    for frame in frames:
+        known = frame.action is not None if known is None else known
+        yield frame if known else replace(frame, action=None)

@@ -93,10 +93,10 @@ class Recording:
             releases the files.
         evidence: Which frames of the demonstration show the hidden answer, part by part; None
             if unknown.
-        scene: `Demonstration.scene`.
         robot: The robot.
         action_first: Whether the action of a frame was executed before its observation, instead of
             after it.
+        scene: What the scene allows and hides, as in `Demonstration.scene`.
     """
 
     goals: tuple[str, ...]
@@ -106,9 +106,9 @@ class Recording:
     exact: bool
     frames: Generator[Frame]
     evidence: tuple[EvidenceSpan, ...] | None = None
-    scene: str | None = None
     robot: Robot = Robot()
     action_first: bool = False
+    scene: str | None = None
 
     def __post_init__(self) -> None:
         if not self.goals or not all(goal.strip() for goal in self.goals):
@@ -130,13 +130,10 @@ class Source(Protocol):
         provenance: What a dataset built from the source records about it, including its `kind`;
             the same on every machine (no local paths), e.g. a Hub repository with its commit.
         time_limit_s: Default limit in seconds for reading and storing one episode.
-        whole: Whether episodes continue after the first live observation, as units and executions
-            require.
     """
 
     provenance: dict[str, Any]
     time_limit_s: float = 1800.0
-    whole: bool = True
 
     def episodes(self) -> list[SourceEpisode]:
         """List all episodes, in the canonical order of their ids.

@@ -1,11 +1,10 @@
 """Sources that are simulators: they play each episode while it is read."""
 
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from dataclasses import replace
 from typing import Any, override
 
-import numpy as np
-
+from robomme_interference_data.errors import SimulatorCrashError
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.shifts import SHIFTS
 from robomme_interference_data.simulators.base import (
@@ -22,20 +21,20 @@ from .base import Frame, Recording, Source, SourceEpisode
 class SimulatorSource(Source):
     """The episodes of the nine families that have demonstrations.
 
-    An episode is the demonstration, the first live observation and, where the simulator has an
-    oracle, what the oracle does until the episode ends. RoboMME has none, and does not record the
-    actions of its demonstrations. `robomme_python` is its interpreter.
+    An episode is the demonstration, the first live observation, and what the oracle does until the
+    episode ends. RoboMME does not return the actions of its
+    demonstrations. `robomme_python` is its interpreter.
     """
 
     def __init__(self, name: str, robomme_python: str | None = None):
         self.name = name
         self._class = simulator_class(name)
-        self.whole = self._class.scripted
         self.time_limit_s = self._class.episode_s
         # Another version of the suite has other episodes.
         version = self._class.suite_version
         self.provenance = {"kind": name, **({} if version is None else {"suite_version": version})}
-        self._options = {"python": robomme_python} if "python" in self._class.settings else {}
+        options = {"python": robomme_python, "subgoals": False}
+        self._options = {key: options[key] for key in options if key in self._class.settings}
         self._simulator: Simulator | None = None
         self._cameras: tuple[str, ...] = ()
 
@@ -61,10 +60,9 @@ class SimulatorSource(Source):
         chosen = choose_cameras(cameras)
         simulator = self._open(chosen)
         lesson, first, info = simulator.reset(str(episode.id), demonstration=bool(chosen))
-        act = (lambda: simulator.act("oracle")) if self.whole else None
-        frames = _play(simulator, lesson, first, act)
+        frames = _play(simulator, lesson, first)
         known = info.goals, info.seed, info.difficulty, info.simulator
-        return Recording(*known, True, frames, lesson.evidence, lesson.scene)
+        return Recording(*known, True, frames, lesson.evidence, scene=lesson.scene)
 
     @override
     def close(self) -> None:
@@ -92,19 +90,18 @@ class ShiftedSource(SimulatorSource):
         return Recording(info.goals, info.seed, info.difficulty, info.simulator, True, frames)
 
 
-def _play(
-    simulator: Simulator, lesson: Demonstration, first: Observation, act: Callable[[], Any] | None
-) -> Generator[Frame]:
+def _play(simulator: Simulator, lesson: Demonstration, first: Observation) -> Generator[Frame]:
     recorded = len(lesson.actions) == len(lesson)
     for index in range(len(lesson)):
         images = {camera: frames[index] for camera, frames in lesson.images.items()}
         action = lesson.actions[index] if recorded else None
         yield Frame(images, lesson.states[index], action, True)
-    if act is None:
-        yield Frame(first.images, first.state, None, False)
-        return
     seen, status = first, Status.ONGOING
     while status is Status.ONGOING:
-        chosen = np.asarray(act(), np.float32)
+        try:
+            chosen = simulator.act("oracle")
+        except SimulatorCrashError:  # no plan; a demonstration ends with this frame in any case
+            yield Frame(seen.images, seen.state, None, False)
+            raise
         yield Frame(seen.images, seen.state, chosen, False)
         seen, status = simulator.step(chosen)

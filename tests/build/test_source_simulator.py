@@ -7,7 +7,10 @@ import pytest
 from support.simulator_doubles import Double
 
 from robomme_interference_data.build_dataset.config import list_episodes
-from robomme_interference_data.build_dataset.frame_selection import select_demonstration
+from robomme_interference_data.build_dataset.frame_selection import (
+    select_demonstration,
+    select_frames,
+)
 from robomme_interference_data.build_dataset.sources import Recording, open_source, simulator
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import InvalidOptionError
@@ -37,7 +40,7 @@ def read(source: Any, cameras: tuple[str, ...] | None = None) -> Recording:
 def test_an_episode_of_the_tabletop(made: list[Double]) -> None:
     source = open_source("tabletop")
     assert source.provenance == {"kind": "tabletop", "suite_version": SUITE_VERSION}
-    assert (source.time_limit_s, source.whole) == (300, True)  # seconds
+    assert source.time_limit_s == 300  # seconds
     recording = read(source)
     told = (recording.seed, recording.difficulty, recording.simulator, recording.exact)
     assert (recording.goals, told) == (("goal", "other"), (9, "easy", "tabletop", True))
@@ -58,11 +61,13 @@ def test_an_episode_of_the_tabletop(made: list[Double]) -> None:
 def test_robomme_provides_demonstrations_without_actions(made: list[Double]) -> None:
     source = open_source("robomme", robomme_python="/opt/python")
     assert source.provenance == {"kind": "robomme"}
-    assert (source.time_limit_s, source.whole) == (1800, False)
+    assert source.time_limit_s == 1800
     frames = list(read(source).frames)
-    assert [frame.is_demonstration for frame in frames] == [True] * 5 + [False]
-    assert [frame.action for frame in frames] == [None] * 6
-    assert made[0].options == {"python": "/opt/python"}
+    assert [frame.is_demonstration for frame in frames] == [True] * 5 + [False] * 3
+    assert [frame.action is None for frame in frames] == [True] * 5 + [False] * 3
+    lesson = list(select_frames(DEMONSTRATIONS, read(source)))
+    assert [frame.action for frame in lesson] == [None] * 6
+    assert made[0].options == {"python": "/opt/python", "subgoals": False}
 
 
 def test_the_tabletop_under_shifts(made: list[Double]) -> None:

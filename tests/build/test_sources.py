@@ -69,7 +69,7 @@ def test_episodes_and_frames(source: Source) -> None:
         assert recording.exact is True
         check_recording(recording, EPISODES[str(episode.id)])
     assert list(source.provenance) == ["kind"]  # no local paths
-    assert (source.time_limit_s, source.whole) == (1800, True)
+    assert source.time_limit_s == 1800
 
 
 def test_only_the_cameras_asked_for_are_read(source: Source) -> None:
