@@ -15,7 +15,6 @@ from robomme_interference_data.schema.conditions import NO_HISTORY
 
 from .policy import Policy
 from .registry import (
-    BUILTINS,
     POLICIES,
     check_workers,
     make_policy,
@@ -60,7 +59,7 @@ def describe_policy(
         metadata["server"] = ", ".join(one["server"] for one in every)
     if policy.privileged:
         metadata["privileged"] = True
-        if text.partition(":")[0] not in BUILTINS:
+        if text.partition(":")[0] == "python":
             logger.warning(
                 "The policy %s is privileged: it gets the simulator under every condition, also "
                 "under %s; run.json records this.",

@@ -28,6 +28,8 @@ class RolloutInfo:
             None for all others.
         evidence: Which history frames show a part of the hidden answer, for privileged policies;
             None where that is unknown, and for all others.
+        answer: For the policy `answers`: the number of the answer to carry out, in `Scene.answers`;
+            None without a choice, and for all other policies.
     """
 
     goal: str
@@ -35,6 +37,7 @@ class RolloutInfo:
     seed: int
     simulator: Simulator | None = None
     evidence: tuple[Evidence, ...] | None = None
+    answer: int | None = None
 
 
 class Policy(ABC):

@@ -55,6 +55,12 @@ POLICIES = Registry(
         "guess": _builtin("guess", "Privileged", name="guess"),
         "follow-subgoals": _builtin("follow-subgoals", "FollowSubgoals"),
         "noop": _builtin("noop", "Noop"),
+        "answers": Kind(
+            "answers:folder of a run of questions, or answers:file.csv",
+            f"{__package__}.answers:ActOutAnswers",
+            r"(?P<path>.+)",
+            no_effect=("path",),
+        ),
         "websocket": Kind(
             "websocket://host:port, with commas between several servers, each once, or websocket "
             'with serve="COMMAND with {port}"',

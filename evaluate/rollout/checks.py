@@ -11,6 +11,7 @@ from robomme_interference_data.evaluate.policies.registry import BUILTINS, POLIC
 from robomme_interference_data.evaluate.run.config import (
     RunConfig,
     check_shared,
+    check_unused,
     nothing_to_retrieve,
     with_retrieval,
 )
@@ -45,10 +46,10 @@ def default_system(config: RunConfig) -> str:
     """
     spec = POLICIES.parse(config.policy)
     # Folders, revisions and served models have the same names for different checkpoints.
-    learned = config.policy if spec.kind in ("websocket", "lerobot") else config.subgoals
+    learned = config.policy if spec.kind in ("websocket", "lerobot", "answers") else config.subgoals
     if learned not in (None, ORACLE):
         raise InvalidOptionError(
-            f"the rows of {learned} need a name: its text does not identify a checkpoint",
+            f"the rows of {learned} need a name: its text does not identify it",
             "Set `system`, such as perceptual-framesamp-modul, or a name of your own: see "
             "docs/how-to/paper-systems.md.",
         )
@@ -85,6 +86,8 @@ def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> 
             else "Set another simulator, such as tabletop, or another policy.",
         )
     retrieval = [] if config.retrieval is None else [config.retrieval_camera]
+    if POLICIES.parse(config.policy).kind == "answers":
+        check_unused(config, ["retrieval"], config.policy, "Set it for the questions instead.")
     for camera in (*policy.history_cameras, *retrieval):
         buffer_set.datasets[DEMONSTRATIONS].shape(camera)  # raises for an unknown camera
     if config.videos:

@@ -12,6 +12,7 @@ from robomme_interference_data.errors import (
     PolicyServerError,
     SimulatorCrashError,
 )
+from robomme_interference_data.evaluate.policies.answers import Answers, read_answers
 from robomme_interference_data.evaluate.policies.identity import (
     check_memory_kind,
     check_metadata,
@@ -49,6 +50,7 @@ class Rollouts(RunKind[RunConfig]):
         policy = with_server(config.policy, config.serve)
         config = dataclasses.replace(config, policy=policy)
         self.system = config.system or default_system(config)
+        self._answers: Answers | None = None
         # The commit of a model is the same for all workers.
         policy, subgoals = POLICIES.pin(policy), pin_subgoals(config.subgoals)
         super().__init__(dataclasses.replace(config, policy=policy, subgoals=subgoals), buffer_set)
@@ -79,10 +81,14 @@ class Rollouts(RunKind[RunConfig]):
     def check(self, plan: Plan, items: Sequence[WorkItem]) -> None:
         """Check every rollout."""
         check_plan(self.config, self._system, self.buffer_set, plan, items)
+        spec = POLICIES.parse(self.config.policy)
+        if spec.kind == "answers":
+            path = Path(spec.target)
+            self._answers = read_answers(self.config, path, self.buffer_set, items)
 
     def task(self, run: Run[RunConfig]) -> RolloutTask:
         """Return the function that runs rollouts."""
-        return RolloutTask(run)
+        return RolloutTask(run, self._answers)
 
     def needs_session(self, todo: Sequence[WorkItem]) -> bool:
         """Whether there is work, or a server that only workers start must be identified."""

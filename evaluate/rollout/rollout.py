@@ -70,8 +70,9 @@ def run_rollout(
     history: HistoryReader | None = None,
     clip: "Clip | None" = None,
     worker: Worker | None = None,
+    answer: int | None = None,
 ) -> Rollout:
-    """Run one rollout and return its row.
+    """Run one rollout and return its row; `answer` is what the policy `answers` carries out.
 
     The policy never sees the simulator's own playback: its history comes from the dataset.
     """
@@ -106,7 +107,8 @@ def run_rollout(
                 chunks = stack.enter_context(_decode(reader, buffer, given, policy, config))
             privileged: tuple[Any, ...] = ()
             if policy.privileged:
-                privileged = simulator, buffer.evidence and among(buffer.evidence, given)
+                evidence = buffer.evidence and among(buffer.evidence, given)
+                privileged = simulator, evidence, answer
             rollout_info = RolloutInfo(info.goal, len(given), config.model_seed, *privileged)
             policy.reset(rollout_info)
             for chunk in chunks:

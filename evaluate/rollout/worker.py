@@ -8,11 +8,13 @@ from typing import Any, cast
 
 from robomme_interference_data.constants import CAMERA_PREFIX
 from robomme_interference_data.errors import (
+    PolicyError,
     PolicyServerError,
     ServerKeepaliveError,
     WorkerRetiredError,
     first_line,
 )
+from robomme_interference_data.evaluate.policies.answers import Answers
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.run.config import RunConfig
@@ -48,10 +50,14 @@ class Opening:
 
 
 class RolloutTask(RunTask[RunConfig]):
-    """Runs rollouts; makes policy and simulator at the first one, and again after an error."""
+    """Runs rollouts; makes policy and simulator at the first one, and again after an error.
 
-    def __init__(self, run: Run[RunConfig]):
+    `answers` are those that the policy `answers` carries out; None for all other policies.
+    """
+
+    def __init__(self, run: Run[RunConfig], answers: Answers | None = None):
         super().__init__(run)
+        self._answers = answers
         self._simulator: Simulator | None = None
         self._policy: Policy | None = None
         self._checked = False  # whether the policy's server is the one that the run began with
@@ -125,6 +131,11 @@ class RolloutTask(RunTask[RunConfig]):
         return self._writer
 
     def _roll(self, job: Job, worker: Worker, clip: Any) -> Rollout:
+        if self._answers is not None and job.item not in self._answers:
+            raise PolicyError(
+                f"the question of {job.item} broke: it has no answer",
+                "Resume the run of questions, then this one.",
+            )
         policy = self._open_policy(worker)
         if not self._checked:
             self._check_served(policy, job.metadata)
@@ -141,6 +152,7 @@ class RolloutTask(RunTask[RunConfig]):
             writer=self._open_writer(),
             clip=clip,
             worker=worker,
+            answer=(self._answers or {}).get(job.item),
         )
 
     def describe(self) -> dict[str, str]:

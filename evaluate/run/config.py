@@ -72,8 +72,8 @@ class RunConfig(WorkConfig):
     policy: str = setting(
         group=_POLICY,
         help="replay or recall (both also with :framesamp or :window), oracle, guess, "
-        "follow-subgoals, noop, websocket://HOST:PORT (several with commas), websocket with "
-        "--serve, lerobot:REPO[@REVISION], lerobot:FOLDER or python:module:factory.",
+        "follow-subgoals, noop, answers:FOLDER, websocket://HOST:PORT (several with commas), "
+        "websocket with --serve, lerobot:REPO[@REVISION], lerobot:FOLDER or python:module:factory.",
     )
     buffer_set: str = setting(
         name="-", metavar="BUFFER_SET", help="Folder of the buffer set, or its NAMESPACE/NAME."

@@ -266,20 +266,24 @@ class Simulator(ABC):
         return observation, status
 
     @abstractmethod
-    def act(self, policy: str, known: Mapping[int, str] | None = None) -> NDArray[np.float32]:
+    def act(
+        self, policy: str, known: Mapping[int, str] | None = None, answer: int | None = None
+    ) -> NDArray[np.float32]:
         """Return the next action of a built-in policy.
 
         Args:
             policy: `oracle` uses the hidden answer; `guess` draws an answer from the episode's
-                seed; `recall` draws one that agrees with `known`. Use the same policy throughout
-                an episode.
+                seed; `recall` draws one that agrees with `known`; `answer` uses the one that is
+                given. Use the same policy throughout an episode.
             known: For `recall`, at its first action: known parts of the answer, number to text as
                 in the demonstration's evidence, the most trusted first.
+            answer: For `answer`, at its first action: the number of an answer in `Scene.answers`.
 
         Returns:
             The action, `(8,) float32`, as `step` takes it.
 
         Raises:
+            InvalidOptionError: The scene has no answer of this number.
             UnknownNameError: The simulator has no such policy.
             SimulatorCrashError: No episode is running, or the simulator is closed.
         """

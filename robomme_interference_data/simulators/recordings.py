@@ -41,7 +41,9 @@ class Recordings(Simulator):
         (self.action_size,) = self._executions.features[ACTION]
 
     @override
-    def act(self, policy: str, known: Mapping[int, str] | None = None) -> NDArray[np.float32]:
+    def act(
+        self, policy: str, known: Mapping[int, str] | None = None, answer: int | None = None
+    ) -> NDArray[np.float32]:
         raise UnknownNameError(f"recordings have no policy {policy}")
 
     @override

@@ -9,6 +9,7 @@ import pytest
 from support.families import families
 
 from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, seed_of
@@ -111,6 +112,31 @@ def test_played_as_computed(blind: TabletopSimulator, family: str, index: int) -
         while status is Status.ONGOING:
             _, status = blind.step(blind.act("recall", known), observe=False)
         assert status is expected
+
+
+@pytest.mark.parametrize(
+    "family", ["VideoUnmask", *(pytest.param(one, marks=pytest.mark.slow) for one in FAMILIES)]
+)
+def test_a_given_answer_is_carried_out(blind: TabletopSimulator, family: str) -> None:
+    """The right one succeeds as the oracle does, step by step; the next one fails."""
+    env, ends = blind.env, {}
+    for policy, offset in (("oracle", 0), ("answer", 0), ("answer", 1)):
+        blind.reset(f"{family}/test/0", demonstration=False)
+        answers = env.episode.answers
+        number, steps, status = (answers.index(env.answer) + offset) % len(answers), 0, None
+        while status in (None, Status.ONGOING):
+            _, status = blind.step(blind.act(policy, answer=number), observe=False)
+            steps += 1
+        ends[policy, offset] = steps, status
+    assert ends["answer", 0] == ends["oracle", 0] and ends["oracle", 0][1] is Status.SUCCESS
+    assert ends["answer", 1][1] is Status.FAIL
+
+
+def test_only_answers_of_the_scene_are_carried_out(blind: TabletopSimulator) -> None:
+    blind.reset("MoveCube/test/0", demonstration=False)
+    for number in (None, -1, len(blind.env.episode.answers)):
+        with pytest.raises(InvalidOptionError, match="answer"):
+            blind.act("answer", answer=number)
 
 
 @pytest.mark.parametrize("index", [0, pytest.param(2, marks=pytest.mark.slow)])

@@ -118,7 +118,9 @@ class RoboMMESimulator(Simulator):
         """Return the recorded scene; None if none was recorded. See `Simulator.scene`."""
         return None if recorded is None else read_scene(family, recorded, difficulty)
 
-    def act(self, policy: str, known: Mapping[int, str] | None = None) -> NDArray[np.float32]:
+    def act(
+        self, policy: str, known: Mapping[int, str] | None = None, answer: int | None = None
+    ) -> NDArray[np.float32]:
         """Return the next action of RoboMME's motion planners for an answer; see `Simulator.act`.
 
         Raises:
@@ -130,8 +132,8 @@ class RoboMMESimulator(Simulator):
             raise UnknownNameError.among("built-in policy", policy, self.name, POLICIES)
         if self._solution is None:
             self._solution = self._solve(policy, known or {})
-        answer, _ = self._process.call("act", answer=self._solution[0])
-        return np.array(answer["action"], np.float32)
+        response, _ = self._process.call("act", answer=self._solution[0])
+        return np.array(response["action"], np.float32)
 
     def _solve(self, policy: str, known: Mapping[int, str]) -> tuple[Any]:
         """Return the answer that a policy acts out, alone in a tuple."""

@@ -164,15 +164,20 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
             self.status = self.episode.judge(self.arm, self.answer)
         return done
 
-    def act(self, policy: str, known: Mapping[int, str] | None = None) -> NDArray[np.float32]:
+    def act(
+        self, policy: str, known: Mapping[int, str] | None = None, answer: int | None = None
+    ) -> NDArray[np.float32]:
         """Return the next action of a policy, `(8,) float32`; see `Simulator.act`."""
         if policy not in self._scripts:
-            if policy == "recall":
-                answer = self.episode.recalled(known or {}, self.number)
+            if policy == "answer":
+                answers = self.episode.answers
+                chosen = answers[_index(answer, 0, len(answers), "answer")]
+            elif policy == "recall":
+                chosen = self.episode.recalled(known or {}, self.number)
             else:
-                answer = self.answer if policy == "oracle" else self.guess
+                chosen = self.answer if policy == "oracle" else self.guess
             self.arm.reset()
-            self._scripts[policy] = self.episode.solve(self.arm, answer)
+            self._scripts[policy] = self.episode.solve(self.arm, chosen)
         next(self._scripts[policy], None)  # a finished script holds its last pose
         return self.arm.action.copy()
 

@@ -26,7 +26,7 @@ from .episodes import episode_ids, further_ids, seed_of
 from .families import known_scene, other_answer
 from .family import Family
 
-POLICIES = ("oracle", "guess", "recall")
+POLICIES = ("oracle", "guess", "recall", "answer")
 
 
 class TabletopSimulator(Simulator):
@@ -86,12 +86,14 @@ class TabletopSimulator(Simulator):
         """Return the scene of a seed; see `Simulator.scene`."""
         return known_scene(family, seed, difficulty)
 
-    def act(self, policy: str, known: Mapping[int, str] | None = None) -> NDArray[np.float32]:
-        """Return the next action of `oracle`, `guess` or `recall`; see `Simulator.act`."""
+    def act(
+        self, policy: str, known: Mapping[int, str] | None = None, answer: int | None = None
+    ) -> NDArray[np.float32]:
+        """Return the next action of one of `POLICIES`; see `Simulator.act`."""
         self._running()
         if policy not in POLICIES:
             raise UnknownNameError.among("built-in policy", policy, self.name, POLICIES)
-        return self.env.act(policy, known)
+        return self.env.act(policy, known, answer)
 
     def subgoal(self) -> Subgoal:
         """Return the next subgoal; see `Simulator.subgoal`."""

@@ -1,0 +1,165 @@
+"""The policy `answers`, and the checked answers of a run of questions that it carries out."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pa_csv
+from numpy.typing import NDArray
+
+from robomme_interference_data.data.buffer_set import BufferSet
+from robomme_interference_data.data.questions import Question, digest_questions, read_questions
+from robomme_interference_data.errors import (
+    FormatError,
+    InvalidOptionError,
+    MissingFileError,
+    RunError,
+    first_line,
+)
+from robomme_interference_data.evaluate.run.config import AskConfig, RunConfig
+from robomme_interference_data.evaluate.run.log import is_done, read_run
+from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.schema.codec import arrow_schema, from_table
+from robomme_interference_data.schema.rollouts import Rollout
+from robomme_interference_data.simulators.base import Observation
+from robomme_interference_data.storage.files import sha256_file
+
+from .builtin import Noop, Privileged
+from .policy import RolloutInfo
+
+Answers = Mapping[WorkItem, int | None]
+"""Number of the chosen option's answer in `Scene.answers`; None where no option was chosen."""
+
+_ASK = "Give the folder of a run of questions (ask), or a CSV file of its rows."
+
+
+class ActOutAnswers(Privileged):
+    """`answers`: the simulator's script carries out what a run of questions answered.
+
+    Without a choice it holds the first pose, as `noop` does: that never succeeds.
+
+    Args:
+        path: Folder of a run of questions, or a CSV file of its rows. Workers do not read it.
+    """
+
+    def __init__(self, path: str):
+        super().__init__("answers")
+        self._path = Path(path)
+
+    def reset(self, info: RolloutInfo) -> None:
+        """Keep the simulator and the answer."""
+        super().reset(info)
+        self._answer = info.answer
+
+    def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
+        """Return the script's next action, `(1, 8) float32`; see `Privileged.act`."""
+        if self._answer is None:
+            return Noop().act(observation, goal)
+        return self._running().act("answer", answer=self._answer)[None]
+
+    def metadata(self) -> dict[str, Any]:
+        """Return its name, and the identity of the answers."""
+        return {"policy": self.name, "answers": answers_identity(self._path)}
+
+
+def answers_identity(path: Path) -> dict[str, Any]:
+    """Return what identifies answers: a run's own identity, or the SHA-256 of a CSV file."""
+    if not path.is_dir():
+        if not path.is_file():
+            raise MissingFileError(f"there are no answers in {path}", _ASK)
+        return {"sha256": sha256_file(path)}
+    header, _ = read_run(path)
+    _check_kind(path, {header.identity.get("simulator")})
+    return header.identity
+
+
+def read_answers(
+    config: RunConfig, path: Path, buffer_set: BufferSet, items: Iterable[WorkItem]
+) -> Answers:
+    """Read the answers of planned rollouts; those whose question broke are left out.
+
+    Args:
+        config: Settings of the rollouts.
+        path: Folder of a run of questions, or a CSV file of its rows.
+        buffer_set: The buffer set of the rollouts.
+        items: The rollouts.
+
+    Raises:
+        RunError, MissingFileError: `path` holds no answers.
+        FormatError: The rows are damaged, or answer other questions.
+        InvalidOptionError: A question was not asked, or the settings differ from the answers'.
+    """
+    questions, stated = read_questions(buffer_set), None
+    if path.is_dir():
+        header, rows = read_run(path)
+        stated = header.identity.get("questions")
+    else:
+        rows = _read_csv(path)
+    _check_kind(path, {row.simulator for row in rows.values()})
+    if stated not in (None, digest_questions(questions.values())):
+        raise _other_questions(path, buffer_set)
+    for row in rows.values():
+        if row.revision != buffer_set.revision:
+            raise _other_questions(path, buffer_set)
+        for name in ("shift", "model_seed"):
+            if getattr(row, name) != getattr(config, name):
+                raise InvalidOptionError(
+                    f"the answers in {path} have {name} {getattr(row, name)}, the rollouts "
+                    f"{getattr(config, name)}",
+                    f"Set `{name}` to that of the answers.",
+                )
+    chosen = {}
+    for item in items:
+        if item not in rows:
+            raise InvalidOptionError(
+                f"{path} has no answer for {item}",
+                "Ask these questions first, or leave out the episode or condition.",
+            )
+        if is_done(rows[item]):
+            chosen[item] = chosen_answer(rows[item], questions[item.episode])
+    return chosen
+
+
+def chosen_answer(row: Rollout, question: Question) -> int | None:
+    """Return the number of the answer that a row chose, or None if it chose no option.
+
+    Raises:
+        FormatError: The row does not answer this question.
+    """
+    right = question.letters[question.right]
+    letter = row.answer
+    if row.success is not (letter == right) or letter not in (None, *question.letters):
+        raise FormatError(
+            f"the row of {WorkItem.of(row)}, {row.status} with the answer {letter}, does not "
+            f"answer its question, whose options are {question.letters} and {right} is right",
+            "Ask the questions of this buffer set again.",
+        )
+    return None if letter is None else question.answers[question.letters.index(letter)]
+
+
+def _read_csv(path: Path) -> dict[WorkItem, Rollout]:
+    options = pa_csv.ConvertOptions(column_types=arrow_schema(Rollout), strings_can_be_null=True)
+    try:
+        table = pa_csv.read_csv(path, convert_options=options)
+        if len({*table.column_names}) == len(table.column_names):
+            rows = [*from_table(Rollout, table, path)]
+            found = {WorkItem.of(row): row for row in rows}
+            if len(found) == len(rows):
+                return found
+    except pa.ArrowInvalid as error:
+        raise FormatError.damaged(path, first_line(error)) from None
+    raise FormatError.damaged(path, "a question has two answers, or a column occurs twice")
+
+
+def _check_kind(path: Path, simulators: set[Any]) -> None:
+    if simulators - {AskConfig.simulator}:
+        raise RunError(f"{path} holds rollouts, not answers to questions", _ASK)
+
+
+def _other_questions(path: Path, buffer_set: BufferSet) -> FormatError:
+    return FormatError(
+        f"{path} answers other questions than those of {buffer_set.location}",
+        "Ask the questions of this buffer set.",
+    )

@@ -1,0 +1,196 @@
+"""The policy `answers`: rollouts carry out what a run of questions answered."""
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support import worlds
+from support.asking import ask, questions
+from support.runs import header
+from support.tabletop import TABLETOP, copy_tabletop
+
+from robomme_interference_data.data.questions import read_questions
+from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.evaluate import RunConfig, RunResult, run_evaluation
+from robomme_interference_data.evaluate.policies.answers import chosen_answer
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.runtime.executor import Serial
+from robomme_interference_data.schema.rollouts import Status
+
+FEW: dict[str, Any] = {"families": ("MoveCube", "PatternLock")}
+LOCK = EpisodeId("PatternLock", "test", 0)
+
+
+@pytest.fixture(autouse=True)
+def world(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(worlds.BUFFER_SET, str(TABLETOP))
+
+
+@pytest.fixture
+def right(tmp_path: Path) -> Path:
+    """A run whose answers are all right."""
+    return ask(tmp_path / "right", sampling="full", conditions=("k0", "k1"), **FEW).folder
+
+
+def act_out(out: Path, answers: Path, **changes: Any) -> RunResult:
+    usual: dict[str, Any] = {
+        **{"policy": f"answers:{answers}", "buffer_set": TABLETOP, "system": "acted"},
+        **{"simulator": "support.worlds:Scripted", "conditions": ("k0",), **FEW},
+    }
+    return run_evaluation(RunConfig(out=out, **usual | changes), executor=Serial())
+
+
+def change(run: Path, **changes: Any) -> Path:
+    """Change the rows of PatternLock/test/0 in a run's record."""
+    record = run / "rollouts.jsonl"
+    rows = [json.loads(line) for line in record.read_text().splitlines()]
+    for row in rows:
+        if (row["family"], row["episode"]) == (LOCK.family, LOCK.index):
+            row.update(changes)
+    record.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return run
+
+
+def wrong_letter() -> str:
+    question = questions()[LOCK]
+    return question.letters[(question.right + 1) % len(question.letters)]
+
+
+def test_right_answers_succeed_and_wrong_ones_fail(tmp_path: Path, right: Path) -> None:
+    result = act_out(tmp_path / "acted", right, conditions=("k0", "k1"))
+    assert [(row.system, row.success) for row in result.rows] == 8 * [("acted", True)]
+    change(right, answer=wrong_letter(), success=False, status="fail")
+    result = act_out(tmp_path / "wrong", right)
+    assert {str(row.episode_id): row.status for row in result.rows} == {
+        **{"MoveCube/test/0": "success", "MoveCube/test/2": "success"},
+        **{"PatternLock/test/0": "fail", "PatternLock/test/2": "success"},
+    }
+
+
+def test_without_a_choice_it_holds_its_pose_until_the_timeout(tmp_path: Path, right: Path) -> None:
+    change(right, answer=None, success=False, status="fail")
+    one = {"families": ("PatternLock",), "episodes": "0"}
+    (row,) = act_out(tmp_path / "acted", right, **one).rows
+    assert (row.status, row.success, row.steps) == ("timeout", False, 1300)
+
+
+def test_a_question_that_broke_is_an_error_until_it_is_answered(
+    tmp_path: Path, right: Path
+) -> None:
+    letter = questions()[LOCK].letters[questions()[LOCK].right]
+    change(right, answer=None, success=None, status="error", error="it broke")
+    result = act_out(tmp_path / "acted", right)
+    assert result.counts == {"success": 3, "fail": 0, "timeout": 0, "error": 1}
+    (error,) = [row.error for row in result.rows if row.error]
+    assert "PatternLock/test/0 under k0 broke" in error and "Resume the run of questions" in error
+    change(right, answer=letter, success=True, status="success", error=None)
+    result = act_out(tmp_path / "acted", right)
+    assert result.counts == {"success": 4, "fail": 0, "timeout": 0, "error": 0}
+
+
+def test_rows_in_a_csv_file(tmp_path: Path, right: Path) -> None:
+    table = right / "rollouts.csv"
+    assert act_out(tmp_path / "acted", table).counts["success"] == 4
+    identity = header(tmp_path / "acted")["identity"]
+    assert (
+        identity["policy"] == "answers"
+        and len(identity["policy_metadata"]["answers"]["sha256"]) == 64
+    )
+    rows = table.read_text().splitlines(keepends=True)
+    for damaged, message in (
+        ([*rows, rows[-1]], "two answers"),
+        (["a,b\n", "1\n"], "damaged|2 columns"),
+        (["a\n", "1\n"], "is missing"),
+    ):
+        (tmp_path / "damaged.csv").write_text("".join(damaged))
+        with pytest.raises(InterferenceError, match=message):
+            act_out(tmp_path / "no", tmp_path / "damaged.csv")
+
+
+def test_the_example_writes_truth_values_like_python(tmp_path: Path, right: Path) -> None:
+    with (right / "rollouts.csv").open(newline="") as file:
+        rows = [row | {"success": row["success"].title()} for row in csv.DictReader(file)]
+    with (tmp_path / "k0.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    assert act_out(tmp_path / "acted", tmp_path / "k0.csv").counts["success"] == 4
+
+
+def test_the_run_of_questions_identifies_the_rollouts(tmp_path: Path, right: Path) -> None:
+    act_out(tmp_path / "acted", right)
+    identity = header(tmp_path / "acted")["identity"]
+    assert identity["policy_metadata"]["answers"] == header(right)["identity"]
+    assert str(tmp_path) not in json.dumps(identity)
+    moved = right.rename(tmp_path / "moved")
+    act_out(tmp_path / "acted", moved)  # resumes
+    other = ask(tmp_path / "other", sampling="window", **FEW).folder
+    with pytest.raises(InterferenceError, match=r"another run.*policy_metadata.answers.sampling"):
+        act_out(tmp_path / "acted", other)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"conditions": ("no-history",)}, "no answer for MoveCube/test/0 under no-history"),
+        ({"families": ("VideoRepick",)}, "no answer for VideoRepick/test/0 under k0"),
+        ({"model_seed": 1}, "model_seed 0, the rollouts 1"),
+        ({"retrieval": "thumbnail"}, "`retrieval` has no effect on answers:"),
+        ({"subgoals": "oracle"}, "reads no subgoals"),
+        ({"system": None}, "need a name"),
+        ({"system": "oracle"}, "not the control oracle"),
+        ({"offline": True, "simulator": "tabletop"}, "needs scripts of the simulator"),
+        ({"policy": "answers:nowhere"}, "no answers in nowhere"),
+        ({"policy": "answers"}, "answers:folder"),
+    ],
+)
+def test_rollouts_that_nothing_answers(
+    tmp_path: Path, right: Path, changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(InterferenceError, match=message):
+        act_out(tmp_path / "acted", right, **changes)
+    assert not (tmp_path / "acted").exists()
+
+
+def test_other_runs_and_other_questions(tmp_path: Path, right: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InterferenceError, match="holds no run"):
+        act_out(tmp_path / "acted", tmp_path / "empty")
+    rollouts = act_out(tmp_path / "rollouts", right).folder
+    for path in (rollouts, rollouts / "rollouts.csv"):
+        with pytest.raises(InterferenceError, match="holds rollouts"):
+            act_out(tmp_path / "acted", path)
+    copy = copy_tabletop(tmp_path / "buffers")
+    from robomme_interference_data.build_dataset.questions import write_questions
+    from robomme_interference_data.data.loading import load_buffer_set
+
+    changed = [
+        replace(one, text=one.text + "?") for one in read_questions(load_buffer_set(copy)).values()
+    ]
+    write_questions(changed, copy)
+    with pytest.raises(InterferenceError, match="answers other questions"):
+        act_out(tmp_path / "acted", right, buffer_set=copy)
+    record = right / "rollouts.jsonl"
+    revision = json.loads(record.read_text().splitlines()[0])["revision"]
+    record.write_text(record.read_text().replace(revision, "f" * len(revision)))
+    with pytest.raises(InterferenceError, match="answers other questions"):
+        act_out(tmp_path / "acted", right)
+
+
+def test_the_answer_that_a_row_chose(right: Path) -> None:
+    from robomme_interference_data.evaluate.run.log import read_run
+
+    question = questions()[LOCK]
+    row = next(one for one in read_run(right)[1].values() if one.episode_id == LOCK)
+    assert chosen_answer(row, question) == question.answers[question.right]
+    wrong = replace(row, answer=wrong_letter(), success=False, status=str(Status.FAIL))
+    index = (question.right + 1) % len(question.letters)
+    assert chosen_answer(wrong, question) == question.answers[index]
+    assert chosen_answer(replace(wrong, answer=None), question) is None
+    for other in (replace(row, answer=wrong_letter()), replace(wrong, answer="H")):
+        if "H" not in question.letters or other.answer != "H":
+            with pytest.raises(InterferenceError, match="does not answer its question"):
+                chosen_answer(other, question)
