@@ -77,16 +77,18 @@ def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> 
     find_simulator(config.simulator)
     check_shift(config.simulator, config.shift)
     check_shared(config)
-    if policy.privileged and not simulator_class(config.simulator).scripted:
+    kind = POLICIES.parse(config.policy).kind
+    script = "answer" if kind == "answers" else kind
+    if policy.privileged and script not in simulator_class(config.simulator).policies:
         raise InvalidOptionError(
-            f"the policy {config.policy} needs scripts of the simulator, and {config.simulator} "
-            "has none",
+            f"the policy {config.policy} needs a script of the simulator, and {config.simulator} "
+            "has none for it",
             "Leave out `offline`, or set another policy."
             if config.offline
             else "Set another simulator, such as tabletop, or another policy.",
         )
     retrieval = [] if config.retrieval is None else [config.retrieval_camera]
-    if POLICIES.parse(config.policy).kind == "answers":
+    if kind == "answers":
         check_unused(config, ["retrieval"], config.policy, "Set it for the questions instead.")
     for camera in (*policy.history_cameras, *retrieval):
         buffer_set.datasets[DEMONSTRATIONS].shape(camera)  # raises for an unknown camera

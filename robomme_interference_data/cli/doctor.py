@@ -22,6 +22,9 @@ DISTRIBUTION = "robomme-interference-data"
 RENDERER = "robomme_interference_data.simulators.tabletop.renderer"
 """Draws an image in a process of its own, since a broken driver can crash or hang it."""
 
+ORACLE_EPISODE = "VideoUnmask/test/0"
+"""The shortest of RoboMME's episodes."""
+
 RENDERER_S, ROBOMME_S, HUB_S = 30, 120, 10
 """Time limits of the checks, in seconds."""
 
@@ -149,21 +152,23 @@ def check_renderer(module: str = RENDERER, seconds: float = RENDERER_S) -> Check
 
 
 def check_robomme() -> Check:
-    """Check that RoboMME can reset an episode, if its interpreter is configured."""
+    """Check that RoboMME's own solvers solve an episode, if its interpreter is configured."""
+    from robomme_interference_data.simulators.play import play
     from robomme_interference_data.simulators.robomme.process import PYTHON_VARIABLE
-    from robomme_interference_data.simulators.robomme.simulator import ARMS, RoboMMESimulator
+    from robomme_interference_data.simulators.robomme.simulator import RoboMMESimulator
 
     name, python = "Official simulator", os.environ.get(PYTHON_VARIABLE)
     fix = f"export {PYTHON_VARIABLE}=PATH, the Python of an environment that has RoboMME"
     if not python:
         return Check(name, None, f"only --simulator robomme needs {PYTHON_VARIABLE}", fix)
     try:
-        with RoboMMESimulator(python, answer_s=ROBOMME_S) as simulator:
+        with RoboMMESimulator(python, (), ROBOMME_S, subgoals=False) as simulator:
             versions = [f"{key} {value}" for key, value in simulator.versions(python).items()]
-            simulator.reset(f"{next(iter(ARMS))}/test/0")
+            status = play(simulator, ORACLE_EPISODE, "oracle", None)["status"]
     except InterferenceError as error:
         return Check(name, False, first_line(error), fix)
-    return Check(name, True, f"{python}: {', '.join(versions)}")
+    detail = f"{python}: {', '.join(versions)}; {ORACLE_EPISODE} with its own solvers: {status}"
+    return Check(name, status == "success", detail, None if status == "success" else fix)
 
 
 def check_hub() -> Check:

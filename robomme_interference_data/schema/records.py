@@ -79,8 +79,8 @@ class EpisodeRecord:
     ] = None
     scene: Annotated[
         str | None,
-        "What the scene allows and hides, as JSON of the simulator; None if its seed tells, or if "
-        "unknown.",
+        "What the scene allows and hides, as JSON of the simulator; None if it follows from the "
+        "seed, or is unknown.",
     ] = None
 
     def __post_init__(self) -> None:

@@ -25,6 +25,9 @@ from .scene import Scene
 CAMERAS = ("front", "wrist")
 """The cameras of every simulator, in canonical order."""
 
+BUILT_IN = ("oracle", "guess", "recall", "answer", "follow-subgoals")
+"""All built-in policies of a simulator."""
+
 ACTION_SIZE = 8
 """Length of an action and of a state: 7 joints, then the gripper."""
 
@@ -119,7 +122,8 @@ class Simulator(ABC):
         settings: Settings of a run that its constructor accepts: `cameras` (to render), `shift`,
             `python` (path of another interpreter), `subgoals` (whether `subgoal` will be called),
             `answer_s` (seconds that a call may take), `buffer_set` (its location).
-        scripted: Whether `act` has built-in policies.
+        policies: Its built-in policies: those of `act`, and `follow-subgoals` if it has
+            `follow_subgoal`.
         shifts: Whether it supports shifts of the live scene.
         suite_version: Version of its episodes; None if they have none.
         packages: Distributions of this environment that it uses.
@@ -131,7 +135,7 @@ class Simulator(ABC):
     about: ClassVar[str] = ""
     remote: ClassVar[bool] = False
     settings: ClassVar[tuple[str, ...]] = ()
-    scripted: ClassVar[bool] = True
+    policies: ClassVar[tuple[str, ...]] = BUILT_IN
     shifts: ClassVar[bool] = False
     suite_version: ClassVar[int | None] = None
     packages: ClassVar[tuple[str, ...]] = ()

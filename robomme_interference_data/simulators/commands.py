@@ -63,7 +63,7 @@ def simulate(
 
     check_shift(simulator, shift)
     supported = simulator_class(simulator)
-    policies = POLICIES if supported.scripted else POLICIES[2:]
+    policies = [one for one in POLICIES if one in (*supported.policies, "none")]
     policy = policy or policies[0]
     if policy not in policies:
         raise InvalidOptionError.one_of(f"policy on {simulator}", policy, policies)

@@ -32,7 +32,7 @@ class Recordings(Simulator):
     name = RECORDINGS
     about = "recordings, played back"
     settings = ("cameras", "buffer_set")
-    scripted = False
+    policies = ()
 
     def __init__(self, buffer_set: str, cameras: Sequence[str] = ()):
         self._buffer_set = load_buffer_set(buffer_set, threads=1)

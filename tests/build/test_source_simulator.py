@@ -12,7 +12,7 @@ from robomme_interference_data.build_dataset.frame_selection import (
     select_frames,
 )
 from robomme_interference_data.build_dataset.sources import Recording, open_source, simulator
-from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.constants import DEMONSTRATIONS, FAMILIES
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators.tabletop import SUITE_VERSION

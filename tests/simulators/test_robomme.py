@@ -10,6 +10,7 @@ import textwrap
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -358,12 +359,10 @@ def test_versions(robomme_python: Path, tmp_path: Path, monkeypatch: pytest.Monk
 # --- answers -------------------------------------------------------------------------------------
 
 
-def act_out(
-    simulator: RoboMMESimulator, policy: str, known: dict[int, str] | None = None
-) -> Status:
+def act_out(simulator: RoboMMESimulator, policy: str, *known: Any, **answer: int) -> Status:
     status = Status.ONGOING
     while status is Status.ONGOING:
-        _, status = simulator.step(simulator.act(policy, known), observe=False)
+        _, status = simulator.step(simulator.act(policy, *known, **answer), observe=False)
     return status
 
 
@@ -391,6 +390,12 @@ def test_answers_are_acted_out_by_robommes_solvers(simulator: RoboMMESimulator) 
             assert act_out(simulator, policy, known) is expected
     with pytest.raises(SimulatorCrashError, match="no episode is running"):
         simulator.act("oracle")
+    for answer, expected in ((0, Status.FAIL), (1, Status.SUCCESS)):
+        simulator.reset("VideoUnmask/test/3")
+        assert act_out(simulator, "answer", answer=answer) is expected
+    simulator.reset("VideoUnmask/test/3")
+    with pytest.raises(InvalidOptionError, match="0 to 2"):
+        simulator.act("answer", answer=3)
 
 
 def test_a_solver_without_a_plan_is_an_error(simulator: RoboMMESimulator) -> None:

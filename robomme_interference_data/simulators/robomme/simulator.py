@@ -29,8 +29,6 @@ from robomme_interference_data.simulators.tabletop.episodes import episode_ids
 from .process import Arrays, Process, find_python, installed_versions
 from .scenes import OfficialScene, evidence_of, read_scene
 
-POLICIES = ("oracle", "guess", "recall")
-
 ARMS = ("VideoUnmask", "PatternLock")
 """Families with a gripper and with a stick whose demonstrations are the shortest."""
 
@@ -76,6 +74,7 @@ class RoboMMESimulator(Simulator):
     about = "the official simulator, RoboMME"
     remote = True
     settings = ("cameras", "python", "subgoals", "answer_s")
+    policies = ("oracle", "guess", "recall", "answer")
     episode_s = 1800.0
 
     def __init__(
@@ -128,19 +127,24 @@ class RoboMMESimulator(Simulator):
                 attributes than those that the answer is read from.
         """
         self._running()
-        if policy not in POLICIES:
-            raise UnknownNameError.among("built-in policy", policy, self.name, POLICIES)
+        if policy not in self.policies:
+            raise UnknownNameError.among("built-in policy", policy, self.name, self.policies)
         if self._solution is None:
-            self._solution = self._solve(policy, known or {})
+            self._solution = self._solve(policy, known or {}, answer)
         response, _ = self._process.call("act", answer=self._solution[0])
         return np.array(response["action"], np.float32)
 
-    def _solve(self, policy: str, known: Mapping[int, str]) -> tuple[Any]:
+    def _solve(self, policy: str, known: Mapping[int, str], answer: int | None) -> tuple[Any]:
         """Return the answer that a policy acts out, alone in a tuple."""
         if self._scene is None:
             raise self._process.error(f"hides its answers: {self._unreadable}")
         if policy == "oracle":
             return (self._scene.own_answer(self._seed),)
+        if policy == "answer":
+            count = len(self._scene.answers)
+            if answer is None or not 0 <= answer < count:
+                raise InvalidOptionError.expected("answer", answer, f"0 to {count - 1}")
+            return (self._scene.answers[answer],)
         return (self._scene.recalled(known if policy == "recall" else {}, self._seed),)
 
     def subgoal(self) -> Subgoal:

@@ -156,6 +156,8 @@ class Episodes:
         # RoboMME would make an environment anyway, with a seed that belongs to no episode.
         if seed is None or not difficulty:
             return {"unknown": f"{family} has {builder.get_episode_num()} {split} episodes"}, {}
+        if cameras or subgoals:  # otherwise the pictures of another environment do as well
+            self._rendering.reset()
         self._env = builder.make_env_for_episode(index)
         self._cameras, self._subgoals = cameras, subgoals
         self._select_cameras(demonstration)
@@ -211,7 +213,6 @@ class Episodes:
             script.close()
         if env is not None:
             env.close()
-        self._rendering.reset()
 
     def _select_cameras(self, requested: bool) -> None:
         """Render the requested cameras, and the front camera, which RoboMME's subgoals need."""
