@@ -35,7 +35,7 @@ def test_a_set_without_images_is_the_same_but_for_them(sets: tuple[Path, Path], 
     for name in load_buffer_set(sets[0]).episode_ids:
         one, other = (load_buffer(str(name), "k1", buffer_set=root) for root in sets)
         assert (one.cameras, other.cameras) == ((), ("front",))
-        assert np.array_equal(one.states(), other.states())
+        assert np.array_equal(one.states, other.states)
         assert one.evidence is not None and len(one) == len(other)
         assert [part.to_dict() for part in one.evidence] == [
             part.to_dict() for part in other.evidence or ()
