@@ -78,8 +78,9 @@ def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> 
     check_shift(config.simulator, config.shift)
     check_shared(config)
     kind = POLICIES.parse(config.policy).kind
-    script = "answer" if kind == "answers" else kind
-    if policy.privileged and script not in simulator_class(config.simulator).policies:
+    scripts = simulator_class(config.simulator).policies
+    needed = {"answers": {"answer"}, "python": {*scripts}}.get(kind, {kind})
+    if policy.privileged and not needed & {*scripts}:
         raise InvalidOptionError(
             f"the policy {config.policy} needs a script of the simulator, and {config.simulator} "
             "has none for it",

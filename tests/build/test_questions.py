@@ -53,7 +53,8 @@ def buffer_set_of(*episodes: EpisodeId, view: Any = GRAY, **changes: Any) -> Any
     def query(episode: EpisodeId) -> Any:
         seed = seed_of(episode)
         known = {"simulator": "tabletop", "seed": seed, "difficulty": difficulty_of(seed)}
-        values = known | {"episode_id": episode, "frame": lambda: view} | changes
+        record = SimpleNamespace(scene=None)
+        values = known | {"episode_id": episode, "frame": lambda: view, "record": record} | changes
         return SimpleNamespace(**values)
 
     demonstrations = SimpleNamespace(identity=SimpleNamespace(revision="r"))

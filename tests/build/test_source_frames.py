@@ -64,10 +64,14 @@ def test_the_example_in_the_docs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     names: dict[str, Any] = {}
     exec(found[1], names)
     source = FramesSource(tmp_path / "my_robot")
-    (episode,) = source.episodes()
-    recording = source.read(episode, None)
-    assert (str(episode.id), recording.exact) == (DRAWER, True)
-    for frame, image in zip(recording.frames, names["frames"], strict=True):
+    drawer, cups = source.episodes()
+    recording = source.read(drawer, None)
+    assert (str(drawer.id), str(cups.id)) == (DRAWER, "StackCups/train/0")
+    assert recording.exact
+    rng, frames = np.random.default_rng(0), list(recording.frames)  # as in the example
+    assert [frame.is_demonstration for frame in frames] == [True] * 40 + [False] * 20
+    for frame in frames:
+        image = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
         np.testing.assert_array_equal(frame.images["front"], image)
 
 

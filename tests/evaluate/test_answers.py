@@ -142,7 +142,7 @@ def test_the_run_of_questions_identifies_the_rollouts(tmp_path: Path, right: Pat
         ({"subgoals": "oracle"}, "reads no subgoals"),
         ({"system": None}, "need a name"),
         ({"system": "oracle"}, "not the control oracle"),
-        ({"offline": True, "simulator": "tabletop"}, "needs scripts of the simulator"),
+        ({"offline": True, "simulator": "tabletop"}, "needs a script of the simulator"),
         ({"policy": "answers:nowhere"}, "no answers in nowhere"),
         ({"policy": "answers"}, "answers:folder"),
     ],

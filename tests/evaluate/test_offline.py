@@ -211,8 +211,8 @@ def test_errors_are_rows_and_run_again(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"policy": "oracle"}, "needs scripts of the simulator.*\nLeave out `offline`"),
-        ({"policy": "follow-subgoals"}, "needs scripts of the simulator"),
+        ({"policy": "oracle"}, "needs a script of the simulator.*\nLeave out `offline`"),
+        ({"policy": "follow-subgoals"}, "needs a script of the simulator"),
         ({"simulator": "robomme"}, "`simulator` has no effect"),
         ({"shift": "light:1"}, "`shift` has no effect"),
         ({"videos": True}, "`videos` has no effect"),

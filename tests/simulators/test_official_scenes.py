@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -9,8 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.build_dataset.questions import planned_questions
+from robomme_interference_data.constants import DEMONSTRATIONS, FAMILIES
 from robomme_interference_data.errors import FormatError
+from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.simulators.robomme.scenes import (
     OfficialScene,
@@ -167,3 +170,26 @@ def test_spans_are_evidence_spans() -> None:
     scene = scene_of("RouteStick/test/0")
     spans = evidence_of(scene, np.array([[93, 1, 0], [94, 2, 0]], np.int64))
     assert spans[0] == EvidenceSpan(0, scene.parts(scene.own_answer(0))[0], 0, 1)
+
+
+def test_questions_about_official_lessons() -> None:
+    def query(episode: EpisodeId) -> Any:
+        one = RECORDED[str(episode)]
+        record = SimpleNamespace(scene=json.dumps(one["scene"]))
+        told = {"simulator": "robomme", "seed": 7, "difficulty": one["difficulty"]}
+        return SimpleNamespace(episode_id=episode, record=record, **told)
+
+    episodes = [EpisodeId.parse(name) for name in RECORDED]
+    datasets = {DEMONSTRATIONS: SimpleNamespace(identity=SimpleNamespace(revision="r"))}
+    queries = SimpleNamespace(episode_ids=episodes, query=query, datasets=datasets)
+    made = [question for question, _ in planned_questions(queries)]  # type: ignore[arg-type]
+    assert {str(one.episode_id) for one in made} == set(RECORDED)
+    for question in made:
+        scene = scene_of(str(question.episode_id))
+        choices = [scene.choice(scene.answers[number]) for number in question.answers]
+        assert 3 <= len(set(choices)) == len(choices) <= 5
+        assert choices[question.right] == scene.choice(scene.own_answer(0))
+        options = list(zip(question.options, question.points, strict=True))
+        assert len(set(options)) == len(options)  # words and places distinguish them
+        for points in question.pixels:
+            assert all(0 <= y < 256 and 0 <= x < 256 for y, x in points)

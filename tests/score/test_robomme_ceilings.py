@@ -1,0 +1,179 @@
+"""What docs/results/robomme-ceilings.md tells is what its rows say."""
+
+import json
+from collections import Counter
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+
+from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.evaluate.score.tables.paper import by_family
+from robomme_interference_data.schema.sampling import Memory
+from robomme_interference_data.simulators.robomme.scenes import OfficialScene, read_scene
+from robomme_interference_data.stats.intervals import wilson
+
+RESULTS = Path(__file__).parents[2] / "docs" / "results"
+PAGE = (RESULTS / "robomme-ceilings.md").read_text(encoding="utf-8")
+LESSONS: list[dict[str, Any]] = pq.read_table(RESULTS / "robomme/lessons.parquet").to_pylist()
+ROLLOUTS: list[dict[str, Any]] = pq.read_table(RESULTS / "robomme/rollouts.parquet").to_pylist()
+
+
+def table(head: str) -> list[list[str]]:
+    """The cells of the page's table whose head contains a text."""
+    blocks = (part.splitlines() for part in PAGE.split("\n\n"))
+    [lines] = (block for block in blocks if block[0].startswith("|") and head in block[0])
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+
+
+def family_of(lesson: dict[str, Any]) -> str:
+    return str(lesson["episode_id"]).partition("/")[0]
+
+
+def scene_of(lesson: dict[str, Any]) -> OfficialScene:
+    scene = read_scene(family_of(lesson), lesson["scene"], lesson["difficulty"])
+    assert scene is not None
+    return scene
+
+
+def chance(lesson: dict[str, Any], memory: str, sessions: int, frames: int = 1) -> float:
+    """The ideal observer's, if a part is known from so many kept frames of the lesson.
+
+    The lesson comes first in a history; each session after it has 32 frames.
+    """
+    kept = set(Memory(memory).kept(range(lesson["lesson_frames"] + 32 * sessions)))
+    seen, texts = Counter[int](), {}
+    for span in lesson["evidence"]:
+        seen[span["part"]] += len(kept.intersection(range(span["start"], span["stop"])))
+        texts[span["part"]] = span["text"]
+    known = {part: text for part, text in texts.items() if seen[part] >= frames}
+    if known == texts:
+        return 1.0
+    return 1 / len(_agreeing(lesson["episode_id"], tuple(known.items())))
+
+
+@cache
+def _agreeing(episode: str, known: tuple[tuple[int, str], ...]) -> list[Any]:
+    return scene_of(next(one for one in LESSONS if one["episode_id"] == episode)).agreeing(
+        dict(known)
+    )
+
+
+def test_all_lessons_of_the_benchmark_are_there() -> None:
+    assert len({one["episode_id"] for one in LESSONS}) == 450
+    assert Counter(map(family_of, LESSONS)) == dict.fromkeys(FAMILIES, 50)
+
+
+@pytest.mark.slow
+def test_ceilings_follow_from_the_lessons() -> None:
+    for lesson in LESSONS:  # every part together tells the answer, in all families
+        scene = scene_of(lesson)
+        parts = {span["part"]: span["text"] for span in lesson["evidence"]}
+        assert scene.agreeing(parts) == [scene.own_answer(0)]
+        assert {chance(lesson, "framesamp", k) for k in (0, 1, 3, 7, 15)} == {1.0}
+        assert {chance(lesson, "full", k) for k in (0, 31)} == {1.0}
+    for family, frames, by_chance, most, two, k31, *windows in table("lesson frames"):
+        lessons = [one for one in LESSONS if family_of(one) == family]
+        lengths = [one["lesson_frames"] for one in lessons]
+        assert frames == f"{min(lengths)} to {max(lengths)}"
+        rates = (
+            [1 / len(scene_of(one).answers) for one in lessons],
+            [chance(one, "framesamp", 15) for one in lessons],
+            [chance(one, "framesamp", 7, frames=2) for one in lessons],
+            [chance(one, "framesamp", 31) for one in lessons],
+            [chance(one, "window", 0) for one in lessons],
+            [chance(one, "window", 1) for one in lessons],
+        )
+        told = (by_chance, most, two, k31, *windows)
+        assert told == tuple(f"{100 * sum(one) / 50:.1f}%" for one in rates)
+
+
+def test_rollouts_are_counted() -> None:
+    columns = (
+        *(("oracle", "no-history"), ("guess", "no-history")),
+        *(("recall-framesamp", "k7"), ("recall-framesamp", "k31")),
+        *(("recall-window", "k0"), ("recall-window", "k1")),
+    )
+    assert {(one["system"], one["condition"]) for one in ROLLOUTS} == set(columns)
+    for family, *cells in table("`oracle`"):
+        for (system, condition), cell in zip(columns, cells, strict=True):
+            key = system, condition, family
+            states = Counter(
+                one["status"]
+                for one in ROLLOUTS
+                if (one["system"], one["condition"], one["family"]) == key
+            )
+            errors = states.pop("error", 0)
+            low, high = wilson(states["success"], states.total())
+            text = f"{states['success']} of {states.total()}, {100 * low:.0f} to {100 * high:.0f}%"
+            assert cell == text + (f"; {errors} without a plan" if errors else ""), key
+
+
+@pytest.mark.slow
+def test_played_and_computed_agree() -> None:
+    """Of 18 cells of ten rollouts each, the 99.9% intervals contain the computed mean."""
+    for system, condition in (("framesamp", 7), ("framesamp", 31), ("window", 0), ("window", 1)):
+        for family in FAMILIES:
+            rows = [
+                one
+                for one in ROLLOUTS
+                if (one["system"], one["condition"], one["family"])
+                == (f"recall-{system}", f"k{condition}", family)
+                and one["status"] != "error"
+            ]
+            names = {f"{family}/test/{one['episode']}" for one in rows}
+            lessons = [one for one in LESSONS if one["episode_id"] in names]
+            expected = sum(chance(one, system, condition) for one in lessons) / len(lessons)
+            low, high = wilson(sum(one["status"] == "success" for one in rows), len(rows), 0.999)
+            assert low - 1e-9 <= expected <= high + 1e-9, (system, condition, family)
+
+
+def test_published_rates() -> None:
+    rates = {(one.system, one.condition, one.part): round(one.rate * 50) for one in by_family()}
+    systems = [("perceptual-framesamp-modul", k) for k in ("k0", "k1", "k3", "k7")]
+    systems.append(("retrieval-framesamp-modul", "k7"))
+    *rows, total = table("with retrieval, k7")
+    for family, *cells, ceiling in rows:
+        assert cells == [f"{2 * rates[(*one, family)]}%" for one in systems]
+        assert ceiling == "100.0%"
+    won = [sum(rates[(*one, family)] for family in FAMILIES) for one in systems]
+    assert total[1:-1] == [f"{100 * one / 450:.1f}%" for one in won]
+    assert [row[0] for row in rows] == list(FAMILIES)
+
+
+def answer_of(lesson: dict[str, Any]) -> Any:
+    return json.loads(lesson["scene"])["answer"]
+
+
+COUNTS: dict[tuple[str, str], Callable[[dict[str, Any]], Any]] = {
+    ("MoveCube", "the manner"): answer_of,
+    ("InsertPeg", "the end"): lambda one: answer_of(one)[1],
+    ("InsertPeg", "the side"): lambda one: answer_of(one)[2],
+    ("RouteStick", "number of moves"): lambda one: len(answer_of(one)[1]),
+    ("PatternLock", "number of moves"): lambda one: len(answer_of(one)),
+    ("VideoUnmaskSwap", "number of swaps"): lambda one: len(json.loads(one["scene"])["swaps"]),
+    ("VideoRepick", "number of swaps"): lambda one: len(json.loads(one["scene"])["swaps"]),
+    ("VideoPlaceOrder", "number of placements"): lambda one: len(
+        json.loads(one["scene"])["visits"]
+    ),
+}
+
+
+def test_what_the_length_tells() -> None:
+    rows = table("most frequent value")
+    assert {(family, what) for family, what, *_ in rows} == set(COUNTS)
+    for family, what, right, frequent in rows:
+        lessons = [one for one in LESSONS if family_of(one) == family]
+        tell = COUNTS[family, what]
+        found = 0
+        for at, one in enumerate(lessons):
+            others = lessons[:at] + lessons[at + 1 :]
+            gaps = [abs(other["lesson_frames"] - one["lesson_frames"]) for other in others]
+            nearest = others[gaps.index(min(gaps))]  # the first of equals
+            found += tell(nearest) == tell(one)
+        values = Counter(tell(one) for one in lessons)
+        assert (right, frequent) == (f"{found} of 50", f"{max(values.values())} of 50"), what
+    assert all(answer_of(one)[0] == 0 for one in LESSONS if family_of(one) == "InsertPeg")
