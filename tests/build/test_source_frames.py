@@ -66,7 +66,7 @@ def test_the_example_in_the_docs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     source = FramesSource(tmp_path / "my_robot")
     drawer, cups = source.episodes()
     recording = source.read(drawer, None)
-    assert (str(drawer.id), str(cups.id)) == (DRAWER, "StackCups/train/0")
+    assert (str(drawer.id), str(cups.id)) == ("OpenDrawer/test/0", "StackCups/train/0")
     assert recording.exact
     rng, frames = np.random.default_rng(0), list(recording.frames)  # as in the example
     assert [frame.is_demonstration for frame in frames] == [True] * 40 + [False] * 20
