@@ -24,7 +24,7 @@ from .run.config import AskConfig, CeilingConfig, RunConfig
 def ceiling(buffer_set: BufferSetFolder, config: CeilingConfig, as_json: AsJson = False) -> None:
     """Print the maximum success that a memory rule allows, without a rollout.
 
-    That is the share of the evidence that it keeps and, on tabletop, the success rate of the ideal
+    That is the share of the evidence that it keeps and the success rate of the ideal
     observer: no policy with that memory can do better.
 
     Examples:

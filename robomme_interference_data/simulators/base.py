@@ -25,7 +25,10 @@ from .scene import Scene
 CAMERAS = ("front", "wrist")
 """The cameras of every simulator, in canonical order."""
 
-BUILT_IN = ("oracle", "guess", "recall", "answer", "follow-subgoals")
+ACTED = ("oracle", "guess", "recall", "answer")
+"""Built-in policies of `Simulator.act`."""
+
+BUILT_IN = (*ACTED, "follow-subgoals")
 """All built-in policies of a simulator."""
 
 ACTION_SIZE = 8

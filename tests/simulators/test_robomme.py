@@ -413,6 +413,47 @@ def test_a_solver_without_a_plan_is_an_error(simulator: RoboMMESimulator) -> Non
     assert simulator.pid == pid
 
 
+def test_subgoals_are_followed(simulator: RoboMMESimulator) -> None:
+    def follow(*subgoals: Subgoal | None) -> tuple[Status, list[float]]:
+        simulator.reset("VideoUnmask/test/3")
+        first, status = None, Status.ONGOING
+        for step in range(10):
+            action = simulator.follow_subgoal(subgoals[min(step, len(subgoals) - 1)])
+            first = first or action.tolist()
+            _, status = simulator.step(action, observe=False)
+            if status is not Status.ONGOING:
+                break
+        assert first is not None
+        return status, first
+
+    # Container n is at (x, y) = (n, 2n), which is the pixel (100 + 20 n, 100 + 10 n).
+    picked = {
+        n: Subgoal("pick up the container at <point>", ((101 + 20 * n, 99 + 10 * n),))
+        for n in range(2)
+    }
+    assert follow(picked[1])[0] is Status.SUCCESS
+    assert follow(picked[0])[0] is Status.FAIL
+    # Words that name no step change nothing: the arm holds its pose, or goes on.
+    status, first = follow(Subgoal("look around", ()))
+    assert (status, first) == (Status.FAIL, [0.5] * 7 + [1.0])
+    assert follow(picked[1], Subgoal("look around", ()))[0] is Status.SUCCESS
+    # A new subgoal ends what was being done: the stand-in looks at the third action.
+    assert follow(picked[0], picked[1])[0] is Status.SUCCESS
+
+
+def test_a_subgoal_without_a_point_draws(simulator: RoboMMESimulator) -> None:
+    found = set()
+    for index in (3, 3, 4, 5, 6, 7):
+        simulator.reset(f"VideoUnmask/test/{index}")
+        subgoal = Subgoal("pick up the container that hides the red cube", ())
+        try:
+            found.add((index, float(simulator.follow_subgoal(subgoal)[0])))
+        except SimulatorCrashError:  # the planner does not reach container 2
+            found.add((index, 2.0))
+    assert len(found) == 5  # the same each time
+    assert len({container for _, container in found}) > 1
+
+
 def test_another_robomme_without_known_attributes(simulator: RoboMMESimulator) -> None:
     # Episodes still play; only what needs the answer is an error.
     for episode in ("VideoUnmask/test/49", "MoveCube/test/3"):

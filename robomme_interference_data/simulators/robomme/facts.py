@@ -55,18 +55,18 @@ class LessonLog:
         return [np.array(self._rows[int(number)], np.int64) for number in recorded]
 
 
-def read_facts(env: Any, family: str) -> dict[str, Any]:
+def read_facts(env: Any, family: str, pixel: Any) -> dict[str, Any]:
     """Return the facts about an episode whose demonstration has been played, as JSON values.
 
     They are its tasks, the points of its things in the front image, the answer, and what else the
-    possible answers depend on.
+    possible answers depend on. `pixel` returns where a thing is in the image (`subgoals.py`).
     """
     base = env.unwrapped
     things = list(getattr(base, _THINGS[family])) if family in _THINGS else []
     if family == "RouteStick":
         things = [things[number] for number in base.route_button_indices]
     tasks = [[str(task["name"]), bool(task["demonstration"])] for task in base.task_list]
-    points = [_pixel(base, thing) for thing in things]
+    points = [pixel(base, thing) for thing in things]
     return {"tasks": tasks, "points": points, **_READ[family](base, things)}
 
 
@@ -146,17 +146,6 @@ def _swapped(base: Any, targets: list[Any]) -> list[Any]:
 def _index(things: list[Any], thing: Any) -> int:
     """Return the number of a thing, by identity."""
     return next(number for number, one in enumerate(things) if one is thing)
-
-
-def _pixel(base: Any, thing: Any) -> list[int]:
-    """Return where a thing is in the front image, (y, x)."""
-    import numpy as np
-
-    camera = base._sensors["base_camera"].get_params()
-    place = np.append(np.asarray(thing.pose.p, np.float64).reshape(-1)[:3], 1.0)
-    seen = np.asarray(camera["extrinsic_cv"], np.float64).reshape(-1, 4)[:3] @ place
-    x, y, depth = np.asarray(camera["intrinsic_cv"], np.float64).reshape(3, 3) @ seen
-    return [round(float(y / depth)), round(float(x / depth))]
 
 
 def _demonstration(env: Any) -> Any:

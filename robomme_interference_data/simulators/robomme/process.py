@@ -78,7 +78,7 @@ class Process:
         self.patches: tuple[str, ...] = tuple(hello["patches"])
 
     def call(self, call: str, **arguments: Any) -> tuple[dict[str, Any], Arrays]:
-        """Call `reset`, `step` or `act` of the worker."""
+        """Call `reset`, `step`, `act` or `follow` of the worker."""
         with suppress(OSError):  # if it died, reading the answer raises
             robomme_worker.send(self._channel, {"call": call, **arguments})
         answer, arrays = self._answer(call)

@@ -15,6 +15,7 @@ from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.subgoal import Subgoal, read_grounded
 from robomme_interference_data.simulators.base import (
+    ACTED,
     ACTION_SIZE,
     CAMERAS,
     Begun,
@@ -74,7 +75,6 @@ class RoboMMESimulator(Simulator):
     about = "the official simulator, RoboMME"
     remote = True
     settings = ("cameras", "python", "subgoals", "answer_s")
-    policies = ("oracle", "guess", "recall", "answer")
     episode_s = 1800.0
 
     def __init__(
@@ -90,6 +90,7 @@ class RoboMMESimulator(Simulator):
         self._subgoal: str | None = None
         self._scene: OfficialScene | None = None
         self._solution: tuple[Any] | None = None
+        self._following: dict[str, Any] = {}
 
     @property
     def patches(self) -> tuple[str, ...]:
@@ -127,8 +128,8 @@ class RoboMMESimulator(Simulator):
                 attributes than those that the answer is read from.
         """
         self._running()
-        if policy not in self.policies:
-            raise UnknownNameError.among("built-in policy", policy, self.name, self.policies)
+        if policy not in ACTED:
+            raise UnknownNameError.among("built-in policy", policy, self.name, ACTED)
         if self._solution is None:
             self._solution = self._solve(policy, known or {}, answer)
         response, _ = self._process.call("act", answer=self._solution[0])
@@ -146,6 +147,22 @@ class RoboMMESimulator(Simulator):
                 raise InvalidOptionError.expected("answer", answer, f"0 to {count - 1}")
             return (self._scene.answers[answer],)
         return (self._scene.recalled(known if policy == "recall" else {}, self._seed),)
+
+    def follow_subgoal(self, subgoal: Subgoal | None) -> NDArray[np.float32]:
+        """Return the next action towards a subgoal; see `Simulator.follow_subgoal`.
+
+        The words are RoboMME's own, with or without points. A subgoal that is not understood
+        changes nothing.
+        """
+        self._running()
+        if subgoal is None and not self._following:
+            return self.act("guess")
+        if self._scene is None:
+            raise self._process.error(f"hides its answers: {self._unreadable}")
+        if subgoal is not None:
+            self._following = {"text": subgoal.text, "points": [list(p) for p in subgoal.points]}
+        response, _ = self._process.call("follow", **self._following, seed=self._seed)
+        return np.array(response["action"], np.float32)
 
     def subgoal(self) -> Subgoal:
         """Return RoboMME's current subgoal; see `Simulator.subgoal`."""
@@ -208,7 +225,7 @@ class RoboMMESimulator(Simulator):
         self, facts: dict[str, Any], family: str, arrays: Arrays
     ) -> tuple[tuple[EvidenceSpan, ...] | None, str | None]:
         """Keep the scene; return the lesson's evidence and the scene as JSON, None if unknown."""
-        self._scene, self._solution = None, None
+        self._scene, self._solution, self._following = None, None, {}
         self._seed, self._unreadable = facts["seed"], facts.get("unreadable", "")
         if facts["scene"] is None:
             return None, None

@@ -6,9 +6,23 @@ as with any other policy.
 """
 
 import importlib
+import importlib.util
 import queue
 import threading
+from pathlib import Path
 from typing import Any
+
+
+def _sibling(name: str) -> Any:
+    """Load a module from the file beside this one; see `worker.py`."""
+    spec: Any = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+_subgoals = _sibling("subgoals")
+pixel = _subgoals.pixel
 
 _STICK = ("PatternLock", "RouteStick")
 _TRIES = 3
@@ -49,13 +63,10 @@ class Script:
     """
 
     def __init__(self, env: Any, family: str) -> None:
-        self._actions: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._results: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._env, self._family = _Handing(env, self._actions, self._results), family
-        self._thread: threading.Thread | None = None
-        self._result: Any = None
-        self._last: list[float] | None = None
-        self._done = False
+        self._env, self._family = env, family
+        self._steps = _subgoals.Steps(env.unwrapped, family)
+        self._doing: Any = None
+        self._run: _Run | None = None
 
     def act(self, answer: Any) -> list[float]:
         """Return the next action for an answer, 8 numbers.
@@ -65,48 +76,85 @@ class Script:
         Raises:
             NoPlanError: The planners find no motion.
         """
-        if self._thread is None:
-            self._thread = threading.Thread(target=self._solve, args=(answer,), daemon=True)
-            self._thread.start()
-        elif self._result is not None and not self._done:
-            self._results.put(self._result)
-        elif self._last is not None:
-            return self._last
-        self._result = None
-        if not self._done:
-            made = self._actions.get()
-            if isinstance(made, Exception):
-                self._done = True
-                raise made
-            self._done = made is None
-            if made is not None:
-                self._last = [*map(float, made), -1.0][:8]
+        if self._run is None:
+            self._run = _Run(self._env, self._family, _SOLVE[self._family], answer)
+        return self._run.act()
+
+    def follow(self, text: str, points: list[list[int]], seed: int) -> list[float]:
+        """Return the next action towards a subgoal, 8 numbers; see `act`.
+
+        A subgoal that is not understood changes nothing; at first, the arm holds its pose.
+        """
+        doing = text, points
+        if doing != self._doing:
+            self._doing = doing
+            step = self._steps.find(text, points, seed)
+            if step is not None:
+                self.close()
+                self._run = _Run(self._env, self._family, _do_step, step)
+        if self._run is not None:
+            return self._run.act()
+        joints = self._env.unwrapped.agent.robot.qpos[0]
+        return [*map(float, joints[:7]), 1.0]
+
+    def stepped(self, result: Any) -> None:
+        """Keep what the environment returned for the last action, for the solvers."""
+        if self._run is not None:
+            self._run.result = result
+
+    def close(self) -> None:
+        """End the solvers' thread."""
+        if self._run is not None:
+            self._run.close()
+
+
+class _Run:
+    """Solvers in a thread; `result` is what the environment returned for their last action."""
+
+    def __init__(self, env: Any, family: str, solve: Any, what: Any) -> None:
+        self.result: Any = None
+        self._actions: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._results: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._last: list[float] | None = None
+        self._done = False
+        handing = _Handing(env, self._actions, self._results)
+        work = (solve, handing, family, what)
+        self._thread = threading.Thread(target=self._solve, args=work, daemon=True)
+        self._thread.start()
+
+    def act(self) -> list[float]:
+        """Return the next action; see `Script.act`."""
+        if self._last is not None:
+            if self._done or self.result is None:
+                return self._last
+            self._results.put(self.result)
+            self.result = None
+        made = self._actions.get()
+        if isinstance(made, Exception):
+            self._done = True
+            raise made
+        self._done = made is None
+        if made is not None:
+            self._last = [*map(float, made), -1.0][:8]
         if self._last is None:
             raise NoPlanError("the solvers moved nowhere")
         return self._last
 
-    def stepped(self, result: Any) -> None:
-        """Keep what the environment returned for the last action, for the solvers."""
-        self._result = result
-
     def close(self) -> None:
         """End the thread."""
-        if self._thread is not None and not self._done:
-            self._done = True
-            while self._thread.is_alive():
-                self._results.put(None)
-                self._thread.join(0.2)
+        while self._thread.is_alive():
+            self._results.put(None)
+            self._thread.join(0.2)
 
-    def _solve(self, answer: Any) -> None:
+    def _solve(self, solve: Any, env: Any, family: str, what: Any) -> None:
+        made = None
         try:
-            solve: Any = _SOLVE[self._family]
-            solve(_Solver(self._env, self._family), self._env.unwrapped, answer)
+            solve(_Solver(env, family), env.unwrapped, what)
         except _Abandoned:
             return
         except Exception as error:
-            self._actions.put(error)
-            return
-        self._actions.put(None)
+            made = error
+        self._actions.put(made)
 
 
 class _Solver:
@@ -149,6 +197,12 @@ def _planner(env: Any, *, stick: bool) -> Any:
     return planner
 
 
+def _do_step(solve: _Solver, base: Any, step: Any) -> None:
+    """Do one step of a task: the name of its solver, and the solver's arguments."""
+    name, arguments = step
+    solve(name, **arguments)
+
+
 def _unmask(solve: _Solver, base: Any, answer: list[int]) -> None:
     for number, container in enumerate(answer):
         if number:
@@ -182,18 +236,9 @@ def _move(solve: _Solver, base: Any, answer: str) -> None:
 
 def _insert(solve: _Solver, base: Any, answer: list[Any]) -> None:
     number, end, side = answer
-    ends = [base.peg_heads[number], base.peg_tails[number]]
-    arm = float(base.agent.robot.pose.p[0][0])
-    ends.sort(key=lambda link: abs(float(link.pose.p[0][0]) - arm))  # the head if both are as near
-    grasped, inserted = ends if end == "near" else reversed(ends)
-    solve("grasp_and_lift_peg_side", grasped)
-    solve(
-        "insert_peg",
-        direction=-1 if side == "left" else 1,
-        obj=-1 if grasped is base.peg_heads[number] else 1,
-        insert_obj=inserted,
-        cut_retreat=True,
-    )
+    held = _subgoals.ends_of(base, number, end)
+    _do_step(solve, base, _subgoals.pick_up_peg(held))
+    _do_step(solve, base, _subgoals.insert_peg(base, held, side))
 
 
 def _pattern(solve: _Solver, base: Any, answer: list[int]) -> None:

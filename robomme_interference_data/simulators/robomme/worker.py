@@ -173,7 +173,10 @@ class Episodes:
         }
         arrays = {"states": _states(observations)}
         try:  # another version of RoboMME may have other attributes; all else works without them
-            scene, moments = _facts.read_facts(self._env, family), log.moments(self._env)
+            scene, moments = (
+                _facts.read_facts(self._env, family, _solvers.pixel),
+                log.moments(self._env),
+            )
             self._script = _solvers.Script(self._env, family)
             facts, arrays = {**facts, "scene": scene}, {**arrays, "moments": moments}
         except Exception as error:
@@ -204,6 +207,10 @@ class Episodes:
     def act(self, answer: Any) -> Answer:
         """Return the next action of RoboMME's solvers for an answer; the same one throughout."""
         return {"action": self._script.act(answer)}, {}
+
+    def follow(self, text: str, points: list[list[int]], seed: int) -> Answer:
+        """Return the next action of RoboMME's solvers towards a subgoal."""
+        return {"action": self._script.follow(text, points, seed)}, {}
 
     def close(self) -> None:
         """Close the environment, if there is one."""

@@ -13,6 +13,7 @@ from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.shifts import NO_SHIFT, Shift, parse_shift
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import (
+    ACTED,
     CAMERAS,
     Begun,
     EpisodeInfo,
@@ -25,8 +26,6 @@ from . import SUITE_VERSION
 from .episodes import episode_ids, further_ids, seed_of
 from .families import known_scene, other_answer
 from .family import Family
-
-POLICIES = ("oracle", "guess", "recall", "answer")
 
 
 class TabletopSimulator(Simulator):
@@ -89,10 +88,10 @@ class TabletopSimulator(Simulator):
     def act(
         self, policy: str, known: Mapping[int, str] | None = None, answer: int | None = None
     ) -> NDArray[np.float32]:
-        """Return the next action of one of `POLICIES`; see `Simulator.act`."""
+        """Return the next action of one of `ACTED`; see `Simulator.act`."""
         self._running()
-        if policy not in POLICIES:
-            raise UnknownNameError.among("built-in policy", policy, self.name, POLICIES)
+        if policy not in ACTED:
+            raise UnknownNameError.among("built-in policy", policy, self.name, ACTED)
         return self.env.act(policy, known, answer)
 
     def subgoal(self) -> Subgoal:

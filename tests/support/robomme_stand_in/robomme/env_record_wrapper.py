@@ -100,7 +100,7 @@ class Environment(BaseEnv):
         self.selected_bins, self.color_names = [self.spawned_bins[1]], ["red", "green"]
         names = ("static", "pick up the container that hides the red cube")
         self.task_list = [{"name": name, "demonstration": name == "static"} for name in names]
-        self.agent = SimpleNamespace(robot=SimpleNamespace(pose="pose"))
+        self.agent = SimpleNamespace(robot=SimpleNamespace(pose="pose", qpos=[[0.5] * 9]))
         # Pixel (y, x) = (100 + 10 y, 100 + 10 x) of a thing at (x, y).
         intrinsic = np.array([[[10.0, 0, 100], [0, 10, 100], [0, 0, 1]]])
         extrinsic = np.array([[[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]])
