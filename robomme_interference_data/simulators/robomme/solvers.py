@@ -6,23 +6,12 @@ as with any other policy.
 """
 
 import importlib
-import importlib.util
 import queue
 import threading
-from pathlib import Path
 from typing import Any
 
-
-def _sibling(name: str) -> Any:
-    """Load a module from the file beside this one; see `worker.py`."""
-    spec: Any = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-_subgoals = _sibling("subgoals")
-pixel = _subgoals.pixel
+subgoals: Any = None
+"""The module `subgoals.py`; `worker.py` sets it, because these files cannot import each other."""
 
 _STICK = ("PatternLock", "RouteStick")
 _TRIES = 3
@@ -64,7 +53,7 @@ class Script:
 
     def __init__(self, env: Any, family: str) -> None:
         self._env, self._family = env, family
-        self._steps = _subgoals.Steps(env.unwrapped, family)
+        self._steps = subgoals.Steps(env.unwrapped, family)
         self._doing: Any = None
         self._run: _Run | None = None
 
@@ -236,9 +225,9 @@ def _move(solve: _Solver, base: Any, answer: str) -> None:
 
 def _insert(solve: _Solver, base: Any, answer: list[Any]) -> None:
     number, end, side = answer
-    held = _subgoals.ends_of(base, number, end)
-    _do_step(solve, base, _subgoals.pick_up_peg(held))
-    _do_step(solve, base, _subgoals.insert_peg(base, held, side))
+    held = subgoals.ends_of(base, number, end)
+    _do_step(solve, base, subgoals.pick_up_peg(held))
+    _do_step(solve, base, subgoals.insert_peg(base, held, side))
 
 
 def _pattern(solve: _Solver, base: Any, answer: list[int]) -> None:

@@ -38,7 +38,8 @@ def _sibling(name: str) -> Any:
 
 
 _patches, _rendering = _sibling("maniskill_patches"), _sibling("render_on_demand")
-_facts, _solvers = _sibling("facts"), _sibling("solvers")
+_facts, _solvers, _subgoals = _sibling("facts"), _sibling("solvers"), _sibling("subgoals")
+_solvers.subgoals = _subgoals
 
 
 def send(
@@ -174,7 +175,7 @@ class Episodes:
         arrays = {"states": _states(observations)}
         try:  # another version of RoboMME may have other attributes; all else works without them
             scene, moments = (
-                _facts.read_facts(self._env, family, _solvers.pixel),
+                _facts.read_facts(self._env, family, _subgoals.pixel),
                 log.moments(self._env),
             )
             self._script = _solvers.Script(self._env, family)
