@@ -29,15 +29,17 @@ class _Abandoned(BaseException):
 class _Handing:
     """The environment for the solvers, in which a step hands out its action and waits."""
 
-    def __init__(self, env: Any, actions: Any, results: Any) -> None:
-        self._env, self._actions, self._results = env, actions, results
+    def __init__(self, env: Any) -> None:
+        self._env = env
+        self.run: _Run | None = None
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._env, name)
 
     def step(self, action: Any) -> Any:
-        self._actions.put(action)
-        result = self._results.get()
+        assert self.run is not None
+        self.run.actions.put(action)
+        result = self.run.results.get()
         if result is None:
             raise _Abandoned
         return result
@@ -52,7 +54,8 @@ class Script:
     """
 
     def __init__(self, env: Any, family: str) -> None:
-        self._env, self._family = env, family
+        self._env, self._family = _Handing(env), family
+        self._solver: _Solver | None = None  # one, because its planner knows if the gripper holds
         self._steps = subgoals.Steps(env.unwrapped, family)
         self._doing: Any = None
         self._run: _Run | None = None
@@ -66,7 +69,7 @@ class Script:
             NoPlanError: The planners find no motion.
         """
         if self._run is None:
-            self._run = _Run(self._env, self._family, _SOLVE[self._family], answer)
+            self._run = self._start(_SOLVE[self._family], answer)
         return self._run.act()
 
     def follow(self, text: str, points: list[list[int]], seed: int) -> list[float]:
@@ -80,11 +83,17 @@ class Script:
             step = self._steps.find(text, points, seed)
             if step is not None:
                 self.close()
-                self._run = _Run(self._env, self._family, _do_step, step)
+                self._run = self._start(_do_step, step)
         if self._run is not None:
             return self._run.act()
         joints = self._env.unwrapped.agent.robot.qpos[0]
         return [*map(float, joints[:7]), 1.0]
+
+    def _start(self, solve: Any, what: Any) -> "_Run":
+        if self._solver is None:
+            self._solver = _Solver(self._env, self._family)
+        self._env.run = _Run(lambda: solve(self._solver, self._env.unwrapped, what))
+        return self._env.run.start()
 
     def stepped(self, result: Any) -> None:
         """Keep what the environment returned for the last action, for the solvers."""
@@ -100,25 +109,27 @@ class Script:
 class _Run:
     """Solvers in a thread; `result` is what the environment returned for their last action."""
 
-    def __init__(self, env: Any, family: str, solve: Any, what: Any) -> None:
+    def __init__(self, solve: Any) -> None:
         self.result: Any = None
-        self._actions: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._results: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self.actions: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self.results: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._last: list[float] | None = None
         self._done = False
-        handing = _Handing(env, self._actions, self._results)
-        work = (solve, handing, family, what)
-        self._thread = threading.Thread(target=self._solve, args=work, daemon=True)
+        self._thread = threading.Thread(target=self._solve, args=(solve,), daemon=True)
+
+    def start(self) -> "_Run":
+        """Start the thread."""
         self._thread.start()
+        return self
 
     def act(self) -> list[float]:
         """Return the next action; see `Script.act`."""
         if self._last is not None:
             if self._done or self.result is None:
                 return self._last
-            self._results.put(self.result)
+            self.results.put(self.result)
             self.result = None
-        made = self._actions.get()
+        made = self.actions.get()
         if isinstance(made, Exception):
             self._done = True
             raise made
@@ -132,18 +143,18 @@ class _Run:
     def close(self) -> None:
         """End the thread."""
         while self._thread.is_alive():
-            self._results.put(None)
+            self.results.put(None)
             self._thread.join(0.2)
 
-    def _solve(self, solve: Any, env: Any, family: str, what: Any) -> None:
+    def _solve(self, solve: Any) -> None:
         made = None
         try:
-            solve(_Solver(env, family), env.unwrapped, what)
+            solve()
         except _Abandoned:
             return
         except Exception as error:
             made = error
-        self._actions.put(made)
+        self.actions.put(made)
 
 
 class _Solver:

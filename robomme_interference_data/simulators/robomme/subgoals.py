@@ -43,13 +43,13 @@ class Steps:
         places = np.array([pixel(self._base, thing) for thing in things])
         return int(np.argmin(((places - np.array(points[0])) ** 2).sum(axis=1)))
 
-    def unmask(self, base: Any, words: str, points: Any, seed: int) -> Any:
+    def _unmask(self, base: Any, words: str, points: Any, seed: int) -> Any:
         if "pick up" in words:
             chosen = self.thing(base.spawned_bins, points, seed)
             return "solve_pickup_bin", {"obj": base.spawned_bins[chosen]}
         return ("solve_putdown_whenhold", {}) if re.search("put|drop", words) else None
 
-    def repick(self, base: Any, words: str, points: Any, seed: int) -> Any:
+    def _repick(self, base: Any, words: str, points: Any, seed: int) -> Any:
         if "button" in words:
             return "solve_button", {"obj": base.button_left}
         if "pick up" in words:
@@ -58,7 +58,7 @@ class Steps:
         put = re.search("put|drop", words)
         return ("solve_putdown_whenhold", {"release_z": 0.01}) if put else None
 
-    def place(self, base: Any, words: str, points: Any, seed: int) -> Any:
+    def _place(self, base: Any, words: str, points: Any, seed: int) -> Any:
         if "pick up" in words:  # the goal names the cube
             cubes = base.all_cubes if points else [base.target_cube]
             return "solve_pickup", {"obj": cubes[self.thing(cubes, points, seed)]}
@@ -67,7 +67,7 @@ class Steps:
             return "solve_putonto_whenhold", {"target": base.targets[chosen]}
         return None
 
-    def move_cube(self, base: Any, words: str, points: Any, seed: int) -> Any:
+    def _move_cube(self, base: Any, words: str, points: Any, seed: int) -> Any:
         both = {"obj": base.cube, "target": base.goal_site}
         if "hook" in words:
             sides = {"direction": base.direction2, "obj_flag": base.obj_flag}
@@ -81,7 +81,7 @@ class Steps:
         put = re.search("place|put|drop", words)
         return ("solve_putonto_whenhold", {"target": base.goal_site}) if put else None
 
-    def insert(self, base: Any, words: str, points: Any, seed: int) -> Any:
+    def _insert(self, base: Any, words: str, points: Any, seed: int) -> Any:
         if "pick up" in words:
             end = "far" if "far" in words else "near"
             self._held = ends_of(base, self.thing(base.pegs, points, seed), end)
@@ -91,7 +91,7 @@ class Steps:
             return None
         return insert_peg(base, self._held, side[0])
 
-    def pattern(self, base: Any, words: str, points: Any, seed: int) -> Any:
+    def _pattern(self, base: Any, words: str, points: Any, seed: int) -> Any:
         import numpy as np
 
         named = re.search(r"(forward|backward)?[- ]?(left|right)?$", words)
@@ -106,7 +106,7 @@ class Steps:
         chosen = int(((spots - goal) ** 2).sum(axis=1).argmin())
         return "solve_swingonto", {"target": base.buttons_grid[chosen]}
 
-    def route(self, base: Any, words: str, points: Any, seed: int) -> Any:
+    def _route(self, base: Any, words: str, points: Any, seed: int) -> Any:
         import numpy as np
 
         side, turn = re.search(r"\b(left|right)\b", words), re.search("(counter)?clockwise", words)
@@ -120,15 +120,15 @@ class Steps:
 
 
 _FIND = {
-    "VideoUnmask": Steps.unmask,
-    "VideoUnmaskSwap": Steps.unmask,
-    "VideoRepick": Steps.repick,
-    "VideoPlaceButton": Steps.place,
-    "VideoPlaceOrder": Steps.place,
-    "MoveCube": Steps.move_cube,
-    "InsertPeg": Steps.insert,
-    "PatternLock": Steps.pattern,
-    "RouteStick": Steps.route,
+    "VideoUnmask": Steps._unmask,
+    "VideoUnmaskSwap": Steps._unmask,
+    "VideoRepick": Steps._repick,
+    "VideoPlaceButton": Steps._place,
+    "VideoPlaceOrder": Steps._place,
+    "MoveCube": Steps._move_cube,
+    "InsertPeg": Steps._insert,
+    "PatternLock": Steps._pattern,
+    "RouteStick": Steps._route,
 }
 
 
