@@ -437,8 +437,8 @@ def test_subgoals_are_followed(simulator: RoboMMESimulator) -> None:
     status, first = follow(Subgoal("look around", ()))
     assert (status, first) == (Status.FAIL, [0.5] * 7 + [1.0])
     assert follow(picked[1], Subgoal("look around", ()))[0] is Status.SUCCESS
-    # A new subgoal ends what was being done: the stand-in looks at the third action.
-    assert follow(picked[0], picked[1])[0] is Status.SUCCESS
+    # A step is finished before the next one begins: the stand-in looks at the third action.
+    assert follow(picked[0], picked[1])[0] is Status.FAIL
 
 
 def test_a_subgoal_without_a_point_draws(simulator: RoboMMESimulator) -> None:

@@ -57,7 +57,6 @@ class Script:
         self._env, self._family = _Handing(env), family
         self._solver: _Solver | None = None  # one, because its planner knows if the gripper holds
         self._steps = subgoals.Steps(env.unwrapped, family)
-        self._doing: Any = None
         self._run: _Run | None = None
 
     def act(self, answer: Any) -> list[float]:
@@ -75,14 +74,13 @@ class Script:
     def follow(self, text: str, points: list[list[int]], seed: int) -> list[float]:
         """Return the next action towards a subgoal, 8 numbers; see `act`.
 
-        A subgoal that is not understood changes nothing; at first, the arm holds its pose.
+        As RoboMME's own wrapper does, it finishes a step before it begins the next one, which may
+        have the same words. A subgoal that is not understood changes nothing; at first, the arm
+        holds its pose.
         """
-        doing = text, points
-        if doing != self._doing:
-            self._doing = doing
+        if self._run is None or self._run.done:
             step = self._steps.find(text, points, seed)
             if step is not None:
-                self.close()
                 self._run = self._start(_do_step, step)
         if self._run is not None:
             return self._run.act()
@@ -107,14 +105,19 @@ class Script:
 
 
 class _Run:
-    """Solvers in a thread; `result` is what the environment returned for their last action."""
+    """Solvers in a thread.
+
+    Attributes:
+        result: What the environment returned for their last action, if that was executed.
+        done: Whether they have finished, or failed.
+    """
 
     def __init__(self, solve: Any) -> None:
         self.result: Any = None
         self.actions: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self.results: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._last: list[float] | None = None
-        self._done = False
+        self.done = False
         self._thread = threading.Thread(target=self._solve, args=(solve,), daemon=True)
 
     def start(self) -> "_Run":
@@ -125,15 +128,15 @@ class _Run:
     def act(self) -> list[float]:
         """Return the next action; see `Script.act`."""
         if self._last is not None:
-            if self._done or self.result is None:
+            if self.done or self.result is None:
                 return self._last
             self.results.put(self.result)
             self.result = None
         made = self.actions.get()
         if isinstance(made, Exception):
-            self._done = True
+            self.done = True
             raise made
-        self._done = made is None
+        self.done = made is None
         if made is not None:
             self._last = [*map(float, made), -1.0][:8]
         if self._last is None:
