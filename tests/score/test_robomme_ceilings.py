@@ -91,6 +91,19 @@ def test_ceilings_follow_from_the_lessons() -> None:
         assert told == tuple(f"{100 * sum(one) / 50:.1f}%" for one in rates)
 
 
+def test_frames_of_the_least_shown_part() -> None:
+    lessons = [one for one in LESSONS if family_of(one) == "PatternLock"]
+    means = []
+    for sessions in (0, 7):
+        fewest = []
+        for one in lessons:
+            kept = set(Memory("framesamp").kept(range(one["lesson_frames"] + 32 * sessions)))
+            spans = (range(span["start"], span["stop"]) for span in one["evidence"])
+            fewest.append(min(len(kept.intersection(span)) for span in spans))
+        means.append(sum(fewest) / len(fewest))
+    assert f"has {means[0]:.1f} of them on average at k0, and {means[1]:.1f} at k7" in PAGE
+
+
 def test_rollouts_are_counted() -> None:
     columns = (
         *(("oracle", "no-history"), ("guess", "no-history")),
