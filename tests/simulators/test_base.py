@@ -150,7 +150,6 @@ def test_simulate_plays_an_episode_and_writes_what_is_seen(run: Run, tmp_path: P
         ("--video {}/out.avi", ".mp4 file"),
         ("--video {}/file/out.mp4", "{}/file"),
         ("--policy orakel", "oracle, guess, none"),
-        ("--simulator robomme --policy oracle", "is none of none"),
         ("--shift fog:1", "such as light:2"),
         ("--shift light:2 --simulator robomme", "does not support shifts"),
         ("--video {}/out.mp4", "no such episode"),
