@@ -7,6 +7,7 @@ told, tells it.
 """
 
 import json
+from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache, lru_cache
 from itertools import combinations, pairwise, permutations, product
@@ -212,9 +213,9 @@ class Place(OfficialSwaps):
         super().set_up()
         self.asked, self.visits = int(self.facts["asked"]), tuple(self.facts["visits"])
 
+    @abstractmethod
     def visit_texts(self, visits: Sequence[int]) -> tuple[str, ...]:
         """Return a text per placement."""
-        raise NotImplementedError
 
     def answer_texts(self, answer: int) -> tuple[str, ...]:
         """Return a text per placement; those of another answer exchange it with the right one."""
