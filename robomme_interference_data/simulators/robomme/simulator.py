@@ -30,9 +30,6 @@ from robomme_interference_data.simulators.tabletop.episodes import episode_ids
 from .process import Arrays, Process, find_python, installed_versions
 from .scenes import OfficialScene, evidence_of, read_scene
 
-ARMS = ("VideoUnmask", "PatternLock")
-"""Families with a gripper and with a stick whose demonstrations are the shortest."""
-
 FRAME_SHAPE = (256, 256, 3)
 
 EPISODES = 5

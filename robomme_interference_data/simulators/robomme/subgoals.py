@@ -7,8 +7,6 @@ and the solver's arguments.
 import re
 from typing import Any
 
-Step = "tuple[str, dict[str, Any]]"
-
 _ALONG = {"forward": 1.0, "backward": -1.0}
 _ACROSS = {"left": 1.0, "right": -1.0}
 
