@@ -9,8 +9,8 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 import pyarrow as pa
 
-from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
-from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.constants import DIFFICULTIES
+from robomme_interference_data.ids import EpisodeId, family_order
 from robomme_interference_data.schema.codec import arrow_schema, descriptions
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS
 from robomme_interference_data.schema.manifest import BufferManifest
@@ -43,7 +43,7 @@ def unit_table(queries: Iterable[EpisodeRecord], units: Iterable[EpisodeRecord])
     """Return the number of queries by family and difficulty, and of units by family."""
     groups, pool = _by_family(queries), Counter(one.episode_id.family for one in units)
     rows = []
-    for name in sorted({*groups, *pool}, key=_family_rank):
+    for name in sorted({*groups, *pool}, key=family_order):
         found = groups.get(name, [])
         rows.append((escape(name), len(found), *_difficulties(found), pool[name]))
     columns = f"family queries:count {_DIFFICULTIES} units:count"
@@ -84,7 +84,7 @@ def _by_family(records: Iterable[EpisodeRecord]) -> dict[str, list[EpisodeRecord
     groups = defaultdict[str, list[EpisodeRecord]](list)
     for record in records:
         groups[record.episode_id.family].append(record)
-    return {name: groups[name] for name in sorted(groups, key=_family_rank)}
+    return {name: groups[name] for name in sorted(groups, key=family_order)}
 
 
 def _difficulties(records: Sequence[EpisodeRecord]) -> tuple[int, ...]:
@@ -95,10 +95,6 @@ def _difficulties(records: Sequence[EpisodeRecord]) -> tuple[int, ...]:
 
 def _total(rows: Sequence[tuple[Any, ...]]) -> tuple[Any, ...]:
     return ("all", *(sum(column) for column in list(zip(*rows, strict=True))[1:]))
-
-
-def _family_rank(name: str) -> tuple[int, str]:
-    return (FAMILIES.index(name) if name in FAMILIES else len(FAMILIES), name)
 
 
 # --- the columns of a table ----------------------------------------------------------------------

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Self
 
-from robomme_interference_data.constants import FAMILIES, SPLITS
+from robomme_interference_data.constants import DIFFICULTIES, FAMILIES, SPLITS
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, nearest
 
 _FAMILY = re.compile(r"[A-Za-z][A-Za-z0-9_.-]*")
@@ -14,6 +14,13 @@ _INDEX = re.compile(r"0|[1-9][0-9]{0,17}")  # fits the int64 of the tables
 _SPAN = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")
 _MOST_NUMBERS = 1_000_000
 _FAMILY_RANK = {family: rank for rank, family in enumerate(FAMILIES)}
+_RESERVED = (*DIFFICULTIES, "all")
+"""What tables call other parts of the episodes."""
+
+
+def family_order(family: str) -> tuple[int, str]:
+    """Return the key of the canonical order of families: the paper's, then others by name."""
+    return (_FAMILY_RANK.get(family, len(FAMILIES)), family)
 
 
 @dataclass(frozen=True)
@@ -23,11 +30,12 @@ class EpisodeId:
     A fourth part, as in `VideoRepick/test/7/2`, denotes a contradicting lesson: the same scene
     played with answer 2.
 
-    Ids sort by family (the benchmark's in the paper's order, then others by name), split and
-    index. This is the canonical order of all stored data.
+    Ids sort by family (see `family_order`), split and index. This is the canonical order of all
+    stored data.
 
     Args:
-        family: Task family: a letter, then letters, digits, `_`, `.` or `-`.
+        family: Task family: a letter, then letters, digits, `_`, `.` or `-`; not `all` or a
+            difficulty.
         split: `train`, `val` or `test`.
         index: Number of the episode within family and split, from 0.
         answer: Number of the played answer, from 0; None for the scene's correct answer.
@@ -46,6 +54,11 @@ class EpisodeId:
             raise InvalidIdError(
                 f"{self.family!r} is not a family name",
                 "Expected a letter, then letters, digits, '_', '.' or '-', such as VideoRepick.",
+            )
+        if self.family in _RESERVED:
+            raise InvalidIdError(
+                f"{self.family!r} is not a family name: tables have other rows of this name",
+                f"Use another one than {', '.join(_RESERVED)}.",
             )
         if self.split not in SPLITS:
             raise InvalidIdError(
@@ -86,9 +99,8 @@ class EpisodeId:
     @property
     def sort_key(self) -> tuple[int, str, int, int, int]:
         """Key of the canonical order."""
-        rank = _FAMILY_RANK.get(self.family, len(FAMILIES))
         answer = -1 if self.answer is None else self.answer
-        return (rank, self.family, SPLITS.index(self.split), self.index, answer)
+        return (*family_order(self.family), SPLITS.index(self.split), self.index, answer)
 
     def __lt__(self, other: "EpisodeId") -> bool:
         return self.sort_key < other.sort_key

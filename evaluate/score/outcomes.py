@@ -64,6 +64,17 @@ class Outcomes:
         names = [self.systems.index(name) for name in (one, other)]
         return one == other or not bool(self.unpinned[names].any())
 
+    @cached_property
+    def families(self) -> tuple[str, ...]:
+        """The families of the episodes, in canonical order."""
+        return tuple(dict.fromkeys(one.family for one in self.episodes))
+
+    @cached_property
+    def family(self) -> NDArray[np.int64]:
+        """The place in `families` of each episode's family, `(E,) int64`."""
+        places = {name: place for place, name in enumerate(self.families)}
+        return np.array([places[one.family] for one in self.episodes])
+
     def of_family(self, family: str) -> Flags:
         """Whether each episode is of a family, `(E,) bool`."""
         return np.array([one.family == family for one in self.episodes], bool)

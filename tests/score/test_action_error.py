@@ -118,7 +118,6 @@ def test_what_needs_outcomes_says_so(tmp_path: Path) -> None:
         ({"action_l1": -0.5}, "action_l1 -0.5; expected a number from 0"),
         ({"action_l1": float("inf")}, "action_l1 inf"),
         ({"action_l1_values": "0.1 x"}, "action_l1_values '0.1 x'"),
-        ({"simulator": "tabletop"}, "OpenDrawer"),
         ({"family": "Open/Drawer"}, "Open/Drawer"),
     ],
 )

@@ -102,17 +102,17 @@ def test_what_is_printed(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("no_pictures")
 def test_lenient_leaves_bad_rows_out_and_counts_them(tmp_path: Path) -> None:
-    lines = ["my-memory,MoveCube,k0,0,7,easy,success,1,9", "my-memory,MoveCub,k0,1,8,easy,fail,0,9"]
+    lines = ["my-memory,MoveCube,k0,0,7,easy,success,1,9", "my-memory,2Cubes,k0,1,8,easy,fail,0,9"]
     path = made.released(tmp_path / "a.csv", lines)
     common = ("score", path, "--expected", "observed", "--out", tmp_path / "out")
     assert isinstance(run(*common).exception, FormatError)
     assert not (tmp_path / "out").exists()
     done = run(*common, "--lenient")
     assert done.exit_code == 0, done.output
-    assert f"left out: {path}, line 3: family 'MoveCub'" in done.stderr
+    assert f"left out: {path}, line 3: '2Cubes' is not a family" in done.stderr
     assert "1 bad rows left out" in done.stderr
     assert "my-memory  100.0% [20.7, 100.0]\n" in done.stdout
-    assert "family &#39;MoveCub&#39;" in (tmp_path / "out" / "report.html").read_text()
+    assert "&#39;2Cubes&#39; is not a family" in (tmp_path / "out" / "report.html").read_text()
     done = run("compare", path, again(path), "--lenient", "--json")
     assert json.loads(done.stdout)["bad_rows"] == [1, 1]
 
@@ -206,7 +206,7 @@ def test_exported_rows_are_the_same_bytes_whatever_they_come_from(tmp_path: Path
 def test_what_cannot_be_exported_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     rows = [*made.rows(), *made.changed(made.rows(), model_seed=3)]
     rows[7] = replace(rows[7], split="val", seed=7)
-    rows[9] = replace(rows[9], family="X")
+    rows[9] = replace(rows[9], family="X/Y")
     path = made.write_csv(tmp_path / "a.csv", rows)
     given = ("score", path, "--lenient", "--out", tmp_path / "o", "--export", tmp_path / "e")
     done = run(*given)

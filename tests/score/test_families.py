@@ -1,10 +1,15 @@
 """Comparisons by family: apart, with families weighing alike, and as a sample of such families."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from support import scoring as made
 
+from robomme_interference_data.evaluate.score.comparisons.compare import compare
 from robomme_interference_data.evaluate.score.comparisons.families import over_families
+from robomme_interference_data.evaluate.score.plots.data import Data
 
 MOVE, PEG = made.FAMILIES
 
@@ -47,3 +52,43 @@ def test_families_that_never_ran_take_no_part_in_draws() -> None:
     # Beside a comparison of all nine, too.
     both = np.concatenate([nine, np.ones((450, 1))], axis=1)
     assert over_families(both, labels, "key")[0] == over_families(three, labels[:150], "key")[0]
+
+
+def test_families_of_another_benchmark_are_scored_like_the_papers(tmp_path: Path) -> None:
+    names = {"MoveCube": "ShellGame", "InsertPeg": "RememberColor"}
+    rows = [replace(row, family=names[row.family], simulator="cue:make") for row in made.rows()]
+    # One row of the paper's grid beside them: it comes first, then the others by name.
+    rows.append(replace(made.rows()[0], simulator="cue:make", seed=99))
+    own = made.score(made.write_parquet(tmp_path / "own.parquet", rows))
+    paper = made.score(made.write_parquet(tmp_path / "paper.parquet", made.rows()))
+    assert own.outcomes["cue:make"].families == ("MoveCube", "RememberColor", "ShellGame")
+    rates = {
+        (row["system"], row["condition"], row["family"]): (row["n"], row["successes"])
+        for row in own.tables["family"].records()
+    }
+    for row in paper.tables["family"].records():
+        # Errors and missing rows included: 5 of 6, 2 of 5, 0 of 5, …
+        key = (row["system"], row["condition"], names[row["family"]])
+        assert rates[key] == (row["n"], row["successes"])
+    of_own = [one for one in own.tables["coverage"].records() if one["family"] == "ShellGame"]
+    assert of_own[0]["expected"] == made.EPISODES
+    differences = {
+        name: [
+            (one["family"], one["difference"])
+            for one in score.tables["family_effects"].records()
+            if (one["system"], one["condition"]) == (made.BASE, "k7")
+        ]
+        for name, score in {"own": own, "paper": paper}.items()
+    }
+    assert sorted(differences["own"]) == sorted(
+        (names[family], change) for family, change in differences["paper"]
+    )
+
+
+def test_figures_and_comparisons_have_the_families_of_the_rows(tmp_path: Path) -> None:
+    rows = [replace(row, family=f"Other{row.family}", simulator="cue:make") for row in made.rows()]
+    path = made.write_parquet(tmp_path / "own.parquet", rows)
+    data = Data(made.score(path), "cue:make")
+    assert data.parts(data.families) == ["OtherInsertPeg", "OtherMoveCube"]
+    found = compare(path, conditions=("k0", "k7")).table.records()
+    assert {row["family"] for row in found} == {"all", "OtherInsertPeg", "OtherMoveCube"}

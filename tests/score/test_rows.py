@@ -158,7 +158,7 @@ def test_a_scene_may_lack_its_seed_but_no_rollout_the_models(tmp_path: Path, gap
 # --- bad rows ----------------------------------------------------------------------------------
 
 BAD = {
-    "a family": ("my-memory,MoveCub,k0,0,7,easy,fail,0,9", "Did you mean 'MoveCube'?"),
+    "a family": ("my-memory,easy,k0,0,7,easy,fail,0,9", "'easy' is not a family name"),
     "a condition": ("my-memory,MoveCube,k64,0,7,easy,fail,0,9", "'k64' is not a condition"),
     "won": ("my-memory,MoveCube,k0,0,7,easy,fail,1,9", "success True contradicts status 'fail'"),
     "neither": ("my-memory,MoveCube,k0,0,7,easy,success,,9", "success (empty) contradicts"),
@@ -222,16 +222,16 @@ def test_lines_are_right_after_quoted_line_breaks(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     path.write_text(
         "system,goal,family,condition,episode,status,success\n"
-        'mine,"do\nit",X,k0,0,fail,0\n'  # lines 2 and 3
+        'mine,"do\nit",X/Y,k0,0,fail,0\n'  # lines 2 and 3
         "mine,do,MoveCube,k0,1,fail,0\n"
         "too,short\n"
         'mine,"a ""long\n\nstory""",MoveCube,k0,1,fail,0\n'  # lines 6 to 8
-        "mine,do,MoveCub,k0,2,fail,0\n"
+        "mine,do,2Cubes,k0,2,fail,0\n"
     )
     found = read_rows([path], lenient=True)
     assert len(found) == 1
     assert [text.removeprefix(f"{path}, line ")[:10] for text in found.refusals] == [
-        *("2: family ", "5: the lin", "6: the sam", "9: family ")
+        *("2: 'X/Y' i", "5: the lin", "6: the sam", "9: '2Cubes")
     ]
     assert f"as {path}, line 4" in found.refusals[2]
 
@@ -270,8 +270,8 @@ def test_rows_of_one_rollout_that_contradict_each_other_all_go(tmp_path: Path) -
 
 
 def test_nothing_but_bad_rows_and_no_rows_are_no_score(tmp_path: Path) -> None:
-    path = made.write_csv(tmp_path / "a.csv", made.changed(made.rows()[:3], family="X"))
-    with pytest.raises(FormatError, match=r"all 3 rows .* are bad; the first is .*line 2: family"):
+    path = made.write_csv(tmp_path / "a.csv", made.changed(made.rows()[:3], family="X/Y"))
+    with pytest.raises(FormatError, match=r"all 3 rows .* are bad; the first is .*line 2: 'X/Y'"):
         made.score(path, lenient=True)
     with pytest.raises(FormatError, match="no rows"):
         made.score(made.write_csv(tmp_path / "b.csv", []))

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.score.config import Expected
 from robomme_interference_data.evaluate.score.outcomes import Outcomes, outcomes_of
@@ -73,7 +72,8 @@ def compare(
     for a, b in matched:
         both = [(conditions[0], conditions[1])] if conditions else [(c, c) for c in a.conditions]
         both = [two for two in both if two[0] in a.conditions and two[1] in b.conditions]
-        pairs = {(part, two): _pairs(a, b, two, part) for part in ("", *FAMILIES) for two in both}
+        parts = ("", *a.outcomes.families)
+        pairs = {(part, two): _pairs(a, b, two, part) for part in parts for two in both}
         for (family, (before, after)), compared in pairs.items():
             if compared.n:
                 names = (a.outcomes.simulator, b.system, after, (a.system, before), "compare")

@@ -8,7 +8,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.outcomes import Outcomes, success
 from robomme_interference_data.stats.bootstrap import (
     MIN_EPISODES,
@@ -30,7 +29,7 @@ _TABLES = ("lift", "effects", "interference")
 
 def family_effects(outcomes: Outcomes, contrasts: Sequence[Contrast]) -> Iterator[Contrast]:
     """Yield each comparison of conditions again, in each family alone."""
-    parts = {name: outcomes.of_family(name) for name in FAMILIES}
+    parts = {name: outcomes.of_family(name) for name in outcomes.families}
     wrong = outcomes.missing | outcomes.other
     for one in _of(outcomes, contrasts):
         cells = [outcomes.cell(*one.against), outcomes.cell(one.system, one.condition)]
@@ -70,7 +69,7 @@ def families_table(every: Iterable[Outcomes], contrasts: Sequence[Contrast]) -> 
     """Return each comparison with equally weighted families, and whether it varies over them."""
     rows = list[Contrast]()
     for outcomes in every:
-        labels = np.array([FAMILIES.index(one.family) for one in outcomes.episodes])
+        labels = outcomes.family
         found = []
         for one in _of(outcomes, contrasts):
             sides = (one.against, (one.system, one.condition))

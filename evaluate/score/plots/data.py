@@ -28,6 +28,7 @@ class Data:
     Attributes:
         cells: What is drawn, by system, condition and part; published systems are named
             `<system>, published`.
+        families: Families of the episodes, in canonical order.
         systems: Systems with rows.
         absent: Published systems without rows that a system with retrieval is compared with.
         beside: Published systems that have rows, drawn as dashes.
@@ -43,6 +44,7 @@ class Data:
 
     def __init__(self, score: Score, simulator: str):
         self.simulator = simulator
+        self.families = score.outcomes[simulator].families
         found = [one for one in score.cells if one.simulator == simulator and one.n]
         self.systems = list(dict.fromkeys(one.system for one in found))
         self.contrasts = [one for one in score.contrasts if one.simulator == simulator]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
+from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
@@ -101,7 +101,7 @@ def _success(figure: Any, data: Data) -> bool:
 
 
 def _families(figure: Any, data: Data) -> bool:
-    panels = {part: (data, part) for part in data.parts(FAMILIES)}
+    panels = {part: (data, part) for part in data.parts(data.families)}
     few = len(data.systems) <= FEW
     published = [name for name in (*data.absent, *data.beside) if few and data.has_parts(name)]
     return _panels(figure, data, panels, [*data.systems, *published])
@@ -117,7 +117,7 @@ def _retrieval(figure: Any, data: Data) -> bool:
     for system in data.systems:
         for base in (base_of(system), f"{base_of(system)}, published"):
             systems += [system, base] if base in (*data.systems, *data.absent) else []
-    panels = {part or _ALL: (data, part) for part in ("", *data.parts(FAMILIES))}
+    panels = {part or _ALL: (data, part) for part in ("", *data.parts(data.families))}
     return _panels(figure, data, panels, systems)
 
 
@@ -157,7 +157,7 @@ def _panels(
 
 
 def _heatmap(figure: Any, data: Data) -> bool:
-    names, conditions = data.parts(FAMILIES), data.shown(data.systems)
+    names, conditions = data.parts(data.families), data.shown(data.systems)
     labels = [curves.short(condition) for condition in conditions]
     turned = 90 if max(map(len, labels)) > len("none") else 0
     many = max(5, len(conditions))

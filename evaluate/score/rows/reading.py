@@ -8,7 +8,6 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import (
     FormatError,
     InterferenceError,
@@ -19,7 +18,6 @@ from robomme_interference_data.evaluate.run.log import RunHeader
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.schema.rollouts import FINAL, success_of
 from robomme_interference_data.schema.shifts import NO_SHIFT
-from robomme_interference_data.simulators.registry import RECORDINGS
 
 from .files import Part, find_sources, read_file, system_of
 from .values import DEFAULTS, Row, parse, shifted
@@ -139,10 +137,6 @@ class _Checks:
             if at not in wrong and row.success is not _SUCCESS[row.status]:
                 shown = "(empty)" if row.success is None else row.success
                 wrong[at] = f"success {shown} contradicts status {row.status!r}"
-            offline = row.simulator == RECORDINGS  # of any robot's families
-            if at not in wrong and row.family not in FAMILIES and not offline:
-                error = InvalidOptionError.one_of("family", row.family, FAMILIES)
-                wrong[at] = f"{error.message}. {error.hint or ''}".strip()
             if at in wrong:
                 self.reasons[number, line] = wrong[at]
             elif row.shift == NO_SHIFT:

@@ -128,7 +128,6 @@ def _check_simulator(text: str) -> None:
 _CHECKS: dict[str, Callable[[str], object]] = {
     **{"system": name_system, "condition": parse_condition},
     **{"shift": parse_shift, "simulator": _check_simulator},
-    # Any robot's: recordings are not of the benchmark's families alone.
     "family": lambda text: EpisodeId(text, "test", 0),
     "action_l1_values": lambda text: [_number(one, _LARGEST) for one in text.split()],
 }

@@ -8,7 +8,7 @@ from itertools import groupby
 
 import numpy as np
 
-from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
+from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.evaluate.score.comparisons.ranks import all_pairs, tied_with_best
 from robomme_interference_data.evaluate.score.outcomes import (
     STATUSES,
@@ -69,6 +69,13 @@ class Cell:
     best: bool = False  # one of several, and no other one is significantly better
 
     @property
+    def part_of(self) -> str:
+        """The table of its row: `main`, `family` or `difficulty`."""
+        if self.part in ("", *DIFFICULTIES):
+            return "difficulty" if self.part else "main"
+        return "family"
+
+    @property
     def as_rate(self) -> Rate:
         """Its rate, for comparisons."""
         return Rate(self.n, self.rate, self.trials)
@@ -96,7 +103,9 @@ def cells_of(every: Iterable[Outcomes]) -> list[Cell]:
 def _cells(outcomes: Outcomes) -> list[Cell]:
     every: Flags = np.ones(len(outcomes.episodes), bool)
     parts = {"": (every, every)}  # name to its episodes, and to those that are expected in it
-    parts |= {name: (here, here) for name in FAMILIES if (here := outcomes.of_family(name)).any()}
+    parts |= {
+        name: (here, here) for name in outcomes.families for here in [outcomes.of_family(name)]
+    }
     for place, name in enumerate(DIFFICULTIES):
         here = outcomes.difficulty == place
         parts[name] = (here, here | (outcomes.difficulty < 0))
@@ -128,7 +137,7 @@ def _cells(outcomes: Outcomes) -> list[Cell]:
 def _fixed(outcomes: Outcomes, system: int, condition: int, rate: Rate) -> tuple[float, float]:
     """Return the interval of a rate for its families as fixed strata; none for one family."""
     status = outcomes.status[system, condition]
-    parts = [rate_of(status[here]) for name in FAMILIES if (here := outcomes.of_family(name)).any()]
+    parts = [rate_of(status[outcomes.of_family(name)]) for name in outcomes.families]
     parts = [part for part in parts if part.n]
     if len(parts) < 2:
         return math.nan, math.nan
@@ -155,12 +164,12 @@ def _ranked(outcomes: Outcomes, cells: list[Cell], parts: Mapping[str, Flags]) -
 
 def rate_table(cells: Sequence[Cell], name: str) -> Table:
     """Return the table `main`, a row per cell, or of cells with rollouts `family`, `difficulty`."""
-    parts = {"family": FAMILIES, "difficulty": DIFFICULTIES}.get(name, ())
+    parts = name in ("family", "difficulty")
     ran = {(c.simulator, c.system, c.condition) for c in cells if any(c.counts)}
     rows = []
     for cell in cells:
         key: tuple[str, ...] = (cell.simulator, cell.system, cell.condition)
-        if cell.part in (parts or ("",)) and not (parts and key not in ran):
+        if cell.part_of == name and not (parts and key not in ran):
             key += (cell.part,) if parts else ()
             bounds = cell.interval if cell.n else (math.nan, math.nan)
             fixed = () if parts else (*cell.fixed, cell.if_errors_fail)
@@ -235,7 +244,7 @@ def coverage_table(cells: Iterable[Cell]) -> Table:
             *map(_numbers, (cell.missing, cell.broken, cell.other)),
         )
         for cell in cells
-        if cell.part in FAMILIES
+        if cell.part_of == "family"
     )
     return Table.make(
         "coverage",

@@ -6,7 +6,6 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.comparisons.pairs import pair
 from robomme_interference_data.evaluate.score.comparisons.tables import (
     corrected,
@@ -88,7 +87,7 @@ def _effects(cells: _Cells) -> Table:
     """Return the differences between the levels, within families."""
     found = []
     for outcomes, cell, levels in cells:
-        families = np.array([FAMILIES.index(one.family) for one in outcomes.episodes])
+        families = outcomes.family
         parts = {name: _by_family(status, families) for name, status in levels.items()}
         complete = bool(outcomes.complete[outcomes.cell(*cell[1:])])
         for one, other in combinations(parts, 2):
@@ -128,8 +127,8 @@ def _effects(cells: _Cells) -> Table:
 
 
 def _by_family(status: Statuses, families: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return successes and effective trials of each family, `(2, 9)`."""
-    rates = [rate_of(status[families == place]) for place in range(len(FAMILIES))]
+    """Return successes and effective trials of each family, `(2, F)`."""
+    rates = [rate_of(status[families == place]) for place in range(families.max() + 1)]
     won = [rate.value * rate.trials if rate.n else 0.0 for rate in rates]
     return np.array([won, [rate.trials for rate in rates]], float)
 

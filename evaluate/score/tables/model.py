@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
+from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.errors import MissingExtraError
 from robomme_interference_data.evaluate.score.comparisons.tables import (
     corrected,
@@ -200,7 +200,6 @@ def _fit(outcomes: Outcomes, system: str, conditions: Sequence[str]) -> tuple[li
     cells = np.stack([outcomes.status[outcomes.cell(system, c)] for c in conditions])
     condition, episode, seed = np.nonzero(counting(cells))
     won = cells[condition, episode, seed] == 0
-    families = np.array([FAMILIES.index(one.family) for one in outcomes.episodes])
     ks = np.log2([parse_condition(c).k + 1 for c in conditions])[condition]
     history = np.array([c != NO_HISTORY for c in conditions], float)[condition]
     levels = outcomes.difficulty[episode]
@@ -219,4 +218,4 @@ def _fit(outcomes: Outcomes, system: str, conditions: Sequence[str]) -> tuple[li
             kept, design = [*kept, name], np.asarray(more, float)
     if not kept:
         return [], Fit(0, 0, *[np.empty(0)] * 3)
-    return kept, fit_within(won, design, episode, families[episode])
+    return kept, fit_within(won, design, episode, outcomes.family[episode])
