@@ -193,6 +193,13 @@ class NoRendererError(InterferenceError, RuntimeError):
     """
 
 
+class SimulatorError(InterferenceError, RuntimeError):
+    """A simulator that cannot be made, lacks a method, or returns data of another shape.
+
+    Fix: the hint states the shapes; the how-to "Interference on another benchmark" has an example.
+    """
+
+
 class SimulatorCrashError(InterferenceError, RuntimeError):
     """A simulator's process ended, timed out, or reported an internal error.
 

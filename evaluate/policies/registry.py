@@ -15,7 +15,6 @@ from robomme_interference_data.runtime.specs import (
     import_factory,
     signature_of,
 )
-from robomme_interference_data.simulators.base import CAMERAS
 
 from .policy import Policy
 
@@ -175,8 +174,8 @@ def _check_members(text: str, policy: Any) -> None:
         if kind is bool:
             valid, expected = isinstance(value, bool), "True or False"
         else:
-            valid = isinstance(value, tuple | list) and all(one in CAMERAS for one in value)
-            expected = f"a tuple of {' and '.join(map(repr, CAMERAS))}, or an empty one"
+            valid = isinstance(value, tuple | list) and all(isinstance(one, str) for one in value)
+            expected = "a tuple of names of cameras, such as ('front', 'wrist'), or an empty one"
         if not valid:
             wrong.append(f"{name} {value!r}; expected {expected}")
     for name, value in vars(Policy).items():

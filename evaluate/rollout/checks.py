@@ -3,9 +3,9 @@
 import re
 from collections.abc import Sequence
 
-from robomme_interference_data.constants import DEMONSTRATIONS
+from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, EXECUTIONS, STATE
 from robomme_interference_data.data.buffer_set import BufferSet
-from robomme_interference_data.errors import InterferenceError, InvalidOptionError
+from robomme_interference_data.errors import InterferenceError, InvalidOptionError, UnknownNameError
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import BUILTINS, POLICIES, policy_options
 from robomme_interference_data.evaluate.run.config import (
@@ -26,6 +26,7 @@ from robomme_interference_data.evaluate.systems import (
 )
 from robomme_interference_data.retrieval.select import Rule
 from robomme_interference_data.schema.conditions import NO_HISTORY
+from robomme_interference_data.simulators.base import ACTION_SIZE
 from robomme_interference_data.simulators.registry import (
     RECORDINGS,
     SIMULATORS,
@@ -33,6 +34,11 @@ from robomme_interference_data.simulators.registry import (
     find_simulator,
     simulator_class,
 )
+
+from .worker import used_cameras
+
+PANDA_POLICIES = ("replay", "noop", "websocket", "lerobot")
+"""Kinds of policies that read and control RoboMME's robot: 7 joints, then the gripper."""
 
 READS_SUBGOALS = ("websocket", "python", "follow-subgoals")
 """Kinds of policies that may read subgoals."""
@@ -91,12 +97,32 @@ def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> 
     retrieval = [] if config.retrieval is None else [config.retrieval_camera]
     if kind == "answers":
         check_unused(config, ["retrieval"], config.policy, "Set it for the questions instead.")
+    demonstrations = buffer_set.datasets[DEMONSTRATIONS]
     for camera in (*policy.history_cameras, *retrieval):
-        buffer_set.datasets[DEMONSTRATIONS].shape(camera)  # raises for an unknown camera
+        demonstrations.shape(camera)  # raises for an unknown camera
+    live = demonstrations if config.offline else simulator_class(config.simulator)
+    for camera in sorted(used_cameras(config, policy.cameras) - {*live.cameras}):
+        raise UnknownNameError.among("live camera", camera, config.simulator, live.cameras)
+    _check_robot(config, buffer_set, kind)
     if config.videos:
         from .clips import check_drawing
 
         check_drawing()
+
+
+def _check_robot(config: RunConfig, buffer_set: BufferSet, kind: str) -> None:
+    """Reject a policy for RoboMME's robot on another one."""
+    (state,) = buffer_set.datasets[DEMONSTRATIONS].features[STATE]
+    action = simulator_class(config.simulator).action_size
+    if config.offline and EXECUTIONS in buffer_set.datasets:
+        (action,) = buffer_set.datasets[EXECUTIONS].features[ACTION]
+    if kind in PANDA_POLICIES and (state, action) != (ACTION_SIZE, ACTION_SIZE):
+        raise InvalidOptionError(
+            f"the policy {config.policy} reads {ACTION_SIZE} state values and returns "
+            f"{ACTION_SIZE} action values, 7 joints and a gripper; this robot has {state} and "
+            f"{action}",
+            'Set a policy for this robot, such as "python:module:factory".',
+        )
 
 
 def _check_name(config: RunConfig, system: System) -> None:
@@ -160,11 +186,10 @@ def check_plan(
                 "Build the demonstrations from a source with evidence; see "
                 "docs/reference/sources.md.",
             )
-        # A simulator of the user may play any episode, and so may a recording.
-        if ":" in config.simulator or config.offline:
-            continue
         recorded = record.simulator
-        if recorded not in (None, config.simulator):
+        # A simulator of the user may play any episode, and so may a recording.
+        own = ":" in config.simulator or config.offline
+        if recorded not in (None, config.simulator) and not own:
             raise InvalidOptionError(
                 f"{episode} was recorded on {recorded!r}, the run is on {config.simulator!r}",
                 f'Set simulator="{recorded}", or give a buffer set of {config.simulator}.'

@@ -37,7 +37,8 @@ from robomme_interference_data.evaluate.subgoals.registry import (
 )
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.runtime.executor import Session
-from robomme_interference_data.simulators.registry import SIMULATORS, simulator_versions
+from robomme_interference_data.simulators.base import Simulator
+from robomme_interference_data.simulators.registry import simulator_class, simulator_versions
 
 from .checks import check_plan, check_settings, check_system, condition_refusal, default_system
 from .worker import Opening, RolloutTask
@@ -95,21 +96,20 @@ class Rollouts(RunKind[RunConfig]):
         return bool(todo) or self.config.serve is not None
 
     def open(self, session: Session, todo: Sequence[WorkItem]) -> None:
-        """Let a worker start the policy's server, and the simulator, before the first rollout.
-
-        A simulator of the user is made at the first rollout.
-        """
+        """Let a worker start the policy's server, and the simulator, before the first rollout."""
         config = self.config
         if config.serve is not None:
-            self._policy_metadata, keeps = _opened(session, "server", None)
+            self._policy_metadata, keeps = _opened(session, Opening("server"), None)
             options = policy_options(config.policy, config.policy_options)
             check_metadata([self._policy_metadata], options["checkpoint"])
             if keeps is not None:
                 check_memory_kind(keeps, self._policy_metadata["server"], self._system)
             self.metadata = self._policy_metadata | self._subgoal_metadata
         if todo:
-            if config.offline or config.simulator in SIMULATORS:
-                _opened(session, "simulator", config.simulator_timeout_s)
+            # A class of the user is tried out on the first episode.
+            own = ":" in config.simulator and simulator_class(config.simulator) is not Simulator
+            opening = Opening("simulator", todo[0].episode if own else None)
+            _opened(session, opening, config.simulator_timeout_s)
             check_servers_memory(config.policy, config.policy_options, self._system)
 
     def identity(self, plan: Plan) -> dict[str, Any]:
@@ -122,11 +122,11 @@ class Rollouts(RunKind[RunConfig]):
         }
 
 
-def _opened(session: Session, what: str, time_limit: float | None) -> Any:
-    (outcome,) = session.run([Opening(what)], time_limit=time_limit, attempts=1)
+def _opened(session: Session, opening: Opening, time_limit: float | None) -> Any:
+    (outcome,) = session.run([opening], time_limit=time_limit, attempts=1)
     if isinstance(outcome.error, InterferenceError):
         raise outcome.error
-    if outcome.error is not None and what == "server":
+    if outcome.error is not None and opening.what == "server":
         raise PolicyServerError(f"the policy's server cannot be started: {outcome.error}")
     if outcome.error is not None:
         raise SimulatorCrashError(

@@ -6,7 +6,7 @@ import numpy as np
 
 from robomme_interference_data.constants import STATE
 from robomme_interference_data.data.query import Query
-from robomme_interference_data.errors import RunError
+from robomme_interference_data.errors import RunError, SimulatorError
 from robomme_interference_data.simulators.base import Demonstration, EpisodeInfo, Observation
 
 STATE_TOLERANCE = 0.01
@@ -17,7 +17,21 @@ the last bits differ, between versions of the suite more."""
 def check_episode(
     query: Query, played: Demonstration, first: Observation, info: EpisodeInfo
 ) -> None:
-    """Compare seed, difficulty, lesson length, goal and first live state with the recorded ones."""
+    """Compare seed, difficulty, lesson length, goal and first live state with the recorded ones.
+
+    A state or image of another shape fits no episode, and is a `SimulatorError`.
+    """
+    recorded_shapes = {"state": query.dataset.features[STATE]}
+    given_shapes = {"state": first.state.shape}
+    for camera in first.images.keys() & {*query.dataset.cameras}:
+        recorded_shapes[camera] = query.dataset.shape(camera)
+        given_shapes[camera] = first.images[camera].shape
+    if given_shapes != recorded_shapes:
+        raise SimulatorError(
+            f"the simulator gives {given_shapes}; the buffer set was recorded with "
+            f"{recorded_shapes}",
+            "Build the buffer set from this simulator, or correct its sizes.",
+        )
     compared: dict[str, tuple[Any, Any]] = {
         "seed": (query.seed, info.seed),
         "difficulty": (query.difficulty, info.difficulty),

@@ -11,6 +11,7 @@ from robomme_interference_data.errors import (
     PolicyError,
     PolicyServerError,
     ServerKeepaliveError,
+    SimulatorError,
     WorkerRetiredError,
     first_line,
 )
@@ -27,16 +28,19 @@ from robomme_interference_data.evaluate.subgoals.writer import (
     SubgoalWriter,
 )
 from robomme_interference_data.evaluate.systems import name_system
+from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.rollouts import Rollout, Status
-from robomme_interference_data.simulators.base import CAMERAS, Simulator
+from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.registry import (
+    accepted_settings,
     make_simulator,
     simulator_class,
     simulator_versions,
 )
 
+from .recording_check import check_episode
 from .rollout import run_rollout
 
 logger = logging.getLogger(__name__)
@@ -44,9 +48,13 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Opening:
-    """What a worker opens before the first job: the `simulator`, or the policy's `server`."""
+    """What a worker opens before the first job: the `simulator`, or the policy's `server`.
+
+    A simulator of the user begins an episode, so that a mistake in it shows.
+    """
 
     what: str
+    episode: EpisodeId | None = None
 
 
 class RolloutTask(RunTask[RunConfig]):
@@ -75,7 +83,9 @@ class RolloutTask(RunTask[RunConfig]):
         """
         policy = self._open_policy(worker)
         if opening.what == "simulator":
-            self._open_simulator(policy, worker)
+            simulator = self._open_simulator(policy, worker)
+            if opening.episode is not None:
+                self._try_out(simulator, opening.episode, worker)
             return None
         from robomme_interference_data.evaluate.policies.identity import policy_metadata
 
@@ -119,6 +129,18 @@ class RolloutTask(RunTask[RunConfig]):
             with worker.limit(config.simulator_timeout_s, "the simulator's start"):
                 self._simulator = make_simulator(config.simulator, **options)
         return self._simulator
+
+    def _try_out(self, simulator: Simulator, episode: EpisodeId, worker: Worker) -> None:
+        """Begin an episode; raise only for what no episode can work with."""
+        limit = worker.limit(self.run.config.simulator_timeout_s, "the simulator's reset")
+        try:
+            with limit:
+                begun = simulator.reset(str(episode), demonstration=False)
+            check_episode(self.buffer_set.query(episode), *begun)
+        except SimulatorError:
+            raise
+        except Exception:
+            self.close()  # the rollout of this episode becomes an error row
 
     def _open_writer(self) -> SubgoalWriter | None:
         config = self.run.config
@@ -219,17 +241,23 @@ class RolloutTask(RunTask[RunConfig]):
             policy.close()
 
 
-def simulator_options(config: RunConfig, policy_cameras: Iterable[str]) -> dict[str, Any]:
-    """Return the options of a run's simulator, which draws only the cameras that are used."""
+def used_cameras(config: RunConfig, policy_cameras: Iterable[str]) -> set[str]:
+    """Return the cameras whose live images a run reads."""
     used = {*policy_cameras}
     if config.subgoals not in (None, ORACLE):
         used.add(CAMERA)
     if config.retrieval is not None:
         used.add(config.retrieval_camera.removeprefix(CAMERA_PREFIX))
+    return used
+
+
+def simulator_options(config: RunConfig, policy_cameras: Iterable[str]) -> dict[str, Any]:
+    """Return the options of a run's simulator, which draws only the cameras that are used."""
+    used = used_cameras(config, policy_cameras)
     if config.videos or config.check_lesson:
-        used |= {*CAMERAS}
+        used |= {*simulator_class(config.simulator).cameras}
     settings = {
-        "cameras": tuple(name for name in sorted(used) if config.offline or name in CAMERAS),
+        "cameras": tuple(sorted(used)),
         "shift": config.shift,
         "python": config.robomme_python,
         "subgoals": config.subgoals == ORACLE,
@@ -237,4 +265,4 @@ def simulator_options(config: RunConfig, policy_cameras: Iterable[str]) -> dict[
         # Its own limit ends a little before the worker's: its error shows its output.
         "answer_s": 0.9 * config.simulator_timeout_s,
     }
-    return {name: settings[name] for name in simulator_class(config.simulator).settings}
+    return accepted_settings(config.simulator, settings)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robomme_interference_data.constants import MAX_STEPS
+from robomme_interference_data.constants import FPS, MAX_STEPS
 from robomme_interference_data.errors import (
     InvalidOptionError,
     SimulatorCrashError,
@@ -23,7 +23,7 @@ from robomme_interference_data.schema.subgoal import Subgoal
 from .scene import Scene
 
 CAMERAS = ("front", "wrist")
-"""The cameras of every simulator, in canonical order."""
+"""The cameras of RoboMME and of simulators that declare no others, in canonical order."""
 
 ACTED = ("oracle", "guess", "recall", "answer")
 """Built-in policies of `Simulator.act`."""
@@ -32,12 +32,12 @@ BUILT_IN = (*ACTED, "follow-subgoals")
 """All built-in policies of a simulator."""
 
 ACTION_SIZE = 8
-"""Length of an action and of a state: 7 joints, then the gripper."""
+"""Length of RoboMME's actions and states, and where none is declared: 7 joints, the gripper."""
 
 
 @dataclass(frozen=True)
 class Observation:
-    """What a policy sees at one time step.
+    """What a policy sees at one time step. Shapes and units are RoboMME's.
 
     Attributes:
         images: Camera name (`front`, `wrist`) to image, `(256, 256, 3) uint8` RGB. Only the
@@ -55,6 +55,9 @@ class Observation:
 @dataclass(frozen=True)
 class Demonstration:
     """The lesson of an episode: T time steps, without the first live observation.
+
+    It may be a demonstration that was played separately, or the first phase of the episode itself,
+    such as a cue: the history of a buffer is given to the policy between it and the live part.
 
     Attributes:
         images: Camera name to frames, `(T, H, W, 3) uint8` RGB; only every n-th frame if these were
@@ -108,23 +111,26 @@ Begun = tuple[Demonstration, Observation, EpisodeInfo]
 
 
 class Simulator(ABC):
-    """Runs one episode of the benchmark's task families at a time.
+    """Runs one episode of its task families at a time.
 
     An episode ends when `step` returns another status than `ongoing`, when a call raises, or after
     1300 steps (`timeout`). Subclasses implement `_begin`, `_execute` and `act`. Instead of a
     subclass, any object with the methods `reset`, `step`, `act` and `close` works as well.
 
-    Class attributes and class methods declare what a simulator supports, before one is made. A
-    simulator that a function makes has the values of this class.
+    Class attributes and class methods declare what a simulator supports, before one is made. For a
+    function that makes one they are those of the class in its return annotation, else of this one.
 
     Attributes:
         name: Registered name.
         about: What its episodes are, for cards, such as `the official simulator, RoboMME`.
         remote: Whether it runs in another process; `evaluate` then decodes the history while the
             simulator begins the episode.
+        cameras: Names of its cameras, in the order of videos.
+        fps: Observations per second: an action is executed for the time between two of them.
         settings: Settings of a run that its constructor accepts: `cameras` (to render), `shift`,
             `python` (path of another interpreter), `subgoals` (whether `subgoal` will be called),
-            `answer_s` (seconds that a call may take), `buffer_set` (its location).
+            `answer_s` (seconds that a call may take), `buffer_set` (its location). A function
+            accepts those that are its parameters.
         policies: Its built-in policies: those of `act`, and `follow-subgoals` if it has
             `follow_subgoal`.
         shifts: Whether it supports shifts of the live scene.
@@ -137,6 +143,8 @@ class Simulator(ABC):
     name: ClassVar[str] = ""
     about: ClassVar[str] = ""
     remote: ClassVar[bool] = False
+    cameras: Sequence[str] = CAMERAS
+    fps: ClassVar[int] = FPS
     settings: ClassVar[tuple[str, ...]] = ()
     policies: ClassVar[tuple[str, ...]] = BUILT_IN
     shifts: ClassVar[bool] = False
@@ -232,8 +240,11 @@ class Simulator(ABC):
             InvalidIdError: The text is not an episode id.
             InvalidOptionError: `demonstration` is negative.
             UnknownNameError: The family or episode does not exist.
+            SimulatorError: What the subclass returned has other shapes or types.
             SimulatorCrashError: The simulator failed, or is closed.
         """
+        from .checks import check_begun
+
         self._check_open()
         self._episode = None
         episode = EpisodeId.parse(str(episode_id))
@@ -241,15 +252,16 @@ class Simulator(ABC):
             expected = "True, False, or n for every n-th frame"
             raise InvalidOptionError.expected("demonstration", demonstration, expected)
         begun = self._begin(episode, int(demonstration))
+        check_begun(self, begun)
         self._episode, self._steps = episode, 0
         return begun
 
     def step(self, action: NDArray[np.float32], observe: bool = True) -> tuple[Observation, Status]:
-        """Execute one action for 0.1 s.
+        """Execute one action for the time between two observations, 0.1 s on RoboMME.
 
         Args:
-            action: `(8,) float32`: 7 absolute joint targets in rad, then the gripper, −1 closed to
-                1 open.
+            action: `(action_size,) float32`; on RoboMME 7 absolute joint targets in rad, then the
+                gripper, −1 closed to 1 open.
             observe: Whether to return images; `False` lets a simulator skip rendering and leave
                 `images` empty. The state is always returned.
 
@@ -394,5 +406,5 @@ def action_array(
         f"expected {expected}, of finite numbers",
         "An action is 7 absolute joint targets in rad, then the gripper, −1 closed to 1 open."
         if size == ACTION_SIZE
-        else "The recordings have actions of this size.",
+        else "The simulator, or the recordings, have actions of this size.",
     )

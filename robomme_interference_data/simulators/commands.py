@@ -33,7 +33,9 @@ def simulate(
     ] = None,
     video: Annotated[Path | None, _option("Output", "Write a video to this .mp4 file.")] = None,
     as_json: AsJson = False,
-    simulator: Annotated[str, _option("Simulator", "tabletop or robomme.")] = "tabletop",
+    simulator: Annotated[
+        str, _option("Simulator", "tabletop, robomme or module:name.")
+    ] = "tabletop",
     shift: Annotated[str, _option("Simulator", SHIFT_HELP)] = NO_SHIFT,
     robomme_python: Annotated[
         str | None,
@@ -59,7 +61,7 @@ def simulate(
     from robomme_interference_data.ids import EpisodeId
 
     from .play import play
-    from .registry import check_shift, make_simulator, simulator_class
+    from .registry import accepted_settings, check_shift, make_simulator, simulator_class
 
     check_shift(simulator, shift)
     supported = simulator_class(simulator)
@@ -74,7 +76,7 @@ def simulate(
     settings: dict[str, Any] = {"shift": shift, "python": robomme_python}
     if video is None:
         settings["cameras"] = ()
-    options = {key: settings[key] for key in supported.settings if key in settings}
+    options = accepted_settings(simulator, settings)
     with closing(make_simulator(simulator, **options)) as running:
         result = play(running, name, policy, video) | {"shift": shift}
     if video is not None:

@@ -37,7 +37,8 @@ class Recordings(Simulator):
     def __init__(self, buffer_set: str, cameras: Sequence[str] = ()):
         self._buffer_set = load_buffer_set(buffer_set, threads=1)
         self._executions = open_dataset(self._buffer_set, EXECUTIONS)
-        self._cameras = choose_cameras(cameras, self._executions.cameras)
+        self.cameras = self._executions.cameras
+        self._cameras = choose_cameras(cameras, self.cameras)
         (self.action_size,) = self._executions.features[ACTION]
 
     @override

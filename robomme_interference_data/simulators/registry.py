@@ -1,10 +1,16 @@
 """Simulators by name. Their libraries are imported when one is made."""
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+import traceback
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, get_type_hints
 
-from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
-from robomme_interference_data.runtime.specs import import_factory
+from robomme_interference_data.errors import (
+    InterferenceError,
+    InvalidOptionError,
+    SimulatorError,
+    UnknownNameError,
+)
+from robomme_interference_data.runtime.specs import import_factory, signature_of
 from robomme_interference_data.schema.shifts import parse_shift
 
 from .base import Simulator
@@ -26,13 +32,14 @@ SIMULATORS: dict[str, str | Callable[..., Simulator]] = {
 """Name to a factory, or to its location `module:name`; add your own simulators here."""
 
 _SEEDS = 1 << 32
+_METHODS = ("reset", "step", "act", "close")
 
 
 def make_simulator(name: str, **options: Any) -> Simulator:
     """Make a simulator in this process; make only one per process.
 
     Args:
-        name: `tabletop`, `robomme`, or `module:function` for your own simulator.
+        name: `tabletop`, `robomme`, or `module:name` of a class or function of your own.
         **options: Passed to the simulator; see `TabletopSimulator` and `RoboMMESimulator`.
 
     Raises:
@@ -40,8 +47,29 @@ def make_simulator(name: str, **options: Any) -> Simulator:
         MissingExtraError: Its libraries are not installed.
         InvalidOptionError: An option has an invalid value.
         NoRendererError: This machine cannot render its camera images.
+        SimulatorError: One of your own cannot be made, or lacks a method.
     """
-    return find_simulator(name)(**options)
+    factory = find_simulator(name)
+    if ":" not in name:
+        return factory(**options)
+    try:
+        simulator = factory(**options)
+    except InterferenceError:
+        raise
+    except Exception as error:
+        trace = error.__traceback__ and error.__traceback__.tb_next
+        raise SimulatorError(
+            f"simulator {name!r}: making it raised {type(error).__name__}: {error}",
+            "".join(traceback.format_exception(type(error), error, trace)).rstrip(),
+        ) from error
+    missing = [f"{one}()" for one in _METHODS if not callable(getattr(simulator, one, None))]
+    if missing:
+        raise SimulatorError(
+            f"simulator {name!r}: {type(simulator).__name__} has no {', '.join(missing)}",
+            "Subclass robomme_interference_data.simulators.Simulator: "
+            "docs/how-to/another-benchmark.md.",
+        )
+    return simulator
 
 
 def find_simulator(name: str) -> Callable[..., Simulator]:
@@ -54,9 +82,27 @@ def find_simulator(name: str) -> Callable[..., Simulator]:
 
 
 def simulator_class(name: str) -> type[Simulator]:
-    """Return the class that declares what a simulator supports; `Simulator` for a function."""
+    """Return the class that declares what a simulator supports.
+
+    For a function it is the one in its return annotation; `Simulator` if nothing is declared.
+    """
+    declared: Any = find_simulator(name)
+    if not isinstance(declared, type):
+        try:
+            declared = get_type_hints(declared).get("return")
+        except (NameError, TypeError):  # no readable annotations
+            declared = None
+    return declared if isinstance(declared, type) and issubclass(declared, Simulator) else Simulator
+
+
+def accepted_settings(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those settings of a run that a simulator accepts; see `Simulator.settings`."""
     factory = find_simulator(name)
-    return factory if isinstance(factory, type) and issubclass(factory, Simulator) else Simulator
+    if isinstance(factory, type) and issubclass(factory, Simulator):
+        accepted: Any = factory.settings
+    else:
+        accepted = signature_of(factory).parameters
+    return {setting: value for setting, value in settings.items() if setting in accepted}
 
 
 def check_shift(name: str, shift: str) -> None:

@@ -193,7 +193,7 @@ def test_every_member_of_the_protocol_is_required() -> None:
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
-        ("history_cameras", '["top"]', "a tuple of 'front' and 'wrist'"),
+        ("history_cameras", "[3]", "a tuple of names of cameras"),
         ("cameras", '"front"', "cameras 'front'"),
         ("every_frame", "1", "every_frame 1; expected True or False"),
         ("act", "3", r"no method act()"),
