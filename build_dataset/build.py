@@ -18,6 +18,7 @@ from robomme_interference_data.errors import (
     InterferenceError,
     InvalidOptionError,
     MissingExtraError,
+    SimulatorError,
     SourceError,
     first_line,
 )
@@ -113,7 +114,7 @@ def _stage(
                 take(outcome.task, outcome.value, before=False, node=outcome.node)
                 continue
             failures.append(outcome)
-            if isinstance(outcome.error, InvalidOptionError | MissingExtraError):
+            if isinstance(outcome.error, InvalidOptionError | MissingExtraError | SimulatorError):
                 break  # the others would fail alike
     if failures:
         raise _failure(failures, len(todo))

@@ -1,9 +1,11 @@
 """Sources of recorded episodes, opened by a specification such as `robomme-h5:recordings/`."""
 
+import re
+from importlib.util import find_spec
 from typing import Any
 
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.runtime.specs import Kind, Registry, signature_of
+from robomme_interference_data.runtime.specs import Kind, Registry, Spec, signature_of
 from robomme_interference_data.simulators.registry import SIMULATORS, simulator_class
 
 from .base import Frame, Recording, Robot, Source, SourceEpisode
@@ -11,6 +13,7 @@ from .base import Frame, Recording, Robot, Source, SourceEpisode
 __all__ = ["SOURCES", "Frame", "Recording", "Robot", "Source", "SourceEpisode", "open_source"]
 
 _LOCATION = "(?P<location>.+)"
+_OWN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 SOURCES = Registry(
     "source",
@@ -30,6 +33,7 @@ SOURCES = Registry(
         },
         "sample": Kind("sample[:FAMILY,…]", f"{__name__}.sample:SampleSource", "(?P<families>.*)"),
     },
+    also="MODULE:NAME of a simulator of your own",
 )
 
 
@@ -37,13 +41,15 @@ def open_source(specification: str, *, shifted: bool = False, **options: Any) ->
     """Open a source.
 
     Args:
-        specification: `KIND:LOCATION` or `KIND`; see `SOURCES`.
+        specification: `KIND:LOCATION` or `KIND`; see `SOURCES`. Or `MODULE:NAME` of a simulator of
+            the user, as in `make_simulator`.
         shifted: Whether to open the first live views under shifts instead of the episodes.
         **options: `columns` and `families_file` for `lerobot`, `robomme_python` for simulators;
             other kinds ignore them.
     """
-    spec = SOURCES.parse(specification)
-    if shifted and not (spec.kind in SIMULATORS and simulator_class(spec.kind).shifts):
+    spec = _parse(specification)
+    simulator = spec.given.get("name")
+    if shifted and not (simulator and simulator_class(simulator).shifts):
         able = [one for one in SIMULATORS if simulator_class(one).shifts]
         raise InvalidOptionError(
             f"the source {specification} cannot show its episodes under shifts",
@@ -54,3 +60,12 @@ def open_source(specification: str, *, shifted: bool = False, **options: Any) ->
     known = {name: value for name, value in options.items() if name in accepted}
     source: Source = factory(**spec.given, **known)
     return source
+
+
+def _parse(specification: str) -> Spec:
+    """Parse the text of a source; a simulator of the user is one like the embedded one."""
+    module = specification.partition(":")[0]
+    own = _OWN.fullmatch(specification) and module not in SOURCES.kinds
+    if own and find_spec(module.partition(".")[0]):
+        return Spec("tabletop", given={"name": specification})
+    return SOURCES.parse(specification)

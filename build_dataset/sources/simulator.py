@@ -1,10 +1,10 @@
 """Sources that are simulators: they play each episode while it is read."""
 
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import replace
 from typing import Any, override
 
-from robomme_interference_data.errors import SimulatorCrashError
+from robomme_interference_data.errors import SimulatorCrashError, SimulatorError, SourceError
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.shifts import SHIFTS
 from robomme_interference_data.simulators.base import (
@@ -13,13 +13,17 @@ from robomme_interference_data.simulators.base import (
     Simulator,
     choose_cameras,
 )
-from robomme_interference_data.simulators.registry import make_simulator, simulator_class
+from robomme_interference_data.simulators.registry import (
+    accepted_settings,
+    make_simulator,
+    simulator_class,
+)
 
-from .base import Frame, Recording, Source, SourceEpisode
+from .base import Frame, Recording, Robot, Source, SourceEpisode
 
 
 class SimulatorSource(Source):
-    """The episodes of the nine families that have demonstrations.
+    """The episodes that a simulator's class lists, those with demonstrations.
 
     An episode is the demonstration, the first live observation, and what the oracle does until the
     episode ends. RoboMME does not return the actions of its
@@ -33,8 +37,7 @@ class SimulatorSource(Source):
         # Another version of the suite has other episodes.
         version = self._class.suite_version
         self.provenance = {"kind": name, **({} if version is None else {"suite_version": version})}
-        options = {"python": robomme_python, "subgoals": False}
-        self._options = {key: options[key] for key in options if key in self._class.settings}
+        self._settings = {"python": robomme_python, "subgoals": False}
         self._simulator: Simulator | None = None
         self._cameras: tuple[str, ...] = ()
 
@@ -44,6 +47,12 @@ class SimulatorSource(Source):
     @override
     def episodes(self) -> list[SourceEpisode]:
         usual, further = self._class.episodes(), self._class.further_episodes()
+        if not usual:
+            raise SourceError(
+                f"the simulator {self.name} lists no episodes",
+                "Define the class method `episodes`, and name the class as MODULE:CLASS, or a "
+                "function with it as return annotation: see docs/how-to/another-benchmark.md.",
+            )
         listed = [SourceEpisode(one, self.provenance) for one in usual]
         listed += [SourceEpisode(one, self.provenance, further=True) for one in further]
         return sorted(listed, key=lambda one: one.id)
@@ -57,12 +66,17 @@ class SimulatorSource(Source):
 
     @override
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
-        chosen = choose_cameras(cameras)
+        chosen = choose_cameras(cameras, self._class.cameras)
         simulator = self._open(chosen)
         lesson, first, info = simulator.reset(str(episode.id), demonstration=bool(chosen))
-        frames = _play(simulator, lesson, first)
+        for camera in chosen:
+            if camera not in first.images:
+                drawn = ", ".join(first.images) or "none"
+                raise SimulatorError(f"{self.name} did not draw the camera {camera}, but {drawn}")
+        frames = _play(simulator, lesson, first, chosen)
         known = info.goals, info.seed, info.difficulty, info.simulator
-        return Recording(*known, True, frames, lesson.evidence, scene=lesson.scene)
+        robot = Robot(fps=self._class.fps)
+        return Recording(*known, True, frames, lesson.evidence, robot=robot, scene=lesson.scene)
 
     @override
     def close(self) -> None:
@@ -74,7 +88,8 @@ class SimulatorSource(Source):
         """Return the simulator with these cameras, which is kept for the next episode."""
         if self._simulator is None or self._cameras != cameras:
             self.close()
-            self._simulator = make_simulator(self.name, cameras=cameras, **self._options)
+            settings = accepted_settings(self.name, {"cameras": cameras, **self._settings})
+            self._simulator = make_simulator(self.name, **settings)
             self._cameras = cameras
         return self._simulator
 
@@ -84,24 +99,27 @@ class ShiftedSource(SimulatorSource):
 
     @override
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
-        simulator = self._open(choose_cameras(cameras))
+        simulator = self._open(choose_cameras(cameras, self._class.cameras))
         _, _, info = simulator.reset(str(episode.id), demonstration=False)
         frames = (Frame(seen.images, seen.state, None, False) for seen in simulator.views(SHIFTS))
         return Recording(info.goals, info.seed, info.difficulty, info.simulator, True, frames)
 
 
-def _play(simulator: Simulator, lesson: Demonstration, first: Observation) -> Generator[Frame]:
+def _play(
+    simulator: Simulator, lesson: Demonstration, first: Observation, cameras: Sequence[str]
+) -> Generator[Frame]:
     recorded = len(lesson.actions) == len(lesson)
     for index in range(len(lesson)):
-        images = {camera: frames[index] for camera, frames in lesson.images.items()}
+        images = {camera: lesson.images[camera][index] for camera in cameras}
         action = lesson.actions[index] if recorded else None
         yield Frame(images, lesson.states[index], action, True)
     seen, status = first, Status.ONGOING
     while status is Status.ONGOING:
+        images = {camera: seen.images[camera] for camera in cameras}
         try:
             chosen = simulator.act("oracle")
         except SimulatorCrashError:  # no plan; a demonstration ends with this frame in any case
-            yield Frame(seen.images, seen.state, None, False)
+            yield Frame(images, seen.state, None, False)
             raise
-        yield Frame(seen.images, seen.state, chosen, False)
+        yield Frame(images, seen.state, chosen, False)
         seen, status = simulator.step(chosen)

@@ -17,17 +17,18 @@ from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.errors import MissingExtraError, counted
 from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.evaluate.subgoals.writer import CAMERA
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.sampling import spread
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import EpisodeInfo, Observation
 from robomme_interference_data.storage.encode import CLIP, VideoEncoder
 from robomme_interference_data.viz.figure import Hue
-from robomme_interference_data.viz.filmstrip import session_colors
+from robomme_interference_data.viz.filmstrip import session_colors, shown_camera
 
 _VIEW = 256  # side of a camera's picture
-_HEADS = ("lesson", "given", "front", "wrist")
-_WIDTH = (len(_HEADS) + 1) * _VIEW  # and the text
+_VIEWS = 4  # lesson, history and two live cameras
+_WIDTH = (_VIEWS + 1) * _VIEW  # and the text
 _HEAD = 24
 _HEIGHT = _VIEW + _HEAD
 _COLUMNS = 8
@@ -86,6 +87,7 @@ class Clip:
         self._heading = [line for name in names for line in textwrap.wrap(name, _LETTERS)]
         self._goal = self._given = ""
         self._views: dict[str, NDArray[np.uint8]] = {}
+        self._cameras: list[str] = []
         self._lesson: Iterator[NDArray[np.uint8]] = iter(())
         self._subgoal: Subgoal | None = None
         self._steps = 0
@@ -102,6 +104,7 @@ class Clip:
         self._goal, self._fps = info.goal, max(1, round(buffer.query.dataset.fps))
         self._given = f"history given: {counted(len(given), 'frame')}" if given else "no history"
         self._views = {"given": history_picture(buffer, given)}
+        self._cameras = sorted(first.images)[: _VIEWS - 2]
         self._lesson = self._file.enter_context(closing(_lesson_of(buffer)))
         self._show(first)
         self._path = Path(
@@ -112,7 +115,7 @@ class Clip:
 
     @_harmless
     def step(self, observation: Observation, status: Status, subgoal: Subgoal | None) -> None:
-        """Draw a step, with the images of both cameras, and its subgoal."""
+        """Draw a step, with the images of two cameras, and its subgoal."""
         if self._encoder is not None:
             self._steps += 1
             self._subgoal = subgoal
@@ -139,14 +142,17 @@ class Clip:
     def _picture(self, status: Status, *, error: str | None = None) -> NDArray[np.uint8]:
         """Return the current picture, `(280, 1280, 3) uint8`."""
         canvas = np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
-        for place, name in enumerate(_HEADS):
+        for place, name in enumerate(("lesson", "given", *self._cameras)):
             if name in self._views:
-                view = self._views[name][:_VIEW, :_VIEW]
+                view = self._views[name]
+                step = -(-max(view.shape[:2]) // _VIEW)  # 1 up to 256 pixels
+                view = view[::step, ::step]
                 x = place * _VIEW
                 canvas[_HEAD : _HEAD + view.shape[0], x : x + view.shape[1]] = view
-        front = _HEADS.index("front") * _VIEW
-        for y, x in self._subgoal.points if self._subgoal else ():
-            _cross(canvas[_HEAD:, front : front + _VIEW], y, x)
+        if self._subgoal and CAMERA in self._cameras:
+            left = (self._cameras.index(CAMERA) + 2) * _VIEW
+            for y, x in self._subgoal.points:
+                _cross(canvas[_HEAD:, left : left + _VIEW], y, x)
         lines = [*self._heading, "", *textwrap.wrap(self._goal, _LETTERS)]
         subgoal = self._subgoal and self._subgoal.simple
         for head, text in (("subgoal:", subgoal), ("error:", error)):
@@ -154,16 +160,18 @@ class Clip:
                 lines += ["", head, *textwrap.wrap(text, _LETTERS)]
         # The last two lines always fit, however long the text before them is.
         lines = [*lines[: _LINES - 3], "", f"step {self._steps} of {MAX_STEPS}", str(status)]
-        heads = ["lesson" if "lesson" in self._views else "no lesson", self._given, *_HEADS[2:]]
+        heads = ["lesson" if "lesson" in self._views else "no lesson", self._given]
+        heads += self._cameras
         return _lettered(canvas, heads, lines, _COLORS[status])
 
 
 def _lesson_of(buffer: Buffer) -> Generator[NDArray[np.uint8]]:
-    """Yield the front frames of a buffer's lesson, `(H, W, 3) uint8`."""
+    """Yield the frames of a buffer's lesson, `(H, W, 3) uint8`, of the camera of strips."""
+    camera = shown_camera(buffer)
     lesson = [one for one in buffer.sessions if one.role == "lesson"]
     indices = [index for one in lesson for index in range(one.start, one.stop)]
-    for chunk in buffer.stream(1, ("front",), indices):
-        yield chunk.frames["front"][0]
+    for chunk in buffer.stream(1, (camera,), indices):
+        yield chunk.frames[camera][0]
 
 
 def _cross(view: NDArray[np.uint8], y: int, x: int) -> None:
@@ -177,10 +185,11 @@ def history_picture(buffer: Buffer, given: Sequence[int]) -> NDArray[np.uint8]:
     """Return 64 evenly spread history frames, `(256, 256, 3) uint8`, underlined by session."""
     picture = np.full((_VIEW, _VIEW, 3), 255, np.uint8)
     colors, sessions = session_colors(buffer.sessions), buffer.session_index
+    camera = shown_camera(buffer)
     for place, chosen in enumerate(spread(0, len(given), _COLUMNS * _COLUMNS)):
         index = given[chosen]
         y, x = (_THUMB * part for part in divmod(place, _COLUMNS))
-        frame = buffer.frame(index, "front")
+        frame = buffer.frame(index, camera)
         step = max(1, frame.shape[0] // _SMALL)
         small = frame[step // 2 :: step, step // 2 :: step][:_SMALL, :_SMALL]
         picture[y : y + small.shape[0], x : x + small.shape[1]] = small
@@ -200,7 +209,7 @@ def _lettered(
     font = ImageFont.load_default(13)
     for place, head in enumerate(heads):
         draw.text((place * _VIEW + 4, 4), head, fill="#333333", font=font)
-    y, left = _HEAD + 4, len(_HEADS) * _VIEW
+    y, left = _HEAD + 4, _VIEWS * _VIEW
     for line in lines[:-1]:
         draw.text((left + 10, y), line, fill="black", font=font)
         y += 17

@@ -67,16 +67,20 @@ class Spec:
 
 
 class Registry:
-    """Kinds by name; messages call them `what`, such as `policy`."""
+    """Kinds by name; messages call them `what`, such as `policy`.
 
-    def __init__(self, what: str, kinds: Mapping[str, Kind]):
-        self._what, self.kinds = what, kinds
+    `also` is the form of texts that the caller parses itself, for messages.
+    """
+
+    def __init__(self, what: str, kinds: Mapping[str, Kind], also: str = ""):
+        self._what, self.kinds, self._also = what, kinds, also
 
     def parse(self, text: str) -> Spec:
         """Parse a text: `UnknownNameError` for an unknown kind, else `InvalidOptionError`."""
         name, colon, target = text.partition(":")
         if name not in self.kinds:
             forms = ", ".join(kind.form for kind in self.kinds.values())
+            forms += f", {self._also}" if self._also else ""
             raise UnknownNameError(
                 f"there is no {self._what} {text!r}; expected {forms}",
                 nearest(name, self.kinds, more=""),
