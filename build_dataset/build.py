@@ -12,7 +12,7 @@ from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from robomme_interference_data.constants import ACTION
+from robomme_interference_data.constants import ACTION, UNITS
 from robomme_interference_data.errors import (
     BuildError,
     InterferenceError,
@@ -171,7 +171,9 @@ def _write(
         reasons = "; ".join(f"{name}: {why}" for name, why in list(skipped.items())[:5])
         raise SourceError(
             f"no episode yields {plan.kind}: {len(skipped)} unusable ({reasons})",
-            "Check `families`, `split` and `episodes` against the sources.",
+            "Check `families`, `split` and `episodes` against the sources."
+            + " `unit_frames` and `unit_stride` allow units of shorter episodes."
+            * (plan.kind in UNITS),
         )
     ordered = sorted(stored, key=lambda one: one.record.episode_id)
     # Actions are stored only if all episodes have them: buffers do not hold them.
@@ -188,7 +190,7 @@ def _write(
     provenances = [source.provenance for source in plan.sources]
     provenances += existing.dataset.identity.sources if existing else ()
     sources = [one for _, one in sorted({canonical_json(p): p for p in provenances}.items())]
-    identity = identity_of(records, plan.kind, plan.version, plan.codec, sources)
+    identity = identity_of(records, plan.kind, plan.version, plan.codec, sources, unit=plan.unit)
     with progress.status("Hashing"):
         complete_dataset(made, records, identity, skipped)
         os.sync()

@@ -14,11 +14,14 @@ from robomme_interference_data.constants import (
     DISTRACTORS,
     EXECUTIONS,
     LESSONS,
+    PAPER_UNIT,
     POSITION_LIMIT,
     SHIFTED,
     SPLITS,
     UNIT_FRAMES,
+    UNIT_STRIDE,
     UNITS,
+    Unit,
 )
 from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
 from robomme_interference_data.ids import EpisodeId, parse_numbers
@@ -63,6 +66,15 @@ class BuildConfig(WorkersConfig):
         help="Episode indices, such as 0-49 or 0,3,10-12; default: all, of tabletop's 900 train "
         "episodes a family 0-99.",
         group="Episodes",
+    )
+    unit_frames: int = setting(
+        UNIT_FRAMES,
+        help="Frames of a distractor unit; another number than the paper's is for episodes that "
+        "are shorter.",
+        group="Episodes",
+    )
+    unit_stride: int = setting(
+        UNIT_STRIDE, help="Raw frames from one frame of a unit to the next.", group="Episodes"
     )
     cameras: tuple[str, ...] = setting(
         (),
@@ -160,6 +172,7 @@ class BuildPlan:
         codec: Name of the video settings.
         version: Version of the dataset.
         time_limit_s: Limit in seconds for one episode; None for the sources' defaults.
+        unit: Size of the distractors' units; of the raw ones, too, by `Unit.of`.
     """
 
     kind: str
@@ -169,6 +182,7 @@ class BuildPlan:
     codec: str = "av1-lossless"
     version: str = "1.0.0"
     time_limit_s: float | None = None
+    unit: Unit = PAPER_UNIT
 
 
 def plan_all(config: AllConfig, plan: PlanConfig) -> dict[str, BuildPlan]:
@@ -261,6 +275,9 @@ def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
     get_codec(config.codec)
     if config.time_limit_s is not None and not config.time_limit_s > 0:
         raise InvalidOptionError.expected("time_limit_s", config.time_limit_s, "a positive number")
+    for name in ("unit_frames", "unit_stride"):
+        if getattr(config, name) < 1:
+            raise InvalidOptionError.expected(name, getattr(config, name), "a positive number")
     make_executor(config)  # checks its settings
     numbers = None if config.episodes is None else parse_numbers(config.episodes)
     columns = _columns(config.columns)
@@ -289,6 +306,7 @@ def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
         codec=config.codec,
         version=config.version,
         time_limit_s=config.time_limit_s,
+        unit=Unit(config.unit_frames, config.unit_stride),
     )
 
 

@@ -20,10 +20,11 @@ from robomme_interference_data.constants import (
     LESSONS,
     MANIFEST_HEADER,
     MANIFESTS,
+    PAPER_UNIT,
     REPORT_PATH,
     SHIFTED,
-    UNIT_MIN_RAW_FRAMES,
     UNITS,
+    Unit,
 )
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.embeddings import IndexHeader, index_folder
@@ -66,18 +67,23 @@ def caught(where: str, violations: Iterable[Violation]) -> Iterator[Violation]:
 
 
 def dataset_violations(
-    name: str, dataset: Dataset, header: ManifestHeader, progress: WorkProgress | None
+    name: str,
+    dataset: Dataset,
+    header: ManifestHeader,
+    units: Dataset | None,
+    progress: WorkProgress | None,
 ) -> Iterator[Violation]:
-    """Check a dataset; decode it and show that only with `progress`."""
+    """Check a dataset; decode it and show that only with `progress`. `units` are distractors."""
+    unit = units.unit if units is not None and name in UNITS else PAPER_UNIT
     yield from _files(name, dataset, header)
     records = list(dataset.records())
-    yield from _identity(name, dataset, records, header)
+    yield from _identity(name, dataset, records, header, unit)
     yield from _report(name, dataset, records)
     yield from (Violation(f"{name}/{where}", what) for where, what in lerobot_violations(dataset))
     statistics = None if progress is None else episode_statistics(episode_table(dataset))
     for record in records:
         where = f"{name} {record.episode_id}"
-        yield from _record(where, name, record)
+        yield from _record(where, name, record, unit)
         if progress is not None and statistics is not None:
             stored = statistics[record.episode_index]
             yield from caught(where, _episode(where, dataset, record, stored))
@@ -113,10 +119,11 @@ def _file_problem(root: Path, path: str) -> str | None:
 
 
 def _identity(
-    name: str, dataset: Dataset, records: list[EpisodeRecord], header: ManifestHeader
+    name: str, dataset: Dataset, records: list[EpisodeRecord], header: ManifestHeader, unit: Unit
 ) -> Iterator[Violation]:
     stored, where = dataset.identity, f"{name}/{IDENTITY_PATH}"
-    made = identity_of(records, name, stored.version, stored.codec, stored.sources, stored.sums)
+    kept = stored.version, stored.codec, stored.sources, stored.sums
+    made = identity_of(records, name, *kept, unit)
     for field, value in (vars(made) | {"cameras": dataset.cameras}).items():
         if getattr(stored, field) != value:
             what = f"{field} is {getattr(stored, field)}; the episodes give {value}"
@@ -142,7 +149,7 @@ def _report(name: str, dataset: Dataset, records: list[EpisodeRecord]) -> Iterat
         yield Violation(where, "has control characters")
 
 
-def _record(where: str, name: str, record: EpisodeRecord) -> Iterator[Violation]:
+def _record(where: str, name: str, record: EpisodeRecord, unit: Unit) -> Iterator[Violation]:
     start = record.exec_start_idx
     lessons = {name in LESSONS, start is not None, record.span_sha256 is not None}
     if len(lessons) > 1:
@@ -155,8 +162,8 @@ def _record(where: str, name: str, record: EpisodeRecord) -> Iterator[Violation]
     elif name == EXECUTIONS:
         expected = range(1, record.length + 1)
     else:
-        most, stride = UNITS[name]
-        expected = range((UNIT_MIN_RAW_FRAMES - 1) // stride + 1, most + 1)
+        most, stride = unit.of(name)
+        expected = range((unit.raw_frames - 1) // stride + 1, most + 1)
     if record.length not in expected:
         yield Violation(where, f"holds {record.length} frames, not {expected[-1]}")
 

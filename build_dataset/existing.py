@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from robomme_interference_data.constants import ACTION, IDENTITY_PATH, REPORT_PATH, STATE
+from robomme_interference_data.constants import ACTION, IDENTITY_PATH, REPORT_PATH, STATE, UNITS
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import BuildError
 from robomme_interference_data.schema.records import EpisodeRecord
@@ -49,6 +49,10 @@ def open_existing(out: Path, plan: BuildPlan) -> ExistingDataset | None:
             f"{out} exists with other settings: kind, version, codec and cameras are {existing}, "
             f"not {planned}",
             _ADVICE,
+        )
+    if plan.kind in UNITS and dataset.unit != plan.unit.of(plan.kind):
+        raise BuildError(
+            f"{out} exists with units of {dataset.unit}, not of {plan.unit.of(plan.kind)}", _ADVICE
         )
     # Another version of a simulator has other episodes under the same ids.
     recorded = {one.get("kind"): one for one in identity.sources}

@@ -3,8 +3,9 @@
 A demonstration is every raw frame of the demonstration section and then the first live
 observation. A distractor unit is the first 256 raw frames of an episode subsampled at stride 8:
 32 frames, raw indices 0, 8, …, 248 (paper, section "The history buffer", footnote); a raw unit has
-all of them, 249 at least, so that every unit has a raw one. No frame after the last needed one is
-read. An execution is every live frame: its first one is the query frame of the demonstration.
+all of them, 249 at least, so that every unit has a raw one. A builder may choose another number of
+frames and another stride. No frame after the last needed one is read. An execution is every live
+frame: its first one is the query frame of the demonstration.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -16,8 +17,8 @@ from robomme_interference_data.constants import (
     CONTRADICTIONS,
     DEMONSTRATIONS,
     EXECUTIONS,
+    PAPER_UNIT,
     SHIFTED,
-    UNIT_MIN_RAW_FRAMES,
     UNITS,
     Unit,
 )
@@ -53,17 +54,18 @@ def select_demonstration(frames: Iterable[Frame]) -> Iterator[Frame]:
     raise NothingToStore("no live observation after the demonstration")
 
 
-def select_unit(frames: Iterable[Frame], unit: Unit) -> Iterator[Frame]:
-    """Yield the frames of a unit."""
-    count, most = 0, (unit.frames - 1) * unit.stride + 1
+def select_unit(frames: Iterable[Frame], kind: str, unit: Unit = PAPER_UNIT) -> Iterator[Frame]:
+    """Yield the frames of a unit in a dataset of a kind, given the one in the distractors."""
+    stored, count = unit.of(kind), 0
+    most = stored.raw_frames
     for frame in frames:
-        if count % unit.stride == 0:
+        if count % stored.stride == 0:
             yield frame
         count += 1
         if count == most:
             return
-    if count < UNIT_MIN_RAW_FRAMES:
-        raise NothingToStore(f"{count} raw frames; a unit needs {UNIT_MIN_RAW_FRAMES}")
+    if count < unit.raw_frames:
+        raise NothingToStore(f"{count} raw frames; a unit needs {unit.raw_frames}")
 
 
 def select_execution(frames: Iterable[Frame]) -> Iterator[Frame]:
@@ -95,18 +97,19 @@ FRAME_SELECTORS: dict[str, Callable[[Iterable[Frame]], Iterator[Frame]]] = {
     CONTRADICTIONS: select_demonstration,
     SHIFTED: iter,
     EXECUTIONS: select_execution,
-    **{kind: partial(select_unit, unit=unit) for kind, unit in UNITS.items()},
+    **{kind: partial(select_unit, kind=kind) for kind in UNITS},
 }
 """Kind of dataset to the frames that it stores of an episode."""
 
 
-def select_frames(kind: str, recording: Recording) -> Iterator[Frame]:
-    """Yield the frames that a kind of dataset stores of a recording.
+def select_frames(kind: str, recording: Recording, unit: Unit = PAPER_UNIT) -> Iterator[Frame]:
+    """Yield the frames that a kind of dataset stores of a recording; `unit` is the distractors'.
 
     Each frame of an execution has the action that was executed after it, so that policies can be
     trained and tested on it; an observation after the last action is left out.
     """
-    frames = FRAME_SELECTORS[kind](recording.frames)
+    select = partial(select_unit, kind=kind, unit=unit) if kind in UNITS else FRAME_SELECTORS[kind]
+    frames = select(recording.frames)
     if kind != EXECUTIONS:
         return _with_actions_of_all(frames)
     if not recording.action_first:

@@ -25,6 +25,7 @@ from robomme_interference_data.constants import (
     IDENTITY_PATH,
     INDEX_DIR,
     MANIFESTS,
+    PAPER_UNIT,
     PARTS_PATH,
     QUESTIONS_PATH,
     RECORDS_PATH,
@@ -32,6 +33,7 @@ from robomme_interference_data.constants import (
     STATS_PATH,
     SUMS_PATH,
     UNITS,
+    Unit,
 )
 from robomme_interference_data.data.dataset import revision_of
 from robomme_interference_data.ids import EpisodeId
@@ -72,8 +74,9 @@ def identity_of(
     codec: str,
     sources: Iterable[dict[str, Any]],
     sums: str = "",
+    unit: Unit = PAPER_UNIT,
 ) -> DatasetIdentity:
-    """Return the identity of a dataset with these episodes."""
+    """Return the identity of a dataset with these episodes; `unit` is the distractors'."""
     families = Counter(record.episode_id.family for record in records)
     features = {name for record in records for name in record.feature_sha256}
     cameras = sorted(name for name in features if name.startswith(CAMERA_PREFIX))
@@ -85,7 +88,7 @@ def identity_of(
         exact=all(record.exact for record in records),
         codec=codec,
         cameras=tuple(name.removeprefix(CAMERA_PREFIX) for name in cameras),
-        unit=UNITS[kind]._asdict() if kind in UNITS else None,
+        unit=unit.of(kind)._asdict() if kind in UNITS else None,
         simulators=tuple(sorted({one.simulator for one in records if one.simulator})),
         sources=tuple(sources),
         counts=Counts(len(records), sum(one.length for one in records), dict(families)),

@@ -94,13 +94,19 @@ def plan_manifests(
                 f"build {name} BUFFER_SET --source KIND:PATH",
             )
     _check_features(opened)
-    for name in UNITS.keys() & opened.keys():
+    for name in {*UNITS} & opened.keys():
         splits = {record.episode_id.split for record in opened[name].records()}
         if splits != {"train"}:
             raise SourceError(
                 "distractor units must come from train episodes, so that no query's scene leaks "
                 f"into another buffer; found {', '.join(sorted(splits))}",
                 f'Build the {name} with split="train".',
+            )
+        if name in opened and opened[name].unit != opened[DISTRACTORS].unit.of(name):
+            raise SourceError(
+                f"the {name} have units of {opened[name].unit}, the distractors of "
+                f"{opened[DISTRACTORS].unit}",
+                "Build both with the same `unit_frames` and `unit_stride`.",
             )
     if SHIFTED in opened:
         _check_scenes(opened[SHIFTED], opened[DEMONSTRATIONS])

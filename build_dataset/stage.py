@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, LESSONS, STATE
+from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, LESSONS, PAPER_UNIT, STATE
 from robomme_interference_data.errors import BuildError, InterferenceError, SourceError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
@@ -89,6 +89,7 @@ def staged_name(plan: BuildPlan, task: Task) -> str:
         "cameras": plan.cameras,
         "codec": [codec.vcodec, codec.pix_fmt, dict(codec.options)],
         "layout": _LAYOUT,
+        **({"unit": plan.unit} if plan.unit != PAPER_UNIT else {}),
     }
     return hashlib.sha256(canonical_json(content).encode()).hexdigest()[:24]
 
@@ -124,7 +125,7 @@ class StageTask:
         codec = get_codec(self.plan.codec)
         writer = _Writer(codec, folder, recording.robot.fps)
         try:
-            for frame in select_frames(self.plan.kind, recording):
+            for frame in select_frames(self.plan.kind, recording, self.plan.unit):
                 writer.add(frame)
         except NothingToStore as reason:
             writer.close()

@@ -87,10 +87,9 @@ def _buffer_set(buffer_set: BufferSet, decode: bool, progress: WorkProgress) -> 
         frames = sum(dataset.identity.counts.frames for dataset in datasets.values())
         progress.start("Verifying", frames)
     for name, dataset in datasets.items():
-        yield from caught(
-            name, dataset_violations(name, dataset, header, progress if decode else None)
-        )
-        yield from index_violations(name, dataset, datasets.get(DISTRACTORS))
+        units, shown = datasets.get(DISTRACTORS), progress if decode else None
+        yield from caught(name, dataset_violations(name, dataset, header, units, shown))
+        yield from index_violations(name, dataset, units)
     if len(datasets) == len(header.datasets):
         yield from caught(MANIFESTS, _buffers(buffer_set, datasets))
     if decode and {DEMONSTRATIONS, EXECUTIONS} <= datasets.keys():

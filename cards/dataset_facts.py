@@ -12,6 +12,7 @@ from robomme_interference_data.constants import (
     EXECUTIONS,
     MANIFEST_ROWS,
     MANIFESTS,
+    PAPER_UNIT,
     QUESTIONS_PATH,
     RAW_DISTRACTORS,
     RECORDS_PATH,
@@ -114,6 +115,12 @@ def buffer_set_facts(buffer_set: BufferSet) -> Facts:
         f"{same_family:,} buffers hold distractors of the query's own family, which the paper's "
         "protocol excludes: results are not comparable with those of the benchmark."
     )
+    unit = datasets[DISTRACTORS].unit if DISTRACTORS in datasets else PAPER_UNIT
+    other_unit = (
+        f"Distractor units have {unit.frames} frames at stride {unit.stride}, not the paper's "
+        f"{PAPER_UNIT.frames} at stride {PAPER_UNIT.stride}: results are not comparable with those "
+        "of the benchmark."
+    )
     split_name, questions = one_split(queries), _questions(buffer_set)
     tables = [CardTable("buffers", BufferManifest, _BUFFERS, header.rows, split_name)]
     if DISTRACTORS in records:
@@ -124,8 +131,9 @@ def buffer_set_facts(buffer_set: BufferSet) -> Facts:
         datasets,
         queries,
         buffer_set.load(shown.episode_id, shown.condition, cameras=()),  # fetches no video
-        [more] * bool(same_family),
+        [more] * bool(same_family) + [other_unit] * (unit != PAPER_UNIT),
         {
+            "unit": unit,
             "cameras": buffer_set.cameras,
             "buffers": len(manifests),
             "queries": len(queries),

@@ -15,10 +15,8 @@ import pyarrow as pa
 from robomme_interference_data.constants import (
     FORMAT_VERSION,
     MAX_STEPS,
+    PAPER_UNIT,
     POSITION_LIMIT,
-    UNIT_FRAMES,
-    UNIT_MIN_RAW_FRAMES,
-    UNIT_STRIDE,
 )
 from robomme_interference_data.viz.tables import Table
 from robomme_interference_data.viz.templates import fill
@@ -42,9 +40,8 @@ BIBTEX = f"""@article{{rathi2026robommeinterference,
 
 _TAGS = ("robotics", "robot-memory", "RoboMME-Interference")
 _PROTOCOL = {
-    "unit_frames": UNIT_FRAMES,
-    "unit_stride": UNIT_STRIDE,
-    "unit_min": UNIT_MIN_RAW_FRAMES,
+    "unit": PAPER_UNIT,
+    "paper_unit": PAPER_UNIT,
     "max_steps": MAX_STEPS,
     "released_limit": POSITION_LIMIT,
 }

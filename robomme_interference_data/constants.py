@@ -39,9 +39,6 @@ UNIT_FRAMES = 32
 UNIT_STRIDE = 8
 """Raw frames between stored frames of a unit."""
 
-UNIT_MIN_RAW_FRAMES = (UNIT_FRAMES - 1) * UNIT_STRIDE + 1
-"""Raw frames needed for a unit with the indices 0, 8, …, 248: 249."""
-
 MAX_STEPS = 1300
 """Executed steps after which a rollout times out."""
 
@@ -112,12 +109,21 @@ class Unit(NamedTuple):
     frames: int
     stride: int
 
+    @property
+    def raw_frames(self) -> int:
+        """Raw frames that an episode must have: 249 for the indices 0, 8, …, 248."""
+        return (self.frames - 1) * self.stride + 1
 
-UNITS = {
-    DISTRACTORS: Unit(UNIT_FRAMES, UNIT_STRIDE),
-    RAW_DISTRACTORS: Unit(UNIT_FRAMES * UNIT_STRIDE, 1),
-}
-"""Datasets of units, with the size of a unit."""
+    def of(self, kind: str) -> "Unit":
+        """Return the unit in a dataset of a kind, given the one in the distractors."""
+        return Unit(self.frames * self.stride, 1) if kind == RAW_DISTRACTORS else self
+
+
+PAPER_UNIT = Unit(UNIT_FRAMES, UNIT_STRIDE)
+"""The paper's; the builder of a buffer set may choose another one."""
+
+UNITS = (DISTRACTORS, RAW_DISTRACTORS)
+"""Datasets of units."""
 
 OPTIONAL_DATASETS = (RAW_DISTRACTORS, CONTRADICTIONS, SHIFTED, EXECUTIONS)
 """Datasets that a buffer set may lack; on the Hub, folders of its repository."""

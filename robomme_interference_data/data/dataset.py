@@ -21,6 +21,7 @@ from robomme_interference_data.constants import (
     RECORDS_PATH,
     STATE,
     SUMS_PATH,
+    Unit,
 )
 from robomme_interference_data.errors import (
     FormatError,
@@ -102,6 +103,18 @@ class Dataset:
     def kind(self) -> str:
         """Name of the dataset in a buffer set, such as `demonstrations`."""
         return self.identity.kind
+
+    @property
+    def unit(self) -> Unit:
+        """Size of its units.
+
+        Raises:
+            FormatError: The identity records no valid one.
+        """
+        stored = self.identity.unit
+        if stored is None or {*stored} != {*Unit._fields} or min(stored.values()) < 1:
+            raise FormatError.damaged(self._name, f"{IDENTITY_PATH}: unit is {stored}")
+        return Unit(**stored)
 
     @property
     def revision(self) -> str:

@@ -12,7 +12,6 @@ from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,
     RAW_DISTRACTORS,
-    UNIT_FRAMES,
 )
 from robomme_interference_data.errors import FormatError, SourceError
 from robomme_interference_data.ids import EpisodeId
@@ -102,7 +101,11 @@ class QuerySessions:
         start, stop = record.spans[part]
         sha256 = getattr(record.span_sha256, part)
         session = replace(whole, start=start, stop=stop, sha256=sha256)
-        return replace(session, role="filler", repeat=UNIT_FRAMES) if part == "last" else session
+        if part != "last":
+            return session
+        return replace(
+            session, role="filler", repeat=self._source.datasets[DISTRACTORS].unit.frames
+        )
 
     def units(self, k: int, dataset: str = DISTRACTORS) -> Sequence[SessionEntry]:
         """Return the units drawn for the query, or the raw units of the same episodes."""
