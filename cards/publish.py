@@ -57,10 +57,11 @@ class BufferSetContent:
     def base(self) -> str | None:
         """Location of the demonstrations that the manifests name, if those are published."""
         recorded = self.buffer_set.header.datasets[DEMONSTRATIONS]
-        repo_id, _, commit = (recorded.location or "").partition("@")
+        location = recorded.location or ""
+        repo_id, _, commit = location.partition("@")
         if not commit or self.config.demonstrations_id not in (None, repo_id):
             return None
-        if Dataset(HubFiles(repo_id, commit)).revision != recorded.revision:
+        if Dataset(HubFiles.parse(location)).revision != recorded.revision:
             raise PublishError(
                 f"{recorded.location} holds other demonstrations than those of "
                 f"{self.buffer_set.location}",

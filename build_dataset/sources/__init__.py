@@ -22,7 +22,7 @@ SOURCES = Registry(
             "robomme-h5:FOLDER", f"{__name__}.h5:H5Source", _LOCATION, extra="build"
         ),
         "lerobot": Kind(
-            "lerobot:FOLDER or lerobot:NAMESPACE/NAME[@REVISION]",
+            "lerobot:FOLDER or lerobot:NAMESPACE/NAME[/FOLDER][@REVISION]",
             f"{__name__}.lerobot:LeRobotSource",
             _LOCATION,
         ),

@@ -76,6 +76,8 @@ class LeRobotSource(Source):
         self.provenance = {"kind": "lerobot"}
         if isinstance(self._files, HubFiles):
             self.provenance |= {"repo": self._files.repo_id, "revision": self._files.commit}
+            if self._files.folder:
+                self.provenance["folder"] = self._files.folder.removesuffix("/")
 
     def __getstate__(self) -> dict[str, Any]:
         lazy = ("_lerobot", "_columns", "_families")

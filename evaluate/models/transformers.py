@@ -66,7 +66,7 @@ class TransformersModel(ChatModel):
         self._path, self._folder = path, files.snapshot(*_FILES)
         self._metadata: dict[str, Any] = {"sha256": digest_weights(self._folder, _FILES)}
         if isinstance(files, HubFiles):
-            self._metadata |= {"model": files.repo_id, "revision": files.commit}
+            self._metadata |= {"model": files.name, "revision": files.commit}
         self._adapter: Path | None = None
         if adapter is not None:
             if find_spec("peft") is None:

@@ -60,7 +60,7 @@ class Siglip:
         origin: dict[str, str | None] = {"model": None, "revision": None}
         self._folder = files.snapshot(*_FILES)
         if isinstance(files, HubFiles):
-            origin = {"model": files.repo_id, "revision": files.commit}
+            origin = {"model": files.name, "revision": files.commit}
         try:
             self._device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
             torch.empty(0, device=self._device)

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from robomme_interference_data.storage.cache import DecodedCache
 
 _FOLDER = re.compile(r"\w[\w.-]*")
-_LOCATION = re.compile(r"\.|[\w.-]+/[\w.-]+@[0-9a-f]{40}")
+_LOCATION = re.compile(r"\.|[\w.-]+(?:/[\w.-]+)+@[0-9a-f]{40}")
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _BATCH_ROWS = 1024
 _KEYS = ("episode_id", "condition", "family", "difficulty")

@@ -100,7 +100,7 @@ class Registry:
 
             files = locate(spec.target, "model")
             if isinstance(files, HubFiles):
-                return f"{spec.kind}:{files.repo_id}@{files.commit}"
+                return f"{spec.kind}:{files.location}"
         return str(spec)
 
     def factory(self, spec: Spec, name: str | None = None) -> Factory:

@@ -25,7 +25,8 @@ from robomme_interference_data.errors import (
 
 from .files import LocalFiles, all_files, check_relative, sha256_file, with_filename
 
-_LOCATION = re.compile(r"([A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*)(?:@(.+))?")
+_NAME = r"[A-Za-z0-9][\w.-]*"
+_LOCATION = re.compile(rf"({_NAME}/{_NAME})((?:/{_NAME})*)(?:@(.+))?")
 _VERSION = re.compile(r"data-\d+\.\d+\.\d+")
 _ENDPOINT = re.compile(r"https?://([\w.-]+|\[[\da-fA-F:.]+\])(:[1-9]\d{0,4})?(/\S*)?")
 _PUBLIC = "https://huggingface.co"
@@ -37,7 +38,7 @@ _LOGIN = (
 )
 _UNKNOWN = (
     "{repo} does not exist, or your login has no access",
-    "Check the name; no local folder {repo_id} exists either. For a private repository, log in: "
+    "Check the name; no local folder of this name exists either. For a private repository, log in: "
     "hf auth login",
 )
 _ERRORS = {
@@ -71,8 +72,9 @@ def locate(
 ) -> "LocalFiles | HubFiles":
     """Return the files at a location: a folder, `namespace/name` or `namespace/name@revision`.
 
-    The revision may also be given separately. An existing folder takes precedence over a
-    repository; a `Path` is always a folder.
+    A folder of a repository follows its name: `namespace/name/folder@revision`. The revision may
+    also be given separately. An existing folder takes precedence over a repository; a `Path` is
+    always a folder.
     """
     folder = Path(location).expanduser()
     if not isinstance(location, str) and not folder.is_dir():
@@ -116,24 +118,26 @@ class HubFiles:
 
     @classmethod
     def parse(cls, location: str, repo_type: str = "dataset", revision: str | None = None) -> Self:
-        """Return the files at `namespace/name` or `namespace/name@revision`."""
+        """Return the files at `namespace/name[/folder][@revision]`."""
         match = _LOCATION.fullmatch(location)
         if match is None:
             raise InvalidOptionError(
                 f"{location!r} is neither a folder nor a {repo_type} repository on the Hub",
                 "Give an existing folder, namespace/name, or namespace/name@revision.",
             )
-        repo_id, at = match.groups()
+        repo_id, folder, at = match.groups()
         if at and revision not in (None, at):
             raise InvalidOptionError(
                 f"{location!r} and revision {revision!r}", "Give the revision once."
             )
-        return cls(repo_id, at or revision, repo_type)
+        files = cls(repo_id, at or revision, repo_type)
+        files.folder = f"{folder[1:]}/" if folder else ""
+        return files
 
     def inside(self, folder: str) -> "HubFiles":
         """Return the files of a folder of the repository, at the same commit."""
         inner = HubFiles(self.repo_id, self.commit, self.repo_type)
-        inner.folder = f"{folder}/"
+        inner.folder = f"{self.folder}{folder}/"
         return inner
 
     @cached_property
@@ -151,8 +155,13 @@ class HubFiles:
 
     @property
     def location(self) -> str:
-        """`namespace/name@commit`; see `Files.location`."""
-        return f"{self.repo_id}@{self.commit}"
+        """`namespace/name[/folder]@commit`; see `Files.location`."""
+        return f"{self.name}@{self.commit}"
+
+    @property
+    def name(self) -> str:
+        """`namespace/name`, and the folder of the repository if it is one."""
+        return f"{self.repo_id}/{self.folder}".removesuffix("/")
 
     def path(self, relative: str) -> Path:
         """Return the file's path in the cache, downloading it if necessary; see `Files.path`.

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from huggingface_hub import constants
 from support.hub_server import HubServer
@@ -35,7 +36,21 @@ FILES |= {"README.md": b"read me", "meta/deep/a.parquet": b"a"}
 
 
 @pytest.mark.parametrize(
-    "text", ["robomme", "a/b/c", "/a/b", "~/a", "a/", "./a/b", "a//b", "a b/c", "a/b@", "@v1"]
+    "text",
+    [
+        "robomme",
+        "a/b/../c",
+        "a/b/.c",
+        "a/b/c/",
+        "/a/b",
+        "~/a",
+        "a/",
+        "./a/b",
+        "a//b",
+        "a b/c",
+        "a/b@",
+        "@v1",
+    ],
 )
 def test_invalid_locations_are_never_requested(hub: HubServer, text: str) -> None:
     with pytest.raises(InvalidOptionError, match="neither a folder nor a model repository"):
@@ -50,6 +65,22 @@ def test_folders_take_precedence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     (tmp_path / REPO).mkdir(parents=True)
     assert isinstance(locate(REPO), LocalFiles)
     assert locate(tmp_path).location == str(tmp_path)
+
+
+def test_a_folder_of_a_repository(hub: HubServer) -> None:
+    commit = hub.push(DATASET, FILES)
+    files = locate(f"{REPO}/meta@main")
+    assert isinstance(files, HubFiles)
+    assert (files.repo_id, files.folder, files.revision) == (REPO, "meta/", "main")
+    assert files.path("deep/a.parquet").read_bytes() == b"a"
+    assert files.list("deep") == ["deep/a.parquet"]
+    assert "README.md" not in files.sizes() and files.sizes()["part-3.json"] == 1
+    assert files.location == f"{REPO}/meta@{commit}"
+    again = locate(files.location)
+    assert again.path("part-3.json") == files.path("part-3.json")
+    deep = files.inside("deep")
+    assert deep.location == f"{REPO}/meta/deep@{commit}"
+    assert deep.path("a.parquet").read_bytes() == b"a"
 
 
 # --- what is fetched -----------------------------------------------------------------------------
@@ -237,6 +268,22 @@ def test_a_source_fetches_what_it_needs_and_opens_offline_again(
     assert len(list(source.read(source.episodes()[1], ("front",)).frames)) == 7
     with pytest.raises(HubError, match="of the dataset repository .* is not in the cache"):
         list(source.read(source.episodes()[1], ("wrist",)).frames)
+
+
+def test_a_source_in_a_folder_of_a_repository(hub: HubServer, tmp_path: Path) -> None:
+    made = write_lerobot(tmp_path / "made")
+    files = {path.relative_to(made): path for path in made.rglob("*") if path.is_file()}
+    content = {f"arm/pick/{name.as_posix()}": path.read_bytes() for name, path in files.items()}
+    commit = hub.push(DATASET, content | {"meta/info.json": b"of another dataset"})
+    source = open_source(f"lerobot:{REPO}/arm/pick@main")
+    assert source.provenance == {
+        **{"kind": "lerobot", "repo": REPO, "revision": commit, "folder": "arm/pick"}
+    }
+    expected = open_source(f"lerobot:{made}")
+    for episode, other in zip(source.episodes(), expected.episodes(), strict=True):
+        ours, theirs = (one.read(e, None) for one, e in ((source, episode), (expected, other)))
+        for frame, recorded in zip(ours.frames, theirs.frames, strict=True):
+            assert np.array_equal(frame.images["front"], recorded.images["front"])
 
 
 def test_the_known_repositories_are_of_robomme(hub: HubServer, tmp_path: Path) -> None:
