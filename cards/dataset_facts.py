@@ -117,9 +117,8 @@ def buffer_set_facts(buffer_set: BufferSet) -> Facts:
     )
     unit = datasets[DISTRACTORS].unit if DISTRACTORS in datasets else PAPER_UNIT
     other_unit = (
-        f"Distractor units have {unit.frames} frames at stride {unit.stride}, not the paper's "
-        f"{PAPER_UNIT.frames} at stride {PAPER_UNIT.stride}: results are not comparable with those "
-        "of the benchmark."
+        f"Distractor units have {unit}, not the paper's {PAPER_UNIT}: results are not comparable "
+        "with those of the benchmark."
     )
     split_name, questions = one_split(queries), _questions(buffer_set)
     tables = [CardTable("buffers", BufferManifest, _BUFFERS, header.rows, split_name)]

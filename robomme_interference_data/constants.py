@@ -109,6 +109,9 @@ class Unit(NamedTuple):
     frames: int
     stride: int
 
+    def __str__(self) -> str:
+        return f"{self.frames} frames at stride {self.stride}"
+
     @property
     def raw_frames(self) -> int:
         """Raw frames that an episode must have: 249 for the indices 0, 8, …, 248."""

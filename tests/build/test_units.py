@@ -1,0 +1,101 @@
+"""Units of another length and stride than the paper's, for episodes that are shorter."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.made_up import MadeUpSource
+
+from robomme_interference_data import load_buffer_set
+from robomme_interference_data.build_dataset.build import build_dataset
+from robomme_interference_data.build_dataset.config import BuildConfig, BuildPlan, plan_build
+from robomme_interference_data.build_dataset.frame_selection import NothingToStore, select_unit
+from robomme_interference_data.build_dataset.manifests import (
+    in_folder,
+    plan_manifests,
+    write_manifests,
+)
+from robomme_interference_data.build_dataset.sources.base import Frame
+from robomme_interference_data.build_dataset.verify import verify_buffer_set
+from robomme_interference_data.cards.dataset_facts import buffer_set_facts
+from robomme_interference_data.cards.publication import Publication
+from robomme_interference_data.cards.render import card_text
+from robomme_interference_data.constants import (
+    DEMONSTRATIONS,
+    DISTRACTORS,
+    IDENTITY_PATH,
+    RAW_DISTRACTORS,
+    Unit,
+)
+from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
+from robomme_interference_data.runtime.executor import Serial
+from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.storage.files import read_json, write_json
+
+QUERIES = {f"{family}/test/0": (12, 5) for family in ("Lift", "Stack")}
+TRAIN = {f"{family}/train/0": (11, None) for family in ("Lift", "Stack")}
+SHORT = Unit(4, 3)  # raw frames 0, 3, 6, 9; at full rate up to 12
+
+
+def steps(kind: str, length: int, unit: Unit = SHORT) -> list[int]:
+    frames = (Frame({}, np.array([n], np.float32), None, None) for n in range(length))
+    return [int(frame.state[0]) for frame in select_unit(frames, kind, unit)]
+
+
+def test_a_unit_is_of_the_chosen_frames() -> None:
+    assert SHORT.raw_frames == 10
+    assert steps(DISTRACTORS, 10) == steps(DISTRACTORS, 50) == [0, 3, 6, 9]
+    assert steps(RAW_DISTRACTORS, 10) == [*range(10)]
+    assert steps(RAW_DISTRACTORS, 50) == [*range(12)]
+    assert steps(DISTRACTORS, 3, Unit(1, 8)) == [0]
+    for kind in (DISTRACTORS, RAW_DISTRACTORS):
+        with pytest.raises(NothingToStore, match="9 raw frames; a unit needs 10"):
+            steps(kind, 9)
+
+
+def build(root: Path, kind: str, lengths: dict[str, Any], unit: Unit = SHORT) -> None:
+    source = MadeUpSource(lengths)
+    tasks = tuple((0, one) for one in source.episodes())
+    plan = BuildPlan(kind, (source,), tasks, unit=unit)
+    build_dataset(plan, root / kind, Serial(), WorkProgress(quiet=True))
+
+
+def violations(root: Path) -> list[str]:
+    return [f"{one.where}: {one.what}" for one in verify_buffer_set(load_buffer_set(root))]
+
+
+def test_a_buffer_set_of_short_units(tmp_path: Path) -> None:
+    for kind, lengths in ((DEMONSTRATIONS, QUERIES), (DISTRACTORS, TRAIN)):
+        build(tmp_path, kind, lengths)
+    build(tmp_path, RAW_DISTRACTORS, TRAIN, Unit(4, 2))
+    conditions = ("k0", "k1", "held-k1", "raw-k1")
+    with pytest.raises(SourceError, match="8 frames at stride 1, .* 4 frames at stride 3"):
+        plan_manifests(in_folder(tmp_path), conditions)
+    with pytest.raises(BuildError, match="exists with units of 8 frames at stride 1, not of 12 "):
+        build(tmp_path, RAW_DISTRACTORS, TRAIN)
+    (tmp_path / RAW_DISTRACTORS).rename(tmp_path / "other")
+    build(tmp_path, RAW_DISTRACTORS, TRAIN)
+    list(write_manifests(plan_manifests(in_folder(tmp_path), conditions), tmp_path))
+    opened = load_buffer_set(tmp_path)
+    # The lesson of 5 frames; then a unit of 4, its last frame 4 times, or its 11 raw frames.
+    assert [len(opened.load("Lift/test/0", one)) for one in conditions] == [5, 9, 9, 16]
+    assert opened.datasets[DISTRACTORS].identity.unit == {"frames": 4, "stride": 3}
+    assert violations(tmp_path) == []
+    text = card_text(buffer_set_facts(opened), Publication("me/short", "1.0.0"))
+    assert "the first 12 raw frames of an episode of another family at stride 3: 4 frames" in text
+    assert "not the paper's 32 frames at stride 8: results are not comparable" in text
+    path = tmp_path / DISTRACTORS / IDENTITY_PATH
+    write_json(path, read_json(path) | {"unit": {"frames": 5, "stride": 3}})
+    assert any("holds 4 frames, not 5" in one for one in violations(tmp_path))
+    write_json(path, read_json(path) | {"unit": {"frames": 0, "stride": 3}})
+    assert any("unit is {'frames': 0" in one for one in violations(tmp_path))
+
+
+def test_only_short_episodes_are_an_error_that_names_the_options(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="11 raw frames; a unit needs 249") as caught:
+        build(tmp_path, DISTRACTORS, TRAIN, Unit(32, 8))
+    assert "`unit_frames` and `unit_stride`" in str(caught.value.hint)
+    config = BuildConfig(("sample",), tmp_path, unit_frames=0)
+    with pytest.raises(InvalidOptionError, match="unit_frames 0; expected a positive number"):
+        plan_build(DISTRACTORS, config)
