@@ -13,7 +13,12 @@ from robomme_interference_data.build_dataset.frame_selection import (
 )
 from robomme_interference_data.build_dataset.sources import Recording, open_source, simulator
 from robomme_interference_data.constants import DEMONSTRATIONS, FAMILIES
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import (
+    InvalidOptionError,
+    SimulatorError,
+    SourceError,
+    UnknownNameError,
+)
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators.tabletop import SUITE_VERSION
 
@@ -112,3 +117,43 @@ def test_episodes(name: str) -> None:
     named = [one.id.index for _, one in list_episodes([source], numbers=(99, 100, 899, 900))]
     assert sorted({*named}) == ([99, 100, 899] if name == "tabletop" else [99])
     assert len(named) == len(FAMILIES) * len({*named})
+
+
+OWN = "support.own_simulators:"
+
+
+@pytest.mark.parametrize("name", ["Listed", "make_listed"])
+def test_a_simulator_of_ones_own_is_a_source(name: str) -> None:
+    source = open_source(OWN + name)
+    assert source.provenance == {"kind": OWN + name, "suite_version": 4}
+    listed = [str(episode.id) for episode in source.episodes()]
+    assert listed == ["Press/train/0", "Press/train/1", "Press/test/0", "Press/test/1"]
+    recording = source.read(source.episodes()[1], None)
+    assert (recording.simulator, recording.robot.fps) == ("listed", 20)
+    frames = list(recording.frames)
+    assert [frame.is_demonstration for frame in frames] == [True] * 5 + [False] * 3
+    assert [sorted(frame.images) for frame in frames] == [["top"]] * 8
+    copy = pickle.loads(pickle.dumps(source))
+    assert [one.images for one in copy.read(source.episodes()[0], ()).frames] == [{}] * 8
+    with pytest.raises(InvalidOptionError, match="'front' is none of top"):
+        source.read(source.episodes()[0], ("front",))
+    with pytest.raises(InvalidOptionError, match="cannot show its episodes under shifts"):
+        open_source(OWN + name, shifted=True)
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "words"),
+    [
+        (f"{OWN}make_any", SourceError, "Define the class method `episodes`"),
+        (f"{OWN}Played", SourceError, "lists no episodes"),
+        (f"{OWN}Blind", SimulatorError, "did not draw the camera top, but none"),
+        (f"{OWN}nothing", UnknownNameError, "'nothing' is not in module"),
+        ("no_such_module:make", UnknownNameError, "MODULE:NAME of a simulator of your own"),
+        ("frames:make", SourceError, "frames.parquet"),
+    ],
+)
+def test_sources_that_give_no_episode(text: str, error: type[Exception], words: str) -> None:
+    with pytest.raises(error) as raised:
+        source = open_source(text)
+        source.read(source.episodes()[0], None)
+    assert words in str(raised.value) + str(getattr(raised.value, "hint", ""))
