@@ -50,9 +50,9 @@ class BuildConfig(WorkersConfig):
     source: tuple[str, ...] = setting(
         whole=True,
         metavar="SOURCE",
-        help="robomme-h5:FOLDER, lerobot:FOLDER, lerobot:NAMESPACE/NAME[@REVISION], frames:FOLDER, "
-        "tabletop, robomme (demonstrations only), MODULE:CLASS of your own simulator or "
-        "sample[:FAMILY,…]; repeat for several.",
+        help="robomme-h5:FOLDER, lerobot:FOLDER, lerobot:NAMESPACE/NAME[/FOLDER][@REVISION], "
+        "frames:FOLDER, tabletop, robomme (demonstrations only), MODULE:CLASS of your simulator "
+        "or sample[:FAMILY,…]; repeat for several.",
     )
     buffer_set: Path = setting(
         name="-", metavar="BUFFER_SET", help="Folder of the buffer set to create or extend."

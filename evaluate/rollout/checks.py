@@ -201,7 +201,7 @@ def check_plan(
             raise InvalidOptionError(
                 f"{config.simulator} does not play the family {episode.family} of {episode}",
                 f"It plays {', '.join(sorted(families))}. Set `families` to some of them, or "
-                '`simulator` to one that plays these episodes, such as "module:function".',
+                '`simulator` to one that plays these episodes, such as "module:class".',
             )
     if system.position_limit is not None and config.retrieval is None:
         planned, longest = set(items), dict.fromkeys(plan.conditions, 0)

@@ -92,9 +92,7 @@ class RunConfig(WorkConfig):
         group=_SIMULATOR,
         help="Compare actions with those of the buffer set's executions, without a simulator.",
     )
-    simulator: str = setting(
-        "tabletop", group=_SIMULATOR, help="tabletop, robomme or module:function."
-    )
+    simulator: str = setting("tabletop", group=_SIMULATOR, help="tabletop, robomme or module:name.")
     shift: str = setting(NO_SHIFT, group=_SIMULATOR, help=SHIFT_HELP)
     serve: str | None = setting(
         None,

@@ -6,9 +6,11 @@ import runpy
 import shlex
 import sys
 import tomllib
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import av
 import pytest
 from support import worlds
 from support.buffer_sets import GOLDEN, QUERIES
@@ -86,6 +88,7 @@ ELSEWHERE = (
     "theirs/",  # published results
     "python:retrace",  # has a test of its own
     "python:memory_policy",  # has a test of its own
+    "lamp",  # has a test of its own
     "k0.csv",  # rows of that policy
     "answers:mixture.csv",  # answers of that policy
     "results/acted-k0",  # their rollouts
@@ -233,6 +236,39 @@ def test_the_example_of_recordings_becomes_buffers(
         "OpenDrawer",
         "StackCups",
     ]
+
+
+@pytest.mark.slow
+def test_another_benchmark_goes_the_whole_way(
+    tmp_path: Path, run: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every command of the page as it stands, with the rates that its table shows."""
+    page = DOCS / "how-to" / "another-benchmark.md"
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(ROOT / "examples" / "own_simulator")
+    for line in command_lines(page):
+        code, out, err = run(*shlex.split(line), *["--workers", "1"] * line.startswith("build "))
+        assert code == 0, f"{line}\n{out}\n{err}"
+    rows = [
+        json.loads(line)
+        for name in ("oracle", "guess", "first", "last")
+        for line in (tmp_path / f"runs/{name}/rollouts.jsonl").read_text().splitlines()
+    ]
+    assert {(row["simulator"], row["error"]) for row in rows} == {("lamp:LampSimulator", None)}
+    won = Counter((row["system"], row["condition"]) for row in rows if row["success"])
+    assert won["oracle", "no-history"] == 12 > won["guess", "no-history"]
+    for name in ("first", "last"):
+        cells = [f"{won[name, one]}/12" for one in ("no-history", "k0", "k1", "k3")]
+        assert f"| {name} | {' | '.join(cells)} |" in text_of(page)
+    assert (tmp_path / "scores/lamp/report.html").is_file()
+    assert (tmp_path / "scores/lamp/figures/families-lamp:LampSimulator.svg").is_file()
+    videos = sorted((tmp_path / "runs/last/videos").iterdir())
+    assert len(videos) == 48
+    with av.open(str(videos[0])) as video:
+        frame = next(video.decode(video=0)).to_ndarray(format="rgb24")
+    # The ground of the only camera, below the heading and beside lesson and history; then nothing.
+    assert abs(frame[24 + 40, 256 * 2 + 8].astype(int) - 200).max() < 10
+    assert frame[24 + 40, 256 * 3 + 8].min() > 240
 
 
 def test_python_in_pages_compiles_and_names_exist() -> None:
