@@ -102,7 +102,7 @@ def plan_manifests(
                 f"into another buffer; found {', '.join(sorted(splits))}",
                 f'Build the {name} with split="train".',
             )
-        if name in opened and opened[name].unit != opened[DISTRACTORS].unit.of(name):
+        if DISTRACTORS in opened and opened[name].unit != opened[DISTRACTORS].unit.of(name):
             raise SourceError(
                 f"the {name} have units of {opened[name].unit}, the distractors of "
                 f"{opened[DISTRACTORS].unit}",

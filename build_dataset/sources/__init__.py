@@ -66,6 +66,6 @@ def _parse(specification: str) -> Spec:
     """Parse the text of a source; a simulator of the user is one like the embedded one."""
     module = specification.partition(":")[0]
     own = _OWN.fullmatch(specification) and module not in SOURCES.kinds
-    if own and find_spec(module.partition(".")[0]):
+    if own and (module == "__main__" or find_spec(module.partition(".")[0])):
         return Spec("tabletop", given={"name": specification})
     return SOURCES.parse(specification)

@@ -4,7 +4,7 @@ from collections.abc import Generator, Sequence
 from dataclasses import replace
 from typing import Any, override
 
-from robomme_interference_data.errors import SimulatorCrashError, SimulatorError, SourceError
+from robomme_interference_data.errors import SimulatorCrashError, SourceError
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.shifts import SHIFTS
 from robomme_interference_data.simulators.base import (
@@ -13,6 +13,7 @@ from robomme_interference_data.simulators.base import (
     Simulator,
     choose_cameras,
 )
+from robomme_interference_data.simulators.checks import check_drawn
 from robomme_interference_data.simulators.registry import (
     accepted_settings,
     make_simulator,
@@ -69,10 +70,7 @@ class SimulatorSource(Source):
         chosen = choose_cameras(cameras, self._class.cameras)
         simulator = self._open(chosen)
         lesson, first, info = simulator.reset(str(episode.id), demonstration=bool(chosen))
-        for camera in chosen:
-            if camera not in first.images:
-                drawn = ", ".join(first.images) or "none"
-                raise SimulatorError(f"{self.name} did not draw the camera {camera}, but {drawn}")
+        check_drawn(lesson, first, chosen)
         frames = _play(simulator, lesson, first, chosen)
         known = info.goals, info.seed, info.difficulty, info.simulator
         robot = Robot(fps=self._class.fps)

@@ -33,6 +33,7 @@ from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.rollouts import Rollout, Status
 from robomme_interference_data.simulators.base import Simulator
+from robomme_interference_data.simulators.checks import check_drawn
 from robomme_interference_data.simulators.registry import (
     accepted_settings,
     make_simulator,
@@ -85,7 +86,8 @@ class RolloutTask(RunTask[RunConfig]):
         if opening.what == "simulator":
             simulator = self._open_simulator(policy, worker)
             if opening.episode is not None:
-                self._try_out(simulator, opening.episode, worker)
+                cameras = used_cameras(self.run.config, policy.cameras)
+                self._try_out(simulator, opening.episode, cameras, worker)
             return None
         from robomme_interference_data.evaluate.policies.identity import policy_metadata
 
@@ -130,13 +132,16 @@ class RolloutTask(RunTask[RunConfig]):
                 self._simulator = make_simulator(config.simulator, **options)
         return self._simulator
 
-    def _try_out(self, simulator: Simulator, episode: EpisodeId, worker: Worker) -> None:
+    def _try_out(
+        self, simulator: Simulator, episode: EpisodeId, cameras: set[str], worker: Worker
+    ) -> None:
         """Begin an episode; raise only for what no episode can work with."""
         limit = worker.limit(self.run.config.simulator_timeout_s, "the simulator's reset")
         try:
             with limit:
-                begun = simulator.reset(str(episode), demonstration=False)
-            check_episode(self.buffer_set.query(episode), *begun)
+                lesson, first, info = simulator.reset(str(episode), demonstration=False)
+            check_drawn(lesson, first, sorted(cameras))
+            check_episode(self.buffer_set.query(episode), lesson, first, info)
         except SimulatorError:
             raise
         except Exception:

@@ -96,7 +96,9 @@ def show(
     episode: QueryName,
     condition: ConditionName,
     out: Picture = None,
-    camera: Annotated[str, typer.Option(help="Camera to draw.")] = "front",
+    camera: Annotated[
+        str | None, typer.Option(help="Camera to draw; default: front, or else the first.")
+    ] = None,
     shift: Annotated[str, typer.Option(help=f"{SHIFT_HELP} Requires --out.")] = NO_SHIFT,
     as_json: AsJson = False,
 ) -> None:
@@ -122,10 +124,12 @@ def show(
         )
     opened = load_buffer_set(buffer_set)
     buffer = opened.load(episode, condition)
-    buffer.query.dataset.shape(camera)  # raises for an unknown one
+    if camera is not None:
+        buffer.query.dataset.shape(camera)  # raises for an unknown one
     if out is not None:
-        from robomme_interference_data.viz.filmstrip import draw_strip
+        from robomme_interference_data.viz.filmstrip import draw_strip, shown_camera
 
+        camera = camera or shown_camera(buffer)
         live = live_frame(opened, buffer, scene_shift, camera)
         draw_strip(buffer, out, camera=camera, live=live)
         print_status(f"{out} written")

@@ -278,6 +278,7 @@ class Simulator(ABC):
         self._episode = None
         self._steps += 1
         observation, status = self._execute(episode, action, observe)
+        status = Status(status)
         if status is Status.ONGOING and self._steps >= MAX_STEPS:
             status = Status.TIMEOUT
         if status is Status.ONGOING:

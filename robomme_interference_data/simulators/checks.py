@@ -1,5 +1,6 @@
 """Check what a simulator returns for a new episode, so that a mistake shows at the first reset."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -22,15 +23,17 @@ def check_begun(simulator: Simulator, begun: Any) -> None:
         _refuse(simulator, [f"`_begin` returned {', '.join(type(one).__name__ for one in parts)}"])
     lesson, first, _ = parts
     state, states, actions = map(np.asarray, (first.state, lesson.states, lesson.actions))
-    wrong, unknown = [], (0, simulator.action_size)
-    if state.ndim != 1 or not len(state):
-        wrong.append(f"the first live state has the shape {state.shape}")
-    elif states.ndim != 2 or states.shape[1:] != state.shape:
-        wrong.append(f"the lesson's states have the shape {states.shape}, a live one {state.shape}")
-    if actions.shape not in (unknown, full := (len(states), simulator.action_size)):
+    wrong, size = [], simulator.action_size
+    if state.ndim != 1 or not len(state) or state.dtype != np.float32:
+        wrong.append(f"the first live state is {state.dtype} {state.shape}")
+    elif states.shape != (len(states), *state.shape) or states.dtype != np.float32:
         wrong.append(
-            f"the lesson's actions have the shape {actions.shape}; expected {full}, or {unknown} "
-            "if they are unknown"
+            f"the lesson's states are {states.dtype} {states.shape}, a live one {state.shape}"
+        )
+    if actions.shape not in ((0, size), (len(states), size)) or actions.dtype != np.float32:
+        wrong.append(
+            f"the lesson's actions are {actions.dtype} {actions.shape}; expected "
+            f"{(len(states), size)}, or {(0, size)} if they are unknown"
         )
     for name, image in first.images.items():
         if name not in simulator.cameras:
@@ -39,6 +42,19 @@ def check_begun(simulator: Simulator, begun: Any) -> None:
             wrong.append(f"the image of {name!r} is {image.dtype} {image.shape}")
     if wrong:
         _refuse(simulator, wrong)
+
+
+def check_drawn(lesson: Demonstration, first: Observation, cameras: Iterable[str]) -> None:
+    """Check that a simulator drew these cameras; of the lesson all frames, or none at all."""
+    for camera in cameras:
+        frames = len(lesson.images.get(camera, ())) if lesson.images else len(lesson)
+        if camera not in first.images or frames != len(lesson):
+            drawn = ", ".join(first.images) or "no camera"
+            raise SimulatorError(
+                f"the simulator was to draw {camera}; it drew {drawn}, and {frames} of "
+                f"{len(lesson)} frames of the lesson",
+                "Draw the cameras of the setting `cameras`, and all that are declared without it.",
+            )
 
 
 def _refuse(simulator: Simulator, wrong: list[str]) -> None:

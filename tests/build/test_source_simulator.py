@@ -146,8 +146,9 @@ def test_a_simulator_of_ones_own_is_a_source(name: str) -> None:
     [
         (f"{OWN}make_any", SourceError, "Define the class method `episodes`"),
         (f"{OWN}Played", SourceError, "lists no episodes"),
-        (f"{OWN}Blind", SimulatorError, "did not draw the camera top, but none"),
+        (f"{OWN}Blind", SimulatorError, "was to draw top; it drew no camera"),
         (f"{OWN}nothing", UnknownNameError, "'nothing' is not in module"),
+        ("__main__:make", InvalidOptionError, "worker processes run another program"),
         ("no_such_module:make", UnknownNameError, "MODULE:NAME of a simulator of your own"),
         ("frames:make", SourceError, "frames.parquet"),
     ],

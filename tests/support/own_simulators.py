@@ -57,6 +57,21 @@ class Uneven(Played):
         return lesson, Observation(first.images, first.state[:7]), info
 
 
+class Doubled(Played):
+    """Has states of float64, as many environments do."""
+
+    def _begin(self, episode: EpisodeId, every: int) -> Begun:
+        lesson, first, info = super()._begin(episode, every)
+        return lesson, Observation(first.images, first.state.astype(float)), info
+
+
+class Blindfolded(Played):
+    """Draws nothing that it is asked for."""
+
+    def __init__(self, cameras: tuple[str, ...] = ()) -> None:
+        super().__init__(())
+
+
 class Small(Played):
     """Draws images of another size than the recorded ones."""
 
