@@ -88,8 +88,8 @@ class LampSimulator(Simulator):
 
     @classmethod
     def episodes(cls) -> list[EpisodeId]:
-        """Return 6 train and 6 test episodes of each family."""
-        counts = {"train": 6, "test": 6}
+        """Return 7 train and 6 test episodes of each family."""
+        counts = {"train": 7, "test": 6}
         return [EpisodeId(f, s, n) for f in GOALS for s in counts for n in range(counts[s])]
 
     def act(
