@@ -59,7 +59,7 @@ def read_facts(env: Any, family: str, pixel: Any) -> dict[str, Any]:
     """Return the facts about an episode whose demonstration has been played, as JSON values.
 
     They are its tasks, the points of its things in the front image, the answer, and what else the
-    possible answers depend on. `pixel` returns where a thing is in the image (`subgoals.py`).
+    possible answers depend on. `pixel` returns where a thing is in the image (`steps.py`).
     """
     base = env.unwrapped
     things = list(getattr(base, _THINGS[family])) if family in _THINGS else []
