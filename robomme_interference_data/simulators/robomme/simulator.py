@@ -28,7 +28,7 @@ from robomme_interference_data.simulators.base import (
 from robomme_interference_data.simulators.tabletop.episodes import episode_ids
 
 from .process import Arrays, Process, find_python, installed_versions
-from .scenes import OfficialScene, evidence_of, read_scene
+from .scenes import OfficialScene, read_scene
 
 FRAME_SHAPE = (256, 256, 3)
 
@@ -228,9 +228,7 @@ class RoboMMESimulator(Simulator):
             return None, None
         text = json.dumps(facts["scene"], separators=(",", ":"), sort_keys=True)
         self._scene = read_scene(family, text, facts["difficulty"])
-        if self._scene is None:
-            return None, None
-        return evidence_of(self._scene, arrays["moments"][:-1]), text
+        return self._scene.evidence(arrays["moments"][:-1]), text
 
     def _execute(
         self, episode: EpisodeId, action: NDArray[np.float32], observe: bool
