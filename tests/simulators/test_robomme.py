@@ -145,6 +145,18 @@ def test_only_requested_cameras_are_rendered(
             assert simulator.subgoal().points == ((2, 200),)
 
 
+def test_the_front_camera_is_drawn_until_a_subgoal_is_located(robomme_python: Path) -> None:
+    with RoboMMESimulator(robomme_python, cameras=[]) as simulator:
+        simulator.reset(f"VideoRepick/test/{DRAWN}", demonstration=False)
+        points = [simulator.subgoal().points]
+        for _ in range(3):
+            seen, _ = simulator.step(HOLD)
+            points.append(simulator.subgoal().points)
+    # Two pictures, when the first subgoal begins and when the second one does, at step 2.
+    assert seen.state[:2].tolist() == [2, 1]
+    assert [one for ((one, _),) in points] == [0, 0, 2, 2]
+
+
 def test_a_process_plays_few_episodes_and_none_depends_on_it(simulator: RoboMMESimulator) -> None:
     # A second reset of one of the stand-in's environments would shift all frames.
     episodes = [f"MoveCube/test/{index}" for index in range(EPISODES + 1)]

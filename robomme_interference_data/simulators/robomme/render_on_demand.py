@@ -4,7 +4,7 @@ Runs in RoboMME's interpreter, as `worker.py` does. Rendered images, states and 
 same, bit for bit; a camera that is not rendered shows its last image.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 CAMERAS = {"front": "base_camera", "wrist": "hand_camera"}
@@ -12,19 +12,24 @@ CAMERAS = {"front": "base_camera", "wrist": "hand_camera"}
 
 
 class RenderOnDemand:
-    """Patches ManiSkill to render only `cameras`, given by RoboMME's names; all at first."""
+    """Patches ManiSkill to render only `cameras`, given by RoboMME's names; all at first.
+
+    Where `needs_front` returns True, it also renders the front camera.
+    """
 
     def __init__(self) -> None:
         from mani_skill.envs.sapien_env import BaseEnv
 
         self.cameras: Iterable[str] = CAMERAS.values()
+        self.needs_front: Callable[[], bool] = bool
         self._last: dict[str, Any] = {}
         render_all = BaseEnv._get_obs_sensor_data
 
         def render(env: Any, *args: Any, **named: Any) -> dict[str, Any]:
             sensors = env._sensors
             if sensors.keys() <= self._last.keys():  # otherwise a camera has no last image yet
-                env._sensors = {name: sensors[name] for name in self.cameras if name in sensors}
+                wanted = {*self.cameras, *([CAMERAS["front"]] if self.needs_front() else [])}
+                env._sensors = {name: one for name, one in sensors.items() if name in wanted}
             env.scene.sensors = env._sensors
             try:
                 if env._sensors:

@@ -60,7 +60,7 @@ class RoboMMESimulator(Simulator):
         answer_s: Seconds that it may take to start, and for each call. On overloaded machines, up
             to 300 s to start, 190 s for a reset and 120 s for a step occur.
         subgoals: Whether `subgoal` can be called. RoboMME locates points in its images, so it then
-            renders the front camera at every step.
+            renders the front camera when a subgoal begins.
 
     Raises:
         InvalidOptionError: The interpreter is missing or does not run, or a camera is unknown.

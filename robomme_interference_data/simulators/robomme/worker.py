@@ -127,6 +127,7 @@ class Episodes:
             self._rendering.reset()
         self._env = builder.make_env_for_episode(index)
         self._cameras, self._subgoals = cameras, subgoals
+        self._rendering.needs_front = self._must_locate if subgoals else bool
         self._select_cameras(demonstration)
         log = _facts.LessonLog(self._env, family)
         observations, info = self._env.reset()
@@ -186,10 +187,22 @@ class Episodes:
             env.close()
 
     def _select_cameras(self, requested: bool) -> None:
-        """Render the requested cameras, and the front camera, which RoboMME's subgoals need."""
-        cameras = {*self._cameras} if requested else set()
-        cameras |= {"front"} if self._subgoals else set()
+        cameras = self._cameras if requested else []
         self._rendering.cameras = [_rendering.CAMERAS[camera] for camera in cameras]
+
+    def _must_locate(self) -> bool:
+        """Whether RoboMME needs a front image to locate the things that its subgoal names.
+
+        Once it has found them it keeps their points until the subgoal changes.
+        """
+        layer = self._env
+        while layer is not None and "latched_replacements" not in vars(layer):
+            layer = vars(layer).get("env")
+        if layer is None:  # another version of RoboMME
+            return True
+        text = getattr(layer.unwrapped, "current_subgoal_segment", None) or ""
+        located = text == layer.last_subgoal_segment and layer.latched_replacements is not None
+        return "<" in text and not located
 
     def _frames(self, observations: Any) -> dict[str, Any]:
         import numpy as np

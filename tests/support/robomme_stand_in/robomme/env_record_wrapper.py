@@ -36,6 +36,9 @@ class Environment(BaseEnv):
         if index == 44:
             sizes["hand_camera"] = 512
         super().__init__({"base_camera": 256, **sizes})
+        if family == "VideoRepick":
+            self.current_subgoal_segment = "pick up the cube at <cube>"
+            self.last_subgoal_segment = self.latched_replacements = None
         if family == "VideoUnmask" and index != 49:
             self._hide_a_cube()
         open_environments.add(self)
@@ -73,6 +76,8 @@ class Environment(BaseEnv):
         if self.index == 41:
             time.sleep(60)
         self.steps += 1
+        if self.family == "VideoRepick" and self.steps == 2:
+            self.current_subgoal_segment = "put the cube at <place>"
         if hasattr(self, "elapsed_steps"):
             self.elapsed_steps[0] += 1
         if self.index == 43 and self.steps == 2:
@@ -119,8 +124,7 @@ class Environment(BaseEnv):
         for t in frames:
             self._shows = {"base_camera": t, "hand_camera": 100 + t % 100}
             seen.append(self._get_obs_sensor_data())
-        # Places of subgoals are found in the front view, as the real one finds them.
-        self.place = int(seen[-1]["base_camera"]["rgb"].numpy().flat[0])
+            self._locate(int(seen[-1]["base_camera"]["rgb"].numpy().flat[0]))
         return {
             "front_rgb_list": [one["base_camera"]["rgb"][0].numpy() for one in seen],
             "wrist_rgb_list": [one["hand_camera"]["rgb"][0].numpy() for one in seen],
@@ -129,6 +133,15 @@ class Environment(BaseEnv):
                 np.float64([0 if stick else g, 0 if stick else -1]) for g in grippers
             ],
         }
+
+    def _locate(self, place):
+        """Find the place of a subgoal in the front view; some keep it until the subgoal changes."""
+        if self.family == "VideoRepick":
+            if self.current_subgoal_segment != self.last_subgoal_segment:
+                self.last_subgoal_segment = self.current_subgoal_segment
+                self.latched_replacements = [place]
+            [place] = self.latched_replacements
+        self.place = place
 
     def _info(self, status):
         goals = ["move the cube as before", "do it again, Schritt für Schritt"]
