@@ -151,12 +151,29 @@ def test_some_parts_leave_some_answers() -> None:
         lambda text: text.replace('"answer"', '"answers"'),
         lambda text: text.replace('"answer": 2', '"answer": 7'),
         lambda text: "[]",
+        lambda text: "[" * 60_000,
     ],
 )
 def test_a_damaged_scene_is_an_error(damage: Any) -> None:
     text = json.dumps(RECORDED["VideoRepick/test/0"]["scene"])
     with pytest.raises(FormatError, match="scene of VideoRepick"):
         read_scene("VideoRepick", damage(text), "easy")
+
+
+@pytest.mark.parametrize(
+    ("family", "facts"),
+    [
+        # Orders of 60 containers, paths over 25 buttons, 4^24 routes, and 300^3 series of swaps.
+        ("VideoUnmask", {"answer": [0], "colors": "r" * 60}),
+        ("PatternLock", {"answer": list(range(25))}),
+        ("RouteStick", {"answer": [[n % 2 for n in range(25)], ["clockwise"] * 24]}),
+        ("VideoRepick", {"answer": 3, "swaps": [[0, 1, 2, 3]] * 3}),
+    ],
+)
+def test_a_scene_with_endless_answers_is_an_error(family: str, facts: dict[str, Any]) -> None:
+    text = json.dumps({"points": [[1, 2]] * 25, "tasks": [], "swaps": []} | facts)
+    with pytest.raises(FormatError, match=f"scene of {family}"):
+        read_scene(family, text, "hard")
 
 
 def test_a_scene_of_another_family_is_an_error() -> None:

@@ -40,6 +40,11 @@ from robomme_interference_data.simulators.scene import (
 _UNRECORDED = ("static", "NO RECORD")
 """Names of tasks in which the robot rests, or that RoboMME does not record."""
 
+# Upper bounds, so that an untrusted scene has no endless number of possible answers.
+_MOST = {"points": 25, "colors": 3, "visits": 4, "swaps": 3}
+_MOST_MOVES = 8  # of a path, or its buttons
+_MOST_SWAPPING = 5  # things where some swap places
+
 
 class Moment(NamedTuple):
     """What RoboMME did at a lesson frame.
@@ -121,6 +126,8 @@ class OfficialSwaps(SwapScene, OfficialScene):
     def __init__(self, facts: Mapping[str, Any], difficulty: str):
         self.swaps = [(one, other) for one, other, _, _ in facts["swaps"]]
         super().__init__(facts, difficulty)
+        if self.swaps and self.count > _MOST_SWAPPING:
+            raise ValueError(f"{self.count} things swap places")
 
     def possible_swaps(self) -> Mapping[tuple[Pair, ...], tuple[str, ...]]:
         """Return every series of as many swaps."""
@@ -293,12 +300,18 @@ def read_scene(family: str, recorded: str, difficulty: str) -> OfficialScene:
         FormatError: The text is not what `facts.py` records of this family.
     """
     try:
-        scene = _SCENES[family](json.loads(recorded), difficulty)
+        facts = json.loads(recorded)
+        for name, most in _MOST.items():
+            if name in facts and len(facts[name]) > most:
+                raise ValueError(f"{name} has over {most} entries")
+        if _longest(facts["answer"]) > _MOST_MOVES:
+            raise ValueError(f"the answer has over {_MOST_MOVES} entries")
+        scene = _SCENES[family](facts, difficulty)
         answer = scene.own_answer(0)
         if answer not in scene.answers:
             raise ValueError(f"the answer {answer} is not possible")
         scene.parts(answer)
-    except (ValueError, KeyError, TypeError, IndexError) as error:
+    except (ValueError, LookupError, TypeError, ArithmeticError, RecursionError) as error:
         raise FormatError(f"the recorded scene of {family} is damaged: {error}") from error
     return scene
 
@@ -314,6 +327,11 @@ def _direction(rows: int, columns: int) -> str:
     along = {1: "forward", -1: "backward"}.get(rows)
     across = {1: "left", -1: "right"}.get(columns)
     return "-".join(word for word in (along, across) if word)
+
+
+def _longest(value: Any) -> int:
+    """Return the length of the longest list in a value of JSON, itself included."""
+    return max([len(value), *map(_longest, value)]) if isinstance(value, list) else 0
 
 
 def _frozen(value: Any) -> Any:
