@@ -37,9 +37,9 @@ LESSON = 48
 UNITS = 17
 
 
-def copy_buffer_set(folder: Path) -> Path:
-    """Copy the golden buffer set, to be damaged."""
-    return Path(shutil.copytree(GOLDEN, folder))
+def copy_buffer_set(folder: Path, buffer_set: Path = GOLDEN) -> Path:
+    """Copy a buffer set, to be damaged or extended."""
+    return Path(shutil.copytree(buffer_set, folder))
 
 
 def build(root: Path, kind: str, source: Source, **episodes: Any) -> None:
