@@ -6,11 +6,11 @@ from typing import Any
 import pytest
 from support.simulator_doubles import Double
 
-from robomme_interference_data.build_dataset.config import list_episodes
 from robomme_interference_data.build_dataset.frame_selection import (
     select_demonstration,
     select_frames,
 )
+from robomme_interference_data.build_dataset.plan import list_episodes
 from robomme_interference_data.build_dataset.sources import Recording, open_source, simulator
 from robomme_interference_data.constants import DEMONSTRATIONS, FAMILIES
 from robomme_interference_data.errors import InvalidOptionError

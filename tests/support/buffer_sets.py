@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.build_dataset.build import build_dataset
-from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
 from robomme_interference_data.build_dataset.frame_selection import FRAME_SELECTORS
 from robomme_interference_data.build_dataset.manifests import (
     in_folder,
     plan_manifests,
     write_manifests,
 )
+from robomme_interference_data.build_dataset.plan import BuildPlan, list_episodes
 from robomme_interference_data.build_dataset.sources import Frame, Source
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.constants import SUMS_PATH
