@@ -63,6 +63,8 @@ class Ceiling:
 def ceiling(buffer_set: BufferSet, config: CeilingConfig) -> list[Ceiling]:
     """Return the ceiling of a memory on a buffer set, by family and for all, and by condition."""
     check_memory(config.memory, "ceiling")
+    if config.frames < 1:
+        raise InvalidOptionError.expected("frames", config.frames, "1 or more")
     non_default_retrieval(config)
     if config.shift != NO_SHIFT and config.retrieval is None:
         raise InvalidOptionError(
@@ -73,28 +75,43 @@ def ceiling(buffer_set: BufferSet, config: CeilingConfig) -> list[Ceiling]:
         raise nothing_to_retrieve(
             f"Leave {NO_HISTORY} out: its ceiling is that of the memory without retrieval."
         )
-    if all(buffer_set.query(one).record.evidence is None for one in buffer_set.episode_ids):
-        raise InvalidOptionError(
-            f"the frames of {buffer_set.location} that show the answer are unknown",
-            "Build it from a source with evidence: see docs/reference/sources.md.",
-        )
+    queries_with_evidence(buffer_set)
     names = [one.name for one in in_order(config.conditions or buffer_set.conditions)]
     every = [
-        left_in_memory(buffer, config.memory, frames)
+        left_in_memory(buffer, config.memory, given, config.frames)
         for name in names
         for buffer in buffer_set.buffers(condition=name)
-        if (frames := _given(buffer_set, buffer, config)) is not None
+        if (given := _given(buffer_set, buffer, config)) is not None
     ]
     return [*_cells(every, buffer_set.families), *_cells(every, (ALL,))]
 
 
-def left_in_memory(buffer: Buffer, memory: str, frames: Sequence[int]) -> Left:
-    """Return the evidence that a memory keeps at the first step, given frames of a buffer."""
+def queries_with_evidence(buffer_set: BufferSet) -> list[Query]:
+    """Return the queries for which the lesson frames that show the answer are known.
+
+    Raises:
+        InvalidOptionError: There is none.
+    """
+    queries = [buffer_set.query(one) for one in buffer_set.episode_ids]
+    known = [one for one in queries if one.record.evidence is not None]
+    if not known:
+        raise InvalidOptionError(
+            f"the frames of {buffer_set.location} that show the answer are unknown",
+            "Build it from a source with evidence: see docs/reference/sources.md.",
+        )
+    return known
+
+
+def left_in_memory(buffer: Buffer, memory: str, given: Sequence[int], frames: int = 1) -> Left:
+    """Return the evidence that a memory keeps at the first step, given frames of a buffer.
+
+    A part of the answer is known from that many kept `frames` on.
+    """
     cell = buffer.episode_id.family, buffer.condition
     if buffer.evidence is None:
         return Left(*cell, None, None)
-    kept = Memory(memory).kept(frames)
-    success = chance(buffer.query, known_parts(buffer.evidence, kept))
+    kept = Memory(memory).kept(given)
+    success = chance(buffer.query, known_parts(buffer.evidence, kept, frames))
     return Left(*cell, evidence_kept(buffer.evidence, kept), success)
 
 

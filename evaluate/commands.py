@@ -1,4 +1,4 @@
-"""The commands `ceiling`, `evaluate`, `ask` and `merge`."""
+"""The commands `ceiling`, `shortcuts`, `evaluate`, `ask` and `merge`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -30,6 +30,7 @@ def ceiling(buffer_set: BufferSetFolder, config: CeilingConfig, as_json: AsJson 
     Examples:
     ```
     robomme-interference ceiling my-buffers --memory window
+    robomme-interference ceiling my-buffers --memory framesamp --frames 2
     robomme-interference ceiling my-buffers --retrieval thumbnail --shift light:2
     ```
     """
@@ -44,10 +45,36 @@ def ceiling(buffer_set: BufferSetFolder, config: CeilingConfig, as_json: AsJson 
         print_json([to_dict(cell) for cell in cells])
         return
     title = f"Ceiling on {opened.name}, memory {config.memory}"
+    if config.frames > 1:
+        title += f", {config.frames} frames of a part"
     if config.retrieval is not None:
         title += f", with retrieval {config.retrieval}, rule {config.retrieval_rule}"
         title += "" if config.shift == NO_SHIFT else f", shift {config.shift}"
     echo(module.ceiling_table(cells, title).text())
+
+
+def shortcuts(buffer_set: BufferSetFolder, as_json: AsJson = False) -> None:
+    """Print how far lesson length, goal and first live view reveal the answer.
+
+    A policy can use all three without any memory. Each episode is guessed from the others of
+    its family. Nothing is simulated.
+
+    Example:
+    ```
+    robomme-interference shortcuts my-buffers
+    ```
+    """
+    from robomme_interference_data.data.loading import load_buffer_set
+    from robomme_interference_data.schema.codec import to_dict
+
+    from . import shortcuts as module
+
+    opened = load_buffer_set(buffer_set)
+    found = [*module.shortcuts(module.cues_of(opened))]
+    if as_json:
+        print_json([to_dict(one) for one in found])
+        return
+    echo(module.shortcut_table(found, f"Shortcuts in {opened.name}").text())
 
 
 @with_settings

@@ -120,7 +120,10 @@ def _control(kind: str, *, retrieval: bool, reference: bool = False) -> tuple[Sy
 _CONTROLS = (
     *(
         System(name.lower(), name, "none", reference=True)
-        for name in ("Oracle", "Guess", "Noop", "Follow-Subgoals", "Follow-Subgoals-Oracle")
+        for name in (
+            *("Oracle", "Guess", "Noop"),
+            *("Follow-Subgoals", "Follow-Subgoals-Oracle", "Follow-Subgoals-Oracle-Simple"),
+        )
     ),
     *_control("Replay", retrieval=False),
     *_control("Replay", retrieval=True),

@@ -9,6 +9,7 @@ from robomme_interference_data.constants import ACTION_CHUNK
 from robomme_interference_data.errors import PolicyError
 from robomme_interference_data.schema.evidence import known_parts
 from robomme_interference_data.schema.sampling import Memory, check_memory
+from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Observation, Simulator
 
 from .policy import Frames, Policy, RolloutInfo
@@ -170,14 +171,21 @@ class FollowSubgoals(Privileged):
 
     It matches their words and points with what the scene allows, and does not know the answer.
     Without subgoals it acts like `guess`.
+
+    Args:
+        points: Whether it sees the points of subgoals; if not, only their words.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, points: bool = True) -> None:
         super().__init__("follow-subgoals")
+        self._points = points
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the script's next action, `(1, 8) float32`; see `Privileged.act`."""
-        return self._running().follow_subgoal(observation.subgoal)[None]
+        subgoal = observation.subgoal
+        if subgoal is not None and not self._points:
+            subgoal = Subgoal(subgoal.simple)
+        return self._running().follow_subgoal(subgoal)[None]
 
 
 class Recall(Privileged):

@@ -54,9 +54,10 @@ def default_system(config: RunConfig) -> str:
             "docs/how-to/paper-systems.md.",
         )
     name = "-".join(filter(None, (spec.kind, spec.target, config.subgoals)))
-    if spec.kind == "replay":
+    if spec.kind in ("replay", "follow-subgoals"):
         options = policy_options(config.policy, config.policy_options)
-        name += "-extrapolate" if options["extrapolate"] else ""
+        name += "-extrapolate" if options.get("extrapolate") else ""
+        name += "" if options.get("points", True) else "-simple"
     if spec.kind == "python":
         name = re.sub(r"[^A-Za-z0-9._-]+", "-", name.partition("-")[2]).strip("-")
     return with_retrieval(name, config)

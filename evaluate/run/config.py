@@ -183,6 +183,7 @@ class CeilingConfig(RetrievalConfig):
     """The settings of a ceiling: which memory, and which buffers."""
 
     memory: str = setting("framesamp", help="full, framesamp or window.")
+    frames: int = setting(1, help="Kept frames of a part of the answer that make it known.")
     conditions: tuple[str, ...] = setting((), help="Conditions; default: all of the buffer set.")
     shift: str = setting(NO_SHIFT, help=SHIFT_HELP)
 

@@ -73,6 +73,7 @@ _GROUPS = {
     ),
     "Rollouts": (
         ("ceiling", evaluating.ceiling),
+        ("shortcuts", evaluating.shortcuts),
         ("evaluate", evaluating.evaluate),
         ("ask", evaluating.ask),
         ("merge", evaluating.merge),

@@ -4,6 +4,7 @@ Spans are recorded with their episode. If the source does not label frames, evid
 """
 
 from bisect import bisect_left
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -101,14 +102,20 @@ def among(evidence: Iterable[Evidence], frames: Sequence[int]) -> tuple[Evidence
     return tuple(replace(one, start=a, stop=b) for one, (a, b) in shown if a < b)
 
 
-def known_parts(evidence: Sequence[Evidence], kept: Collection[int]) -> dict[int, str]:
+def known_parts(
+    evidence: Sequence[Evidence], kept: Collection[int], frames: int = 1
+) -> dict[int, str]:
     """Return the texts of the parts of the answer that frames of the buffer show, newest first.
 
-    If two sessions show the same part, the later one counts, regardless of its role.
+    If two sessions show the same part, the later one counts, regardless of its role. A part is
+    known if at least `frames` of the kept frames show it.
     """
+    counts = Counter[tuple[int, str]]()
+    for one in evidence:
+        counts[one.span.part, one.span.text] += sum(one.start <= frame < one.stop for frame in kept)
     texts: dict[int, str] = {}
     for one in reversed(evidence):
-        if one.seen(kept):
+        if counts[one.span.part, one.span.text] >= frames and one.seen(kept):
             texts.setdefault(one.span.part, one.span.text)
     return texts
 

@@ -165,6 +165,17 @@ def test_known_are_the_parts_of_which_a_frame_is_kept() -> None:
     assert known_parts(evidence, [9]) == {1: "from the left", 0: "takes peg 2"}
 
 
+def test_a_part_may_need_several_frames() -> None:
+    evidence = placed(replace(ENTRY, stop=9), replace(ENTRY, start=9))  # one span in two halves
+    first = [
+        frame for one in evidence if one.span.part == 0 for frame in range(one.start, one.stop)
+    ]
+    for count in range(len(first) + 1):
+        assert (0 in known_parts(evidence, first[:count], 3)) == (count >= 3)
+    assert known_parts(evidence, first[:-1], len(first)) == {}
+    assert known_parts(evidence, first, len(first)) == {0: "takes peg 2"}
+
+
 def test_of_two_lessons_the_newer_one_counts() -> None:
     wrong = replace(ENTRY, role="contradiction", dataset="contradictions")
     spans = {"demonstrations": (FIRST,), "contradictions": (replace(FIRST, text="peg 1"), THEN)}

@@ -1,5 +1,8 @@
 """The policies without weights: what replay keeps, where it starts, and how it moves."""
 
+from dataclasses import replace
+from typing import cast
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -8,6 +11,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import PolicyError, UnknownNameError
 from robomme_interference_data.evaluate.policies.builtin import (
+    FollowSubgoals,
     Noop,
     Privileged,
     Recall,
@@ -21,7 +25,8 @@ from robomme_interference_data.schema.evidence import map_evidence
 from robomme_interference_data.schema.manifest import SessionEntry, layout_sessions
 from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.schema.sampling import MEMORIES, Memory
-from robomme_interference_data.simulators.base import Observation
+from robomme_interference_data.schema.subgoal import Subgoal
+from robomme_interference_data.simulators.base import Observation, Simulator
 
 Vector = NDArray[np.float32]
 
@@ -206,3 +211,19 @@ def test_recall_needs_evidence() -> None:
         Recall().reset(RolloutInfo("goal", 0, 0, Recorder(), None))  # type: ignore[arg-type]
     with pytest.raises(UnknownNameError, match="framesamp"):
         Recall("framesmap")
+
+
+@pytest.mark.parametrize(("points", "text"), [(True, "take it at <7, 9>"), (False, "take it")])
+def test_points_of_subgoals_can_be_hidden(points: bool, text: str) -> None:
+    followed = []
+
+    class Scripted:
+        def follow_subgoal(self, subgoal: Subgoal) -> Vector:
+            followed.append(subgoal.grounded)
+            return np.zeros(8, np.float32)
+
+    policy = FollowSubgoals(points=points)
+    policy.reset(RolloutInfo("goal", 0, 0, simulator=cast(Simulator, Scripted())))
+    view = replace(seen(0, 0.0), subgoal=Subgoal("take it at <point>", ((7, 9),)))
+    assert policy.act(view, "goal").shape == (1, 8)
+    assert followed == [text]

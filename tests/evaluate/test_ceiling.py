@@ -12,6 +12,7 @@ from support.buffer_sets import copy_buffer_set
 from support.made_up import record
 from support.retrieval import make_index
 from support.shifted import add_shifted
+from support.tabletop import TABLETOP
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.data.buffer_set import BufferSet
@@ -73,6 +74,8 @@ def test_invalid_settings_are_errors(tiny_buffers: Path, monkeypatch: pytest.Mon
     buffer_set = load_buffer_set(tiny_buffers)
     with pytest.raises(UnknownNameError, match=r"'framesmap'(.|\n)*framesamp"):
         ceiling(buffer_set, CeilingConfig("framesmap"))
+    with pytest.raises(InvalidOptionError, match="frames"):
+        ceiling(buffer_set, CeilingConfig(frames=0))
     with pytest.raises(UnknownNameError, match="k9"):
         ceiling(buffer_set, CeilingConfig(conditions=("k9",)))
     with pytest.raises(InvalidOptionError, match="`retrieval_rule` has no effect"):
@@ -83,6 +86,20 @@ def test_invalid_settings_are_errors(tiny_buffers: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(BufferSet, "query", lambda *_: unknown)
     with pytest.raises(InvalidOptionError, match="that show the answer are unknown"):
         ceiling(buffer_set, CeilingConfig())
+
+
+def test_a_part_that_needs_more_frames_than_are_kept_is_unknown() -> None:
+    buffer_set = load_buffer_set(TABLETOP)
+    rates = {
+        frames: {
+            cell.condition: cell.success
+            for cell in ceiling(buffer_set, CeilingConfig(memory="full", frames=frames))
+            if cell.family == ALL
+        }
+        for frames in (1, 1000)
+    }
+    assert rates[1]["k0"] == rates[1]["k1"] == 1
+    assert rates[1000]["k0"] == rates[1000]["no-history"] < 1
 
 
 # --- the ideal observer --------------------------------------------------------------------------

@@ -215,6 +215,14 @@ def check_name(tiny_buffers: Path, system: str, **changes: Any) -> None:
         ({}, "replay-window", "replay-full"),
         ({"policy_options": ("extrapolate=true",)}, "replay-window-extrapolate", "replay-window"),
         (
+            {
+                "policy": "follow-subgoals",
+                "subgoals": "oracle",
+                "policy_options": ("points=false",),
+            },
+            *("follow-subgoals-oracle-simple", "follow-subgoals-oracle"),
+        ),
+        (
             {"retrieval": "siglip", "retrieval_rule": "max/0.9", "retrieval_camera": "wrist"},
             *("retrieval-replay-window-max-0.9-wrist", "retrieval-replay-window"),
         ),

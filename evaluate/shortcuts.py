@@ -1,0 +1,160 @@
+"""Shortcuts: how far something other than the lesson's frames reveals the hidden answer.
+
+Policies receive the length of the history, the goal and the live view. A policy that guesses from
+one of them needs no memory, and looks like one that remembers. Here each episode's answer is
+guessed from the other episodes of its family (leave-one-out), by a cue alone.
+"""
+
+from collections import Counter
+from collections.abc import Hashable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.data.buffer_set import BufferSet
+from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
+from robomme_interference_data.schema.records import EvidenceSpan
+from robomme_interference_data.viz.tables import Table
+
+from .ceiling import queries_with_evidence
+
+COUNT = "count"
+
+
+@dataclass(frozen=True)
+class Cues:
+    """The answer of an episode, and what a policy sees without its lesson.
+
+    Attributes:
+        family: Its family.
+        evidence: The evidence of its lesson.
+        length: Number of frames of its lesson.
+        goal: Its goal in words.
+        view: The first live front image, `(H, W, 3) uint8` RGB; None if it was not stored.
+    """
+
+    family: str
+    evidence: Sequence[EvidenceSpan]
+    length: int
+    goal: str
+    view: NDArray[np.uint8] | None = None
+
+
+@dataclass(frozen=True)
+class Shortcut:
+    """How often guesses are right, for one part of the answers of a family.
+
+    Attributes:
+        family: The family.
+        part: Number of the part, from 0, or `count`: how many parts there are.
+        queries: Number of episodes that have the part.
+        most_frequent: Right guesses if the most frequent value is always guessed: no cue at all.
+        length, goal, view: Right guesses by a cue: the value of the episode whose lesson is nearest
+            in length, the most frequent value among episodes with the same goal, the value of the
+            episode whose live view looks most alike (encoder `thumbnail`). `view` is None if
+            images are not stored.
+    """
+
+    family: str
+    part: str
+    queries: int
+    most_frequent: int
+    length: int
+    goal: int
+    view: int | None
+
+
+def cues_of(buffer_set: BufferSet) -> list[Cues]:
+    """Return the cues of all queries of a buffer set whose evidence is known.
+
+    Raises:
+        InvalidOptionError: No query has known evidence.
+    """
+    return [
+        Cues(
+            one.episode_id.family,
+            one.record.evidence or (),
+            one.lesson_frames,
+            one.goal,
+            one.frame() if "front" in one.dataset.cameras else None,
+        )
+        for one in queries_with_evidence(buffer_set)
+    ]
+
+
+def shortcuts(episodes: Sequence[Cues]) -> Iterator[Shortcut]:
+    """Yield, for each family and each part of its answers, what each cue reveals."""
+    for family in dict.fromkeys(one.family for one in episodes):
+        members = [one for one in episodes if one.family == family]
+        texts = [{span.part: span.text for span in one.evidence} for one in members]
+        if len({len(one) for one in texts}) > 1:
+            yield _measure(family, COUNT, members, [len(one) for one in texts])
+        for part in sorted({part for one in texts for part in one}):
+            have = [at for at, one in enumerate(texts) if part in one]
+            values = [texts[at][part] for at in have]
+            if len(set(values)) > 1:
+                yield _measure(family, str(part), [members[at] for at in have], values)
+
+
+def _measure(
+    family: str, part: str, members: Sequence[Cues], values: Sequence[Hashable]
+) -> Shortcut:
+    lengths = np.array([[one.length] for one in members], np.float64)
+    views = [one.view for one in members if one.view is not None]
+    seen: int | None = None
+    if len(views) == len(members):
+        seen = by_nearest(Thumbnail().prepare(np.stack(views)), values)
+    frequent = max(Counter(values).values())
+    goals = by_group([one.goal for one in members], values)
+    return Shortcut(family, part, len(values), frequent, by_nearest(lengths, values), goals, seen)
+
+
+def by_nearest(features: NDArray[Any], values: Sequence[Hashable]) -> int:
+    """Count the values that equal that of the nearest other one.
+
+    Args:
+        features: `(N, D)`; distances are Euclidean, and of equal ones the first counts.
+        values: N values, N at least 2.
+    """
+    right = 0
+    for at, value in enumerate(values):
+        distances = ((features - features[at]) ** 2).sum(axis=1, dtype=np.float64)
+        distances[at] = np.inf
+        right += values[int(np.argmin(distances))] == value
+    return right
+
+
+def by_group(groups: Sequence[Hashable], values: Sequence[Hashable]) -> int:
+    """Count the values that equal the most frequent one of the other members of their group.
+
+    Of equally frequent ones the first counts. A member without others is compared with the most
+    frequent value of all others.
+    """
+    right = 0
+    for at, value in enumerate(values):
+        others = [*values[:at], *values[at + 1 :]]
+        names = [*groups[:at], *groups[at + 1 :]]
+        same = [one for one, name in zip(others, names, strict=True) if name == groups[at]]
+        [(guess, _)] = Counter(same or others).most_common(1)
+        right += guess == value
+    return right
+
+
+def shortcut_table(found: Sequence[Shortcut], title: str) -> Table:
+    """Return the table for the terminal."""
+    return Table.make(
+        "shortcuts",
+        title,
+        "family part queries:count most_frequent:count length:count goal:count live_view:count",
+        (
+            (one.family, one.part, one.queries, one.most_frequent, one.length, one.goal, one.view)
+            for one in found
+        ),
+        "right guesses of each part of the answer (count: of how many there are) without the "
+        "lesson's frames: always the most frequent value; the value of the other episode nearest "
+        "in lesson length; the most frequent among episodes with the same goal; the value of the "
+        "episode whose first live view looks most alike. Parts that are equal in all episodes are "
+        "left out.",
+    )
