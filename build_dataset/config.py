@@ -29,7 +29,7 @@ class BuildConfig(WorkersConfig):
         whole=True,
         metavar="SOURCE",
         help="robomme-h5:FOLDER, lerobot:FOLDER, lerobot:NAMESPACE/NAME[@REVISION], frames:FOLDER, "
-        "tabletop, robomme (demonstrations only) or sample[:FAMILY,…]; repeat for several.",
+        "tabletop, robomme or sample[:FAMILY,…]; repeat for several.",
     )
     buffer_set: Path = setting(
         name="-", metavar="BUFFER_SET", help="Folder of the buffer set to create or extend."
