@@ -121,7 +121,7 @@ def test_an_interpreter_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_missing_interpreter(tmp_path: Path) -> None:
     with pytest.raises(InvalidOptionError, match="none is given") as caught:
         make_simulator("robomme")
-    assert "robomme_python=PATH" in str(caught.value)
+    assert "`robomme_python`" in str(caught.value)
     (tmp_path / "notes.txt").write_text("not a program")
     for path in (tmp_path / "nowhere" / "python", tmp_path, tmp_path / "notes.txt"):
         with pytest.raises(InvalidOptionError, match=f"{path.name} is not an executable file"):

@@ -37,7 +37,7 @@ _ENVIRONMENT = {
 
 _INSTALL = (
     "Install RoboMME (https://github.com/RoboMME/robomme_benchmark) into a separate environment "
-    f"and pass its Python with robomme_python=PATH, or export {PYTHON_VARIABLE}=PATH."
+    f"and set `robomme_python` to its Python, or export {PYTHON_VARIABLE}=PATH."
 )
 
 Arrays = dict[str, NDArray[Any]]
