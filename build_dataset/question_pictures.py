@@ -13,6 +13,7 @@ from robomme_interference_data.schema.subgoal import Pixel
 
 _LARGER = 3  # times: the picture of things
 _OVER = 14  # pixels of the view: a letter over its thing
+_APART = 40  # pixels: letters over the same thing
 _TILE, _MARGIN = 480, 16  # pixels: a drawing at most; of the view, round all paths
 _INK, _PAPER, _PATH = "black", "white", "#ffe800"
 
@@ -22,7 +23,8 @@ Spot = tuple[float, float]
 def picture(view: NDArray[np.uint8], marks: Sequence[Sequence[Pixel]]) -> NDArray[np.uint8]:
     """Return an enlarged first live view with options marked and lettered, `(H, W, 3) uint8`.
 
-    An option of one point has its letter over it. Options of several points are paths: each gets
+    An option of one point has its letter over it, beside those of other options of this point.
+    Options of several points are paths: each gets
     its own drawing. Without points, the picture is the view.
     """
     if not all(marks):
@@ -30,10 +32,15 @@ def picture(view: NDArray[np.uint8], marks: Sequence[Sequence[Pixel]]) -> NDArra
     if max(map(len, marks)) == 1:
         image = Image.fromarray(_enlarged(view, _LARGER))
         draw = ImageDraw.Draw(image)
-        for letter, [(y, x)] in zip(LETTERS, marks, strict=False):
-            at = (_LARGER * x, _LARGER * (y - _OVER))
-            draw.line((at, (_LARGER * x, _LARGER * y)), fill=_INK, width=3)
-            _letter(draw, letter, at)
+        letters: dict[Pixel, list[str]] = {}
+        for letter, [point] in zip(LETTERS, marks, strict=False):
+            letters.setdefault(point, []).append(letter)
+        for (y, x), together in letters.items():
+            above = _LARGER * (y - _OVER)
+            draw.line((_LARGER * x, above, _LARGER * x, _LARGER * y), fill=_INK, width=3)
+            for place, letter in enumerate(together):
+                aside = _APART * (2 * place - len(together) + 1) // 2
+                _letter(draw, letter, (_LARGER * x + aside, above))
         return np.asarray(image)
     top, left, side = _window(view, [point for path in marks for point in path])
     part = _enlarged(view[top : top + side, left : left + side], times := _TILE // side)

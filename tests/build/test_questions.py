@@ -282,6 +282,17 @@ def test_a_thing_has_its_letter_over_it() -> None:
     assert (view == 200).all()
 
 
+def test_letters_of_one_thing_stand_side_by_side() -> None:
+    view = np.full((80, 100, 3), 200, np.uint8)
+    alone = [picture(view, [((50, x),) for x in (10, 50, 90)])[108:109, 3 * x] for x in (10, 50, 90)]
+    together = picture(view, [((50, 50),)] * 3)
+    assert not np.array_equal(*alone[:2])  # the letters differ in their middles
+    for x, letter in zip((110, 150, 190), alone, strict=True):
+        assert np.array_equal(together[108:109, x], letter)
+    assert (together[150, [110, 190]] == 200).all()  # one line leads down to the thing
+    assert (together[150, 150] == 0).all()
+
+
 @pytest.mark.parametrize("changes", [{"simulator": "robomme"}, {"seed": -1}])
 def test_only_tabletops_episodes_have_questions(changes: dict[str, Any]) -> None:
     with pytest.raises(BuildError, match="MoveCube/test/0 .*does not list the possible answers"):
