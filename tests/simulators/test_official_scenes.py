@@ -192,8 +192,8 @@ def test_questions_about_official_lessons() -> None:
     def query(episode: EpisodeId) -> Any:
         one = RECORDED[str(episode)]
         record = SimpleNamespace(scene=json.dumps(one["scene"]))
-        told = {"simulator": "robomme", "seed": 7, "difficulty": one["difficulty"]}
-        return SimpleNamespace(episode_id=episode, record=record, **told)
+        metadata = {"simulator": "robomme", "seed": 7, "difficulty": one["difficulty"]}
+        return SimpleNamespace(episode_id=episode, record=record, **metadata)
 
     episodes = [EpisodeId.parse(name) for name in RECORDED]
     datasets = {DEMONSTRATIONS: SimpleNamespace(identity=SimpleNamespace(revision="r"))}
