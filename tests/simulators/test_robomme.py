@@ -158,6 +158,7 @@ def test_unknown_robomme_names(simulator: RoboMMESimulator) -> None:
     for episode, message in (
         ("MoveCube/test/50", "MoveCube has 50 test episodes"),
         ("MoveQube/test/0", "Did you mean 'MoveCube'"),
+        ("BinFill/test/0", "'BinFill' is not in robomme"),  # it has no demonstration
     ):
         with pytest.raises(UnknownNameError, match=message):
             simulator.reset(episode)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import MAX_STEPS
+from robomme_interference_data.constants import FAMILIES, MAX_STEPS
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EvidenceSpan
@@ -160,7 +160,7 @@ class RoboMMESimulator(Simulator):
                 f"{episode}: RoboMME cannot combine a scene with another answer",
                 f"Use the episode {episode.scene}, or the simulator tabletop.",
             )
-        families = self._process.families
+        families = [one for one in self._process.families if one in FAMILIES]
         if episode.family not in families:
             raise UnknownNameError.among("family", episode.family, self.name, families)
         most = EPISODES if self._cameras or self._subgoals else 5 * EPISODES

@@ -177,7 +177,7 @@ class BenchmarkEnvBuilder:
 
     @classmethod
     def get_task_list(cls):
-        return ["MoveCube", "VideoRepick", "VideoUnmask", "PatternLock", "RouteStick"]
+        return ["MoveCube", "VideoRepick", "VideoUnmask", "PatternLock", "RouteStick", "BinFill"]
 
     def get_episode_num(self):
         return 50
