@@ -319,7 +319,8 @@ class Simulator(ABC):
         throughout an episode.
 
         Args:
-            subgoal: The current subgoal; None for none.
+            subgoal: The subgoal that was written since the last call, perhaps the same one again;
+                None if none was.
 
         Returns:
             The action, `(8,) float32`, as `step` takes it.

@@ -283,6 +283,7 @@ def test_subgoals_are_followed(simulator: RoboMMESimulator) -> None:
     assert follow(picked[1], Subgoal("look around", ()))[0] is Status.SUCCESS
     # A step is finished before the next one begins: the stand-in looks at the third action.
     assert follow(picked[0], picked[1])[0] is Status.FAIL
+    assert follow(picked[1], None)[0] is Status.SUCCESS  # no new one: it goes on
 
 
 def test_a_subgoal_without_a_point_draws(simulator: RoboMMESimulator) -> None:

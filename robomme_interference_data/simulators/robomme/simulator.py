@@ -87,7 +87,7 @@ class RoboMMESimulator(Simulator):
         self._subgoal: str | None = None
         self._scene: OfficialScene | None = None
         self._answer: Any = None  # what the solvers act out
-        self._following: dict[str, Any] = {}
+        self._follows = False  # whether it has got a subgoal
 
     @property
     def patches(self) -> tuple[str, ...]:
@@ -122,12 +122,13 @@ class RoboMMESimulator(Simulator):
         changes nothing.
         """
         self._running()
-        if subgoal is None and not self._following:
+        if subgoal is None and not self._follows:
             return self.act("guess")
         self._known_scene()
-        if subgoal is not None:
-            self._following = {"text": subgoal.text, "points": [list(p) for p in subgoal.points]}
-        response, _ = self._process.call("follow", **self._following, seed=self._seed)
+        self._follows = True
+        text = None if subgoal is None else subgoal.text
+        points = [] if subgoal is None else [list(point) for point in subgoal.points]
+        response, _ = self._process.call("follow", text=text, points=points, seed=self._seed)
         return np.array(response["action"], np.float32)
 
     def subgoal(self) -> Subgoal:
@@ -191,7 +192,7 @@ class RoboMMESimulator(Simulator):
         self, facts: dict[str, Any], family: str, arrays: Arrays
     ) -> tuple[tuple[EvidenceSpan, ...] | None, str | None]:
         """Keep the scene; return the lesson's evidence and the scene as JSON, None if unknown."""
-        self._scene, self._answer, self._following = None, None, {}
+        self._scene, self._answer, self._follows = None, None, False
         self._seed, self._unreadable = facts["seed"], facts.get("unreadable", "")
         if facts["scene"] is None:
             return None, None

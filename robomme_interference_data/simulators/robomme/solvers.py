@@ -53,6 +53,8 @@ class Script:
         self._env, self._steps = _Handing(env), steps
         self._planner: Any = None  # one, because it knows if the gripper holds something
         self._run: _Run | None = None
+        self._text: str | None = None  # of the subgoal that is followed
+        self._next: tuple[str, list[list[int]]] | None = None
 
     def act(self, answer: Any) -> list[float]:
         """Return the next action for an answer, 8 numbers.
@@ -66,15 +68,25 @@ class Script:
             self._run = self._start(self._steps.of_answer(answer))
         return self._run.act()
 
-    def follow(self, text: str, points: list[list[int]], seed: int) -> list[float]:
+    def follow(self, text: str | None, points: list[list[int]], seed: int) -> list[float]:
         """Return the next action towards a subgoal, 8 numbers; see `act`.
 
-        As RoboMME's own wrapper does, it finishes a step before it begins the next one, which may
-        have the same words. A subgoal that is not understood changes nothing; at first, the arm
-        holds its pose.
+        As RoboMME's own wrapper does, it finishes a step before it begins the next one, for which
+        it waits. A subgoal with the words of the step under way means that step; written after its
+        end, it means another one. A subgoal that is not understood changes nothing; at first, the
+        arm holds its pose.
+
+        Args:
+            text: The words of a subgoal that was just written; None if none was.
+            points: Its points.
+            seed: Seed for a draw among several things that it may mean.
         """
-        if self._run is None or self._run.done:
-            step = self._steps.of_subgoal(text, points, seed)
+        done = self._run is None or self._run.done
+        if text is not None and (done or text != self._text):
+            self._next = text, points
+        if done and self._next is not None:
+            (self._text, points), self._next = self._next, None
+            step = self._steps.of_subgoal(self._text, points, seed)
             if step is not None:
                 self._run = self._start([step])
         if self._run is not None:

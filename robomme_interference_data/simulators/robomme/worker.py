@@ -173,8 +173,8 @@ class Episodes:
         """Return the next action of RoboMME's solvers for an answer; the same one throughout."""
         return {"action": self._script.act(answer)}, {}
 
-    def follow(self, text: str, points: list[list[int]], seed: int) -> Answer:
-        """Return the next action of RoboMME's solvers towards a subgoal."""
+    def follow(self, text: str | None, points: list[list[int]], seed: int) -> Answer:
+        """Return the next action of RoboMME's solvers; `text` is a new subgoal, or None."""
         return {"action": self._script.follow(text, points, seed)}, {}
 
     def close(self) -> None:
