@@ -19,10 +19,10 @@ import av
 from common import Times, interleave, machine, positive, table
 
 from robomme_interference_data.build_dataset.build import build_dataset
-from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
 from robomme_interference_data.build_dataset.frame_selection import select_demonstration
 from robomme_interference_data.build_dataset.image_stats import ImageStats
 from robomme_interference_data.build_dataset.lerobot_writer import load_lerobot, require_lerobot
+from robomme_interference_data.build_dataset.plan import BuildPlan, list_episodes
 from robomme_interference_data.build_dataset.sources import (
     Frame,
     Recording,

@@ -29,10 +29,10 @@ from robomme_interference_data.storage.encode import get_codec
 from robomme_interference_data.storage.files import canonical_json
 from robomme_interference_data.storage.staging import replace_folder, staging_dir
 
-from .config import BuildPlan
 from .existing import ExistingDataset, open_existing
 from .identity import complete_dataset, identity_of
 from .lerobot_writer import StoredEpisode, load_lerobot, require_lerobot, write_lerobot
+from .plan import BuildPlan
 from .stage import Staged, StageTask, Task, keep_staged, read_staged, staged_name
 
 

@@ -21,17 +21,8 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.errors import MissingFileError, counted
 from robomme_interference_data.runtime.executor import WorkersConfig, make_executor
 
-from .config import (
-    AllConfig,
-    BuildConfig,
-    BuildPlan,
-    NewConfig,
-    PlanConfig,
-    plan_all,
-    plan_build,
-    plan_new,
-    position_limit,
-)
+from .config import AllConfig, BuildConfig, NewConfig, PlanConfig, position_limit
+from .plan import BuildPlan, plan_all, plan_build, plan_new
 
 if TYPE_CHECKING:
     from robomme_interference_data.storage.files import Files

@@ -10,10 +10,10 @@ from robomme_interference_data.errors import BuildError
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.files import LocalFiles, read_header
 
-from .config import BuildPlan
 from .identity import BuildReport
 from .image_stats import Statistics, before_scaling, episode_statistics, episode_table
 from .lerobot_writer import StoredEpisode
+from .plan import BuildPlan
 from .sources.base import Robot
 from .sources.columns import value_names
 

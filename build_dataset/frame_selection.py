@@ -118,7 +118,7 @@ def select_frames(kind: str, recording: Recording, unit: Unit = PAPER_UNIT) -> I
 
 
 def _with_actions_of_all(frames: Iterable[Frame]) -> Iterator[Frame]:
-    """Drop actions if the first frame has none: RoboMME tells those of live frames alone."""
+    """Drop actions if the first frame has none: RoboMME returns those of live frames only."""
     known: bool | None = None
     for frame in frames:
         known = frame.action is not None if known is None else known

@@ -32,10 +32,10 @@ from robomme_interference_data.storage.encode import Codec, VideoEncoder, get_co
 from robomme_interference_data.storage.files import canonical_json, read_header, write_json
 from robomme_interference_data.storage.video import iter_frames
 
-from .config import BuildPlan
 from .frame_selection import NothingToStore, select_frames
 from .image_stats import STATISTICS, ImageStats
 from .lerobot_writer import StoredEpisode
+from .plan import BuildPlan
 from .sources import Frame, Recording, Robot, SourceEpisode
 
 _RECORD = "record.json"

@@ -196,6 +196,20 @@ def tiny_buffers() -> Path:
     return GOLDEN
 
 
+@pytest.fixture(scope="session")
+def executed_buffers(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The golden buffer set with executions of its queries: not to be written to."""
+    from support.buffer_sets import build, copy_buffer_set, plan_again
+
+    from robomme_interference_data.build_dataset.sources.sample import SampleSource
+
+    root = copy_buffer_set(tmp_path_factory.mktemp("executed") / "buffers")
+    families = ("VideoRepick", "MoveCube", "PatternLock")
+    build(root, "executions", SampleSource(size=32), families=families, split="test")
+    plan_again(root)
+    return root
+
+
 @pytest.fixture
 def own_buffers(tmp_path: Path) -> Path:
     """A copy of the golden buffer set, to be damaged."""

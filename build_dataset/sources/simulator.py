@@ -27,8 +27,11 @@ class SimulatorSource(Source):
     """The episodes that a simulator's class lists, those with demonstrations.
 
     An episode is the demonstration, the first live observation, and what the oracle does until the
-    episode ends. RoboMME does not return the actions of its
-    demonstrations. `robomme_python` is its interpreter.
+    episode ends. RoboMME does not return the actions of its demonstrations.
+
+    Args:
+        name: Registered name of the simulator.
+        robomme_python: RoboMME's interpreter.
     """
 
     def __init__(self, name: str, robomme_python: str | None = None):

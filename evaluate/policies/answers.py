@@ -143,14 +143,15 @@ def _read_csv(path: Path) -> dict[WorkItem, Rollout]:
     options = pa_csv.ConvertOptions(column_types=arrow_schema(Rollout), strings_can_be_null=True)
     try:
         table = pa_csv.read_csv(path, convert_options=options)
-        if len({*table.column_names}) == len(table.column_names):
-            rows = [*from_table(Rollout, table, path)]
-            found = {WorkItem.of(row): row for row in rows}
-            if len(found) == len(rows):
-                return found
     except pa.ArrowInvalid as error:
         raise FormatError.damaged(path, first_line(error)) from None
-    raise FormatError.damaged(path, "a question has two answers, or a column occurs twice")
+    if len({*table.column_names}) < len(table.column_names):
+        raise FormatError.damaged(path, "a column occurs twice")
+    rows = [*from_table(Rollout, table, path)]
+    found = {WorkItem.of(row): row for row in rows}
+    if len(found) < len(rows):
+        raise FormatError.damaged(path, "a question has two answers")
+    return found
 
 
 def _check_kind(path: Path, simulators: set[Any]) -> None:

@@ -179,13 +179,21 @@ class FollowSubgoals(Privileged):
     def __init__(self, *, points: bool = True) -> None:
         super().__init__("follow-subgoals")
         self._points = points
+        self._followed: Subgoal | None = None
+
+    def reset(self, info: RolloutInfo) -> None:
+        """Keep the simulator, and forget the last subgoal."""
+        super().reset(info)
+        self._followed = None
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the script's next action, `(1, 8) float32`; see `Privileged.act`."""
-        subgoal = observation.subgoal
-        if subgoal is not None and not self._points:
-            subgoal = Subgoal(subgoal.simple)
-        return self._running().follow_subgoal(subgoal)[None]
+        # A subgoal stays the same object until one is written, perhaps with the same words.
+        new = observation.subgoal if observation.subgoal is not self._followed else None
+        self._followed = observation.subgoal
+        if new is not None and not self._points:
+            new = Subgoal(new.simple)
+        return self._running().follow_subgoal(new)[None]
 
 
 class Recall(Privileged):

@@ -92,10 +92,9 @@ class LampSimulator(Simulator):
         counts = {"train": 7, "test": 6}
         return [EpisodeId(f, s, n) for f in GOALS for s in counts for n in range(counts[s])]
 
-    def act(
-        self, policy: str, known: Mapping[int, str] | None = None, answer: int | None = None
+    def _act(
+        self, policy: str, known: Mapping[int, str], answer: int | None
     ) -> NDArray[np.float32]:
-        """Move towards the right button (`oracle`) or a random one (`guess`)."""
         button = self._env.right if policy == "oracle" else self._guess
         return np.clip((CORNERS[button] - self._env.position) / SPEED, -1, 1)
 

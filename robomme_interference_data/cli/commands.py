@@ -124,12 +124,11 @@ def show(
         )
     opened = load_buffer_set(buffer_set)
     buffer = opened.load(episode, condition)
-    if camera is not None:
-        buffer.query.dataset.shape(camera)  # raises for an unknown one
     if out is not None:
         from robomme_interference_data.viz.filmstrip import draw_strip, shown_camera
 
         camera = camera or shown_camera(buffer)
+        buffer.query.dataset.shape(camera)  # raises for an unknown one
         live = live_frame(opened, buffer, scene_shift, camera)
         draw_strip(buffer, out, camera=camera, live=live)
         print_status(f"{out} written")

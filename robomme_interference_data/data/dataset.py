@@ -314,5 +314,10 @@ class Dataset:
         name = camera_feature(camera)
         if name not in self.features:
             plain = camera.removeprefix(CAMERA_PREFIX)
+            if not self.cameras:
+                raise UnknownNameError(
+                    f"{self._name} was stored without images; camera {plain!r} is needed",
+                    "Build a buffer set with `cameras`, such as front.",
+                )
             raise UnknownNameError.among("camera", plain, self._name, self.cameras)
         return name

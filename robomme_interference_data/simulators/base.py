@@ -114,8 +114,9 @@ class Simulator(ABC):
     """Runs one episode of its task families at a time.
 
     An episode ends when `step` returns another status than `ongoing`, when a call raises, or after
-    1300 steps (`timeout`). Subclasses implement `_begin`, `_execute` and `act`. Instead of a
-    subclass, any object with the methods `reset`, `step`, `act` and `close` works as well.
+    1300 steps (`timeout`). Subclasses implement `_begin`, `_execute` and, if they have built-in
+    policies, `_act`. Instead of a subclass, any object with the methods `reset`, `step`, `act` and
+    `close` works as well.
 
     Class attributes and class methods declare what a simulator supports, before one is made. For a
     function that makes one they are those of the class in its return annotation, else of this one.
@@ -285,7 +286,6 @@ class Simulator(ABC):
             self._episode = episode
         return observation, status
 
-    @abstractmethod
     def act(
         self, policy: str, known: Mapping[int, str] | None = None, answer: int | None = None
     ) -> NDArray[np.float32]:
@@ -307,6 +307,10 @@ class Simulator(ABC):
             UnknownNameError: The simulator has no such policy.
             SimulatorCrashError: No episode is running, or the simulator is closed.
         """
+        self._running()
+        if policy not in ACTED or policy not in self.policies:
+            raise UnknownNameError.among("built-in policy", policy, self.name, self.policies)
+        return self._act(policy, known or {}, answer)
 
     def subgoal(self) -> Subgoal:
         """Return the next subgoal for the current state; it depends on the hidden answer.
@@ -328,7 +332,8 @@ class Simulator(ABC):
         throughout an episode.
 
         Args:
-            subgoal: The current subgoal; None for none.
+            subgoal: The subgoal that was written since the last call, perhaps the same one again;
+                None if none was.
 
         Returns:
             The action, `(8,) float32`, as `step` takes it.
@@ -365,6 +370,12 @@ class Simulator(ABC):
                 "no episode is running", "Call reset('<Family>/<split>/<index>') first."
             )
         return self._episode
+
+    def _act(
+        self, policy: str, known: Mapping[int, str], answer: int | None
+    ) -> NDArray[np.float32]:
+        """Return the next action of one of `policies`; see `act`."""
+        raise NotImplementedError
 
     @abstractmethod
     def _begin(self, episode: EpisodeId, every: int) -> Begun:

@@ -11,9 +11,6 @@ from robomme_interference_data.cli.options import AsJson
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP
 
-POLICIES = ("oracle", "guess", "none")
-"""Built-in policies; `none` plays the demonstration only, the only choice on some simulators."""
-
 
 def _option(panel: str, text: str, **more: Any) -> Any:
     return typer.Option(help=text, rich_help_panel=panel, **more)
@@ -24,13 +21,13 @@ def simulate(
     episode: Annotated[int, _option("Episode", "Index of the episode in its split, from 0.")] = 0,
     split: Annotated[str, _option("Episode", "train, val or test.")] = "test",
     policy: Annotated[
-        str | None,
+        str,
         _option(
             "Policy",
             "oracle: knows the answer; guess: draws one at random; none: plays the demonstration "
-            "only. Default: oracle, or none on robomme, which has no built-in policies.",
+            "only.",
         ),
-    ] = None,
+    ] = "oracle",
     video: Annotated[Path | None, _option("Output", "Write a video to this .mp4 file.")] = None,
     as_json: AsJson = False,
     simulator: Annotated[
@@ -60,13 +57,12 @@ def simulate(
     """
     from robomme_interference_data.ids import EpisodeId
 
-    from .play import play
+    from .play import NO_POLICY, play
     from .registry import accepted_settings, check_shift, make_simulator, simulator_class
 
     check_shift(simulator, shift)
     supported = simulator_class(simulator)
-    policies = [one for one in POLICIES if one in (*supported.policies, "none")]
-    policy = policy or policies[0]
+    policies = (*(one for one in ("oracle", "guess") if one in supported.policies), NO_POLICY)
     if policy not in policies:
         raise InvalidOptionError.one_of(f"policy on {simulator}", policy, policies)
     if video is not None and (video.suffix != ".mp4" or video.is_dir()):

@@ -1,6 +1,6 @@
 """Recorded executions, played back, to compare a policy's actions with those of a recording."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, override
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import ACTION, EXECUTIONS, MAX_STEPS, STATE
 from robomme_interference_data.data.dataset import camera_feature
 from robomme_interference_data.data.loading import load_buffer_set, open_dataset
-from robomme_interference_data.errors import HashMismatchError, UnknownNameError
+from robomme_interference_data.errors import HashMismatchError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.schema.rollouts import Status
@@ -40,12 +40,6 @@ class Recordings(Simulator):
         self.cameras = self._executions.cameras
         self._cameras = choose_cameras(cameras, self.cameras)
         (self.action_size,) = self._executions.features[ACTION]
-
-    @override
-    def act(
-        self, policy: str, known: Mapping[int, str] | None = None, answer: int | None = None
-    ) -> NDArray[np.float32]:
-        raise UnknownNameError(f"recordings have no policy {policy}")
 
     @override
     def columns(self) -> dict[str, Any]:

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import CAMERA_PREFIX, SAMPLE_FRAMES, UNIT_FRAMES
-from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.schema.manifest import Session
 from robomme_interference_data.schema.sampling import even_sample, spread
 
@@ -140,12 +139,9 @@ def draw_strip(
 
 def shown_camera(buffer: "Buffer") -> str:
     """Return the default camera of a strip: the front camera if there is one."""
-    if not buffer.cameras:
-        raise InvalidOptionError(
-            f"{buffer.episode_id} was stored without images, so there is none to show",
-            "Build the buffer set with `cameras`, such as front.",
-        )
-    return "front" if "front" in buffer.cameras else buffer.cameras[0]
+    camera = min(buffer.cameras, key=lambda name: name != "front", default="front")
+    buffer.query.dataset.shape(camera)  # raises without images
+    return camera
 
 
 def strip_png(buffer: "Buffer") -> bytes:

@@ -11,10 +11,9 @@ from support.buffer_sets import GOLDEN, contents
 from support.made_up import MadeUpSource
 
 from robomme_interference_data.build_dataset.build import BuildResult, build_dataset
-from robomme_interference_data.build_dataset.config import (
-    AllConfig,
+from robomme_interference_data.build_dataset.config import AllConfig, PlanConfig
+from robomme_interference_data.build_dataset.plan import (
     BuildPlan,
-    PlanConfig,
     list_episodes,
     plan_all,
     plan_build,

@@ -13,9 +13,10 @@ from support.made_up import MadeUpSource, record, write_metadata
 from support.recordings import EPISODES, write_frames, write_h5
 
 from robomme_interference_data import load_buffer, load_buffer_set
-from robomme_interference_data.build_dataset.config import BuildConfig, plan_build
+from robomme_interference_data.build_dataset.config import BuildConfig
 from robomme_interference_data.build_dataset.frame_selection import FRAME_SELECTORS, NothingToStore
 from robomme_interference_data.build_dataset.manifests import in_folder, plan_manifests
+from robomme_interference_data.build_dataset.plan import plan_build
 from robomme_interference_data.build_dataset.sources import Frame, open_source
 from robomme_interference_data.build_dataset.verify import verify_buffer_set
 from robomme_interference_data.constants import (

@@ -34,6 +34,7 @@ def sets(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 def test_a_set_without_images_is_the_same_but_for_them(sets: tuple[Path, Path], run: Run) -> None:
     assert run("verify", sets[0])[0] == 0
+    assert run("show", sets[0], "MoveCube/test/0", "k0")[0] == 0
     for name in load_buffer_set(sets[0]).episode_ids:
         one, other = (load_buffer(str(name), "k1", buffer_set=root) for root in sets)
         assert (one.cameras, other.cameras) == ((), ("front",))
@@ -62,13 +63,14 @@ def test_lerobot_opens_it(sets: tuple[Path, Path]) -> None:
         ("index", "--encoder", "thumbnail"),
         ("evaluate", "--policy", "replay", "--out", "out"),
         ("card",),
+        ("show", "MoveCube/test/0", "k0", "--out", "out/strip.png"),
     ],
 )
 def test_what_needs_images_says_so(
     sets: tuple[Path, Path], tmp_path: Path, run: Run, command: tuple[str, ...]
 ) -> None:
-    name, *options = (str(tmp_path / one) if one == "out" else one for one in command)
+    name, *options = (str(tmp_path / one) if one.startswith("out") else one for one in command)
     code, _, errors = run(name, sets[0], *options)
     assert code != 0 and "Traceback" not in errors
-    assert "camera" in errors or "without images" in errors
+    assert "stored without images" in errors and "Build a buffer set with `cameras`" in errors
     assert not (tmp_path / "out").exists()

@@ -284,7 +284,9 @@ def test_a_thing_has_its_letter_over_it() -> None:
 
 def test_letters_of_one_thing_stand_side_by_side() -> None:
     view = np.full((80, 100, 3), 200, np.uint8)
-    alone = [picture(view, [((50, x),) for x in (10, 50, 90)])[108:109, 3 * x] for x in (10, 50, 90)]
+    alone = [
+        picture(view, [((50, x),) for x in (10, 50, 90)])[108:109, 3 * x] for x in (10, 50, 90)
+    ]
     together = picture(view, [((50, 50),)] * 3)
     assert not np.array_equal(*alone[:2])  # the letters differ in their middles
     for x, letter in zip((110, 150, 190), alone, strict=True):

@@ -11,7 +11,8 @@ from support.goal_texts import GOALS
 from support.lerobot_layouts import DATA, TABLE, edit_columns, edit_info, write_lerobot
 from support.recordings import EPISODES, MOVE, PEG, Episode, check_recording, make_episode
 
-from robomme_interference_data.build_dataset.config import BuildConfig, plan_build
+from robomme_interference_data.build_dataset.config import BuildConfig
+from robomme_interference_data.build_dataset.plan import plan_build
 from robomme_interference_data.build_dataset.sources import Recording, Robot, open_source
 from robomme_interference_data.build_dataset.sources.robomme_families import BLOCKS
 from robomme_interference_data.errors import (

@@ -6,11 +6,11 @@ from typing import Any
 import pytest
 from support.simulator_doubles import Double
 
-from robomme_interference_data.build_dataset.config import list_episodes
 from robomme_interference_data.build_dataset.frame_selection import (
     select_demonstration,
     select_frames,
 )
+from robomme_interference_data.build_dataset.plan import list_episodes
 from robomme_interference_data.build_dataset.sources import Recording, open_source, simulator
 from robomme_interference_data.constants import DEMONSTRATIONS, FAMILIES
 from robomme_interference_data.errors import (
@@ -29,7 +29,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[Double]:
     found: list[Double] = []
 
     def make(name: str, **options: Any) -> Double:
-        found.append(Double(name=name, told=name == "tabletop", **options))
+        found.append(Double(name=name, actions=name == "tabletop", **options))
         return found[-1]
 
     monkeypatch.setattr(simulator, "make_simulator", make)
@@ -47,8 +47,8 @@ def test_an_episode_of_the_tabletop(made: list[Double]) -> None:
     assert source.provenance == {"kind": "tabletop", "suite_version": SUITE_VERSION}
     assert source.time_limit_s == 300  # seconds
     recording = read(source)
-    told = (recording.seed, recording.difficulty, recording.simulator, recording.exact)
-    assert (recording.goals, told) == (("goal", "other"), (9, "easy", "tabletop", True))
+    metadata = (recording.seed, recording.difficulty, recording.simulator, recording.exact)
+    assert (recording.goals, metadata) == (("goal", "other"), (9, "easy", "tabletop", True))
     frames = list(recording.frames)
     # 5 frames of the lesson, then one before each of the 3 steps; none after the end.
     assert [frame.is_demonstration for frame in frames] == [True] * 5 + [False] * 3

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from support.made_up import MadeUpSource, picture
 
 from robomme_interference_data.build_dataset import stage
-from robomme_interference_data.build_dataset.config import BuildPlan
 from robomme_interference_data.build_dataset.frame_selection import FRAME_SELECTORS, NothingToStore
 from robomme_interference_data.build_dataset.image_stats import ImageStats
 from robomme_interference_data.build_dataset.lerobot_writer import StoredEpisode
+from robomme_interference_data.build_dataset.plan import BuildPlan
 from robomme_interference_data.build_dataset.sources import Frame
 from robomme_interference_data.build_dataset.stage import (
     Staged,

@@ -9,13 +9,14 @@ from support.made_up import MadeUpSource
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.build import build_dataset
-from robomme_interference_data.build_dataset.config import BuildConfig, BuildPlan, plan_build
+from robomme_interference_data.build_dataset.config import BuildConfig
 from robomme_interference_data.build_dataset.frame_selection import NothingToStore, select_unit
 from robomme_interference_data.build_dataset.manifests import (
     in_folder,
     plan_manifests,
     write_manifests,
 )
+from robomme_interference_data.build_dataset.plan import BuildPlan, plan_build
 from robomme_interference_data.build_dataset.sources.base import Frame
 from robomme_interference_data.build_dataset.verify import verify_buffer_set
 from robomme_interference_data.cards.dataset_facts import buffer_set_facts

@@ -102,6 +102,7 @@ def test_rows_in_a_csv_file(tmp_path: Path, right: Path) -> None:
     rows = table.read_text().splitlines(keepends=True)
     for damaged, message in (
         ([*rows, rows[-1]], "two answers"),
+        ([f"{row.rstrip()},{row}" for row in rows], "a column occurs twice"),
         (["a,b\n", "1\n"], "damaged|2 columns"),
         (["a\n", "1\n"], "is missing"),
     ):

@@ -218,12 +218,15 @@ def test_points_of_subgoals_can_be_hidden(points: bool, text: str) -> None:
     followed = []
 
     class Scripted:
-        def follow_subgoal(self, subgoal: Subgoal) -> Vector:
-            followed.append(subgoal.grounded)
+        def follow_subgoal(self, subgoal: Subgoal | None) -> Vector:
+            followed.append(subgoal and subgoal.grounded)
             return np.zeros(8, np.float32)
 
     policy = FollowSubgoals(points=points)
     policy.reset(RolloutInfo("goal", 0, 0, simulator=cast(Simulator, Scripted())))
     view = replace(seen(0, 0.0), subgoal=Subgoal("take it at <point>", ((7, 9),)))
     assert policy.act(view, "goal").shape == (1, 8)
-    assert followed == [text]
+    policy.act(view, "goal")
+    written_again = replace(view, subgoal=Subgoal("take it at <point>", ((7, 9),)))
+    policy.act(written_again, "goal")
+    assert followed == [text, None, text]

@@ -13,12 +13,12 @@ from support.worlds import World
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.build import build_dataset
-from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
 from robomme_interference_data.build_dataset.manifests import (
     in_folder,
     plan_manifests,
     write_manifests,
 )
+from robomme_interference_data.build_dataset.plan import BuildPlan, list_episodes
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.constants import CONTRADICTIONS
 from robomme_interference_data.errors import (

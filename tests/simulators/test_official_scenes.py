@@ -15,11 +15,7 @@ from robomme_interference_data.constants import DEMONSTRATIONS, FAMILIES
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EvidenceSpan
-from robomme_interference_data.simulators.robomme.scenes import (
-    OfficialScene,
-    evidence_of,
-    read_scene,
-)
+from robomme_interference_data.simulators.robomme.scenes import OfficialScene, read_scene
 
 # What RoboMME 0.1.0 (commit 598e3b4) recorded; `moments` are runs of equal tasks: first step,
 # number of frames, task, whether hidden things are visible.
@@ -31,9 +27,7 @@ ALL = pytest.mark.parametrize("episode", RECORDED)
 def scene_of(episode: str) -> OfficialScene:
     recorded = RECORDED[episode]
     text = json.dumps(recorded["scene"])
-    scene = read_scene(episode.partition("/")[0], text, recorded["difficulty"])
-    assert scene is not None
-    return scene
+    return read_scene(episode.partition("/")[0], text, recorded["difficulty"])
 
 
 def evidence(episode: str) -> list[tuple[Any, ...]]:
@@ -42,7 +36,7 @@ def evidence(episode: str) -> list[tuple[Any, ...]]:
         for first, count, task, revealed in RECORDED[episode]["moments"]
         for n in range(count)
     ]
-    spans = evidence_of(scene_of(episode), np.array(rows, np.int64))
+    spans = scene_of(episode).evidence(np.array(rows, np.int64))
     return [(span.part, span.text, span.start, span.stop) for span in spans]
 
 
@@ -157,18 +151,40 @@ def test_some_parts_leave_some_answers() -> None:
         lambda text: text.replace('"answer"', '"answers"'),
         lambda text: text.replace('"answer": 2', '"answer": 7'),
         lambda text: "[]",
+        lambda text: "[" * 60_000,
     ],
 )
 def test_a_damaged_scene_is_an_error(damage: Any) -> None:
     text = json.dumps(RECORDED["VideoRepick/test/0"]["scene"])
     with pytest.raises(FormatError, match="scene of VideoRepick"):
         read_scene("VideoRepick", damage(text), "easy")
-    assert read_scene("StopCube", text, "easy") is None
+
+
+@pytest.mark.parametrize(
+    ("family", "facts"),
+    [
+        # Orders of 60 containers, paths over 25 buttons, 4^24 routes, and 300^3 series of swaps.
+        ("VideoUnmask", {"answer": [0], "colors": "r" * 60}),
+        ("PatternLock", {"answer": list(range(25))}),
+        ("RouteStick", {"answer": [[n % 2 for n in range(25)], ["clockwise"] * 24]}),
+        ("VideoRepick", {"answer": 3, "swaps": [[0, 1, 2, 3]] * 3}),
+    ],
+)
+def test_a_scene_with_endless_answers_is_an_error(family: str, facts: dict[str, Any]) -> None:
+    text = json.dumps({"points": [[1, 2]] * 25, "tasks": [], "swaps": []} | facts)
+    with pytest.raises(FormatError, match=f"scene of {family}"):
+        read_scene(family, text, "hard")
+
+
+def test_a_scene_of_another_family_is_an_error() -> None:
+    text = json.dumps(RECORDED["VideoRepick/test/0"]["scene"])
+    with pytest.raises(FormatError, match="scene of StopCube"):
+        read_scene("StopCube", text, "easy")
 
 
 def test_spans_are_evidence_spans() -> None:
     scene = scene_of("RouteStick/test/0")
-    spans = evidence_of(scene, np.array([[93, 1, 0], [94, 2, 0]], np.int64))
+    spans = scene.evidence(np.array([[93, 1, 0], [94, 2, 0]], np.int64))
     assert spans[0] == EvidenceSpan(0, scene.parts(scene.own_answer(0))[0], 0, 1)
 
 
@@ -176,8 +192,8 @@ def test_questions_about_official_lessons() -> None:
     def query(episode: EpisodeId) -> Any:
         one = RECORDED[str(episode)]
         record = SimpleNamespace(scene=json.dumps(one["scene"]))
-        told = {"simulator": "robomme", "seed": 7, "difficulty": one["difficulty"]}
-        return SimpleNamespace(episode_id=episode, record=record, **told)
+        metadata = {"simulator": "robomme", "seed": 7, "difficulty": one["difficulty"]}
+        return SimpleNamespace(episode_id=episode, record=record, **metadata)
 
     episodes = [EpisodeId.parse(name) for name in RECORDED]
     datasets = {DEMONSTRATIONS: SimpleNamespace(identity=SimpleNamespace(revision="r"))}

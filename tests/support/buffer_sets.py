@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.build_dataset.build import build_dataset
-from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
 from robomme_interference_data.build_dataset.frame_selection import FRAME_SELECTORS
 from robomme_interference_data.build_dataset.manifests import (
     in_folder,
     plan_manifests,
     write_manifests,
 )
+from robomme_interference_data.build_dataset.plan import BuildPlan, list_episodes
 from robomme_interference_data.build_dataset.sources import Frame, Source
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.constants import SUMS_PATH
@@ -37,9 +37,9 @@ LESSON = 48
 UNITS = 17
 
 
-def copy_buffer_set(folder: Path) -> Path:
-    """Copy the golden buffer set, to be damaged."""
-    return Path(shutil.copytree(GOLDEN, folder))
+def copy_buffer_set(folder: Path, buffer_set: Path = GOLDEN) -> Path:
+    """Copy a buffer set, to be damaged or extended."""
+    return Path(shutil.copytree(buffer_set, folder))
 
 
 def build(root: Path, kind: str, source: Source, **episodes: Any) -> None:

@@ -1,8 +1,18 @@
-"""Files that are damaged bit by bit."""
+"""Files that are damaged bit by bit, and buffer sets whose content is changed."""
 
+import json
 import random
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from robomme_interference_data.storage.files import sha256_file
+
+HEADER = "manifests/manifest.json"
+ROWS = "manifests/buffers.parquet"
 
 
 def flipped_bits(path: Path, count: int) -> Iterator[None]:
@@ -17,3 +27,21 @@ def flipped_bits(path: Path, count: int) -> Iterator[None]:
             yield
     finally:
         path.write_bytes(data)
+
+
+def edit(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
+    """Change a Parquet file."""
+    pq.write_table(change(pq.read_table(path)), path)
+
+
+def put(table: pa.Table, name: str, values: Any) -> pa.Table:
+    """Replace a column's values, with the same type."""
+    place = table.column_names.index(name)
+    return table.set_column(place, name, pa.array(values, table.schema.field(name).type))
+
+
+def renew_header(root: Path, **changes: Any) -> None:
+    """Record the rows as they are now in a buffer set's header, and change its fields."""
+    path = root / HEADER
+    header = json.loads(path.read_text())
+    path.write_text(json.dumps({**header, "rows": sha256_file(root / ROWS), **changes}))

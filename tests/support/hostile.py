@@ -5,6 +5,7 @@ A target puts the bytes of one file among valid files, and reads it. It returns,
 """
 
 import io
+import json
 import random
 import shutil
 from collections.abc import Callable
@@ -29,6 +30,7 @@ from robomme_interference_data.data.questions import digest_questions, read_ques
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.evaluate.run.log import read_run
 from robomme_interference_data.evaluate.score.rows.reading import read_rows
+from robomme_interference_data.simulators.robomme.scenes import read_scene
 from robomme_interference_data.storage.arrays import read_array
 from robomme_interference_data.storage.encode import decode_image
 from robomme_interference_data.storage.files import LocalFiles, read_sums
@@ -37,6 +39,12 @@ from robomme_interference_data.storage.video import iter_frames
 _VIDEO = "demonstrations/videos/observation.images.front/chunk-000/file-000.mp4"
 _ROWS = "demonstrations/data/chunk-000/file-000.parquet"
 _EPISODES = "demonstrations/meta/interference.parquet"
+_SCENES = {
+    one["episode"].partition("/")[0]: json.dumps(one["scene"])
+    for one in json.loads((GOLDEN.parent / "robomme" / "scenes.json").read_text())
+}
+"""Family to the recorded scene of an episode."""
+
 _MOST_LISTED = 64  # of what a file lists, so many are looked at: there may be any number
 
 
@@ -75,6 +83,7 @@ def places(root: Path) -> Path:
     image = encode_image(np.arange(8 * 6 * 3, dtype=np.uint8).reshape(8, 6, 3), "png")
     (root / "single/a.png").write_bytes(image)
     shutil.copy(GOLDEN / "demonstrations/meta/SHA256SUMS", root / "single")
+    (root / "single/scene.json").write_text(_SCENES["VideoUnmaskSwap"])
     return root
 
 
@@ -115,6 +124,25 @@ def _rows(root: Path) -> None:
     values = dataset.read_vectors(0, "observation.state", 0, 48)
     assert values.shape == (48, 8)
     dataset.lerobot.rows(0).table()
+
+
+def _scene(root: Path) -> None:
+    """Read a text as the scene of each family."""
+    text = (root / "single/scene.json").read_text("utf-8", "replace")
+    scenes, errors = [], []
+    for family in _SCENES:
+        try:
+            scenes.append(read_scene(family, text, "hard"))
+        except InterferenceError as error:
+            errors.append(error)
+    for scene in scenes:
+        assert 0 < len(scene.agreeing({})) < 1 << 17
+    if not scenes:
+        raise errors[0]
+
+
+def _other_scenes(sound: bytes) -> list[bytes]:
+    return [text.encode() for text in _SCENES.values()]
 
 
 def _video(root: Path) -> None:
@@ -192,6 +220,7 @@ TARGETS = {
     "video": Target(f"buffer_set/{_VIDEO}", _video),
     "array": Target("single/a.npy", _array),
     "image": Target("single/a.png", _image),
+    "scene": Target("single/scene.json", _scene, _other_scenes),
     "questions": Target("asked/questions.parquet", _questions, rewritten),
     "sums": Target("single/SHA256SUMS", lambda root: read_sums(root / "single/SHA256SUMS")),
     "index": Target("buffer_set/distractors/index/thumbnail/index.json", _index),

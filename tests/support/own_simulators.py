@@ -21,9 +21,7 @@ class Played(Simulator):
     def __init__(self, cameras: tuple[str, ...] = ("front", "wrist")) -> None:
         self.world, self.drawn = World(), cameras
 
-    def act(
-        self, policy: str, known: Mapping[int, str] | None = None, answer: int | None = None
-    ) -> Any:
+    def _act(self, policy: str, known: Mapping[int, str], answer: int | None) -> Any:
         return self.world.act(policy)
 
     def _begin(self, episode: EpisodeId, every: int) -> Begun:
@@ -123,8 +121,6 @@ class Elsewhere(Played):
 
 class Abstract(Simulator):
     """Forgets `_begin` and `_execute`."""
-
-    def act(self, policy: str, *_: Any) -> Any: ...
 
 
 class Breaks(Played):

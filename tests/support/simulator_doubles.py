@@ -27,18 +27,18 @@ class Double(Simulator):
     """A simulator of 4×4 images, with a lesson of five frames in every episode.
 
     Pixels of the front camera are the episode's index, of others 99. States count the frames of the
-    lesson, and then the steps from 10 on; actions count the steps. `told` is whether it returns the
-    lesson's actions.
+    lesson, and then the steps from 10 on; actions count the steps. `actions` is whether it returns
+    the lesson's actions.
     """
 
     def __init__(
         self,
         cameras: tuple[str, ...] = ("front", "wrist"),
         name: str = "double",
-        told: bool = True,
+        actions: bool = True,
         **options: Any,
     ):
-        self.cameras, self.name, self.told, self.options = cameras, name, told, options
+        self.cameras, self.name, self.actions, self.options = cameras, name, actions, options
         self.executed, self.closed = 0, False
 
     def act(self, policy: str) -> np.ndarray:
@@ -60,7 +60,7 @@ class Double(Simulator):
         lesson = Demonstration(
             {name: np.stack([image] * 5) for name, image in self._images(episode).items()},
             np.arange(5, dtype=np.float32)[:, None].repeat(8, 1),
-            np.ones((5 * self.told, 8), np.float32),
+            np.ones((5 * self.actions, 8), np.float32),
         )
         info = EpisodeInfo(("goal", "other"), "easy", episode.index, self.name)
         return lesson, Observation(self._images(episode), np.full(8, 10, np.float32)), info

@@ -19,7 +19,7 @@ from support.serve_policy import command
 from support.worker_calls import Marked, behave, wait_until_gone
 
 from robomme_interference_data.build_dataset.build import build_dataset
-from robomme_interference_data.build_dataset.config import BuildPlan
+from robomme_interference_data.build_dataset.plan import BuildPlan
 from robomme_interference_data.errors import WorkerError
 from robomme_interference_data.evaluate.run.log import read_record
 from robomme_interference_data.runtime.executor import Executor, Serial

@@ -20,7 +20,8 @@ def test_a_policy_trained_on_built_executions_acts(tmp_path: Path) -> None:
     from support.lerobot_policies import SMALL, features, play
 
     from robomme_interference_data.build_dataset.build import build_dataset
-    from robomme_interference_data.build_dataset.config import BuildConfig, plan_build
+    from robomme_interference_data.build_dataset.config import BuildConfig
+    from robomme_interference_data.build_dataset.plan import plan_build
     from robomme_interference_data.constants import ACTION
     from robomme_interference_data.evaluate.policies.registry import make_policy
     from robomme_interference_data.runtime.executor import Serial

@@ -9,13 +9,10 @@ from typing import Any
 
 import pytest
 import torch
-from support.buffer_sets import build, copy_buffer_set, plan_again
 from support.tabletop import TABLETOP
 from support.worlds import BUFFER_SET
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.build_dataset.sources.sample import SampleSource
-from robomme_interference_data.constants import EXECUTIONS
 from robomme_interference_data.evaluate import RunConfig, run_evaluation
 from robomme_interference_data.evaluate.score.rows.reading import read_rows
 from robomme_interference_data.runtime.executor import Serial
@@ -45,16 +42,6 @@ def program(monkeypatch: pytest.MonkeyPatch) -> Any:
     return call
 
 
-@pytest.fixture(scope="module")
-def acting(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The golden buffer set with executions."""
-    root = copy_buffer_set(tmp_path_factory.mktemp("acting") / "buffers")
-    families = ("VideoRepick", "MoveCube", "PatternLock")
-    build(root, EXECUTIONS, SampleSource(size=32), families=families, split="test")
-    plan_again(root)
-    return root
-
-
 def weights(run: Path) -> dict[str, torch.Tensor]:
     from safetensors.torch import load_file
 
@@ -82,11 +69,11 @@ def test_it_learns_to_answer_and_writes_rows(program: Any, tmp_path: Path) -> No
 
 
 def test_an_interrupted_run_ends_like_another(
-    program: Any, acting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    program: Any, executed_buffers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = ("--task", "act", "--conditions", "k0=2", "k3", "--steps", 6, "--save-every", 2)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    program("train", acting, "--out", whole, *settings, *SMALL)
+    program("train", executed_buffers, "--out", whole, *settings, *SMALL)
     step, taken = sys.modules["train"].train_step, []
 
     def interrupted(*given: Any) -> Any:
@@ -97,11 +84,11 @@ def test_an_interrupted_run_ends_like_another(
 
     monkeypatch.setattr(sys.modules["train"], "train_step", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        program("train", acting, "--out", parts, *settings, *SMALL)
+        program("train", executed_buffers, "--out", parts, *settings, *SMALL)
     monkeypatch.setattr(sys.modules["train"], "train_step", step)
     with pytest.raises(SystemExit, match="another seed"):
-        program("train", acting, "--out", parts, *settings, *SMALL, "--seed", 1)
-    program("train", acting, "--out", parts, *settings, *SMALL)
+        program("train", executed_buffers, "--out", parts, *settings, *SMALL, "--seed", 1)
+    program("train", executed_buffers, "--out", parts, *settings, *SMALL)
     expected, found = weights(whole), weights(parts)
     assert all(torch.equal(expected[name], found[name]) for name in expected)
 
@@ -111,18 +98,18 @@ def test_the_trained_policy_in_rollouts(
     trunk: str,
     memory: str,
     program: Any,
-    acting: Path,
+    executed_buffers: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     run = tmp_path / "run"
     options = ("--task", "act", "--trunk", trunk, "--memory", memory, "--steps", 2, "--chunk", 8)
-    program("train", acting, "--out", run, "--conditions", "k1", *options, *SMALL)
-    monkeypatch.setenv(BUFFER_SET, str(acting))
+    program("train", executed_buffers, "--out", run, "--conditions", "k1", *options, *SMALL)
+    monkeypatch.setenv(BUFFER_SET, str(executed_buffers))
     config = RunConfig(
         policy="python:memory_policy:MemoryPolicy",
         policy_options=(f"checkpoint={run}", "device=cpu"),
-        buffer_set=acting,
+        buffer_set=executed_buffers,
         out=tmp_path / "results",
         simulator="support.worlds:World",
         system="learned",
@@ -133,9 +120,11 @@ def test_the_trained_policy_in_rollouts(
     assert result.counts == {"success": 0, "fail": 2, "timeout": 0, "error": 0}
 
 
-def test_a_checkpoint_of_the_other_task(program: Any, acting: Path, tmp_path: Path) -> None:
+def test_a_checkpoint_of_the_other_task(
+    program: Any, executed_buffers: Path, tmp_path: Path
+) -> None:
     run = tmp_path / "run"
-    program("train", acting, "--out", run, "--task", "act", "--steps", 1, *SMALL)
+    program("train", executed_buffers, "--out", run, "--task", "act", "--steps", 1, *SMALL)
     with pytest.raises(SystemExit, match="expected --task answer"):
         program("answer", run, TABLETOP, "--system", "x", "--out", tmp_path / "rows.csv")
     with pytest.raises(SystemExit, match="is not a checkpoint"):
@@ -146,7 +135,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "train-a-policy.md"
 
 
 def test_the_pages_commands_and_its_example(
-    acting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    executed_buffers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = PAGE.read_text()
     lines = re.findall(r"^python examples/memory_policy/(\w+)\.py (.*)$", text, flags=re.M)
@@ -156,7 +145,7 @@ def test_the_pages_commands_and_its_example(
         __import__(name)
         assert sys.modules[name].arguments().out
     [code] = re.findall(r"<!-- example: train -->\n```python\n(.*?)```", text, flags=re.S)
-    (tmp_path / "my-training").symlink_to(acting)
+    (tmp_path / "my-training").symlink_to(executed_buffers)
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
     exec(code.replace("image_size=96", "image_size=16"), names)  # of 32 pixels

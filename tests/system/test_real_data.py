@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.build_dataset.build import build_dataset
-from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
 from robomme_interference_data.build_dataset.manifests import (
     in_folder,
     plan_manifests,
     write_manifests,
 )
+from robomme_interference_data.build_dataset.plan import BuildPlan, list_episodes
 from robomme_interference_data.build_dataset.sources import open_source
 from robomme_interference_data.build_dataset.verify import verify_buffer_set
 from robomme_interference_data.runtime.executor import Serial

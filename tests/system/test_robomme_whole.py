@@ -6,12 +6,13 @@ from pathlib import Path
 import pytest
 
 from robomme_interference_data.build_dataset.build import build_dataset
-from robomme_interference_data.build_dataset.config import BuildConfig, plan_build
+from robomme_interference_data.build_dataset.config import BuildConfig
 from robomme_interference_data.build_dataset.manifests import (
     in_folder,
     plan_manifests,
     write_manifests,
 )
+from robomme_interference_data.build_dataset.plan import plan_build
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS
 from robomme_interference_data.errors import BuildError
 from robomme_interference_data.runtime.executor import Serial

@@ -1,6 +1,7 @@
 """Items of `HistoryDataset`: frames of the right history, draws, and what it refuses."""
 
 import pickle
+import shutil
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -12,14 +13,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from support.buffer_sets import QUERIES, build, copy_buffer_set, plan_again
+from support.buffer_sets import GOLDEN, QUERIES, copy_buffer_set, plan_again
 from support.retrieval import make_index
 from support.shifted import add_shifted
 from support.tabletop import TABLETOP
 
 from robomme_interference_data import load_buffer, load_buffer_set
-from robomme_interference_data.build_dataset.sources.sample import SampleSource
-from robomme_interference_data.constants import EXECUTIONS, STATE
+from robomme_interference_data.constants import EXECUTIONS, MANIFESTS, STATE
 from robomme_interference_data.data.questions import read_questions
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError, UnknownNameError
 from robomme_interference_data.retrieval.select import choose, measure
@@ -36,11 +36,9 @@ Make = Callable[..., HistoryDataset]
 
 
 @pytest.fixture(scope="session")
-def buffers(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The golden buffer set with executions, an index, and two lessons shown again."""
-    root = copy_buffer_set(tmp_path_factory.mktemp("training") / "buffers")
-    families = ("VideoRepick", "MoveCube", "PatternLock")
-    build(root, EXECUTIONS, SampleSource(size=32), families=families, split="test")
+def buffers(executed_buffers: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The golden buffer set with executions, shifted views, and an index."""
+    root = copy_buffer_set(tmp_path_factory.mktemp("training") / "buffers", executed_buffers)
     add_shifted(root)
     make_index(root)
     return root
@@ -267,10 +265,10 @@ def test_a_buffer_set_without_executions(tiny_buffers: Path, tmp_path: Path) -> 
     assert HistoryDataset(tiny_buffers, ["k0"], chunk=0, store=tmp_path, quiet=True)[0]
 
 
-def test_manifests_planned_before_the_executions(tmp_path: Path) -> None:
-    root = copy_buffer_set(tmp_path / "buffers")
-    build(root, EXECUTIONS, SampleSource(size=32), families=("MoveCube",), split="test")
+def test_manifests_planned_before_the_executions(executed_buffers: Path, tmp_path: Path) -> None:
+    root = copy_buffer_set(tmp_path / "buffers", executed_buffers)
+    shutil.copytree(GOLDEN / MANIFESTS, root / MANIFESTS, dirs_exist_ok=True)
     with pytest.raises(MissingFileError, match="build manifests"):
         HistoryDataset(root, ["k0"], store=tmp_path)
     plan_again(root)
-    assert len(HistoryDataset(root, ["k0"], store=tmp_path, quiet=True)) == LIVE
+    assert len(HistoryDataset(root, ["k0"], store=tmp_path, quiet=True)) == 3 * LIVE

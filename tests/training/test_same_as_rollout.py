@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from support.buffer_sets import build, copy_buffer_set, plan_again
+from support.buffer_sets import copy_buffer_set, plan_again
 from support.retrieval import make_index
 from support.runs import config
 from support.worlds import BUFFER_SET
 
 from robomme_interference_data import BufferSet, load_buffer_set
-from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.constants import ACTION, EXECUTIONS, STATE
 from robomme_interference_data.evaluate import Observation, Policy, RolloutInfo
 from robomme_interference_data.evaluate.rollout.rollout import run_rollout
@@ -31,9 +30,8 @@ CAMERAS = ("front", "wrist")
 
 
 @pytest.fixture(scope="module")
-def buffers(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = copy_buffer_set(tmp_path_factory.mktemp("same") / "buffers")
-    build(root, EXECUTIONS, SampleSource(size=32), families=("MoveCube",), split="test")
+def buffers(executed_buffers: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = copy_buffer_set(tmp_path_factory.mktemp("same") / "buffers", executed_buffers)
     plan_again(root, ("no-history", "k0", "k3", "before-k3"))
     make_index(root)
     return root
@@ -44,9 +42,12 @@ class Player:
 
     def __init__(self, buffer_set: BufferSet):
         self.query, live = buffer_set.query(EPISODE), buffer_set.datasets[EXECUTIONS]
-        count = live.record(0).length
-        frames = {name: list(map(np.copy, live.iter_frames(0, name, 0, count))) for name in CAMERAS}
-        states = live.read_vectors(0, STATE, 0, count)
+        index = live.index_of(EPISODE)
+        count = live.record(index).length
+        frames = {
+            name: list(map(np.copy, live.iter_frames(index, name, 0, count))) for name in CAMERAS
+        }
+        states = live.read_vectors(index, STATE, 0, count)
         self.seen = [
             Observation({name: frames[name][step] for name in CAMERAS}, states[step])
             for step in range(count)
@@ -154,7 +155,8 @@ def test_same_frames_states_and_positions(
 
 def test_actions_are_those_of_the_recording(buffers: Path, tmp_path: Path) -> None:
     data = HistoryDataset(buffers, ["k0"], chunk=20, image_size=8, store=tmp_path, quiet=True)
-    actions = load_buffer_set(buffers).datasets[EXECUTIONS].read_vectors(0, ACTION, 0, 212)
+    live = load_buffer_set(buffers).datasets[EXECUTIONS]
+    actions = live.read_vectors(live.index_of(EPISODE), ACTION, 0, 212)
     item = data[data.index_of(EPISODE, 200)]
     np.testing.assert_array_equal(item["action"][:12], actions[200:])
     np.testing.assert_array_equal(item["action"][12:], np.repeat(actions[-1:], 8, 0))

@@ -5,18 +5,6 @@ Runs in RoboMME's interpreter, as `worker.py` does. `scenes.py` has the rules th
 
 from typing import Any
 
-_THINGS = {
-    "VideoUnmask": "spawned_bins",
-    "VideoUnmaskSwap": "spawned_bins",
-    "VideoRepick": "spawned_cubes",
-    "VideoPlaceButton": "targets",
-    "VideoPlaceOrder": "targets",
-    "InsertPeg": "pegs",
-    "PatternLock": "buttons_grid",
-    "RouteStick": "buttons_grid",
-}
-"""Family to the attribute that lists the things an answer is about."""
-
 _GONE = 1.0
 """Distance in m beyond which a container was moved out of sight, so that its cube is visible."""
 
@@ -25,7 +13,7 @@ class LessonLog:
     """Logs what RoboMME does at each step of a demonstration; made before the reset."""
 
     def __init__(self, env: Any, family: str) -> None:
-        base = getattr(env, "unwrapped", env)
+        base = env.unwrapped
         self._rows: dict[int, list[int]] = {}
         self._error: AttributeError | None = None
         execute, containers = base.step, family in ("VideoUnmask", "VideoUnmaskSwap")
@@ -59,15 +47,16 @@ def read_facts(env: Any, family: str, pixel: Any) -> dict[str, Any]:
     """Return the facts about an episode whose demonstration has been played, as JSON values.
 
     They are its tasks, the points of its things in the front image, the answer, and what else the
-    possible answers depend on. `pixel` returns where a thing is in the image (`subgoals.py`).
+    possible answers depend on. `pixel` returns where a thing is in the image (`steps.py`).
     """
     base = env.unwrapped
-    things = list(getattr(base, _THINGS[family])) if family in _THINGS else []
+    name, read = _READ[family]
+    things = list(getattr(base, name)) if name else []
     if family == "RouteStick":
         things = [things[number] for number in base.route_button_indices]
     tasks = [[str(task["name"]), bool(task["demonstration"])] for task in base.task_list]
     points = [pixel(base, thing) for thing in things]
-    return {"tasks": tasks, "points": points, **_READ[family](base, things)}
+    return {"tasks": tasks, "points": points, **read(base, things)}
 
 
 def _unmask(base: Any, bins: list[Any]) -> dict[str, Any]:
@@ -115,16 +104,17 @@ def _route(base: Any, targets: list[Any]) -> dict[str, Any]:
 
 
 _READ = {
-    "VideoUnmask": _unmask,
-    "VideoUnmaskSwap": _unmask,
-    "VideoRepick": _repick,
-    "VideoPlaceButton": _place_button,
-    "VideoPlaceOrder": _place_order,
-    "MoveCube": _move,
-    "InsertPeg": _insert,
-    "PatternLock": _pattern,
-    "RouteStick": _route,
+    "VideoUnmask": ("spawned_bins", _unmask),
+    "VideoUnmaskSwap": ("spawned_bins", _unmask),
+    "VideoRepick": ("spawned_cubes", _repick),
+    "VideoPlaceButton": ("targets", _place_button),
+    "VideoPlaceOrder": ("targets", _place_order),
+    "MoveCube": ("", _move),
+    "InsertPeg": ("pegs", _insert),
+    "PatternLock": ("buttons_grid", _pattern),
+    "RouteStick": ("buttons_grid", _route),
 }
+"""Family to the attribute that lists the things of its answers, and what returns its facts."""
 
 
 def _scheduled(base: Any, things: list[Any]) -> list[Any]:

@@ -23,6 +23,7 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.storage.cache import default_cache_folder
 
+from . import versions as robomme_versions
 from . import worker as robomme_worker
 
 PYTHON_VARIABLE = "ROBOMME_PYTHON"
@@ -36,7 +37,7 @@ _ENVIRONMENT = {
 
 _INSTALL = (
     "Install RoboMME (https://github.com/RoboMME/robomme_benchmark) into a separate environment "
-    f"and pass its Python with robomme_python=PATH, or export {PYTHON_VARIABLE}=PATH."
+    f"and set `robomme_python` to its Python, or export {PYTHON_VARIABLE}=PATH."
 )
 
 Arrays = dict[str, NDArray[Any]]
@@ -136,7 +137,7 @@ def installed_versions(python: str) -> dict[str, str]:
     """Return the versions in an interpreter, without starting RoboMME."""
     try:
         output = subprocess.check_output(
-            [python, robomme_worker.__file__, "versions"],
+            [python, robomme_versions.__file__],
             env={**os.environ, **_ENVIRONMENT},
             stdin=subprocess.DEVNULL,
             stderr=subprocess.PIPE,

@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import MAX_STEPS
+from robomme_interference_data.constants import FAMILIES, MAX_STEPS
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.subgoal import Subgoal, read_grounded
 from robomme_interference_data.simulators.base import (
-    ACTED,
     ACTION_SIZE,
     CAMERAS,
     Begun,
@@ -28,7 +27,7 @@ from robomme_interference_data.simulators.base import (
 from robomme_interference_data.simulators.tabletop.episodes import episode_ids
 
 from .process import Arrays, Process, find_python, installed_versions
-from .scenes import OfficialScene, evidence_of, read_scene
+from .scenes import OfficialScene, read_scene
 
 FRAME_SHAPE = (256, 256, 3)
 
@@ -47,7 +46,8 @@ class RoboMMESimulator(Simulator):
     It does not return the demonstration's actions, so `Demonstration.actions` is `(0, 8)`. In the
     families with a stick (`PatternLock`, `RouteStick`) the gripper's opening is always 0, and its
     action has no effect. Its built-in policies act with the motion planners that play the
-    demonstrations.
+    demonstrations; they raise `SimulatorCrashError` if these find no motion, or if this version of
+    RoboMME has other attributes than those that the answer is read from.
 
     A new process replaces the old one every few episodes, because RoboMME's memory grows; results
     do not depend on that. If the process dies or takes too long, it is ended and the call raises
@@ -86,8 +86,8 @@ class RoboMMESimulator(Simulator):
         self._process = Process(self._python, answer_s)
         self._subgoal: str | None = None
         self._scene: OfficialScene | None = None
-        self._solution: tuple[Any] | None = None
-        self._following: dict[str, Any] = {}
+        self._answer: Any = None  # what the solvers act out
+        self._follows = False  # whether it has got a subgoal
 
     @property
     def patches(self) -> tuple[str, ...]:
@@ -115,36 +115,6 @@ class RoboMMESimulator(Simulator):
         """Return the recorded scene; None if none was recorded. See `Simulator.scene`."""
         return None if recorded is None else read_scene(family, recorded, difficulty)
 
-    def act(
-        self, policy: str, known: Mapping[int, str] | None = None, answer: int | None = None
-    ) -> NDArray[np.float32]:
-        """Return the next action of RoboMME's motion planners for an answer; see `Simulator.act`.
-
-        Raises:
-            SimulatorCrashError: The planners find no motion, or this version of RoboMME has other
-                attributes than those that the answer is read from.
-        """
-        self._running()
-        if policy not in ACTED:
-            raise UnknownNameError.among("built-in policy", policy, self.name, ACTED)
-        if self._solution is None:
-            self._solution = self._solve(policy, known or {}, answer)
-        response, _ = self._process.call("act", answer=self._solution[0])
-        return np.array(response["action"], np.float32)
-
-    def _solve(self, policy: str, known: Mapping[int, str], answer: int | None) -> tuple[Any]:
-        """Return the answer that a policy acts out, alone in a tuple."""
-        if self._scene is None:
-            raise self._process.error(f"hides its answers: {self._unreadable}")
-        if policy == "oracle":
-            return (self._scene.own_answer(self._seed),)
-        if policy == "answer":
-            count = len(self._scene.answers)
-            if answer is None or not 0 <= answer < count:
-                raise InvalidOptionError.expected("answer", answer, f"0 to {count - 1}")
-            return (self._scene.answers[answer],)
-        return (self._scene.recalled(known if policy == "recall" else {}, self._seed),)
-
     def follow_subgoal(self, subgoal: Subgoal | None) -> NDArray[np.float32]:
         """Return the next action towards a subgoal; see `Simulator.follow_subgoal`.
 
@@ -152,13 +122,13 @@ class RoboMMESimulator(Simulator):
         changes nothing.
         """
         self._running()
-        if subgoal is None and not self._following:
+        if subgoal is None and not self._follows:
             return self.act("guess")
-        if self._scene is None:
-            raise self._process.error(f"hides its answers: {self._unreadable}")
-        if subgoal is not None:
-            self._following = {"text": subgoal.text, "points": [list(p) for p in subgoal.points]}
-        response, _ = self._process.call("follow", **self._following, seed=self._seed)
+        self._known_scene()
+        self._follows = True
+        text = None if subgoal is None else subgoal.text
+        points = [] if subgoal is None else [list(point) for point in subgoal.points]
+        response, _ = self._process.call("follow", text=text, points=points, seed=self._seed)
         return np.array(response["action"], np.float32)
 
     def subgoal(self) -> Subgoal:
@@ -191,7 +161,7 @@ class RoboMMESimulator(Simulator):
                 f"{episode}: RoboMME cannot combine a scene with another answer",
                 f"Use the episode {episode.scene}, or the simulator tabletop.",
             )
-        families = self._process.families
+        families = [one for one in self._process.families if one in FAMILIES]
         if episode.family not in families:
             raise UnknownNameError.among("family", episode.family, self.name, families)
         most = EPISODES if self._cameras or self._subgoals else 5 * EPISODES
@@ -222,15 +192,38 @@ class RoboMMESimulator(Simulator):
         self, facts: dict[str, Any], family: str, arrays: Arrays
     ) -> tuple[tuple[EvidenceSpan, ...] | None, str | None]:
         """Keep the scene; return the lesson's evidence and the scene as JSON, None if unknown."""
-        self._scene, self._solution, self._following = None, None, {}
+        self._scene, self._answer, self._follows = None, None, False
         self._seed, self._unreadable = facts["seed"], facts.get("unreadable", "")
         if facts["scene"] is None:
             return None, None
         text = json.dumps(facts["scene"], separators=(",", ":"), sort_keys=True)
         self._scene = read_scene(family, text, facts["difficulty"])
+        return self._scene.evidence(arrays["moments"][:-1]), text
+
+    def _act(
+        self, policy: str, known: Mapping[int, str], answer: int | None
+    ) -> NDArray[np.float32]:
+        if self._answer is None:
+            self._answer = self._choose(policy, known, answer)
+        response, _ = self._process.call("act", answer=self._answer)
+        return np.array(response["action"], np.float32)
+
+    def _choose(self, policy: str, known: Mapping[int, str], answer: int | None) -> Any:
+        """Return the answer that a policy acts out."""
+        scene = self._known_scene()
+        if policy == "oracle":
+            return scene.own_answer(self._seed)
+        if policy == "answer":
+            count = len(scene.answers)
+            if answer is None or not 0 <= answer < count:
+                raise InvalidOptionError.expected("answer", answer, f"0 to {count - 1}")
+            return scene.answers[answer]
+        return scene.recalled(known if policy == "recall" else {}, self._seed)
+
+    def _known_scene(self) -> OfficialScene:
         if self._scene is None:
-            return None, None
-        return evidence_of(self._scene, arrays["moments"][:-1]), text
+            raise self._process.error(f"hides its answers: {self._unreadable}")
+        return self._scene
 
     def _execute(
         self, episode: EpisodeId, action: NDArray[np.float32], observe: bool

@@ -1,4 +1,4 @@
-"""Act out an answer with the motion planners that play RoboMME's own demonstrations.
+"""Do steps of a task with the motion planners that play RoboMME's own demonstrations.
 
 Runs in RoboMME's interpreter, as `worker.py` does. The solvers step an environment themselves; here
 they run in a thread that hands out one action at a time, so that an episode is stepped from outside
@@ -10,10 +10,6 @@ import queue
 import threading
 from typing import Any
 
-subgoals: Any = None
-"""The module `subgoals.py`; `worker.py` sets it, because these files cannot import each other."""
-
-_STICK = ("PatternLock", "RouteStick")
 _TRIES = 3
 """Attempts of each planner: a straight screw motion first, then a random search."""
 
@@ -31,15 +27,15 @@ class _Handing:
 
     def __init__(self, env: Any) -> None:
         self._env = env
-        self.run: _Run | None = None
+        self.actions: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self.results: queue.SimpleQueue[Any] = queue.SimpleQueue()
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._env, name)
 
     def step(self, action: Any) -> Any:
-        assert self.run is not None
-        self.run.actions.put(action)
-        result = self.run.results.get()
+        self.actions.put(action)
+        result = self.results.get()
         if result is None:
             raise _Abandoned
         return result
@@ -50,14 +46,15 @@ class Script:
 
     Args:
         env: The environment, after the reset.
-        family: Its family.
+        steps: Its `Steps`; see `steps.py`.
     """
 
-    def __init__(self, env: Any, family: str) -> None:
-        self._env, self._family = _Handing(env), family
-        self._solver: _Solver | None = None  # one, because its planner knows if the gripper holds
-        self._steps = subgoals.Steps(env.unwrapped, family)
+    def __init__(self, env: Any, steps: Any) -> None:
+        self._env, self._steps = _Handing(env), steps
+        self._planner: Any = None  # one, because it knows if the gripper holds something
         self._run: _Run | None = None
+        self._text: str | None = None  # of the subgoal that is followed
+        self._next: tuple[str, list[list[int]]] | None = None
 
     def act(self, answer: Any) -> list[float]:
         """Return the next action for an answer, 8 numbers.
@@ -68,30 +65,44 @@ class Script:
             NoPlanError: The planners find no motion.
         """
         if self._run is None:
-            self._run = self._start(_SOLVE[self._family], answer)
+            self._run = self._start(self._steps.of_answer(answer))
         return self._run.act()
 
-    def follow(self, text: str, points: list[list[int]], seed: int) -> list[float]:
+    def follow(self, text: str | None, points: list[list[int]], seed: int) -> list[float]:
         """Return the next action towards a subgoal, 8 numbers; see `act`.
 
-        As RoboMME's own wrapper does, it finishes a step before it begins the next one, which may
-        have the same words. A subgoal that is not understood changes nothing; at first, the arm
-        holds its pose.
+        As RoboMME's own wrapper does, it finishes a step before it begins the next one, for which
+        it waits. A subgoal with the words of the step under way means that step; written after its
+        end, it means another one. A subgoal that is not understood changes nothing; at first, the
+        arm holds its pose.
+
+        Args:
+            text: The words of a subgoal that was just written; None if none was.
+            points: Its points.
+            seed: Seed for a draw among several things that it may mean.
         """
-        if self._run is None or self._run.done:
-            step = self._steps.find(text, points, seed)
+        done = self._run is None or self._run.done
+        if text is not None and (done or text != self._text):
+            self._next = text, points
+        if done and self._next is not None:
+            (self._text, points), self._next = self._next, None
+            step = self._steps.of_subgoal(self._text, points, seed)
             if step is not None:
-                self._run = self._start(_do_step, step)
+                self._run = self._start([step])
         if self._run is not None:
             return self._run.act()
         joints = self._env.unwrapped.agent.robot.qpos[0]
         return [*map(float, joints[:7]), 1.0]
 
-    def _start(self, solve: Any, what: Any) -> "_Run":
-        if self._solver is None:
-            self._solver = _Solver(self._env, self._family)
-        self._env.run = _Run(lambda: solve(self._solver, self._env.unwrapped, what))
-        return self._env.run.start()
+    def _start(self, steps: Any) -> "_Run":
+        solvers = importlib.import_module("robomme.robomme_env.utils.subgoal_planner_func")
+        planner = self._planner = self._planner or _planner(self._env, stick=self._steps.stick)
+
+        def solve() -> None:
+            for name, arguments in steps:
+                getattr(solvers, name)(self._env, planner, **arguments)
+
+        return _Run(self._env, solve)
 
     def stepped(self, result: Any) -> None:
         """Keep what the environment returned for the last action, for the solvers."""
@@ -112,27 +123,20 @@ class _Run:
         done: Whether they have finished, or failed.
     """
 
-    def __init__(self, solve: Any) -> None:
-        self.result: Any = None
-        self.actions: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self.results: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    def __init__(self, env: _Handing, solve: Any) -> None:
+        self._env, self.result, self.done = env, None, False
         self._last: list[float] | None = None
-        self.done = False
         self._thread = threading.Thread(target=self._solve, args=(solve,), daemon=True)
-
-    def start(self) -> "_Run":
-        """Start the thread."""
         self._thread.start()
-        return self
 
     def act(self) -> list[float]:
         """Return the next action; see `Script.act`."""
         if self._last is not None:
             if self.done or self.result is None:
                 return self._last
-            self.results.put(self.result)
+            self._env.results.put(self.result)
             self.result = None
-        made = self.actions.get()
+        made = self._env.actions.get()
         if isinstance(made, Exception):
             self.done = True
             raise made
@@ -146,7 +150,7 @@ class _Run:
     def close(self) -> None:
         """End the thread."""
         while self._thread.is_alive():
-            self.results.put(None)
+            self._env.results.put(None)
             self._thread.join(0.2)
 
     def _solve(self, solve: Any) -> None:
@@ -157,18 +161,7 @@ class _Run:
             return
         except Exception as error:
             made = error
-        self.actions.put(made)
-
-
-class _Solver:
-    """RoboMME's solvers, by name, bound to an environment and its motion planner."""
-
-    def __init__(self, env: Any, family: str) -> None:
-        self._env, self._planner = env, _planner(env, stick=family in _STICK)
-        self._module = importlib.import_module("robomme.robomme_env.utils.subgoal_planner_func")
-
-    def __call__(self, name: str, *args: Any, **named: Any) -> None:
-        getattr(self._module, name)(self._env, self._planner, *args, **named)
+        self._env.actions.put(made)
 
 
 def _planner(env: Any, *, stick: bool) -> Any:
@@ -198,72 +191,3 @@ def _planner(env: Any, *, stick: bool) -> Any:
 
     planner.move_to_pose_with_screw = move
     return planner
-
-
-def _do_step(solve: _Solver, base: Any, step: Any) -> None:
-    """Do one step of a task: the name of its solver, and the solver's arguments."""
-    name, arguments = step
-    solve(name, **arguments)
-
-
-def _unmask(solve: _Solver, base: Any, answer: list[int]) -> None:
-    for number, container in enumerate(answer):
-        if number:
-            solve("solve_putdown_whenhold")
-        solve("solve_pickup_bin", obj=base.spawned_bins[container])
-
-
-def _repick(solve: _Solver, base: Any, answer: int) -> None:
-    for _ in range(int(base.num_repeats)):
-        solve("solve_pickup", obj=base.spawned_cubes[answer])
-        solve("solve_putdown_whenhold", release_z=0.01)
-    solve("solve_button", obj=base.button_left)
-
-
-def _place(solve: _Solver, base: Any, answer: int) -> None:
-    solve("solve_pickup", obj=base.target_cube)
-    solve("solve_putonto_whenhold", target=base.targets[answer])
-
-
-def _move(solve: _Solver, base: Any, answer: str) -> None:
-    if answer == "peg_push":
-        solve("grasp_and_lift_peg_side", base.grasp_target)
-        side, end = base.direction2, base.obj_flag
-        solve("solve_push_to_target_with_peg", base.cube, base.goal_site, side, end)
-    elif answer == "gripper_push":
-        solve("solve_push_to_target", base.cube, base.goal_site)
-    else:
-        solve("solve_pickup", obj=base.cube)
-        solve("solve_putonto_whenhold", target=base.goal_site)
-
-
-def _insert(solve: _Solver, base: Any, answer: list[Any]) -> None:
-    number, end, side = answer
-    held = subgoals.ends_of(base, number, end)
-    _do_step(solve, base, subgoals.pick_up_peg(held))
-    _do_step(solve, base, subgoals.insert_peg(base, held, side))
-
-
-def _pattern(solve: _Solver, base: Any, answer: list[int]) -> None:
-    for button in answer[1:]:
-        solve("solve_swingonto", target=base.buttons_grid[button])
-
-
-def _route(solve: _Solver, base: Any, answer: list[Any]) -> None:
-    route, turns = answer
-    for target, turn in zip(route[1:], turns, strict=True):
-        button = base.buttons_grid[base.route_button_indices[target]]
-        solve("solve_swingonto_withDirection", target=button, radius=0.2, direction=turn)
-
-
-_SOLVE = {
-    "VideoUnmask": _unmask,
-    "VideoUnmaskSwap": _unmask,
-    "VideoRepick": _repick,
-    "VideoPlaceButton": _place,
-    "VideoPlaceOrder": _place,
-    "MoveCube": _move,
-    "InsertPeg": _insert,
-    "PatternLock": _pattern,
-    "RouteStick": _route,
-}

@@ -6,19 +6,14 @@ pickled, because pickles of numpy 1 and 2 differ.
 """
 
 import importlib
-import importlib.metadata
 import importlib.util
 import json
 import os
-import platform
 import queue
 import signal
-import subprocess
 import sys
 import threading
 import traceback
-import urllib.parse
-import urllib.request
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -38,8 +33,7 @@ def _sibling(name: str) -> Any:
 
 
 _patches, _rendering = _sibling("maniskill_patches"), _sibling("render_on_demand")
-_facts, _solvers, _subgoals = _sibling("facts"), _sibling("solvers"), _sibling("subgoals")
-_solvers.subgoals = _subgoals
+_facts, _solvers, _steps = _sibling("facts"), _sibling("solvers"), _sibling("steps")
 
 
 def send(
@@ -90,34 +84,6 @@ def probe(folder: Path) -> dict[str, Any]:
     except Exception as error:
         traceback.print_exc()
         return {"problem": f"robomme cannot be imported: {_text(error)}"}
-
-
-def installed_versions() -> dict[str, str]:
-    """Return the versions in this interpreter, with the commit where it is known."""
-    versions = {"robomme_python": platform.python_version()}
-    for name in ("robomme", "mani_skill", "sapien", "torch", "numpy"):
-        try:
-            installed = importlib.metadata.distribution(name)
-        except importlib.metadata.PackageNotFoundError:  # only on the path
-            continue
-        origin = json.loads(installed.read_text("direct_url.json") or "{}")
-        commit = origin.get("vcs_info", {}).get("commit_id") or _commit(origin.get("url", ""))
-        key = "robomme" if name == "robomme" else f"robomme_{name}"
-        versions[key] = f"{installed.version}+{commit}" if commit else installed.version
-    return versions
-
-
-def _commit(url: str) -> str | None:
-    """Return the commit of the checkout that a package was installed from, or None."""
-    folder = urllib.request.url2pathname(urllib.parse.urlparse(url).path)
-    if not url.startswith("file:") or not Path(folder, ".git").exists():
-        return None
-    describe = ["git", "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
-    try:
-        output = subprocess.check_output(describe, cwd=folder, stderr=subprocess.PIPE, timeout=20)
-        return output.decode().strip()
-    except (OSError, subprocess.SubprocessError):
-        return None
 
 
 class Episodes:
@@ -171,19 +137,16 @@ class Episodes:
             "difficulty": str(difficulty),
             "goals": [goals] if isinstance(goals, str) else [str(goal) for goal in goals],
             "subgoal": self._subgoal(info),
-            "scene": None,
         }
         arrays = {"states": _states(observations)}
         try:  # another version of RoboMME may have other attributes; all else works without them
-            scene, moments = (
-                _facts.read_facts(self._env, family, _subgoals.pixel),
-                log.moments(self._env),
-            )
-            self._script = _solvers.Script(self._env, family)
-            facts, arrays = {**facts, "scene": scene}, {**arrays, "moments": moments}
+            facts["scene"] = _facts.read_facts(self._env, family, _steps.pixel)
+            arrays["moments"] = log.moments(self._env)
+            steps = _steps.STEPS[family](self._env.unwrapped)
+            self._script = _solvers.Script(self._env, steps)
         except Exception as error:
             traceback.print_exc()
-            facts["unreadable"] = _text(error)
+            facts |= {"scene": None, "unreadable": _text(error)}
         if demonstration:
             return facts, {**arrays, **self._frames(observations)}
         images = self._rendering.images(self._env, cameras)
@@ -210,8 +173,8 @@ class Episodes:
         """Return the next action of RoboMME's solvers for an answer; the same one throughout."""
         return {"action": self._script.act(answer)}, {}
 
-    def follow(self, text: str, points: list[list[int]], seed: int) -> Answer:
-        """Return the next action of RoboMME's solvers towards a subgoal."""
+    def follow(self, text: str | None, points: list[list[int]], seed: int) -> Answer:
+        """Return the next action of RoboMME's solvers; `text` is a new subgoal, or None."""
         return {"action": self._script.follow(text, points, seed)}, {}
 
     def close(self) -> None:
@@ -305,13 +268,7 @@ def _text(error: BaseException) -> str:
 
 
 def main() -> None:
-    """Serve on the pipe of a file descriptor; the second argument is a folder for patched files.
-
-    With `versions` alone, print the installed versions.
-    """
-    if sys.argv[1:] == ["versions"]:
-        sys.stdout.write(json.dumps(installed_versions()))  # noqa: TID251 - a separate program
-        return
+    """Serve on the pipe of a file descriptor; the second argument is a folder for patched files."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other side handles Ctrl-C
     os.set_inheritable(int(sys.argv[1]), False)
     serve(Connection(int(sys.argv[1])), Path(sys.argv[2]))

@@ -6,14 +6,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import UnknownNameError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.lazy import load_extra
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.shifts import NO_SHIFT, Shift, parse_shift
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import (
-    ACTED,
     CAMERAS,
     Begun,
     EpisodeInfo,
@@ -85,15 +83,6 @@ class TabletopSimulator(Simulator):
         """Return the scene of a seed; see `Simulator.scene`."""
         return known_scene(family, seed, difficulty)
 
-    def act(
-        self, policy: str, known: Mapping[int, str] | None = None, answer: int | None = None
-    ) -> NDArray[np.float32]:
-        """Return the next action of one of `ACTED`; see `Simulator.act`."""
-        self._running()
-        if policy not in ACTED:
-            raise UnknownNameError.among("built-in policy", policy, self.name, ACTED)
-        return self.env.act(policy, known, answer)
-
     def subgoal(self) -> Subgoal:
         """Return the next subgoal; see `Simulator.subgoal`."""
         self._running()
@@ -126,6 +115,11 @@ class TabletopSimulator(Simulator):
         _, info = self.env.reset(seed=seed, options=options)
         about = EpisodeInfo(info["goals"], info["difficulty"], seed, self.name)
         return info["demonstration"], self.env.observe(self._cameras), about
+
+    def _act(
+        self, policy: str, known: Mapping[int, str], answer: int | None
+    ) -> NDArray[np.float32]:
+        return self.env.act(policy, known, answer)
 
     def _execute(
         self, episode: EpisodeId, action: NDArray[np.float32], observe: bool

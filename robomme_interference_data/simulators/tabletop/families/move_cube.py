@@ -1,13 +1,14 @@
 """MoveCube: remember in which manner a cube was moved."""
 
 import math
+from typing import ClassVar
 
 import numpy as np
 from numpy.random import RandomState
 from numpy.typing import NDArray
 
 from robomme_interference_data.schema.rollouts import Status
-from robomme_interference_data.simulators.scene import Option
+from robomme_interference_data.simulators.family_scenes import MoveScene
 from robomme_interference_data.simulators.tabletop.bodies import CUBE, SceneBuilder
 from robomme_interference_data.simulators.tabletop.family import Family, Step
 from robomme_interference_data.simulators.tabletop.layout import distance_to_segment, is_near
@@ -17,11 +18,6 @@ Vector = NDArray[np.float64]
 
 HANDLE, CROSS = 0.17, 0.065  # m, of the hook
 STILL, SLACK = 1e-5, 0.002  # m: motion per step of a resting cube; total motion in wrong manners
-_WORDS = {
-    "push": "pushes the cube with the closed gripper",
-    "grasp": "grasps the cube",
-    "hook": "hooks the cube",
-}
 _STEPS = {
     "push": "push the cube at <point> to the target at <point> with the closed gripper",
     "grasp": "grasp the cube at <point> and put it on the target at <point>",
@@ -30,11 +26,15 @@ _STEPS = {
 BESIDE = 0.034  # m, from the middle of the handle to the middle of the cube
 
 
-class MoveCube(Family):
+class MoveCube(MoveScene, Family):
     """The arm moves a cube to the target: it pushes it, grasps it, or hooks it."""
 
     goal = "move the cube to the target in the same manner as in the video"
-    question = "In which manner was the cube moved to the target?"
+    words: ClassVar = {
+        "push": "pushes the cube with the closed gripper",
+        "grasp": "grasps the cube",
+        "hook": "hooks the cube",
+    }
     steps = 1
     table = (0.86, 0.83, 0.76)
     spread = (0.02, 0.05, 0.08)  # m, how far cube and target may lie from the middle
@@ -48,7 +48,7 @@ class MoveCube(Family):
         way = self.target_at - self.cube_at
         self.way = np.append(way / np.linalg.norm(way), 0.0)
         self.turn = math.atan2(-way[1], -way[0])  # yaw at which x points back along the path
-        self.answers = ["push", "grasp", "hook"]
+        self.answers = list(self.words)
         self.moved: dict[str, float] = {}  # m, by manner, how far the cube has moved
         self.manner, self.opening = "", 0.04
 
@@ -57,12 +57,6 @@ class MoveCube(Family):
         self.target = builder.target(self.target_at, (0.20, 0.45, 0.75), 0.04)
         self.hook = builder.hook((-0.20, -0.23), (0.25, 0.55, 0.50), HANDLE, CROSS)
         self.last = self.cube.p
-
-    def answer_texts(self, answer: str) -> tuple[str, ...]:
-        return (_WORDS[answer],)
-
-    def option(self, choice: str) -> Option:
-        return Option(_WORDS[choice])
 
     def demonstrate(self, arm: Arm, answer: str) -> Script:
         move, home = self.frames[self.level]

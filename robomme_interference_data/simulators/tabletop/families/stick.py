@@ -10,6 +10,7 @@ from numpy.random import RandomState
 from numpy.typing import NDArray
 
 from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.simulators.family_scenes import grid_paths, row_paths
 from robomme_interference_data.simulators.scene import Option
 from robomme_interference_data.simulators.tabletop.bodies import Body, SceneBuilder
 from robomme_interference_data.simulators.tabletop.family import Family, Step
@@ -104,7 +105,7 @@ class PatternLock(StickFamily):
             for row, column in product(range(self.side_buttons), repeat=2)
         ]
         self.steps = self.length[self.level]
-        self.answers = paths(self.side_buttons, self.steps)
+        self.answers = grid_paths(self.side_buttons, range(self.side_buttons**2), self.steps)
         self.done, self.last = 0, -1
 
     def build(self, builder: SceneBuilder) -> None:
@@ -136,20 +137,6 @@ class PatternLock(StickFamily):
                 return Status.FAIL
             self.done, self.last = self.done + 1, self.now
         return Status.SUCCESS if self.done == len(answer) else Status.ONGOING
-
-
-@cache
-def paths(side: int, length: int) -> list[Path]:
-    """Return all paths of `length` different buttons, each adjacent to the one before it."""
-    found: list[Path] = [(start,) for start in range(side * side)]
-    for _ in range(length - 1):
-        found = [
-            (*path, to)
-            for path in found
-            for to in range(side * side)
-            if to not in path and math.dist(divmod(to, side), divmod(path[-1], side)) < 1.5
-        ]
-    return found
 
 
 class RouteStick(StickFamily):
@@ -267,7 +254,5 @@ class RouteStick(StickFamily):
 @cache
 def routes(count: int, turns: int) -> list[Route]:
     """Return all routes with a number of turns: targets, and the sides of the passed posts."""
-    walks: list[Path] = [(start,) for start in range(count)]
-    for _ in range(turns):
-        walks = [(*w, to) for w in walks for to in (w[-1] - 1, w[-1] + 1) if 0 <= to < count]
+    walks = row_paths(count, range(count), turns)
     return list(product(walks, product((1, -1), repeat=turns)))

@@ -1,13 +1,9 @@
 """VideoPlaceButton and VideoPlaceOrder: remember on which target a cube was placed when."""
 
-from abc import abstractmethod
-from collections.abc import Iterable
-from itertools import permutations
-from typing import ClassVar
-
 from numpy.random import RandomState
 
 from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.simulators.family_scenes import PlaceScene
 from robomme_interference_data.simulators.scene import Option
 from robomme_interference_data.simulators.tabletop.bodies import CUBE, SceneBuilder
 from robomme_interference_data.simulators.tabletop.family import Step
@@ -22,19 +18,12 @@ WHEN = ("before", "after")
 ORDINALS = ("first", "second", "third")
 
 
-class PlaceFamily(SwapFamily):
+class PlaceFamily(PlaceScene, SwapFamily):
     """Cubes, identical targets, and a goal to place one cube on the right target.
 
     In hard episodes all targets swap places after the demonstration.
-
-    Attributes:
-        asked: Which of the targets that the cube visits the goal asks for, from 0.
-        times: Texts of when the cube visits each target.
     """
 
-    asked: int
-    times: ClassVar[tuple[str, ...]]
-    question = "Which of the marked targets does the goal mean?"
     steps = 2
     pace = 1.6
     targets_at = (3, 4, 5)
@@ -49,6 +38,7 @@ class PlaceFamily(SwapFamily):
         colors = self.colors_at[self.level]
         names = [str(name) for name in rng.permutation(["red", "green", "blue"])]
         self.colors = names[:colors]  # the goal asks for the first one
+        self.cube = f"the {self.colors[0]} cube"
         flat = row(rng, self.count, self.row_of_targets, 0.1)
         self.target_spots = [(x - self.bow * (y / 0.2) ** 2, y) for x, y in flat]
         self.cube_spots = row(rng, colors, -0.18, 0.12)
@@ -63,24 +53,8 @@ class PlaceFamily(SwapFamily):
         cubes = zip(self.cube_spots, self.colors, strict=True)
         self.cubes = [builder.cube(spot, color) for spot, color in cubes]
 
-    @abstractmethod
-    def visits(self, answer: int) -> tuple[int, ...]:
-        """Return the targets that the cube visits, in order."""
-
-    def visit_texts(self, visits: Iterable[int]) -> tuple[str, ...]:
-        """Return a text per visit."""
-        steps = zip(visits, self.times, strict=True)
-        return tuple(f"puts the {self.colors[0]} cube on target {n} {time}" for n, time in steps)
-
-    def answer_texts(self, answer: int) -> tuple[str, ...]:
-        return self.visit_texts(self.visits(answer))
-
     def option(self, choice: int) -> Option:
         return Option("", ((*self.target_spots[choice], 0.0),))
-
-    def lessons(self) -> Iterable[tuple[int, tuple[str, ...]]]:
-        orders = permutations(range(self.count), len(self.times))
-        return ((visits[self.asked], self.visit_texts(visits)) for visits in orders)
 
     def reach(self, arm: Arm, cube: int) -> Script:
         """Move above a cube."""
@@ -116,7 +90,7 @@ class PlaceFamily(SwapFamily):
 
     def step(self, answer: int, number: int) -> Step:
         if number == 0:
-            text, at = f"pick up the {self.colors[0]} cube at <point>", self.cubes[0].p
+            text, at = f"pick up {self.cube} at <point>", self.cubes[0].p
             return Step(text, (at,), lambda arm: arm.pick(self.cubes[0].p))
         text = "put it on the target at <point>"
         return Step(text, (self.targets[answer].p,), lambda arm: self.put(arm, answer))
@@ -146,7 +120,7 @@ class VideoPlaceButton(PlaceFamily):
         super().draw(rng)
         self.asked = WHEN.index(str(rng.choice(WHEN)))
         self.goal = (
-            f"put the {self.colors[0]} cube on the target where it was right {WHEN[self.asked]} "
+            f"put {self.cube} on the target where it was right {WHEN[self.asked]} "
             "the button was pressed"
         )
 
@@ -192,8 +166,7 @@ class VideoPlaceOrder(PlaceFamily):
         super().draw(rng)
         self.asked = int(rng.randint(3))
         self.second = shuffled(rng, self.count)
-        cube, ordinal = self.colors[0], ORDINALS[self.asked]
-        self.goal = f"put the {cube} cube on the {ordinal} target it was placed on"
+        self.goal = f"put {self.cube} on the {ORDINALS[self.asked]} target it was placed on"
 
     def build(self, builder: SceneBuilder) -> None:
         super().build(builder)

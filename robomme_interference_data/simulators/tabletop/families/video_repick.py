@@ -3,6 +3,7 @@
 from numpy.random import RandomState
 
 from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.simulators.family_scenes import RepickScene
 from robomme_interference_data.simulators.scene import Option
 from robomme_interference_data.simulators.tabletop.bodies import CUBE, SceneBuilder
 from robomme_interference_data.simulators.tabletop.family import Step
@@ -15,14 +16,13 @@ LIFTED = 0.06  # m, height of the cube's middle
 TIMES = ("once", "twice, putting it down in between", "three times, putting it down in between")
 
 
-class VideoRepick(SwapFamily):
+class VideoRepick(RepickScene, SwapFamily):
     """The arm picks one of several cubes; the task is to pick it n times, then press the button.
 
     Easy: three cubes of different colors. Medium: five of the same color. Hard: all five swap
     places after the demonstration.
     """
 
-    question = "Which of the marked cubes was picked up?"
     table = (0.26, 0.30, 0.34)
     cubes_at = (3, 5, 5)
     gap = 0.055
@@ -45,9 +45,6 @@ class VideoRepick(SwapFamily):
     def build(self, builder: SceneBuilder) -> None:
         self.cubes = [builder.cube(s, c) for s, c in zip(self.spots, self.colors, strict=True)]
         self.button = builder.button(self.button_at)
-
-    def answer_texts(self, answer: int) -> tuple[str, ...]:
-        return (f"lifts cube {answer}",)
 
     def option(self, choice: int) -> Option:
         return Option("", ((*self.spots[choice], CUBE / 2),))

@@ -1,11 +1,12 @@
 """VideoUnmask and VideoUnmaskSwap: remember which container hides a cube."""
 
 from collections.abc import Sequence
-from itertools import chain, islice, permutations, product
+from itertools import chain, islice, product
 
 from numpy.random import RandomState
 
 from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.simulators.family_scenes import UnmaskScene
 from robomme_interference_data.simulators.scene import Option
 from robomme_interference_data.simulators.tabletop.bodies import (
     CUBE,
@@ -25,11 +26,8 @@ LIFTED = 0.05  # m, of the right container
 PEEKED = 0.010  # m, of a wrong one: its cube becomes visible at 0.02
 
 
-class VideoUnmask(Family):
-    """Opaque containers descend over cubes; the task is to lift the right one.
-
-    An answer is the container of each color that the goal asks for, in that order.
-    """
+class VideoUnmask(UnmaskScene, Family):
+    """Opaque containers descend over cubes; the task is to lift the right one."""
 
     table = (0.60, 0.44, 0.28)
     pace = 0.4
@@ -39,15 +37,13 @@ class VideoUnmask(Family):
     def draw(self, rng: RandomState) -> None:
         count = self.containers[self.level]
         colors = [str(color) for color in rng.permutation(["red", "green", "blue"])]
-        self.asked = colors[: 2 if self.level == 2 else 1]
+        self.hide(count, colors[: 2 if self.level == 2 else 1])
         hiding = (f"pick up the container that hides the {color} cube" for color in self.asked)
         self.goal = ", put it down, then ".join(hiding)
-        self.question = f"Which of the marked containers hides the {self.asked[0]} cube?"
         self.steps = 2 * len(self.asked)
         self.colors = colors
         self.spots = row(rng, count, -0.04, 0.105, zigzag=0.02)
         self.order = shuffled(rng, count)
-        self.answers = list(permutations(range(count), len(self.asked)))
         self.found, self.held = 0, False
 
     def build(self, builder: SceneBuilder) -> None:
@@ -59,13 +55,6 @@ class VideoUnmask(Family):
         """Return the containers that hide a cube, in the order of `colors`."""
         rest = [number for number in self.order if number not in answer]
         return [*answer, *rest][: len(self.colors)]
-
-    def answer_texts(self, answer: Sequence[int]) -> tuple[str, ...]:
-        cubes = (f"the {c} cube at place {n}" for c, n in zip(self.asked, answer, strict=True))
-        return (f"shows {' and '.join(cubes)}",)
-
-    def choice(self, answer: Sequence[int]) -> int:
-        return answer[0]
 
     def option(self, choice: int) -> Option:
         return Option("", ((*self.spots[choice], SIDE),))

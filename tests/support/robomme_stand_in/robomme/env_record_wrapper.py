@@ -2,7 +2,7 @@
 
 Like the real one it returns lists, prints to stdout, in color, gives another episode at a second
 reset of the same environment, makes environments of episodes that do not exist, and lets an episode
-go on for one step more than it is told.
+go on for one step more than `max_steps`.
 """
 
 import os
@@ -151,7 +151,7 @@ class Environment(BaseEnv):
             goals.append(f"open environments: {len(open_environments)}")
         info = {"task_goal": goals, "status": status}
         if self.family in STICKS:
-            return info  # older ones tell no subgoals
+            return info  # older ones provide no subgoals
         step = self.steps
         return info | {
             "simple_subgoal_online": f"pick up the cube, step {step}",
@@ -177,7 +177,7 @@ class BenchmarkEnvBuilder:
 
     @classmethod
     def get_task_list(cls):
-        return ["MoveCube", "VideoRepick", "VideoUnmask", "PatternLock", "RouteStick"]
+        return ["MoveCube", "VideoRepick", "VideoUnmask", "PatternLock", "RouteStick", "BinFill"]
 
     def get_episode_num(self):
         return 50

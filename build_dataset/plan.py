@@ -1,0 +1,245 @@
+"""The plan that follows from the settings of a build."""
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+from robomme_interference_data.constants import (
+    CONTRADICTIONS,
+    DEMONSTRATIONS,
+    DISTRACTORS,
+    EXECUTIONS,
+    LESSONS,
+    PAPER_UNIT,
+    SHIFTED,
+    SPLITS,
+    UNIT_FRAMES,
+    UNITS,
+    Unit,
+)
+from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
+from robomme_interference_data.ids import EpisodeId, parse_numbers
+from robomme_interference_data.runtime.executor import make_executor
+from robomme_interference_data.schema.conditions import datasets_of, in_order
+from robomme_interference_data.schema.manifest import SessionEntry
+
+from .config import NO_CAMERAS, AllConfig, BuildConfig, NewConfig, PlanConfig, position_limit
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from robomme_interference_data.data.dataset import Dataset
+    from robomme_interference_data.schema.draw import UnitPool
+
+    from .sources import Source, SourceEpisode
+
+
+@dataclass(frozen=True)
+class BuildPlan:
+    """A build with open sources; from a `BuildConfig`, or made directly.
+
+    Attributes:
+        kind: Name of the dataset in a buffer set, such as `demonstrations`.
+        sources: The sources.
+        tasks: The episodes to store: index of the source, and episode.
+        cameras: Cameras to store, possibly none of them; None for all.
+        codec: Name of the video settings.
+        version: Version of the dataset.
+        time_limit_s: Limit in seconds for one episode; None for the sources' defaults.
+        unit: Size of the distractors' units; of the raw ones, too, by `Unit.of`.
+    """
+
+    kind: str
+    sources: "tuple[Source, ...]"
+    tasks: "tuple[tuple[int, SourceEpisode], ...]"
+    cameras: tuple[str, ...] | None = None
+    codec: str = "av1-lossless"
+    version: str = "1.0.0"
+    time_limit_s: float | None = None
+    unit: Unit = PAPER_UNIT
+
+
+def plan_all(config: AllConfig, plan: PlanConfig) -> dict[str, BuildPlan]:
+    """Plan the datasets of a buffer set, and check everything known before episodes are read."""
+    units = dataclasses.replace(config, families=(), episodes=config.unit_episodes, split="train")
+    optional = {SHIFTED: config.shifted, EXECUTIONS: config.executions}
+    names = [*datasets_of(in_order(plan.conditions)), *(one for one in optional if optional[one])]
+    plans = {name: plan_build(name, units if name in UNITS else config) for name in names}
+    queries = (episode.id for _, episode in plans[DEMONSTRATIONS].tasks)
+    _check_plans(queries, plans, config.buffer_set, plan)
+    return plans
+
+
+def plan_new(config: NewConfig, plan: PlanConfig) -> "tuple[Dataset, BuildPlan]":
+    """Open published demonstrations, and plan units with their cameras; see `plan_all`."""
+    from robomme_interference_data.data.dataset import Dataset
+    from robomme_interference_data.storage.files import LocalFiles
+    from robomme_interference_data.storage.hub import locate
+
+    from .manifests import check_needs, in_folder
+
+    base = Dataset(locate(config.demonstrations))
+    if base.kind != DEMONSTRATIONS:
+        raise InvalidOptionError.expected(
+            "demonstrations",
+            config.demonstrations,
+            f"a repository or folder of demonstrations, not of {base.kind}",
+            "The card of a published buffer set names the repository of its demonstrations.",
+        )
+    link = config.buffer_set / DEMONSTRATIONS
+    if isinstance(base.files, LocalFiles) and link.exists() and not link.samefile(base.files.root):
+        raise BuildError(
+            f"{link} exists, and is not {base.files.root}",
+            "Choose another `buffer_set`, or remove the folder first.",
+        )
+    check_needs(in_order(plan.conditions), in_folder(config.buffer_set))
+    cameras = config.cameras or base.cameras or NO_CAMERAS
+    units = plan_build(DISTRACTORS, dataclasses.replace(config, cameras=cameras))
+    queries = (record.episode_id for record in base.records())
+    _check_plans(queries, {DISTRACTORS: units}, config.buffer_set, plan)
+    return base, units
+
+
+def _check_plans(
+    queries: Iterable[EpisodeId], plans: dict[str, BuildPlan], root: "Path", plan: PlanConfig
+) -> None:
+    from robomme_interference_data.schema.draw import UnitPool
+
+    from .existing import open_existing
+    from .manifests import check_manifests_folder
+
+    position_limit(plan)
+    pool = UnitPool(episode.id for _, episode in plans[DISTRACTORS].tasks)
+    for query in {one.family: one for one in queries}.values():
+        for condition in in_order(plan.conditions):
+            condition.sessions(_UnreadSessions(query, pool))
+    for kind, one in plans.items():
+        open_existing(root.resolve() / kind, one)
+    check_manifests_folder(root)
+
+
+@dataclass(frozen=True)
+class _UnreadSessions:
+    """Sessions of a query before its data is read: drawing them checks that units suffice."""
+
+    query: EpisodeId
+    pool: "UnitPool"
+
+    def lesson(self, part: str = "lesson") -> SessionEntry:
+        source = self.query
+        return SessionEntry("lesson", source.family, source, "", "", 0, 0, UNIT_FRAMES, 1, "")
+
+    def contradiction(self) -> SessionEntry:
+        return self.lesson()
+
+    def units(self, k: int, dataset: str = DISTRACTORS) -> Sequence[SessionEntry]:
+        return [self.lesson() for _ in self.pool.draw(self.query, k)]
+
+    def own_units(self, k: int) -> Sequence[SessionEntry]:
+        return [self.lesson() for _ in self.pool.draw_own(self.query, k)]
+
+
+def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
+    """Open the sources and plan one dataset."""
+    from robomme_interference_data.storage.encode import get_codec
+
+    from .frame_selection import unmarked_error
+    from .sources import open_source
+
+    get_codec(config.codec)
+    if config.time_limit_s is not None and not config.time_limit_s > 0:
+        raise InvalidOptionError.expected("time_limit_s", config.time_limit_s, "a positive number")
+    for name in ("unit_frames", "unit_stride"):
+        if getattr(config, name) < 1:
+            raise InvalidOptionError.expected(name, getattr(config, name), "a positive number")
+    make_executor(config)  # checks its settings
+    numbers = None if config.episodes is None else parse_numbers(config.episodes)
+    columns = _columns(config.columns)
+    sources = tuple(
+        open_source(
+            text,
+            shifted=kind == SHIFTED,
+            columns=columns,
+            families_file=config.families_file,
+            robomme_python=config.robomme_python,
+        )
+        for text in config.source
+    )
+    split = config.split or ("train" if kind in UNITS else None)
+    tasks = list_episodes(sources, families=config.families, split=split, numbers=numbers)
+    unmarked = next((one for _, one in tasks if not one.marked), None)
+    if kind in (*LESSONS, EXECUTIONS) and unmarked is not None:
+        raise unmarked_error().about(unmarked.id)
+    if kind == CONTRADICTIONS:
+        tasks = tuple((number, sources[number].contradict(one)) for number, one in tasks)
+    return BuildPlan(
+        kind=kind,
+        sources=sources,
+        tasks=tasks,
+        cameras=() if config.cameras == NO_CAMERAS else tuple(sorted(config.cameras)) or None,
+        codec=config.codec,
+        version=config.version,
+        time_limit_s=config.time_limit_s,
+        unit=Unit(config.unit_frames, config.unit_stride),
+    )
+
+
+def _columns(texts: Sequence[str]) -> dict[str, str]:
+    columns: dict[str, str] = {}
+    for text in texts:
+        name, _, column = text.partition("=")
+        if not name or not column:
+            raise InvalidOptionError.expected(
+                "columns", text, "NAME=COLUMN, such as front=top_image"
+            )
+        if name in columns:
+            raise InvalidOptionError(
+                f"columns names two columns for {name!r}: {columns[name]!r} and {column!r}",
+                "Give one.",
+                option="columns",
+            )
+        columns[name] = column
+    return columns
+
+
+def list_episodes(
+    sources: "Sequence[Source]",
+    *,
+    families: Iterable[str] = (),
+    split: str | None = None,
+    numbers: Iterable[int] | None = None,
+) -> "tuple[tuple[int, SourceEpisode], ...]":
+    """List the episodes of sources that pass all filters, in canonical order."""
+    listed = [(number, one) for number, source in enumerate(sources) for one in source.episodes()]
+    known = {one.id.family for _, one in listed}
+    chosen_families = set(families) or known
+    for family in sorted(chosen_families - known):
+        raise InvalidOptionError.one_of("families", family, sorted(known))
+    if split is not None and split not in SPLITS:
+        raise InvalidOptionError.one_of("split", split, SPLITS)
+    chosen_indices = None if numbers is None else set(numbers)
+    chosen = sorted(
+        (
+            (number, one)
+            for number, one in listed
+            if one.id.family in chosen_families
+            and split in (None, one.id.split)
+            and (not one.further if chosen_indices is None else one.id.index in chosen_indices)
+        ),
+        key=lambda item: item[1].id.sort_key,
+    )
+    for (first, one), (second, other) in pairwise(chosen):
+        if one.id == other.id:
+            raise SourceError(
+                f"{one.id} is recorded twice (in source {first + 1} and source {second + 1})",
+                "Leave one out with `families`, `split` or `episodes`, or give fewer sources.",
+            )
+    if not chosen:
+        raise SourceError(
+            f"none of the sources' {len(listed)} episodes matches `families`, `split` and "
+            "`episodes`",
+            "Choose others.",
+        )
+    return tuple(chosen)
