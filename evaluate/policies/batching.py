@@ -17,19 +17,20 @@ class Batcher[K: Hashable]:
     """Collects requests for actions, and answers those that wait together in one call.
 
     A batch is due when `max_batch_size` requests wait, when every open session waits, so that no
-    other request can come, or when the oldest request has waited long enough. All other calls are
-    made at once. No two calls run at the same time.
+    other request can come, or when requests have waited long enough since the last batch ended. All
+    other calls are made at once. No two calls run at the same time.
 
     Args:
         make: Makes the policy, for the first session; called again if it raised.
         max_batch_size: Maximum requests in a batch; with 1, `act_batch` is never called.
-        timeout_s: Maximum seconds that a request waits for others.
+        timeout_s: Maximum seconds that requests wait for others while no batch runs.
     """
 
     def __init__(self, make: Callable[[], BatchPolicy], max_batch_size: int, timeout_s: float):
         self._make, self._size, self._timeout_s = make, max_batch_size, timeout_s
         self._sessions: dict[K, Policy] = {}
-        self._waiting: dict[K, tuple[float, tuple[Any, ...]]] = {}  # oldest first
+        self._waiting: dict[K, tuple[Any, ...]] = {}  # arguments of `act`, oldest first
+        self._since: float | None = None  # when the next batch began to be collected
         self._warned = False
 
     @cached_property
@@ -54,22 +55,24 @@ class Batcher[K: Hashable]:
         if "_policy" in vars(self):
             self._policy.close()
 
-    def call(self, key: K, request: tuple[str, tuple[Any, ...]], now: float) -> Answer | None:
+    def call(self, key: K, request: tuple[str, tuple[Any, ...]]) -> Answer | None:
         """Call a session's method, by its name and arguments; None if it is `act`, which waits."""
         method, arguments = request
         if method == "act":
-            self._waiting[key] = now, arguments
+            self._waiting[key] = arguments
             return None
         return attempt(getattr(self._sessions[key], method), *arguments)
 
     def due_s(self, now: float) -> float | None:
         """Return the seconds until a batch is due, 0 if one is; None if no request waits."""
         if not self._waiting:
+            self._since = None
             return None
+        if self._since is None:
+            self._since = now
         if len(self._waiting) >= min(self._size, len(self._sessions)):
             return 0.0
-        oldest, _ = next(iter(self._waiting.values()))
-        return max(0.0, oldest + self._timeout_s - now)
+        return max(0.0, self._since + self._timeout_s - now)
 
     def act(self) -> dict[K, Answer]:
         """Answer the oldest requests, as many as fit into a batch.
@@ -78,7 +81,8 @@ class Batcher[K: Hashable]:
         """
         keys = [*self._waiting][: self._size]
         sessions = [self._sessions[key] for key in keys]
-        requests = [self._waiting.pop(key)[1] for key in keys]
+        requests = [self._waiting.pop(key) for key in keys]
+        self._since = None
         if len(keys) > 1:
             observations, goals = zip(*requests, strict=True)
             actions, error = attempt(self._policy.act_batch, sessions, observations, goals)

@@ -101,7 +101,7 @@ class SharedPolicy(Policy):
 def connect(address: str) -> Connection:
     """Request a session from the process that listens at a socket's path."""
     with _death():
-        connection = cast("Connection", Client(address))
+        connection = Client(address)
         _send(connection, (_OPEN, ()))
         return connection
 
@@ -142,7 +142,7 @@ class ServePolicy:
                             return
                         elif request[0] == _OPEN:
                             _reply(client, attempt(self._open, batcher, client))
-                        elif answer := batcher.call(client, request, time.monotonic()):
+                        elif answer := batcher.call(client, request):
                             _reply(client, answer)
                     if batcher.due_s(time.monotonic()) == 0:
                         for client, answer in batcher.act().items():

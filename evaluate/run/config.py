@@ -118,7 +118,7 @@ class RunConfig(WorkConfig):
     batch_wait_timeout_s: float = setting(
         0.01,
         group=_POLICY,
-        help="Maximum seconds that a rollout waits for others to join its batch.",
+        help="Maximum seconds that an idle shared policy waits for a larger batch.",
     )
     subgoals: str | None = setting(
         None,
