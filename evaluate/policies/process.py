@@ -239,9 +239,7 @@ def _death() -> Iterator[None]:
     try:
         yield
     except (EOFError, OSError) as error:
-        raise ServerDiedError(
-            "the policy's process ended", "Its last output is above; it is started again."
-        ) from error
+        raise ServerDiedError("the policy's process ended", "Its output is above.") from error
 
 
 def _reply(client: Connection, answer: Answer) -> None:

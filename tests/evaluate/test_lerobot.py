@@ -193,6 +193,7 @@ def test_a_batch_of_sessions_acts_as_each_alone(act: Path) -> None:
     np.testing.assert_array_equal(play_alone(first, 1), play_alone(alone, 1))
 
 
+@pytest.mark.slow
 def test_what_cannot_be_batched_acts_session_by_session(
     act: Path, vqbet: Path, tmp_path: Path
 ) -> None:
