@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from robomme_interference_data.schema.subgoal import Subgoal
     from robomme_interference_data.simulators.base import Observation, Simulator
 
-    from .policies.policy import Frames, Policy, RolloutInfo
+    from .policies.policy import BatchPolicy, Frames, Policy, RolloutInfo
     from .run.config import AskConfig, RunConfig
     from .run.evaluation import RunResult, run_evaluation
     from .run.merge import Merged, merge_runs
@@ -34,6 +34,7 @@ __all__ = [
     "merge_runs",
     "run_evaluation",
     # implement a policy
+    "BatchPolicy",
     "Evidence",
     "Frames",
     "Observation",
@@ -46,7 +47,7 @@ __all__ = [
 __getattr__ = lazy_exports(
     __name__,
     {
-        ".policies.policy": "Frames Policy RolloutInfo",
+        ".policies.policy": "BatchPolicy Frames Policy RolloutInfo",
         ".run.config": "AskConfig RunConfig",
         ".run.evaluation": "RunResult run_evaluation",
         ".run.merge": "Merged merge_runs",

@@ -136,7 +136,7 @@ def _run(config: RunConfig | AskConfig, kept: str, unit: str, *, as_json: bool) 
     offline = isinstance(config, RunConfig) and config.offline
     with (
         graceful_interrupt(f"{kept} are in {config.out}", config.out),
-        RunProgress(quiet=as_json, unit=unit) as shown,
+        RunProgress(quiet=as_json, unit=unit, workers=config.workers) as shown,
     ):
         result = run_evaluation(config, progress=shown, command=[command_line()])
     if as_json:

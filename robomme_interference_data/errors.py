@@ -229,9 +229,9 @@ class ServerKeepaliveError(PolicyServerError):
 
 
 class ServerDiedError(PolicyServerError):
-    """A policy server that a worker started and whose process ended.
+    """A policy server that a worker started, or a policy's own process, that ended.
 
-    Fix: read the server's log in `RUN/servers`.
+    Fix: read the server's log in `RUN/servers`, or the process's output.
     """
 
 

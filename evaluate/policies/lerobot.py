@@ -3,9 +3,10 @@
 The configuration is checked when the policy is made; weights are loaded at the first rollout.
 """
 
+import copy
 import sys
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ from robomme_interference_data.simulators.base import ACTION_SIZE, Observation
 from robomme_interference_data.storage.hub import locate
 from robomme_interference_data.storage.weights import digest_weights
 
-from .policy import Frames, Policy, RolloutInfo
+from .policy import BatchPolicy, Frames, RolloutInfo
 
 _IMAGE_SHAPE = (3, 256, 256)
 """Shape of an image of the simulators, channels first."""
@@ -48,12 +49,15 @@ _NEEDED = (
 )
 
 
-class LeRobotPolicy(Policy):
+class LeRobotPolicy(BatchPolicy):
     """A policy trained with LeRobot, such as one of its ACT, diffusion or VLA models.
 
     A policy that acts on one observation uses no history and runs under `no-history` only. One that
     acts on the last few (`n_obs_steps` above 1, such as diffusion policies) gets them in its own
     queue: first the end of the history, then live observations.
+
+    Sessions of a policy act in one forward pass, unless it keeps such a queue, averages over chunks
+    (temporal ensembling) or draws random numbers: then they act one after the other.
 
     Args:
         path: Folder that `save_pretrained` wrote, or a model on the Hub, `namespace/name` or
@@ -68,11 +72,7 @@ class LeRobotPolicy(Policy):
             self._config = PreTrainedConfig.from_pretrained(self._folder)
             self._config.device = self._device
             self._config.pretrained_path = self._folder
-            self._before, self._after = make_pre_post_processors(
-                self._config,
-                pretrained_path=str(self._folder),
-                preprocessor_overrides={"device_processor": {"device": self._device}},
-            )
+            self._before, self._after = self._make_processors()
         names = _feature_names(self._before)
         _check_features(path, self._config, names)
         wanted = [name for name in (FRONT, WRIST) if names[name] in self._config.input_features]
@@ -83,13 +83,35 @@ class LeRobotPolicy(Policy):
         self._model: Any = None
         self._recent: deque[dict[str, Any]] = deque(maxlen=self._steps)
         self._seed = self._asked = 0
+        self._draws = False  # whether it is known to draw random numbers
 
-    def reset(self, info: RolloutInfo) -> None:
-        """Empty the policy's queues, loading its weights first if necessary."""
+    def _make_processors(self) -> Any:
+        return make_pre_post_processors(
+            self._config,
+            pretrained_path=str(self._folder),
+            preprocessor_overrides={"device_processor": {"device": self._device}},
+        )
+
+    def _load(self) -> None:
         if self._model is None:
             with _explained(str(self._folder)):
                 kind = get_policy_class(self._config.type)
                 self._model = kind.from_pretrained(self._folder, config=self._config, strict=True)
+
+    def session(self) -> "LeRobotPolicy":
+        """Return a policy with its own queues and processors, loading the weights if necessary."""
+        self._load()
+        session = copy.copy(self)
+        session._before, session._after = self._make_processors()
+        session._recent = deque(maxlen=self._steps)
+        # A copy of all that the model keeps between calls, whatever its type, but not of tensors.
+        weights = (*self._model.parameters(), *self._model.buffers())
+        session._model = copy.deepcopy(self._model, {id(one): one for one in weights})
+        return session
+
+    def reset(self, info: RolloutInfo) -> None:
+        """Empty the policy's queues, loading its weights first if necessary."""
+        self._load()
         self._model.reset()
         self._before.reset()
         self._after.reset()
@@ -112,12 +134,44 @@ class LeRobotPolicy(Policy):
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return a chunk of actions, `(n, 8) float32`, n at most 16."""
-        *earlier, last = [self._before(one | {"task": [goal]}) for one in self._recent]
-        self._recent.clear()
+        *earlier, last = self._processed(goal)
         with torch.inference_mode(), self._seeded():
             chunk = self._ask(earlier, last) if self._has_queue else self._predict(last)
-            # One at a time: a processor step may refer to a single processed observation.
-            actions = [self._after(action) for action in chunk[:ACTION_CHUNK]]
+            actions = self._finished(chunk)
+        self._recent.clear()
+        return actions
+
+    def act_batch(
+        self, sessions: Sequence[Any], observations: Sequence[Observation], goals: Sequence[str]
+    ) -> list[NDArray[np.float32]]:
+        """Return the chunks of several sessions, `(n, 8) float32` each; see the class."""
+        batch = None
+        if not (self._draws or self._ensembles or any(one._has_queue for one in sessions)):
+            pairs = zip(sessions, goals, strict=True)
+            batch = _stacked([one._processed(goal)[-1] for one, goal in pairs])
+        if batch is not None:
+            with torch.inference_mode(), self._seeded():
+                before = self._generators()
+                chunks = self._chunk(batch)
+                self._draws = not all(map(torch.equal, before, self._generators()))
+                if not self._draws:
+                    parts = zip(sessions, chunks.unbind(), strict=True)
+                    actions = [one._finished([*chunk[:, None]]) for one, chunk in parts]
+                    for one in sessions:
+                        one._recent.clear()
+                    return actions
+        # Each session has its own seed, which a batch could not follow.
+        every = zip(sessions, observations, goals, strict=True)
+        return [session.act(observation, goal) for session, observation, goal in every]
+
+    def _processed(self, goal: str) -> list[dict[str, Any]]:
+        """Return the last observations as the model takes them."""
+        return [self._before(one | {"task": [goal]}) for one in self._recent]
+
+    def _finished(self, chunk: list[torch.Tensor]) -> NDArray[np.float32]:
+        """Return the executed part of a chunk, `(n, 8)`, in the units of actions."""
+        # One at a time: a processor step may refer to a single processed observation.
+        actions = [self._after(action) for action in chunk[:ACTION_CHUNK]]
         result: NDArray[np.float32] = torch.cat(actions).to("cpu", torch.float32).numpy()
         return result
 
@@ -141,12 +195,28 @@ class LeRobotPolicy(Policy):
         self._model._queues[ACTION].clear()
         return [first, *rest]
 
+    @property
+    def _ensembles(self) -> bool:
+        """Whether it averages over the chunks of every step."""
+        return getattr(self._config, "temporal_ensemble_coeff", None) is not None
+
     def _predict(self, one: dict[str, Any]) -> list[torch.Tensor]:
-        if getattr(self._config, "temporal_ensemble_coeff", None) is not None:
-            return [self._model.select_action(one)]  # it averages over the chunks of every step
-        chunk = self._model.predict_action_chunk(one)
+        if self._ensembles:
+            return [self._model.select_action(one)]
+        return list(self._chunk(one).unbind(1))
+
+    def _chunk(self, batch: dict[str, Any]) -> torch.Tensor:
+        """Return the actions of B observations, `(B, n, 8)`."""
+        chunk: torch.Tensor = self._model.predict_action_chunk(batch)
         steps = int(getattr(self._config, "n_action_steps", None) or chunk.shape[1])
-        return list(chunk[:, :steps].unbind(1))
+        return chunk[:, :steps]
+
+    def _generators(self) -> list[torch.Tensor]:
+        """Return the states of PyTorch's random generators."""
+        states = [torch.get_rng_state()]
+        if self._device.startswith("cuda"):
+            states.append(torch.cuda.get_rng_state(self._device))
+        return states
 
     @contextmanager
     def _seeded(self) -> Iterator[None]:
@@ -171,6 +241,27 @@ class LeRobotPolicy(Policy):
     def close(self) -> None:
         """Release the weights."""
         self._model = None
+
+
+def _stacked(items: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
+    """Return one batch of processed observations; None if they do not fit into one.
+
+    Tensors, whose first dimension is 1, and lists are joined; anything else must be equal.
+    """
+    batch: dict[str, Any] = {}
+    for name, first in items[0].items():
+        values = [one[name] for one in items]
+        if isinstance(first, torch.Tensor):
+            if {one.shape for one in values} != {first.shape}:
+                return None
+            batch[name] = torch.cat(values)
+        elif isinstance(first, list):
+            batch[name] = [entry for one in values for entry in one]
+        elif any(one != first for one in values):
+            return None
+        else:
+            batch[name] = first
+    return batch
 
 
 def _choose_device(device: str | None) -> str:

@@ -1,7 +1,7 @@
 """The interface of policies: implement `Policy` to evaluate a policy of your own."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -110,3 +110,41 @@ class Policy(ABC):
 
     def close(self) -> None:
         """Release all resources."""
+
+
+BATCH_METHODS = ("session", "act_batch")
+"""What `BatchPolicy` adds to `Policy`."""
+
+
+class BatchPolicy(Policy):
+    """A policy that several rollouts can share (`policies`): one copy of its weights for all.
+
+    Without `policies` it acts as any other policy. A policy need not be a subclass: it needs these
+    two methods.
+    """
+
+    @abstractmethod
+    def session(self) -> Policy:
+        """Return a policy with a memory of its own, and the weights of this one.
+
+        A session runs one rollout after the other. With `policies`, only sessions are reset and
+        act; each is closed before this policy.
+        """
+
+    @abstractmethod
+    def act_batch(
+        self, sessions: Sequence[Policy], observations: Sequence[Observation], goals: Sequence[str]
+    ) -> Sequence[NDArray[np.float32]]:
+        """Return the next actions of several sessions, what the `act` of each would return.
+
+        If it raises, each session's `act` is called instead, so that only the rollout at fault
+        fails: change no memory before the last statement that can raise.
+
+        Args:
+            sessions: Different sessions of this policy, at least 2.
+            observations: The current observation of each.
+            goals: The goal of each.
+
+        Returns:
+            `(n, 8) float32` for each session, see `Policy.act`.
+        """

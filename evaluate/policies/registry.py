@@ -118,7 +118,7 @@ def make_policy(text: str, options: Sequence[str] = (), *, worker: int = 0) -> P
             f"policy {text!r}: its factory raised {type(error).__name__}: {error}",
             "".join(traceback.format_exception(type(error), error, trace)).rstrip(),
         ) from error
-    _check_members(text, policy)
+    check_members(f"policy {text!r}", policy)
     return policy  # type: ignore[no-any-return]
 
 
@@ -166,7 +166,7 @@ def _factory(text: str, worker: int) -> tuple[Factory, dict[str, Any]]:
     return POLICIES.factory(spec), dict(spec.given)
 
 
-def _check_members(text: str, policy: Any) -> None:
+def check_members(what: str, policy: Any) -> None:
     """Compare a policy with the protocol, so that a slip shows before the first episode."""
     wrong = []
     for name, kind in get_type_hints(Policy).items():
@@ -184,6 +184,6 @@ def _check_members(text: str, policy: Any) -> None:
             wrong.append(f"no method {name}()")
     if wrong:
         raise PolicyError(
-            f"policy {text!r}: {type(policy).__name__} has {'; '.join(wrong)}",
+            f"{what}: {type(policy).__name__} has {'; '.join(wrong)}",
             "Subclass robomme_interference_data.evaluate.Policy: docs/how-to/your-own-policy.md.",
         )

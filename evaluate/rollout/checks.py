@@ -1,12 +1,13 @@
 """Checks of a run of rollouts before the first one."""
 
+import math
 import re
 from collections.abc import Sequence
 
 from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, EXECUTIONS, STATE
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import InterferenceError, InvalidOptionError, UnknownNameError
-from robomme_interference_data.evaluate.policies.policy import Policy
+from robomme_interference_data.evaluate.policies.policy import BATCH_METHODS, Policy
 from robomme_interference_data.evaluate.policies.registry import BUILTINS, POLICIES, policy_options
 from robomme_interference_data.evaluate.run.config import (
     RunConfig,
@@ -84,6 +85,7 @@ def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> 
     find_simulator(config.simulator)
     check_shift(config.simulator, config.shift)
     check_shared(config)
+    _check_policies(config, policy)
     kind = POLICIES.parse(config.policy).kind
     scripts = simulator_class(config.simulator).policies
     needed = {"answers": {"answer"}, "python": {*scripts}}.get(kind, {kind})
@@ -123,6 +125,36 @@ def _check_robot(config: RunConfig, buffer_set: BufferSet, kind: str) -> None:
             f"{ACTION_SIZE} action values, 7 joints and a gripper; this robot has {state} and "
             f"{action}",
             'Set a policy for this robot, such as "python:module:factory".',
+        )
+
+
+def _check_policies(config: RunConfig, policy: Policy) -> None:
+    """Check the settings of shared policies, and that the policy can be shared."""
+    if config.policies is None:
+        own = "policies that are not shared"
+        check_unused(config, ("max_batch_size", "batch_wait_timeout_s"), own, "Set `policies`.")
+        return
+    for name, valid, expected in (
+        ("policies", 1 <= config.policies <= config.workers, f"1 to `workers`, {config.workers}"),
+        ("max_batch_size", config.max_batch_size >= 1, "1 or more"),
+        ("batch_wait_timeout_s", 0 <= config.batch_wait_timeout_s < math.inf, "0 or more"),
+    ):
+        if not valid:
+            raise InvalidOptionError.expected(name, getattr(config, name), expected)
+    missing = [f"{one}()" for one in BATCH_METHODS if not callable(getattr(policy, one, None))]
+    fault = None
+    if POLICIES.parse(config.policy).kind == "websocket":
+        fault = "its server holds one memory"
+    elif policy.privileged:
+        fault = "it needs the simulator, which runs in the worker"
+    elif missing:
+        fault = f"it has no {' and no '.join(missing)}"
+    elif config.executor != "processes":
+        fault = "its process and the workers must be on one machine"
+    if fault is not None:
+        raise InvalidOptionError(
+            f"the policy {config.policy} cannot be shared by workers (`policies`): {fault}",
+            "Leave out `policies`; docs/how-to/your-own-policy.md describes shared policies.",
         )
 
 

@@ -1,8 +1,8 @@
 """Rollouts as a kind of run: the checks before it starts, and what identifies it."""
 
 import dataclasses
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +52,7 @@ class Rollouts(RunKind[RunConfig]):
         config = dataclasses.replace(config, policy=policy)
         self.system = config.system or default_system(config)
         self._answers: Answers | None = None
+        self._addresses: tuple[str, ...] = ()
         # The commit of a model is the same for all workers.
         policy, subgoals = POLICIES.pin(policy), pin_subgoals(config.subgoals)
         super().__init__(dataclasses.replace(config, policy=policy, subgoals=subgoals), buffer_set)
@@ -87,9 +88,20 @@ class Rollouts(RunKind[RunConfig]):
             path = Path(spec.target)
             self._answers = read_answers(self.config, path, self.buffer_set, items)
 
+    @contextmanager
+    def shared(self) -> Iterator[None]:
+        """Run the processes of shared policies in the block."""
+        if self.config.policies is None:
+            yield
+            return
+        from robomme_interference_data.evaluate.policies.process import policy_processes
+
+        with policy_processes(self.config) as self._addresses:
+            yield
+
     def task(self, run: Run[RunConfig]) -> RolloutTask:
         """Return the function that runs rollouts."""
-        return RolloutTask(run, self._answers)
+        return RolloutTask(run, self._answers, self._addresses)
 
     def needs_session(self, todo: Sequence[WorkItem]) -> bool:
         """Whether there is work, or a server that only workers start must be identified."""

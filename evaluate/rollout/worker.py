@@ -1,8 +1,8 @@
 """What a worker of a run does: one rollout after the other."""
 
 import logging
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -62,11 +62,14 @@ class RolloutTask(RunTask[RunConfig]):
     """Runs rollouts; makes policy and simulator at the first one, and again after an error.
 
     `answers` are those that the policy `answers` carries out; None for all other policies.
+    `addresses` are those of shared policies; empty if each worker has its own policy.
     """
 
-    def __init__(self, run: Run[RunConfig], answers: Answers | None = None):
+    def __init__(
+        self, run: Run[RunConfig], answers: Answers | None = None, addresses: Sequence[str] = ()
+    ):
         super().__init__(run)
-        self._answers = answers
+        self._answers, self._addresses = answers, addresses
         self._simulator: Simulator | None = None
         self._policy: Policy | None = None
         self._checked = False  # whether the policy's server is the one that the run began with
@@ -118,11 +121,18 @@ class RolloutTask(RunTask[RunConfig]):
         return row, clip.problem if clip else None
 
     def _open_policy(self, worker: Worker) -> Policy:
-        config = self.run.config
         if self._policy is None:
-            self._policy = make_policy(config.policy, config.policy_options, worker=worker.number)
+            self._policy = self._make_policy(worker)
             self._checked = False
         return self._policy
+
+    def _make_policy(self, worker: Worker) -> Policy:
+        config = self.run.config
+        if not self._addresses:
+            return make_policy(config.policy, config.policy_options, worker=worker.number)
+        from robomme_interference_data.evaluate.policies.process import SharedPolicy, connect
+
+        return SharedPolicy(connect(self._addresses[worker.number % len(self._addresses)]))
 
     def _open_simulator(self, policy: Policy, worker: Worker) -> Simulator:
         config = self.run.config
@@ -236,14 +246,11 @@ class RolloutTask(RunTask[RunConfig]):
 
     def _check_reachable(self, worker: Worker) -> None:
         """Retire the worker if the policy's server cannot be reached."""
-        config = self.run.config
-        policy = make_policy(config.policy, config.policy_options, worker=worker.number)
         try:
-            policy.metadata()  # connects
+            with closing(self._make_policy(worker)) as policy:
+                policy.metadata()  # connects
         except PolicyServerError as error:
             raise WorkerRetiredError(error.message, error.hint) from error
-        finally:
-            policy.close()
 
 
 def used_cameras(config: RunConfig, policy_cameras: Iterable[str]) -> set[str]:

@@ -100,6 +100,24 @@ class RunConfig(WorkConfig):
         group=_POLICY,
         help="Command with {port} that starts a server for each worker of --policy websocket.",
     )
+    policies: int | None = setting(
+        None,
+        metavar="N",
+        group=_POLICY,
+        help="Processes with one policy each that the workers share; default: one per worker, in "
+        "its process.",
+    )
+    max_batch_size: int = setting(
+        8,
+        metavar="N",
+        group=_POLICY,
+        help="Maximum rollouts for which a shared policy acts at once.",
+    )
+    batch_wait_timeout_s: float = setting(
+        0.01,
+        group=_POLICY,
+        help="Maximum seconds that an idle shared policy waits for a larger batch.",
+    )
     subgoals: str | None = setting(
         None,
         group=_SUBGOALS,

@@ -131,6 +131,7 @@ def run_evaluation(
         run: Run[Any] = Run(config, kind.system, buffer_set.name, buffer_set.revision)
         session: Session | None = None
         if kind.needs_session(todo):
+            stack.enter_context(kind.shared())
             session = stack.enter_context(executor.session(kind.task(run)))
             kind.open(session, todo)
         identity = run_identity(kind, plan)

@@ -217,6 +217,10 @@ class RunKind[C: RunConfig | AskConfig](ABC):
     def check(self, plan: Plan, items: Sequence[WorkItem]) -> None:
         """Check the plan."""
 
+    def shared(self) -> AbstractContextManager[None]:
+        """Run what the workers share in the block."""
+        return nullcontext()
+
     @abstractmethod
     def task(self, run: Run[C]) -> RunTask[C]:
         """Return the function of the workers."""

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from operator import itemgetter
 from statistics import fmean
 from typing import Any, Self
 
@@ -22,11 +23,13 @@ Cell = tuple[str, str]
 class RunProgress:
     """A table of successes above a progress bar, on stderr; use as a context manager.
 
-    If stderr is no terminal, it prints a line whenever a family is done under a condition.
+    If stderr is no terminal, it prints a line whenever a family is done under a condition. Once
+    each of the workers has ended two rows or so, it prints what the time left depends on.
     """
 
-    def __init__(self, *, quiet: bool = False, unit: str = "rollouts"):
-        self._unit = unit
+    def __init__(self, *, quiet: bool = False, unit: str = "rollouts", workers: int = 1):
+        self._unit, self._workers = unit, workers
+        self._timed: list[Rollout] = []  # until the estimate is printed
         self._bar = WorkProgress(unit=unit, quiet=quiet, above=self.rates)
         self._console = self._bar.console
         self._planned: Counter[Cell] = Counter()
@@ -58,6 +61,10 @@ class RunProgress:
         ended[row.status] += 1
         self._left -= 1
         self._bar.advance(1, node=node)
+        if row.wall_s is not None and len(self._timed) < 2 * self._workers:
+            self._timed.append(row)
+            if len(self._timed) == 2 * self._workers and self._left > len(self._timed):
+                self._console.print(estimate(self._timed, self._left, self._workers))
         if not is_done(row):
             error = visible(f"{WorkItem.of(row)} broke: {row.error}")
             self._console.print(error, style="red", markup=False)
@@ -69,6 +76,36 @@ class RunProgress:
     def rates(self) -> str:
         """Return the table of successes so far."""
         return _table(self._ended).text() if self._ended else ""
+
+
+_PARTS = {
+    "reset_s": "the simulator",
+    "simulator_s": "the simulator",
+    "policy_s": "the policy",
+    "history_s": "the history",
+    "model_s": "the model",
+}
+"""Where the time of a row goes, by column."""
+
+
+def estimate(rows: Sequence[Rollout], left: int, workers: int) -> str:
+    """Return how long the remaining rows take, and on what, if they are as the given ones.
+
+    Args:
+        rows: Rows with times.
+        left: Number of remaining rows.
+        workers: Number of workers, which all have work.
+    """
+    total = sum(row.wall_s or 0.0 for row in rows)
+    seconds = total / len(rows) * left / workers
+    parts = dict.fromkeys(_PARTS.values(), 0.0)
+    for column, part in _PARTS.items():
+        parts[part] += sum(getattr(row, column) or 0.0 for row in rows)
+    longest = sorted(parts.items(), key=itemgetter(1), reverse=True)
+    shares = [f"{part} {value / total:.0%}" for part, value in longest if value]
+    hours, minutes = seconds / 3600, max(1, round(seconds / 60))
+    time = f"{hours:.1f} h" if hours >= 2 else f"{minutes} min"
+    return f"about {time} left; where the time goes: {', '.join(shares)}"
 
 
 def rate_table(rows: Iterable[Rollout]) -> Table:

@@ -87,9 +87,13 @@ class WorkerProcess:
                 "Worker processes import the script that starts them, and what it imports.",
             )
 
-    def stop(self) -> None:
+    def kill(self) -> None:
         """Kill it; its guard kills the processes that it started."""
         self._process.kill()
+
+    def stop(self) -> None:
+        """Kill it, and release everything that it used."""
+        self.kill()
         self.end(0.0)
 
     def end(self, seconds: float) -> None:

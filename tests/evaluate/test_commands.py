@@ -2,6 +2,7 @@
 
 import json
 import resource
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -163,6 +164,22 @@ def test_nine_families_and_five_conditions_fit_in_80_columns() -> None:
     for family in FAMILIES:
         (line,) = [line for line in lines if line.startswith(f"{family} ")]
         assert line.split()[1:] == ["50/50", "100%"] * 5
+
+
+def test_an_estimate_is_printed_once_after_two_rows_of_each_worker(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    times = {"reset_s": 10.0, "simulator_s": 60.0, "policy_s": 20.0, "history_s": 5.0}
+    with RunProgress(workers=2) as progress:
+        progress.start(PLAN[:64], [])
+        progress.row(row(PLAN[0], "error"))  # has no times
+        for item in PLAN[1:9]:
+            progress.row(replace(row(item, "success"), wall_s=100.0, **times))
+    (line,) = [one for one in capsys.readouterr().err.splitlines() if "left" in one]
+    # 59 of 100 s on two workers are 2,950 s.
+    assert line == (
+        "about 49 min left; where the time goes: the simulator 70%, the policy 20%, the history 5%"
+    )
 
 
 def test_errors_are_listed_beside_the_rate() -> None:

@@ -144,6 +144,77 @@ def test_rollouts_are_deterministic_and_leave_the_global_generator_alone(vqbet: 
     assert not np.array_equal(first[0], small.play(policy, 3, [1])[0])
 
 
+# --- sessions ----------------------------------------------------------------------------------
+
+
+def play_together(policy: Any, count: int, rounds: int = 2) -> list[list[np.ndarray]]:
+    """Let sessions act in batches, each on frames of its own; return the actions of each."""
+    sessions = [policy.session() for _ in range(count)]
+    actions: list[list[np.ndarray]] = [[] for _ in sessions]
+    for number, session in enumerate(sessions):
+        session.reset(RolloutInfo("pick the cube", 0, small.SEED + number))
+    for at in range(rounds):
+        seen = []
+        for number, session in enumerate(sessions):
+            frames, states = small.section(10 * number + at, 10 * number + at + 1)
+            session.observe(frames, states)
+            images = {name: part[0] for name, part in frames.items()}
+            seen.append(lerobot.Observation(images, states[0]))
+        chunks = policy.act_batch(sessions, seen, ["pick the cube"] * count)
+        for own, chunk in zip(actions, chunks, strict=True):
+            own.append(chunk)
+    return actions
+
+
+def play_alone(policy: Any, number: int, rounds: int = 2) -> list[np.ndarray]:
+    """Play what session `number` plays, without others."""
+    policy.reset(RolloutInfo("pick the cube", 0, small.SEED + number))
+    actions = []
+    for at in range(rounds):
+        frames, states = small.section(10 * number + at, 10 * number + at + 1)
+        policy.observe(frames, states)
+        images = {name: part[0] for name, part in frames.items()}
+        actions.append(policy.act(lerobot.Observation(images, states[0]), "pick the cube"))
+    return actions
+
+
+def test_a_batch_of_sessions_acts_as_each_alone(act: Path) -> None:
+    policy, alone = made(act), made(act)
+    calls = []
+    first = policy.session()
+    predict = policy._model.predict_action_chunk
+    policy._model.predict_action_chunk = lambda batch: calls.append(1) or predict(batch)
+    for number, own in enumerate(play_together(policy, 3)):
+        expected = play_alone(alone, number)
+        assert [chunk.shape for chunk in own] == [(16, 8), (16, 8)]
+        np.testing.assert_allclose(own, expected, rtol=1e-4, atol=1e-5)
+    assert len(calls) == 2  # one forward pass for three sessions
+    assert next(first._model.parameters()) is next(policy._model.parameters())
+    np.testing.assert_array_equal(play_alone(first, 1), play_alone(alone, 1))
+
+
+@pytest.mark.slow
+def test_what_cannot_be_batched_acts_session_by_session(
+    act: Path, vqbet: Path, tmp_path: Path
+) -> None:
+    """Queues of observations, temporal ensembling, and random draws: bit by bit as alone."""
+    ensemble = shutil.copytree(act, tmp_path / "ensemble")
+    change = {"n_action_steps": 1, "temporal_ensemble_coeff": 0.01}
+    small.edit(ensemble, lambda config: config.update(change))
+    for folder in (vqbet, ensemble):
+        for number, own in enumerate(play_together(made(folder), 2)):
+            np.testing.assert_array_equal(own, play_alone(made(folder), number))
+    # One that draws is found out by its draws, whatever its type.
+    policy, alone = made(act), made(act)
+    for one in (policy, alone):
+        one._load()
+        model = one._model
+        predict = model.predict_action_chunk
+        model.predict_action_chunk = lambda batch, predict=predict: predict(batch) + torch.rand(1)
+    for number, own in enumerate(play_together(policy, 2)):
+        np.testing.assert_array_equal(own, play_alone(alone, number))
+
+
 # --- policies that do not fit --------------------------------------------------------------------
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import av
+import numpy as np
 import pytest
 from support import worlds
 from support.buffer_sets import GOLDEN, QUERIES
@@ -21,6 +22,8 @@ from support.runs import run as evaluate_world
 from support.tabletop import copy_tabletop
 
 from robomme_interference_data import load_buffer
+from robomme_interference_data.evaluate import Observation, RolloutInfo
+from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.run import evaluation as run_module
 from robomme_interference_data.runtime.executor import Serial
 
@@ -86,7 +89,7 @@ ELSEWHERE = (
     "siglip",  # weights
     "lerobot:",  # a checkpoint
     "theirs/",  # published results
-    "python:retrace",  # has a test of its own
+    "python:retrace",  # have tests of their own
     "python:memory_policy",  # has a test of its own
     "lamp",  # has a test of its own
     "k0.csv",  # rows of that policy
@@ -219,6 +222,25 @@ def test_the_example_of_a_policy_runs(
         ("no-history", "fail", worlds.STEPS),
         ("k0", "success", 4),
     ]
+
+
+def test_the_example_of_a_batch_acts_as_the_policy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = DOCS / "how-to" / "your-own-policy.md"
+    for name, module in (("policy", "retrace"), ("batch", "retrace_batch")):
+        (tmp_path / f"{module}.py").write_text(example(page, name), encoding="utf-8")
+        monkeypatch.delitem(sys.modules, module, raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    policy: Any = make_policy("python:retrace_batch:make")
+    seen = [Observation({}, np.full(8, number, np.float32)) for number in (0.0, 1.0)]
+    sessions = [policy.session() for _ in seen]
+    for session, number in zip(sessions, (2.0, 3.0), strict=True):
+        session.reset(RolloutInfo("go", 1, 0))
+        session.add_history({}, np.full((1, 8), number, np.float32), 1)
+    for numbers in ((2.0, 3.0), (0.0, 1.0)):  # the history, then the current pose
+        chunks = policy.act_batch(sessions, seen, ["go", "go"])
+        assert [chunk[0, 0] for chunk in chunks] == list(numbers)
 
 
 def test_the_example_of_recordings_becomes_buffers(
