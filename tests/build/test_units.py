@@ -66,6 +66,7 @@ def violations(root: Path) -> list[str]:
     return [f"{one.where}: {one.what}" for one in verify_buffer_set(load_buffer_set(root))]
 
 
+@pytest.mark.slow
 def test_a_buffer_set_of_short_units(tmp_path: Path) -> None:
     for kind, lengths in ((DEMONSTRATIONS, QUERIES), (DISTRACTORS, TRAIN)):
         build(tmp_path, kind, lengths)

@@ -75,7 +75,8 @@ def test_rows_are_those_of_policies_that_are_not_shared(tmp_path: Path) -> None:
     assert {*(tmp_path / "batches").read_text().split()} == {"2"}
 
 
-@pytest.mark.parametrize("fault", ["die", pytest.param("hang", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", ["die", "hang"])
 def test_a_process_that_dies_or_hangs_costs_no_rollout(tmp_path: Path, fault: str) -> None:
     (tmp_path / fault).write_text("")
     limit = 30.0 if fault == "hang" else 600.0

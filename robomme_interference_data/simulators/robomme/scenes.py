@@ -2,7 +2,7 @@
 
 `facts.py` records what they need, from the attributes and the task list of RoboMME's environment.
 Things are numbered as RoboMME makes them; a place is where a thing is before any swap. The numbers
-of moves, placements and swaps of a lesson are taken as known, because they follow from its length,
+of moves, placements and swaps of a lesson are taken as known: nearly all follow from its length,
 which policies know.
 """
 
