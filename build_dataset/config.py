@@ -3,16 +3,12 @@
 import os
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from robomme_interference_data.constants import POSITION_LIMIT, UNIT_FRAMES, UNIT_STRIDE
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.runtime.executor import WorkersConfig
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS
 from robomme_interference_data.schema.settings import setting
-
-if TYPE_CHECKING:
-    pass
 
 _CPUS = os.cpu_count() or 1
 

@@ -2,16 +2,18 @@
 
 import json
 from collections import Counter
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.tables.paper import by_family
+from robomme_interference_data.evaluate.shortcuts import Cues, Shortcut, shortcuts
+from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.simulators.robomme.scenes import OfficialScene, read_scene
 from robomme_interference_data.stats.intervals import wilson
@@ -105,24 +107,35 @@ def test_frames_of_the_least_shown_part() -> None:
 
 
 def test_rollouts_are_counted() -> None:
-    columns = (
-        *(("oracle", "no-history"), ("guess", "no-history")),
-        *(("recall-framesamp", "k7"), ("recall-framesamp", "k31")),
-        *(("recall-window", "k0"), ("recall-window", "k1")),
+    tables = {
+        "`guess`": (
+            *(("oracle", "no-history"), ("guess", "no-history")),
+            *(("recall-framesamp", "k7"), ("recall-framesamp", "k31")),
+            *(("recall-window", "k0"), ("recall-window", "k1")),
+        ),
+        "in words alone": (
+            ("follow-subgoals-oracle", "no-history"),
+            ("follow-subgoals-oracle-simple", "no-history"),
+        ),
+    }
+    found = {(one["system"], one["condition"]) for one in ROLLOUTS}
+    assert found == {column for columns in tables.values() for column in columns}
+    for head, columns in tables.items():
+        for family, *cells in table(head):
+            for (system, condition), cell in zip(columns, cells, strict=True):
+                key = system, condition, family
+                assert cell == counted(*key), key
+
+
+def counted(*key: str) -> str:
+    """The successes of a system under a condition in a family, as the page writes them."""
+    states = Counter(
+        one["status"] for one in ROLLOUTS if (one["system"], one["condition"], one["family"]) == key
     )
-    assert {(one["system"], one["condition"]) for one in ROLLOUTS} == set(columns)
-    for family, *cells in table("`oracle`"):
-        for (system, condition), cell in zip(columns, cells, strict=True):
-            key = system, condition, family
-            states = Counter(
-                one["status"]
-                for one in ROLLOUTS
-                if (one["system"], one["condition"], one["family"]) == key
-            )
-            errors = states.pop("error", 0)
-            low, high = wilson(states["success"], states.total())
-            text = f"{states['success']} of {states.total()}, {100 * low:.0f} to {100 * high:.0f}%"
-            assert cell == text + (f"; {errors} without a plan" if errors else ""), key
+    errors = states.pop("error", 0)
+    low, high = wilson(states["success"], states.total())
+    text = f"{states['success']} of {states.total()}, {100 * low:.0f} to {100 * high:.0f}%"
+    return text + (f"; {errors} without a plan" if errors else "")
 
 
 @pytest.mark.slow
@@ -157,36 +170,46 @@ def test_published_rates() -> None:
     assert [row[0] for row in rows] == list(FAMILIES)
 
 
-def answer_of(lesson: dict[str, Any]) -> Any:
-    return json.loads(lesson["scene"])["answer"]
-
-
-COUNTS: dict[tuple[str, str], Callable[[dict[str, Any]], Any]] = {
-    ("MoveCube", "the manner"): answer_of,
-    ("InsertPeg", "the end"): lambda one: answer_of(one)[1],
-    ("InsertPeg", "the side"): lambda one: answer_of(one)[2],
-    ("RouteStick", "number of moves"): lambda one: len(answer_of(one)[1]),
-    ("PatternLock", "number of moves"): lambda one: len(answer_of(one)),
-    ("VideoUnmaskSwap", "number of swaps"): lambda one: len(json.loads(one["scene"])["swaps"]),
-    ("VideoRepick", "number of swaps"): lambda one: len(json.loads(one["scene"])["swaps"]),
-    ("VideoPlaceOrder", "number of placements"): lambda one: len(
-        json.loads(one["scene"])["visits"]
-    ),
+PARTS = {
+    ("MoveCube", "the manner"): "0",
+    ("InsertPeg", "the end"): "0",
+    ("InsertPeg", "the side"): "1",
+    ("PatternLock", "the first move"): "0",
+    ("RouteStick", "the first move"): "0",
+    ("PatternLock", "number of moves"): "count",
+    ("RouteStick", "number of moves"): "count",
+    ("VideoUnmaskSwap", "number of swaps"): "count",
+    ("VideoRepick", "number of swaps"): "count",
+    ("VideoPlaceOrder", "number of placements and swaps"): "count",
+    ("VideoPlaceButton", "number of swaps"): "count",
 }
+"""What the page names, and the parts of `shortcuts`, which count the swaps or the placements."""
 
 
-def test_what_the_length_tells() -> None:
+def test_what_else_reveals_the_answer() -> None:
+    def measured(lessons: list[dict[str, Any]]) -> dict[tuple[str, str], Shortcut]:
+        cues = [
+            Cues(
+                family_of(one),
+                [EvidenceSpan(**span) for span in one["evidence"]],
+                one["lesson_frames"],
+                one["goal"],
+                one["live_view"] and np.frombuffer(one["live_view"], np.uint8).reshape(8, 8, 3),
+            )
+            for one in lessons
+        ]
+        return {(one.family, one.part): one for one in shortcuts(cues)}
+
+    everything = measured(LESSONS)
+    viewed = measured([one for one in LESSONS if one["live_view"]])
     rows = table("most frequent value")
-    assert {(family, what) for family, what, *_ in rows} == set(COUNTS)
-    for family, what, right, frequent in rows:
-        lessons = [one for one in LESSONS if family_of(one) == family]
-        tell = COUNTS[family, what]
-        found = 0
-        for at, one in enumerate(lessons):
-            others = lessons[:at] + lessons[at + 1 :]
-            gaps = [abs(other["lesson_frames"] - one["lesson_frames"]) for other in others]
-            nearest = others[gaps.index(min(gaps))]  # the first of equals
-            found += tell(nearest) == tell(one)
-        values = Counter(tell(one) for one in lessons)
-        assert (right, frequent) == (f"{found} of 50", f"{max(values.values())} of 50"), what
-    assert all(answer_of(one)[0] == 0 for one in LESSONS if family_of(one) == "InsertPeg")
+    assert {(family, what) for family, what, *_ in rows} == {*PARTS}
+    for family, what, *cells in rows:
+        key = family, PARTS[family, what]
+        found, seen = everything[key], viewed[key]
+        assert found.queries == 50
+        expected = [f"{one} of 50" for one in (found.most_frequent, found.length, found.goal)]
+        assert cells == [*expected, f"{seen.view} of {seen.queries} ({seen.most_frequent})"], key
+    for one in LESSONS:
+        if family_of(one) == "InsertPeg":
+            assert json.loads(one["scene"])["answer"][0] == 0
