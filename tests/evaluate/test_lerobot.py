@@ -178,6 +178,7 @@ def play_alone(policy: Any, number: int, rounds: int = 2) -> list[np.ndarray]:
     return actions
 
 
+@pytest.mark.slow
 def test_a_batch_of_sessions_acts_as_each_alone(act: Path) -> None:
     policy, alone = made(act), made(act)
     calls = []

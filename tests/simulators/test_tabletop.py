@@ -63,6 +63,7 @@ def parts(lesson: Demonstration, first: Observation) -> list[NDArray[Any]]:
 # --- results -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_reset_serves_what_it_says_the_same_each_time(tabletop: TabletopSimulator) -> None:
     lesson, first, info = tabletop.reset(SHORT)
     assert set(lesson.images) == set(first.images) == {"front", "wrist"}
@@ -84,6 +85,7 @@ def test_reset_serves_what_it_says_the_same_each_time(tabletop: TabletopSimulato
         assert np.array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_every_fourth_frame_of_a_lesson(tabletop: TabletopSimulator) -> None:
     lesson, first, _ = tabletop.reset(SHORT)
     fewer, again, _ = tabletop.reset(SHORT, demonstration=4)

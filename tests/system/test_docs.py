@@ -243,6 +243,7 @@ def test_the_example_of_a_batch_acts_as_the_policy(
         assert [chunk[0, 0] for chunk in chunks] == list(numbers)
 
 
+@pytest.mark.slow
 def test_the_example_of_recordings_becomes_buffers(
     tmp_path: Path, run: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

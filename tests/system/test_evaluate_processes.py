@@ -161,6 +161,7 @@ class Stopper:
             self.stops.pop().close()
 
 
+@pytest.mark.slow
 def test_servers_that_go_away_cost_no_rollout(tmp_path: Path, monkeypatch: Any) -> None:
     """The policy holds still: all rollouts fail. Another server does the rest, or a later run."""
     served: dict[str, Any] = {"policy": "python:support.own_policies:Served", "workers": 2}
@@ -182,7 +183,9 @@ def test_servers_that_go_away_cost_no_rollout(tmp_path: Path, monkeypatch: Any) 
         assert runs.run(tmp_path / "two", Processes(2), **served).counts["fail"] == ROLLOUTS
 
 
-@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT])
+@pytest.mark.parametrize(
+    "sent", [pytest.param(signal.SIGKILL, marks=pytest.mark.slow), signal.SIGINT]
+)
 def test_servers_that_workers_start_end_with_the_command(
     tmp_path: Path, sent: signal.Signals
 ) -> None:

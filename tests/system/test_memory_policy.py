@@ -48,6 +48,7 @@ def weights(run: Path) -> dict[str, torch.Tensor]:
     return load_file(run / "model.safetensors")
 
 
+@pytest.mark.slow
 def test_it_learns_to_answer_and_writes_rows(program: Any, tmp_path: Path) -> None:
     """Of six golden lessons: their frames are of one color each, so not all can be told apart."""
     run, families = tmp_path / "run", ("VideoRepick", "MoveCube", "InsertPeg")

@@ -61,6 +61,7 @@ def test_a_buffer_set_for_published_demonstrations(
     assert [*verify_buffer_set(buffer_set)] == []
 
 
+@pytest.mark.slow
 def test_a_buffer_set_for_demonstrations_in_a_folder(mine: str, tmp_path: Path, run: Any) -> None:
     """The demonstrations are linked, stay unchanged, and are exported with the buffer set."""
     base = shutil.copytree(GOLDEN / "demonstrations", tmp_path / "base/demonstrations")
