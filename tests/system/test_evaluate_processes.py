@@ -126,6 +126,7 @@ def test_a_simulator_that_hangs_or_takes_its_process_along_is_an_error(tmp_path:
     assert [(row.status, row.attempt) for row in again.rows] == [("fail", 4), ("fail", 4)]
 
 
+@pytest.mark.slow
 def test_policies_are_closed_and_what_they_print_is_not_among_the_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
