@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
+import pytest
 from huggingface_hub import constants
 from support.buffer_sets import GOLDEN, QUERIES
 from support.hub import BUFFER_SET, kill_at, push_buffer_set
@@ -39,6 +40,7 @@ def asked_for(requests: Iterable[Request]) -> list[tuple[str, ...]]:
     return [match.groups() for match in matches if match]
 
 
+@pytest.mark.slow
 def test_fetch_after_a_kill(hub: HubServer, run: Run, tmp_path: Path) -> None:
     push_buffer_set(hub, GOLDEN, tmp_path / "work")
     out = tmp_path / "out"
