@@ -375,7 +375,10 @@ class Simulator(ABC):
         self, policy: str, known: Mapping[int, str], answer: int | None
     ) -> NDArray[np.float32]:
         """Return the next action of one of `policies`; see `act`."""
-        raise NotImplementedError
+        raise UnknownNameError(
+            f"the simulator {type(self).__name__} cannot act as {policy}",
+            "Define `_act`, or declare `policies = ()`: docs/how-to/another-benchmark.md.",
+        )
 
     @abstractmethod
     def _begin(self, episode: EpisodeId, every: int) -> Begun:

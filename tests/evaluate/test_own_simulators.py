@@ -4,6 +4,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.buffer_sets import QUERIES
+from support.own_simulators import Played
 from support.runs import config, run, run_one
 from support.worlds import World
 
@@ -117,3 +119,13 @@ def test_policies_that_do_not_fit(
     with pytest.raises(error) as raised:
         check_settings(settings, opened, made)
     assert words in raised.value.message
+
+
+def test_a_simulator_without_a_script_cannot_act() -> None:
+    class Scriptless(Played):
+        _act = Simulator._act  # as if it did not define one
+
+    simulator = Scriptless()
+    simulator.reset(QUERIES[0])
+    with pytest.raises(UnknownNameError, match="Scriptless cannot act as oracle"):
+        simulator.act("oracle")

@@ -5,6 +5,7 @@ and the solver's arguments.
 """
 
 import re
+from abc import ABC, abstractmethod
 from typing import Any
 
 _PUT = "place|put|drop"
@@ -12,7 +13,7 @@ _ALONG = {"forward": 1.0, "backward": -1.0}
 _ACROSS = {"left": 1.0, "right": -1.0}
 
 
-class Steps:
+class Steps(ABC):
     """The steps of one live episode.
 
     Args:
@@ -27,13 +28,13 @@ class Steps:
     def __init__(self, base: Any) -> None:
         self.base = base
 
+    @abstractmethod
     def of_answer(self, answer: Any) -> Any:
         """Yield the steps that carry out an answer."""
-        raise NotImplementedError
 
+    @abstractmethod
     def of_words(self, words: str, points: list[list[int]], seed: int) -> Any:
         """Return the step that words name, in lower case and without `<point>`, or None."""
-        raise NotImplementedError
 
     def of_subgoal(self, text: str, points: list[list[int]], seed: int) -> Any:
         """Return the step that a subgoal names, or None.
