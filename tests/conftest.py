@@ -43,6 +43,7 @@ _SET = {
     "HF_HUB_OFFLINE": "1",  # a test with a server on the loopback interface sets it back
     "HF_LEROBOT_HOME": str(_SCRATCH / "lerobot"),
     "NO_COLOR": "1",
+    "OMP_NUM_THREADS": "1",  # sums of floats depend on it; models this small are slower on more
     "XDG_CACHE_HOME": str(_SCRATCH / "cache"),
 }
 for _name in _REMOVED:

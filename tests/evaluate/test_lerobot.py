@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,15 +24,6 @@ torch, _ = lazy("torch"), lazy("lerobot")
 lerobot = lazy("robomme_interference_data.evaluate.policies.lerobot")
 small = lazy("support.lerobot_policies")
 pytestmark = pytest.mark.filterwarnings("ignore:To evaluate in the environment, your VQ-BeT")
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread() -> Iterator[None]:
-    """Models this small are slower on several threads, and much slower on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")

@@ -43,7 +43,6 @@ class BuildServer:
             **os.environ,
             _MARK: self.mark,
             "PYTHONHASHSEED": str(hash_seed),
-            "OMP_NUM_THREADS": "1",
             "OPENBLAS_NUM_THREADS": "1",
         }
         self._process = subprocess.Popen(

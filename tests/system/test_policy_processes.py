@@ -35,7 +35,6 @@ def _world(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv(worlds.BUFFER_SET, str(TESTS / "golden" / "buffer_set"))
     monkeypatch.setenv(FAULT, str(tmp_path))
     monkeypatch.setenv("PYTHONPATH", str(TESTS))
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
 
 
 def run(out: Path, policy: str = "Remembering", **changes: Any) -> Any:

@@ -30,7 +30,6 @@ def siglip(folder: Path) -> str:
         text_config=tower | {"num_hidden_layers": 1, "vocab_size": 64, "projection_size": 32},
     )
     torch.manual_seed(0)
-    torch.set_num_threads(1)  # so small a model waits for its threads longer than it computes
     transformers.SiglipModel(config).save_pretrained(folder)
     settings = {"image_processor_type": "SiglipImageProcessor", "size": {"height": 32, "width": 32}}
     (folder / "preprocessor_config.json").write_text(json.dumps(settings))
