@@ -62,14 +62,19 @@ class RolloutTask(RunTask[RunConfig]):
     """Runs rollouts; makes policy and simulator at the first one, and again after an error.
 
     `answers` are those that the policy `answers` carries out; None for all other policies.
-    `addresses` are those of shared policies; empty if each worker has its own policy.
+    `addresses` are those of shared policies; empty if each worker has its own policy. `policy` is
+    one that is made already.
     """
 
     def __init__(
-        self, run: Run[RunConfig], answers: Answers | None = None, addresses: Sequence[str] = ()
+        self,
+        run: Run[RunConfig],
+        answers: Answers | None = None,
+        addresses: Sequence[str] = (),
+        policy: Policy | None = None,
     ):
         super().__init__(run)
-        self._answers, self._addresses = answers, addresses
+        self._answers, self._addresses, self._given = answers, addresses, policy
         self._simulator: Simulator | None = None
         self._policy: Policy | None = None
         self._checked = False  # whether the policy's server is the one that the run began with
@@ -128,6 +133,8 @@ class RolloutTask(RunTask[RunConfig]):
 
     def _make_policy(self, worker: Worker) -> Policy:
         config = self.run.config
+        if self._given is not None:
+            return self._given
         if not self._addresses:
             return make_policy(config.policy, config.policy_options, worker=worker.number)
         from robomme_interference_data.evaluate.policies.process import SharedPolicy, connect

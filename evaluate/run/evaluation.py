@@ -30,7 +30,7 @@ from .config import AskConfig, RunConfig
 from .identity import invocation, now, plain, run_identity
 from .kind import Job, Run, RunKind
 from .log import RunLog, count_statuses, is_done, open_log, read_record, row_line, row_of
-from .plan import WorkItem, plan_work, shuffle_work
+from .plan import Plan, WorkItem, plan_work, shuffle_work
 
 _ERROR_LETTERS = 2000
 """Maximum length of an error text in a row."""
@@ -107,24 +107,7 @@ def run_evaluation(
     with kind.lock(folder), ExitStack() as stack:
         kind.prepare()
         config = kind.config
-        plan = plan_work(
-            buffer_set.episode_ids,
-            conditions=config.conditions
-            or tuple(one for one in buffer_set.conditions if kind.refusal(one) is None),
-            families=config.families,
-            episodes=config.episodes,
-            split=config.split,
-            shard=config.shard,
-        )
-        items = plan.items()
-        for condition in plan.conditions:
-            if (refusal := kind.refusal(condition)) is not None:
-                raise refusal
-            buffer_set.manifest(
-                buffer_set.episode_ids[0], condition
-            )  # raises, with the available ones
-        buffer_set.check_tables(plan.conditions)
-        kind.check(plan, items)
+        plan, items = plan_run(kind)
         existing = read_record(folder)
         todo = [item for item in items if item not in existing or not is_done(existing[item])]
         executor = executor or make_executor(config)
@@ -140,6 +123,28 @@ def run_evaluation(
             # The buffer set may have moved to another folder: its label in rows stays the same.
             run = dataclasses.replace(run, buffer_set=log.header.buffer_set)
             return _run_items(run, kind, session, items, log, progress)
+
+
+def plan_run(kind: RunKind[Any]) -> tuple[Plan, tuple[WorkItem, ...]]:
+    """Return the plan of a prepared run and its work items, and check them."""
+    config, buffer_set = kind.config, kind.buffer_set
+    plan = plan_work(
+        buffer_set.episode_ids,
+        conditions=config.conditions
+        or tuple(one for one in buffer_set.conditions if kind.refusal(one) is None),
+        families=config.families,
+        episodes=config.episodes,
+        split=config.split,
+        shard=config.shard,
+    )
+    items = plan.items()
+    for condition in plan.conditions:
+        if (refusal := kind.refusal(condition)) is not None:
+            raise refusal
+        buffer_set.manifest(buffer_set.episode_ids[0], condition)  # raises, with the available ones
+    buffer_set.check_tables(plan.conditions)
+    kind.check(plan, items)
+    return plan, items
 
 
 def _kind(config: RunConfig | AskConfig, buffer_set: BufferSet) -> RunKind[Any]:

@@ -52,24 +52,25 @@ class Run[C: RunConfig | AskConfig]:
     buffer_set: str
     revision: str
 
+    def key(self, item: WorkItem) -> dict[str, Any]:
+        """Return what identifies the row of a work item: its `KEY_COLUMNS`."""
+        return {
+            "system": self.system,
+            "simulator": self.config.simulator,
+            "buffer_set": self.buffer_set,
+            "revision": self.revision,
+            "family": item.episode.family,
+            "condition": item.condition,
+            "split": item.episode.split,
+            "episode": item.episode.index,
+            "shift": self.config.shift,
+            "model_seed": self.config.model_seed,
+            "protocol_version": PROTOCOL_VERSION,
+        }
+
     def row(self, item: WorkItem, status: Status, **values: Any) -> Rollout:
         """Return the row of a work item."""
-        return Rollout(
-            system=self.system,
-            simulator=self.config.simulator,
-            buffer_set=self.buffer_set,
-            revision=self.revision,
-            family=item.episode.family,
-            condition=item.condition,
-            split=item.episode.split,
-            episode=item.episode.index,
-            shift=self.config.shift,
-            model_seed=self.config.model_seed,
-            protocol_version=PROTOCOL_VERSION,
-            status=str(status),
-            success=success_of(status),
-            **values,
-        )
+        return Rollout(**self.key(item), status=str(status), success=success_of(status), **values)
 
 
 def make_selector(config: RetrievalConfig) -> "Selector | None":

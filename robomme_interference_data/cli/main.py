@@ -14,6 +14,7 @@ from robomme_interference_data.cards import commands as publishing
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.evaluate import commands as evaluating
 from robomme_interference_data.evaluate.score import commands as scoring
+from robomme_interference_data.evaluate.vla_eval import commands as vla_eval
 from robomme_interference_data.retrieval import commands as retrieving
 from robomme_interference_data.simulators import commands as simulating
 from robomme_interference_data.storage.hub import check_endpoint
@@ -77,6 +78,7 @@ _GROUPS = {
         ("evaluate", evaluating.evaluate),
         ("ask", evaluating.ask),
         ("merge", evaluating.merge),
+        ("vla-eval-config", vla_eval.vla_eval_config),
     ),
     "Scores": (("score", scoring.score), ("compare", scoring.compare), ("power", scoring.power)),
     "Publish": (

@@ -15,9 +15,10 @@ import pyarrow.json as pa_json
 from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD, RUN_TABLES
 from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
 from robomme_interference_data.evaluate.run.log import MOST_BYTES, RunHeader, whole_lines
+from robomme_interference_data.ids import parse_numbers
 from robomme_interference_data.schema.codec import arrow_schema
 from robomme_interference_data.schema.rollouts import KEY_COLUMNS, Rollout, Status
-from robomme_interference_data.storage.files import read_bytes, read_header
+from robomme_interference_data.storage.files import parse_json, read_bytes, read_header
 from robomme_interference_data.storage.parquet import open_parquet, read_table, reading
 
 _REQUIRED = ("family", "condition", "episode", "status", "success")
@@ -45,7 +46,7 @@ def find_sources(paths: Sequence[Path]) -> dict[Path, RunHeader | None]:
         if not path.is_file():
             raise MissingFileError(
                 f"there is no file {path}",
-                "Give folders of runs, or .csv, .parquet or .jsonl files.",
+                "Give folders of runs, .csv, .parquet or .jsonl files, or .json of vla-eval.",
             )
         if any(path.samefile(other) for other in sources):
             raise InvalidOptionError(f"{path} is given twice", "Give each file once.")
@@ -66,7 +67,12 @@ def read_file(path: Path, names: Sequence[str], has_system: bool) -> Part:
 
     The file must have a column `system` unless the system is known otherwise (`has_system`).
     """
-    readers = {".parquet": _read_parquet, ".csv": _read_csv, ".jsonl": _read_record}
+    readers = {
+        ".parquet": _read_parquet,
+        ".csv": _read_csv,
+        ".jsonl": _read_record,
+        ".json": _read_vla_eval,
+    }
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise FormatError(f"{path} is not a {' or '.join(readers)} file", "Give a file of rows.")
@@ -168,3 +174,29 @@ def _read_record(path: Path, names: Sequence[str], has_system: bool) -> Part:
     return Part(
         {name: [columns[name][at] for at in kept] for name in names}, [at + 1 for at in kept]
     )
+
+
+def _read_vla_eval(path: Path, names: Sequence[str], has_system: bool) -> Part:
+    """Read the results of `vla-eval run` with the benchmark of `evaluate.vla_eval`.
+
+    An episode's metrics are a row. One that has a reason of a failure instead is an error: it says
+    nothing about the policy, though vla-eval counts it as no success.
+    """
+    results = parse_json(read_bytes(path, MOST_BYTES), str(path))
+    rows = []
+    try:
+        for episode in (one for task in results["tasks"] for one in task["episodes"]):
+            row = episode["metrics"]
+            if episode.get("failure_reason"):
+                number = parse_numbers(episode["episode"])[episode["episode_idx"]]
+                row = {**episode, "episode": number, "status": Status.ERROR, "success": None}
+            rows.append({name: row.get(name) for name in names})
+            if any(isinstance(value, list | dict) for value in rows[-1].values()):
+                raise ValueError("a column holds lists or maps; expected text and numbers")
+            _check_count(len(rows))
+    except (KeyError, TypeError, AttributeError, IndexError) as error:
+        raise FormatError.damaged(
+            path, f"it holds no results of vla-eval: {type(error).__name__} {error}"
+        ) from None
+    columns = {name: [row[name] for row in rows] for name in names}
+    return Part(columns, range(1, len(rows) + 1))

@@ -66,7 +66,7 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
     """Read rows from folders of runs and files, and check each of them.
 
     Args:
-        paths: Folders of runs, and `.jsonl`, `.parquet` and `.csv` files.
+        paths: Folders of runs, `.jsonl`, `.parquet` and `.csv` files, and `.json` of vla-eval.
         system: System of rows that name none; by default the one in the name of an exported file.
         lenient: Leave bad rows out, and count them. Of identical rows of one rollout the first is
             kept, of rows that contradict each other none.
@@ -149,7 +149,7 @@ class _Checks:
     def locate(self, row: _Location) -> str:
         """Return where a row is, for messages."""
         path = self._paths[row[0]]
-        return f"{path}, {'row' if path.suffix.lower() == '.parquet' else 'line'} {row[1]}"
+        return f"{path}, {'line' if path.suffix.lower() in ('.csv', '.jsonl') else 'row'} {row[1]}"
 
     def check_alike(self, name: str, group: Sequence[str], why: str) -> None:
         """Refuse rows whose value differs from the most frequent one of the same group."""

@@ -1,0 +1,267 @@
+"""RoboMME-Interference as a benchmark of vla-eval: `vla-eval run` plays it against its servers."""
+
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any, ClassVar, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from vla_eval.benchmarks.base import StepBenchmark, StepResult
+from vla_eval.specs import DimSpec
+from vla_eval.types import Action, EpisodeResult, Task
+from vla_eval.types import Observation as ServerObservation
+
+from robomme_interference_data.constants import MAX_STEPS
+from robomme_interference_data.data.loading import load_buffer_set
+from robomme_interference_data.errors import InvalidOptionError, RunError, UnknownNameError
+from robomme_interference_data.evaluate.policies.policy import Frames, Policy, RolloutInfo
+from robomme_interference_data.evaluate.rollout.kind import Rollouts
+from robomme_interference_data.evaluate.rollout.worker import RolloutTask
+from robomme_interference_data.evaluate.run.config import RunConfig
+from robomme_interference_data.evaluate.run.evaluation import plan_run
+from robomme_interference_data.evaluate.run.kind import Job, Run
+from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.evaluate.systems import name_system
+from robomme_interference_data.ids import EpisodeId, parse_numbers
+from robomme_interference_data.runtime.worker import Worker
+from robomme_interference_data.schema.codec import to_dict
+from robomme_interference_data.schema.conditions import NO_HISTORY
+from robomme_interference_data.simulators.base import Observation
+
+from .observations import ACTION_SPEC, CAMERAS, OBSERVATION_SPEC, make_observation
+
+SETTINGS = (
+    *("conditions", "families", "episodes", "split", "simulator", "robomme_python", "shift"),
+    *("retrieval", "retrieval_rule", "retrieval_camera", "check_lesson", "model_seed"),
+)
+"""Settings of `evaluate` that the benchmark takes too."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a rollout asks an action for.
+
+    Attributes:
+        observation: The current observation.
+        goal: The goal.
+        first: Whether it is the first one of its rollout, which brings the history.
+        history: Camera to its T history frames, each `(H, W, 3) uint8`.
+        states: Their states, `(T, 8) float32`; None without history.
+    """
+
+    observation: Observation
+    goal: str
+    first: bool
+    history: dict[str, list[NDArray[np.uint8]]]
+    states: NDArray[np.float32] | None
+
+
+class ServedPolicy(Policy):
+    """Passes on what a rollout asks, and waits for the answer; each has its own thread.
+
+    Attributes:
+        asked: `Request` by `Request`, then the finished rollout.
+        answers: Actions, `(n, 8) float32`, or None to end the rollout.
+    """
+
+    def __init__(self, wrist: bool = False, history: bool = False):
+        self.cameras = tuple(CAMERAS)[: 1 + wrist]
+        self.history_cameras = self.cameras if history else ()
+        self.wants_history = history
+        self.asked, self.answers = SimpleQueue[Any](), SimpleQueue[Any]()
+
+    def reset(self, info: RolloutInfo) -> None:
+        """Forget the history of the last rollout."""
+        self._first, self._states = True, list[NDArray[np.float32]]()
+        self._history: dict[str, list[NDArray[np.uint8]]] = {}
+
+    def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
+        """Keep the frames until the first request."""
+        for camera, images in frames.items():
+            self._history.setdefault(camera, []).extend(images)
+        self._states.append(states)
+
+    def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
+        """Return the answer to a request."""
+        states = np.concatenate(self._states) if self._states else None
+        self.asked.put(Request(observation, goal, self._first, self._history, states))
+        self._first, self._history, self._states = False, {}, []
+        if (actions := self.answers.get()) is None:
+            raise RunError("vla-eval ended the rollout")
+        return cast("NDArray[np.float32]", actions)
+
+    def metadata(self) -> dict[str, Any]:
+        """Return nothing: vla-eval records what its server reports."""
+        return {}
+
+
+class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
+    """Rollouts under the conditions of a buffer set, with a server of vla-eval as the policy.
+
+    A task is a family under a condition, such as `MoveCube/k7`; its episode n is the n-th query
+    episode of the family. A rollout runs as in `evaluate`, and its row is in the `metrics`.
+
+    Args:
+        buffer_set: Folder of the buffer set, or `NAMESPACE/NAME` on the Hub.
+        system: Label of the rows; not one of the paper's, whose servers speak another protocol.
+        send_wrist_image: Whether the server gets the wrist camera, live and of the history.
+        send_state: Whether it gets the states, live and of the history.
+        send_video_history: Whether it gets the history. vla-eval sets this and the two above as
+            the server asks, unless its configuration names them.
+        settings: `SETTINGS`, as the options of `evaluate`. By default the conditions are all that
+            apply.
+
+    Raises:
+        InvalidOptionError: Settings do not fit each other, the buffer set or the simulator; or a
+            condition has a history, and the server did not ask for it.
+        UnknownNameError: A setting is unknown; or a family, condition or episode.
+    """
+
+    render_backends: ClassVar[frozenset[str]] = frozenset({"gpu", "cpu"})
+
+    @classmethod
+    def configure_render(cls, mode: str) -> dict[str, str]:
+        """Set nothing: the simulators draw with the machine's Vulkan driver."""
+        return {}
+
+    def __init__(
+        self,
+        buffer_set: str,
+        system: str,
+        *,
+        send_wrist_image: bool = False,
+        send_state: bool = True,
+        send_video_history: bool = False,
+        **settings: Any,
+    ):
+        super().__init__()
+        if unknown := sorted({*settings} - {*SETTINGS}):
+            raise UnknownNameError.among("setting", unknown[0], "the benchmark", SETTINGS)
+        if name_system(system).paper:
+            raise InvalidOptionError(
+                f"a server of vla-eval is not the paper's system {system}",
+                "Set `system` to a name of your own; docs/how-to/vla-eval.md says what differs.",
+            )
+        opened = load_buffer_set(buffer_set)
+        chosen: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value
+            for name, value in settings.items()
+        }
+        options = {"wrist": send_wrist_image, "history": send_video_history}
+        config = RunConfig(
+            policy=f"python:{__name__}:{ServedPolicy.__name__}",
+            policy_options=tuple(f"{name}={value}".lower() for name, value in options.items()),
+            buffer_set=opened.location,
+            out=Path(),  # vla-eval writes the results
+            system=system,
+            **chosen,
+        )
+        kind = Rollouts(config, opened)
+        kind.prepare()
+        with_history = [one for one in config.conditions if one != NO_HISTORY]
+        if with_history and not send_video_history:
+            raise InvalidOptionError(
+                "the server did not ask for histories: its observation_params have no "
+                f"send_video_history, and {', '.join(with_history)} would be {NO_HISTORY}",
+                f"Set `conditions` to [{NO_HISTORY}], or serve a model with a memory.",
+            )
+        self._plan, _ = plan_run(kind)
+        self._run = Run(kind.config, kind.system, opened.name, opened.revision)
+        self._send_state = send_state
+        self._policy = ServedPolicy(**options)
+        self._rollouts = RolloutTask(self._run, policy=self._policy)
+        # A rollout asks its policy for actions, and vla-eval asks its benchmark for observations:
+        # each has its own thread.
+        self._thread = ThreadPoolExecutor(1, "rollout")
+        self._running: Future[Any] | None = None
+
+    def get_tasks(self) -> list[Task]:
+        """Return the tasks, with what identifies the rows of each."""
+        tasks = []
+        for group, numbers in self._plan.episodes.items():
+            for condition in self._plan.conditions:
+                episode = EpisodeId.parse(f"{group}/{parse_numbers(numbers)[0]}")
+                key = self._run.key(WorkItem(condition, episode)) | {"episode": numbers}
+                name = f"{episode.family}/{condition}"
+                tasks.append({"name": name, "suite": episode.family, **key})
+        return tasks
+
+    def get_metadata(self) -> dict[str, Any]:
+        """Return the benchmark's limit of steps."""
+        return {"max_steps": MAX_STEPS}
+
+    def get_action_spec(self) -> dict[str, DimSpec]:
+        """Return what an action is."""
+        return ACTION_SPEC
+
+    def get_observation_spec(self) -> dict[str, DimSpec]:
+        """Return what an observation holds."""
+        names = ["language", *(CAMERAS[camera] for camera in self._policy.cameras)]
+        return {name: OBSERVATION_SPEC[name] for name in names + ["state"] * self._send_state}
+
+    def reset(self, task: Task) -> "Request":
+        """Begin the rollout of an episode; return what the server gets first."""
+        self._stop()
+        numbers = parse_numbers(task["episode"])
+        index = task["episode_idx"]
+        if index >= len(numbers):
+            raise InvalidOptionError(
+                f"{task['name']} has {len(numbers)} episodes, and vla-eval asks for number {index}",
+                f"Set `episodes_per_task` to {len(numbers)}.",
+            )
+        episode = EpisodeId(task["family"], task["split"], numbers[index])
+        job = Job(WorkItem(task["condition"], episode))
+        self._running = self._thread.submit(self._rollouts, job, Worker(0))
+        self._running.add_done_callback(self._policy.asked.put)
+        return cast("Request", self._next().obs)
+
+    def step(self, action: Action) -> StepResult:
+        """Execute a server's action, or a chunk of them."""
+        values = action.get("actions", action.get("action"))
+        self._policy.answers.put(np.atleast_2d(np.asarray(values, np.float32)))
+        return self._next()
+
+    def make_obs(self, raw_obs: "Request", task: Task) -> ServerObservation:
+        """Return what the server gets."""
+        observation, state = raw_obs.observation, self._send_state
+        return make_observation(
+            {camera: observation.images[camera] for camera in self._policy.cameras},
+            raw_obs.goal,
+            state=observation.state if state else None,
+            first=raw_obs.first,
+            history=raw_obs.history,
+            states=raw_obs.states if state else None,
+        )
+
+    def get_step_result(self, step_result: StepResult) -> EpisodeResult:
+        """Return the row of the rollout."""
+        if not step_result.done:
+            raise RunError(
+                f"vla-eval ended the rollout before its end, after {MAX_STEPS} actions at most",
+                "Leave out `max_steps` in its configuration.",
+            )
+        return step_result.info
+
+    def cleanup(self) -> None:
+        """End the simulator."""
+        self._stop()
+        self._thread.submit(self._rollouts.close).result()
+        self._thread.shutdown()
+
+    def _next(self) -> StepResult:
+        """Wait for the rollout to ask for an action, or to end."""
+        asked = self._policy.asked.get()
+        if isinstance(asked, Request):
+            return StepResult(asked, 0.0, False, {})
+        row, _ = asked.result()  # raises what the rollout raised
+        return StepResult(None, float(row.success), True, to_dict(row))
+
+    def _stop(self) -> None:
+        """Stop a rollout whose server failed."""
+        if self._running is not None and not self._running.done():
+            self._policy.answers.put(None)
+            while isinstance(self._policy.asked.get(), Request):
+                pass
+        self._running = None

@@ -1,0 +1,47 @@
+"""The command `vla-eval-config`."""
+
+from typing import Annotated
+
+import typer
+
+from robomme_interference_data.cli.console import echo
+from robomme_interference_data.cli.options import BufferSetFolder, Conditions, Families
+
+
+def vla_eval_config(
+    buffer_set: BufferSetFolder,
+    system: Annotated[str, typer.Option(help="Label of the rows: a name of your own.")],
+    conditions: Conditions = [],  # noqa: B006 - typer reads it only
+    families: Families = [],  # noqa: B006
+    episodes: Annotated[
+        str | None, typer.Option(help="Episode numbers, such as 0-49; default: all.")
+    ] = None,
+    simulator: Annotated[str, typer.Option(help="tabletop, robomme or module:name.")] = "tabletop",
+    url: Annotated[str, typer.Option(help="Address of the server.")] = "ws://localhost:8000",
+    output_dir: Annotated[str, typer.Option(help="Folder of vla-eval's results.")] = "results",
+) -> None:
+    """Print a configuration of vla-eval, with which its servers play this benchmark.
+
+    The server must keep histories, except under no-history. score reads the results.
+
+    Example:
+    ```
+    robomme-interference vla-eval-config my-buffers --system my-model \
+      --conditions k0,k7 > config.yaml
+    vla-eval run --no-docker -c config.yaml
+    robomme-interference score results/RoboMMEInterference_aggregate.json
+    ```
+    """
+    from .configuration import configuration
+
+    echo(
+        configuration(
+            *(buffer_set, system),
+            conditions=conditions,
+            families=families,
+            episodes=episodes,
+            simulator=simulator,
+            url=url,
+            output_dir=output_dir,
+        )
+    )

@@ -1,0 +1,70 @@
+"""The configuration with which `vla-eval run` plays this benchmark."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import Any
+
+import yaml
+
+from robomme_interference_data.data.loading import load_buffer_set
+from robomme_interference_data.evaluate.run.plan import plan_work
+from robomme_interference_data.evaluate.systems import name_system
+from robomme_interference_data.ids import count_numbers
+
+BENCHMARK = f"{__package__}.benchmark:RoboMMEInterference"
+
+_ANSWER_S = 600.0
+"""Seconds for an answer: the first one comes after the whole history was sent and taken in."""
+
+
+def configuration(
+    buffer_set: str,
+    system: str,
+    *,
+    conditions: Sequence[str] = (),
+    families: Sequence[str] = (),
+    episodes: str | None = None,
+    simulator: str = "tabletop",
+    url: str = "ws://localhost:8000",
+    output_dir: str = "results",
+) -> str:
+    """Return it as YAML, for all query episodes of the split `test` or the chosen ones.
+
+    vla-eval runs the same number of episodes of each task: families with different numbers are
+    different entries.
+
+    Raises:
+        UnknownNameError: The buffer set lacks a family, condition or episode.
+        InvalidIdError: `system` is not a name.
+    """
+    name_system(system)
+    opened = load_buffer_set(buffer_set)
+    plan = plan_work(
+        opened.episode_ids,
+        conditions=conditions or opened.conditions,
+        families=families,
+        episodes=episodes,
+    )
+    for condition in plan.conditions:
+        opened.manifest(opened.episode_ids[0], condition)  # raises, with the available ones
+    groups = defaultdict[int, list[str]](list)
+    for group, numbers in plan.episodes.items():
+        groups[count_numbers(numbers)].append(group.partition("/")[0])
+    params: dict[str, Any] = {"buffer_set": opened.location, "system": system}
+    params |= {"simulator": simulator, "conditions": [*plan.conditions]}
+    params |= {} if episodes is None else {"episodes": episodes}
+    entries = [
+        {
+            "benchmark": BENCHMARK,
+            **({"subname": f"{count}-episodes"} if len(groups) > 1 else {}),
+            "episodes_per_task": count,
+            "params": params | {"families": names},
+        }
+        for count, names in groups.items()
+    ]
+    whole = {
+        "server": {"url": url, "timeout": _ANSWER_S},
+        "output_dir": output_dir,
+        "benchmarks": entries,
+    }
+    return str(yaml.safe_dump(whole, sort_keys=False)).rstrip()

@@ -1,0 +1,166 @@
+"""`vla-eval run` with this benchmark, against vla-eval's own server on the loopback interface."""
+
+import json
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support import runs, worlds
+from support.lazy import lazy
+from typer.testing import CliRunner
+
+from robomme_interference_data.cli.main import app
+from robomme_interference_data.errors import InvalidOptionError, RunError, UnknownNameError
+from robomme_interference_data.evaluate.score.rows.reading import read_rows
+
+TESTS = Path(__file__).parents[1]
+BUFFERS = str(TESTS / "golden" / "buffer_set")
+CONDITIONS = ("no-history", "k0", "k1")
+benchmark = lazy("robomme_interference_data.evaluate.vla_eval.benchmark")
+
+
+@pytest.fixture(autouse=True)
+def _world(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(worlds.BUFFER_SET, BUFFERS)
+    monkeypatch.setenv("PYTHONPATH", str(TESTS))
+
+
+@contextmanager
+def serving(name: str) -> Iterator[str]:
+    """A server of `support.vla_eval_servers`; gives its address."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "support.vla_eval_servers", name, str(port)]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as server:
+        try:
+            end = time.monotonic() + 60
+            while True:
+                try:
+                    with urllib.request.urlopen(f"http://127.0.0.1:{port}/health"):
+                        break
+                except OSError:
+                    assert time.monotonic() < end and server.poll() is None
+                    time.sleep(0.1)
+            yield f"ws://127.0.0.1:{port}"
+        finally:
+            server.kill()
+
+
+def run(folder: Path, server: str, conditions: str = "no-history,k0,k1") -> tuple[Any, Path]:
+    """What `vla-eval run` printed, and the file of its results."""
+    arguments = ["vla-eval-config", BUFFERS, "--system", "mine", "--simulator", runs.WORLD]
+    arguments += ["--families", ",".join(worlds.FAMILIES), "--conditions", conditions]
+    arguments += ["--url", server, "--output-dir", str(folder)]
+    printed = CliRunner().invoke(app, arguments)
+    assert printed.exit_code == 0, printed.output
+    folder.mkdir()
+    (folder / "config.yaml").write_text(printed.output)
+    program = Path(sys.executable).with_name("vla-eval")
+    command = [program, "run", "--no-docker", "-c", folder / "config.yaml"]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=120)
+    return done, folder / "RoboMMEInterference_aggregate.json"
+
+
+@pytest.mark.slow
+def test_its_rows_are_those_of_evaluate(tmp_path: Path) -> None:
+    policy = "python:support.shared_policies:Remembering"
+    expected = runs.untimed(runs.run(tmp_path / "own", policy=policy, conditions=CONDITIONS).rows)
+    with serving("Remembering") as server:
+        done, results = run(tmp_path / "results", server)
+    assert done.returncode == 0, done.stderr
+    tasks = json.loads(results.read_text())["tasks"]
+    rows = [episode["metrics"] for task in tasks for episode in task["episodes"]]
+    timed = {name for name in rows[0] if name not in expected[0]}
+    found = [{name: value for name, value in row.items() if name not in timed} for row in rows]
+
+    def key(row: Any) -> Any:
+        return row["family"], row["condition"]
+
+    assert sorted(found, key=key) == sorted(expected, key=key)
+    assert {(row["condition"], row["status"]) for row in found} == {
+        *(("no-history", "fail"), ("k0", "success"), ("k1", "success"))
+    }
+    # They are scored together with those of runs.
+    scored = read_rows([results])
+    assert {row._replace(video=None) for row in scored} == {*read_rows([tmp_path / "own"])}
+
+
+@pytest.mark.slow
+def test_a_server_without_memory_gets_no_history(tmp_path: Path) -> None:
+    with serving("Blind") as server:
+        done, results = run(tmp_path / "refused", server)
+        assert done.returncode != 0 and not results.exists()
+        assert "did not ask for histories" in done.stderr and "no-history" in done.stderr
+        done, results = run(tmp_path / "results", server, "no-history")
+    assert [row.status for row in read_rows([results])] == ["fail", "fail"]
+
+
+@pytest.mark.slow
+def test_what_fails_is_an_error_and_the_next_rollout_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "MoveCube-0").write_text("raise once")
+    monkeypatch.setenv(worlds.TROUBLE, str(tmp_path))
+    with serving("Refusing") as server:
+        done, results = run(tmp_path / "results", server, "no-history,k0")
+    assert done.returncode == 0, done.stderr
+    statuses = {(row.family, row.condition): row.status for row in read_rows([results])}
+    assert statuses == {
+        ("VideoRepick", "no-history"): "error",  # the server raised
+        ("VideoRepick", "k0"): "error",
+        ("MoveCube", "no-history"): "error",  # the simulator broke
+        ("MoveCube", "k0"): "success",
+    }
+    text = results.read_text()
+    assert "this goal is odd" in text and "the world fell apart" in text
+
+
+def make(**settings: Any) -> Any:
+    given = {"buffer_set": BUFFERS, "system": "mine", "simulator": runs.WORLD}
+    return benchmark.RoboMMEInterference(**given | settings)
+
+
+def test_bad_settings_are_refused() -> None:
+    with pytest.raises(InvalidOptionError, match="k0 would be no-history"):
+        make(conditions=["k0"])
+    with pytest.raises(InvalidOptionError, match="not the paper's system"):
+        make(system="perceptual-framesamp-modul")
+    with pytest.raises(UnknownNameError, match="'condition'"):
+        make(condition=["k0"])
+    with pytest.raises(UnknownNameError, match="'k5'"):
+        make(conditions=["k5"], send_video_history=True)
+
+
+def test_an_episode_beyond_the_last_and_one_that_is_cut_short() -> None:
+    played = make(conditions=["no-history"], families=["MoveCube"], episodes="0")
+    (task,) = played.get_tasks()
+    assert task["name"] == "MoveCube/no-history" and task["episode"] == "0"
+    with pytest.raises(InvalidOptionError, match="has 1 episode"):
+        played.reset({**task, "episode_idx": 1})
+    first = played.make_obs(played.reset({**task, "episode_idx": 0}), task)
+    assert sorted(first["images"]) == ["agentview"] and "video_history" not in first
+    result = played.step({"actions": first["states"]})
+    assert not result.done
+    with pytest.raises(RunError, match="before its end"):
+        played.get_step_result(result)
+    played.cleanup()  # while the rollout waits for an action
+
+
+def test_a_chunk_is_carried_out_action_by_action() -> None:
+    played = make(conditions=["no-history"], families=["MoveCube"], episodes="0")
+    (task,) = played.get_tasks()
+    observation = played.make_obs(played.reset({**task, "episode_idx": 0}), task)
+    chunk = [observation["states"]] * 25  # 16 are executed
+    results = [played.step({"actions": chunk}) for _ in range(3)]
+    assert [one.done for one in results] == [False, False, True]
+    row = played.get_step_result(results[-1])
+    assert (row["steps"], row["status"], row["success"]) == (worlds.STEPS, "fail", False)
+    played.cleanup()
