@@ -134,10 +134,10 @@ def test_only_kept_frames_of_a_lesson_are_rendered(robomme_python: Path) -> None
         for every, shown, drawn in (
             # The first picture of all, 11 kept frames, once more the live view, and a step.
             (1, [*range(10)], 14),
-            # Of ten frames of the lesson 0, 4 and 8.
-            (4, [0, 4, 8], 6),
-            # No frame but the first, and the live view after ten: it is the eleventh kept one.
-            (10, [0], 5),
+            # Of ten frames of the lesson 0, 4 and 8, the live view, and a step.
+            (4, [0, 4, 8], 5),
+            # The first frame; the live view as the eleventh, and once more; and a step.
+            (10, [0], 4),
         ):
             lesson, first, _ = simulator.reset(f"MoveCube/test/{DRAWN}", demonstration=every)
             assert lesson.images["front"][:, 0, 0, 0].tolist() == shown
@@ -149,7 +149,7 @@ def test_only_kept_frames_of_a_lesson_are_rendered(robomme_python: Path) -> None
 def test_a_demonstration_that_keeps_other_frames_is_an_error() -> None:
     environment = SimpleNamespace(elapsed_steps=[0], current_task_name="NO RECORD")
     kept = KeptFrames(environment, every=2)
-    assert kept()  # the observation of the reset
+    assert not kept()  # the observation of the reset
     drawn = []
     for step, name in enumerate(["NO RECORD", "go", "go", "NO RECORD", "go"], 1):
         environment.elapsed_steps, environment.current_task_name = [step], name

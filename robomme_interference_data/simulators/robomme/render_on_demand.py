@@ -29,9 +29,8 @@ class KeptFrames:
     def __call__(self) -> bool:
         """Count the frame if RoboMME keeps it; return whether to render it."""
         step = int(self._env.elapsed_steps[0])
-        if step == 0:  # the observation of the reset is no frame
-            return True
-        if getattr(self._env, "current_task_name", None) == "NO RECORD":
+        # At step 0, in a reset, there is an observation that is no frame.
+        if step == 0 or getattr(self._env, "current_task_name", None) == "NO RECORD":
             return False
         self._steps.append(step)
         return (len(self._steps) - 1) % self._every == 0
@@ -47,6 +46,9 @@ class RenderOnDemand:
 
     Where `keep` returns False, it renders none of them; where `needs_front` returns True, it
     renders the front camera in any case.
+
+    One renderer is kept from the first picture on: while none exists, SAPIEN forgets the lighting
+    table that it computes with the first one, which takes most of a reset without a GPU.
     """
 
     def __init__(self) -> None:
@@ -56,6 +58,7 @@ class RenderOnDemand:
         self.keep: Callable[[], bool] = always
         self.needs_front: Callable[[], bool] = bool
         self._last: dict[str, Any] = {}
+        self._renderer: Any = None
         render_all = BaseEnv._get_obs_sensor_data
 
         def render(env: Any, *args: Any, **named: Any) -> dict[str, Any]:
@@ -68,15 +71,18 @@ class RenderOnDemand:
             try:
                 if env._sensors:
                     self._last |= render_all(env, *args, **named)
+                    self._keep_renderer(env)
             finally:
                 env._sensors = env.scene.sensors = sensors
             return dict(self._last)
 
         BaseEnv._get_obs_sensor_data = render
 
-    def reset(self) -> None:
-        """Forget the last images, before another environment is made."""
-        self._last = {}
+    def _keep_renderer(self, env: Any) -> None:
+        if self._renderer is None:
+            from sapien.render import RenderSystem
+
+            self._renderer = RenderSystem(env._render_device)
 
     def images(self, env: Any, cameras: Iterable[str]) -> dict[str, Any]:
         """Return the current images of some cameras, `(256, 256, 3) uint8` each."""

@@ -123,8 +123,6 @@ class Episodes:
         # RoboMME would make an environment anyway, with a seed that belongs to no episode.
         if seed is None or not difficulty:
             return {"unknown": f"{family} has {builder.get_episode_num()} {split} episodes"}, {}
-        if cameras or subgoals:  # otherwise the pictures of another environment do as well
-            self._rendering.reset()
         self._env = builder.make_env_for_episode(index)
         self._cameras, self._subgoals = cameras, subgoals
         self._rendering.needs_front = self._must_locate if subgoals else bool

@@ -22,6 +22,8 @@ class Tensor:
 class BaseEnv:
     """An environment: `_shows` maps its cameras to what they show, `drawn` counts pictures."""
 
+    _render_device = "cpu"
+
     def __init__(self, sizes):
         self._sensors = dict(sizes)
         self.scene = SimpleNamespace(sensors=self._sensors)

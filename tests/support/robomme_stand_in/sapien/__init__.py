@@ -1,0 +1,1 @@
+"""The part of SAPIEN that is kept between episodes."""
