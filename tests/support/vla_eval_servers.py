@@ -1,12 +1,25 @@
-"""Servers of vla-eval for tests: `python -m support.vla_eval_servers NAME PORT`."""
+"""Servers of vla-eval for tests, in a thread or by `python -m support.vla_eval_servers NAME PORT`.
 
+All of them are served by vla-eval itself.
+"""
+
+import asyncio
+import os
+import socket
 import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from vla_eval.model_servers.predict import PredictModelServer
-from vla_eval.model_servers.serve import serve
+from vla_eval.model_servers.serve import serve, serve_async
 from vla_eval.specs import IMAGE_RGB, RAW
+
+NOTES = "VLA_EVAL_NOTES"
+"""Environment variable: a folder for files that servers write."""
 
 
 class Blind(PredictModelServer):
@@ -55,6 +68,101 @@ class Refusing(Remembering):
         if "VideoRepick" in obs["task_description"]:
             raise RuntimeError("this goal is odd")
         return super().predict(obs, ctx)
+
+
+class Batching(Remembering):
+    """Answers several sessions at once, and counts them in the file `batches` of `NOTES`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.max_batch_size, self.max_wait_time = 2, 0.05
+
+    def predict_batch(self, obs_batch: Any, ctx_batch: Any) -> Any:
+        with Path(os.environ[NOTES], "batches").open("a") as file:
+            file.write(f"{len(obs_batch)}\n")
+        return [self.predict(*pair) for pair in zip(obs_batch, ctx_batch, strict=True)]
+
+
+class Dying(Remembering):
+    """Kills its process at its 20th observation, once: a file in `NOTES` keeps it alive then."""
+
+    def predict(self, obs: Any, ctx: Any) -> Any:
+        died = Path(os.environ[NOTES], "died")
+        if ctx.step == 20 and not died.exists():
+            died.touch()
+            os._exit(3)
+        return super().predict(obs, ctx)
+
+
+class Noting(Blind):
+    """Notes what happens, as (session, event, content), and answers what a function returns."""
+
+    def __init__(
+        self,
+        params: dict[str, Any] | None = None,
+        *,
+        answer: Callable[[Any], Any] = lambda obs: np.zeros(8),
+        actions: dict[str, Any] | None = None,
+        observations: dict[str, Any] | None = None,
+        chunk_size: int | None = None,
+    ):
+        super().__init__()
+        self.params = params or {}  # type: ignore[misc]
+        self.answer, self.chunk_size = answer, chunk_size
+        self.actions, self.observations = actions or {}, observations or {}
+        self.events = list[tuple[str, str, Any]]()
+
+    def get_action_spec(self) -> dict[str, Any]:
+        return self.actions
+
+    def get_observation_spec(self) -> dict[str, Any]:
+        return self.observations
+
+    async def on_episode_start(self, config: Any, ctx: Any) -> None:
+        self.events.append((ctx.session_id, "start", config))
+        await super().on_episode_start(config, ctx)
+
+    async def on_observation(self, obs: Any, ctx: Any) -> None:
+        self.events.append((ctx.session_id, "observation", obs))
+        await super().on_observation(obs, ctx)
+
+    async def on_episode_end(self, result: Any, ctx: Any) -> None:
+        self.events.append((ctx.session_id, "end", result))
+        await super().on_episode_end(result, ctx)
+
+    def predict(self, obs: Any, ctx: Any) -> Any:
+        return {"actions": self.answer(obs)}
+
+
+class MmeVlaModelServer(Noting):
+    """Has the name of the server that keeps one memory for all sessions."""
+
+
+def free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+@contextmanager
+def running(server: Any, port: int | None = None) -> Iterator[int]:
+    """Serve in a thread of this process; gives the port."""
+    port = port or free_port()
+    loop = asyncio.new_event_loop()
+    task = loop.create_task(serve_async(server, "127.0.0.1", port))
+
+    def run() -> None:
+        with suppress(asyncio.CancelledError):
+            loop.run_until_complete(task)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    try:
+        yield port
+    finally:
+        loop.call_soon_threadsafe(task.cancel)
+        thread.join(20)
+        loop.close()
 
 
 def pose(state: Any) -> Any:

@@ -1,0 +1,373 @@
+"""Servers of vla-eval as policies: what they get, what is executed, and what is an error."""
+
+import asyncio
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support import worlds
+from support.lazy import lazy
+from support.policy_calls import info, observation, section
+from support.policy_server import PolicyServer
+from support.runs import header, run, run_one
+
+from robomme_interference_data.errors import (
+    InvalidOptionError,
+    PolicyError,
+    PolicyServerError,
+    RunError,
+)
+from robomme_interference_data.evaluate.policies.registry import make_policy
+
+servers = lazy("support.vla_eval_servers")
+specs = lazy("vla_eval.specs")
+
+NAMED = ("checkpoint=mine/1",)
+ALL = {"send_wrist_image": True, "send_state": True, "send_video_history": True}
+
+
+@contextmanager
+def connected(server: Any, *options: str) -> Iterator[Any]:
+    """A policy that asks a server in a thread."""
+    with servers.running(server) as port, closing(made(port, *options)) as policy:
+        yield policy
+
+
+def made(port: int, *options: str) -> Any:
+    return make_policy(f"vla-eval:ws://127.0.0.1:{port}", (*NAMED, "connect_s=20", *options))
+
+
+def play(policy: Any, history: int = 0, live: int = 1) -> list[Any]:
+    """A rollout: the history in chunks of two frames, then live observations; the actions."""
+    policy.reset(info(history))
+    for start in range(0, history, 2):
+        frames, states = section(start, min(start + 2, history))
+        policy.add_history(frames, states, history)
+        for array in (*frames.values(), states):
+            array[:] = 0  # callers reuse their arrays
+    return [policy.act(observation(history + one), "pick") for one in range(live)]
+
+
+def expect(got: Any, **expected: Any) -> None:
+    """Compare an observation of a server with what is expected, arrays exactly."""
+    assert got.keys() == expected.keys()
+    for name, value in expected.items():
+        np.testing.assert_equal(got[name], value, name)
+
+
+# --- what a server gets ------------------------------------------------------------------------
+
+
+def test_a_server_that_asks_for_everything() -> None:
+    server = servers.Noting(ALL, answer=lambda obs: obs["states"])
+    with connected(server) as policy:
+        assert policy.cameras == policy.history_cameras == ("front", "wrist")
+        assert policy.wants_history and not policy.every_frame and not policy.one_memory
+        first, second = play(policy, history=5, live=2)
+        np.testing.assert_array_equal(first, np.full((1, 8), 5))
+        np.testing.assert_array_equal(second, np.full((1, 8), 6))
+        play(policy)
+    frames, states = section(0, 7)
+
+    def live(index: int) -> dict[str, Any]:
+        images = {"agentview": frames["front"][index], "wrist": observation(index).images["wrist"]}
+        return {"images": images, "task_description": "pick", "states": states[index]}
+
+    (one, event, start), *rest = server.events
+    assert (event, start) == ("start", {"task": {"name": "pick", "seed": 3}})
+    expect(
+        rest[0][2],
+        **live(5),
+        episode_restart=True,
+        video_history=list(frames["front"][:5]),
+        wrist_video_history=[
+            *section(0, 2)[0]["wrist"],
+            *section(2, 4)[0]["wrist"],
+            *section(4, 5)[0]["wrist"],
+        ],
+        state_history=states[:5],
+    )
+    expect(rest[1][2], **live(6))
+    expect(rest[4][2], **live(0), episode_restart=True)  # without history no key
+    assert [name for _, name, _ in server.events] == [
+        *("start", "observation", "observation", "end"),
+        *("start", "observation", "end"),
+    ]
+    assert {session for session, _, _ in server.events} == {one}
+
+
+@pytest.mark.parametrize(
+    ("params", "spec", "cameras", "state", "history"),
+    [
+        ({}, {}, ("front",), False, False),
+        ({"send_state": True, "send_wrist_image": False}, {}, ("front",), True, False),
+        ({}, {"image": "IMAGE_RGB", "language": "LANGUAGE"}, ("front",), False, False),
+        ({}, {"wrist": "IMAGE_RGB", "state": "RAW"}, ("front", "wrist"), True, False),
+        ({"send_state": False}, {"wrist_image": "IMAGE_RGB", "state": "RAW"}, None, False, False),
+        ({}, {"video_history": "IMAGE_RGB"}, ("front",), False, True),
+    ],
+)
+def test_a_server_gets_what_it_asks_for(
+    params: Any, spec: Any, cameras: Any, state: bool, history: bool
+) -> None:
+    declared = {name: getattr(specs, constant) for name, constant in spec.items()}
+    server = servers.Noting(params, observations=declared)
+    cameras = cameras or ("front", "wrist")
+    with connected(server) as policy:
+        assert (policy.cameras, policy.wants_history) == (cameras, history)
+        assert policy.history_cameras == (cameras if history else ())
+        play(policy)
+    got = server.events[1][2]
+    assert len(got["images"]) == len(cameras) and ("states" in got) is state
+
+
+# --- what is executed --------------------------------------------------------------------------
+
+
+def test_a_chunk_is_given_action_by_action_or_whole() -> None:
+    def chunk(obs: Any) -> Any:
+        asked.append(obs)
+        return np.arange(20.0)[:, None].repeat(8, 1)
+
+    asked: list[Any] = []
+    with connected(servers.Noting(answer=chunk, chunk_size=3)) as policy:
+        actions = play(policy, live=7)
+        assert [one.tolist() for one in actions] == [[[n] * 8] for n in (0, 1, 2, 0, 1, 2, 0)]
+        assert len(asked) == 3
+    with connected(servers.Noting(answer=chunk)) as policy:
+        (actions,) = play(policy)
+        assert actions.shape == (20, 8)  # a rollout executes 16 of them
+
+
+# --- what does not fit -------------------------------------------------------------------------
+
+
+def dims(size: int, form: str) -> Any:
+    return specs.DimSpec("part", size, form)
+
+
+@pytest.mark.parametrize(
+    ("kind", "parts", "words"),
+    [
+        ("actions", {"position": (3, "delta_xyz")}, r"position \(3 values, delta_xyz\); expected"),
+        ("actions", {"actions": (7, "raw")}, r"actions \(7 values, raw\); expected 8 values"),
+        ("actions", {"joints": (7, "joint_delta_pos")}, "joints .*joint_delta_pos.* expected 7"),
+        ("actions", {"joints": (7, "joint_positions")}, "7 action values; expected 8"),
+        (
+            "actions",
+            {"joints": (7, "joint_positions"), "gripper": (1, "binary_close_positive")},
+            "gripper .*binary_close_positive.*expected 1 values, binary_close_negative",
+        ),
+        ("observations", {"state": (9, "raw")}, r"state \(9 values, raw\); expected 8 values"),
+        ("observations", {"state": (8, "eef_pos3_quat4_gripper1")}, "state .*eef_pos3"),
+        ("observations", {"head": (0, "rgb_hwc_uint8")}, "observation head .*expected image, "),
+        ("params", {"send_subgoal": True}, "asks for send_subgoal, which is not sent"),
+    ],
+)
+def test_a_server_that_does_not_fit_is_an_error(kind: str, parts: Any, words: str) -> None:
+    if kind != "params":
+        parts = {name: dims(*part) for name, part in parts.items()}
+    match = f"Noting.* does not fit.*{words}"
+    with (
+        servers.running(servers.Noting(**{kind: parts})) as port,
+        pytest.raises(PolicyServerError, match=match),
+    ):
+        made(port)
+
+
+def test_servers_that_fit() -> None:
+    for parts in ({"actions": (0, "raw")}, {"joints": (7, "joint_positions"), "gripper": None}):
+        actions = {
+            name: dims(*part) if part else specs.GRIPPER_CLOSE_NEG for name, part in parts.items()
+        }
+        state = {"state": specs.STATE_JOINT, "agentview": specs.IMAGE_RGB}
+        params = {"send_subgoal": False, "absolute_action": True}
+        with connected(servers.Noting(params, actions=actions, observations=state)) as policy:
+            play(policy)
+
+
+# --- errors ------------------------------------------------------------------------------------
+
+
+def test_an_error_ends_a_rollout_and_the_next_one_has_a_new_session() -> None:
+    def broken(obs: Any) -> Any:
+        if len(server.events) < 4:
+            raise KeyError("no such layer")
+        return np.zeros(8)
+
+    server = servers.Noting(answer=broken)
+    with connected(server) as policy:
+        with pytest.raises(
+            PolicyServerError, match="observation_failed: KeyError: 'no such layer'"
+        ):
+            play(policy)
+        with pytest.raises(PolicyServerError, match="was lost"):
+            policy.act(observation(1), "pick")
+        play(policy)
+    assert len({session for session, _, _ in server.events}) == 2
+
+
+def test_an_error_at_the_start_of_an_episode() -> None:
+    class Full(servers.Noting):  # type: ignore[misc, name-defined]
+        async def on_episode_start(self, config: Any, ctx: Any) -> None:
+            raise MemoryError("full")
+
+    match = "episode_start_failed: MemoryError: full"
+    with connected(Full()) as policy, pytest.raises(PolicyServerError, match=match):
+        play(policy)
+
+
+def test_a_session_that_drops_in_an_episode_is_an_error() -> None:
+    from websockets.exceptions import ConnectionClosedOK
+
+    def drop(obs: Any) -> Any:
+        if len(server.events) == 3:
+            raise ConnectionClosedOK(None, None)  # vla-eval closes the session
+        return np.zeros(8)
+
+    server = servers.Noting(answer=drop)
+    with connected(server) as policy:
+        with pytest.raises(PolicyServerError, match="closed the connection"):
+            play(policy, live=2)
+        play(policy, live=2)
+    names = [name for _, name, _ in server.events]
+    assert names == ["start", "observation", "observation", "end"] * 2
+
+
+def test_a_server_that_is_started_again_must_be_the_same() -> None:
+    with servers.running(servers.Noting(ALL)) as port:
+        policy = made(port)
+        play(policy)
+    with servers.running(servers.Noting(ALL), port):
+        play(policy)
+    with servers.running(servers.Noting(), port):
+        with pytest.raises(PolicyServerError, match="it began with"):
+            play(policy)
+        policy.close()
+
+
+class Twice:
+    """Answers each observation twice."""
+
+    async def on_observation(self, obs: Any, ctx: Any) -> None:
+        for _ in range(2):
+            await ctx.send_action({"actions": np.zeros(8)})
+
+
+class Silent:
+    """Never answers."""
+
+    async def on_observation(self, obs: Any, ctx: Any) -> None:
+        await asyncio.sleep(0)
+
+
+class Empty:
+    """Answers without actions."""
+
+    def predict(self, obs: Any, ctx: Any) -> Any:
+        return {"joints": np.zeros(8)}
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (Twice, r"sends action 3; expected action 4"),
+        (Silent, r"did not answer within 0\.3 s"),
+        (Empty, "answers without actions: joints"),
+    ],
+)
+def test_answers_that_do_not_fit(fault: type, words: str) -> None:
+    server = type("Odd", (fault, servers.Noting), {})()
+    with (
+        connected(server, "response_s=0.3") as policy,
+        pytest.raises(PolicyServerError, match=words),
+    ):
+        play(policy, live=2)
+
+
+def test_another_version_of_the_protocol(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vla_eval.protocol.messages.PROTOCOL_VERSION", 2)
+    match = "version 2 of vla-eval.*expected version 1"
+    with servers.running(servers.Noting()) as port, pytest.raises(PolicyServerError, match=match):
+        made(port)
+
+
+def test_a_server_of_another_kind(server: PolicyServer) -> None:
+    with pytest.raises(PolicyServerError, match="is no server of vla-eval: .*missing"):
+        made(server.port)
+
+
+# --- in a run ----------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("world")
+def test_a_run_resumes_with_the_same_checkpoint_only(tmp_path: Path) -> None:
+    with servers.running(servers.Remembering()) as port:
+        settings: dict[str, Any] = {"policy": f"vla-eval:ws://127.0.0.1:{port}"}
+        result = run(tmp_path / "run", policy_options=NAMED, **settings)
+        assert {(row.condition, row.status) for row in result.rows} == {
+            *(("no-history", "fail"), ("k0", "success"))
+        }
+        identity = header(tmp_path / "run")["identity"]
+        assert (identity["policy"], identity["policy_options"]) == (
+            *("vla-eval", {"checkpoint": "mine/1"}),
+        )
+        (start,) = header(tmp_path / "run")["starts"]
+        assert start["policy"]["server"] == f"127.0.0.1:{port}"
+        assert start["versions"]["vla-eval"]
+        assert run(tmp_path / "run", policy_options=NAMED, **settings).rows == result.rows
+        with pytest.raises(RunError, match="checkpoint is 'mine/1' there, 'other' here"):
+            run(tmp_path / "run", policy_options=("checkpoint=other",), **settings)
+        for changes, words in (
+            ({"policy_options": ()}, "'checkpoint'"),
+            ({"policy_options": ("checkpoint= ",)}, "expected its name"),
+            ({"policy_options": NAMED, "system": None}, "need a name"),
+            ({"policy_options": NAMED, "system": "perceptual-framesamp-modul"}, "paper's system"),
+            ({"policy_options": NAMED, "subgoals": "oracle"}, "reads no subgoals"),
+            ({"policy_options": NAMED, "serve": "serve {port}"}, "no server to start"),
+            ({"policy_options": NAMED, "workers": 2, "policies": 1}, "cannot be shared"),
+        ):
+            with pytest.raises(InvalidOptionError, match=words):
+                run(tmp_path / "other", **settings, **changes)
+
+
+@pytest.mark.usefixtures("world")
+def test_a_server_without_memory_runs_without_history_only(tmp_path: Path) -> None:
+    with servers.running(servers.Blind()) as port:
+        settings = {"policy": f"vla-eval:ws://127.0.0.1:{port}", "policy_options": NAMED}
+        with pytest.raises(InvalidOptionError, match="takes no history, so k0 has no effect"):
+            run(tmp_path / "run", **settings)
+        (row,) = run_one(tmp_path / "run", **settings).rows
+        assert (row.status, row.steps) == ("fail", worlds.STEPS)
+
+
+@pytest.mark.usefixtures("world")
+def test_an_error_of_the_server_is_an_error_row(tmp_path: Path) -> None:
+    def answer(obs: Any) -> Any:
+        return np.zeros(7 if "VideoRepick" in obs["task_description"] else 8)
+
+    with servers.running(servers.Noting(answer=answer)) as port:
+        result = run(
+            tmp_path / "run",
+            policy=f"vla-eval:ws://127.0.0.1:{port}",
+            policy_options=NAMED,
+            conditions=("no-history",),
+        )
+    (wrong,) = [row for row in result.rows if row.status == "error"]
+    assert wrong.family == "VideoRepick" and "got float32 (1, 7)" in str(wrong.error)
+    assert PolicyError.__name__ in str(wrong.error)
+
+
+@pytest.mark.usefixtures("world")
+def test_a_server_with_one_memory_has_one_worker(tmp_path: Path) -> None:
+    settings: dict[str, Any] = {"policy_options": NAMED, "conditions": ("no-history",)}
+    for params, shared in ((ALL, False), ({}, True)):
+        with servers.running(servers.MmeVlaModelServer(params)) as port:
+            settings["policy"] = f"vla-eval:ws://127.0.0.1:{port}"
+            if not shared:
+                with pytest.raises(InvalidOptionError, match="2 workers need 2 policy servers"):
+                    run(tmp_path / "run", workers=2, **settings)
+            assert run(tmp_path / f"{shared}", workers=1 + shared, **settings).counts["fail"] == 2
