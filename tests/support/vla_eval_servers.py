@@ -6,8 +6,11 @@ All of them are served by vla-eval itself.
 import asyncio
 import os
 import socket
+import subprocess
 import sys
 import threading
+import time
+import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -163,6 +166,26 @@ def running(server: Any, port: int | None = None) -> Iterator[int]:
         loop.call_soon_threadsafe(task.cancel)
         thread.join(20)
         loop.close()
+
+
+@contextmanager
+def serving(name: str, port: int | None = None) -> Iterator[str]:
+    """A server of this file in a process of its own; gives its address."""
+    port = port or free_port()
+    command = [sys.executable, "-m", "support.vla_eval_servers", name, str(port)]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as server:
+        try:
+            end = time.monotonic() + 60
+            while True:
+                try:
+                    with urllib.request.urlopen(f"http://127.0.0.1:{port}/health"):
+                        break
+                except OSError:
+                    assert time.monotonic() < end and server.poll() is None
+                    time.sleep(0.1)
+            yield f"ws://127.0.0.1:{port}"
+        finally:
+            server.kill()
 
 
 def pose(state: Any) -> Any:
