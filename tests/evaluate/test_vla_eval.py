@@ -138,6 +138,21 @@ def test_a_chunk_is_given_action_by_action_or_whole() -> None:
         assert actions.shape == (20, 8)  # a rollout executes 16 of them
 
 
+def test_the_faults_of_its_mme_vla_server() -> None:
+    """docs/how-to/vla-eval.md lists them: it is true as long as this passes."""
+    server = servers.MmeVlaModelServer()
+    with servers.running(server) as port, closing(made(port)) as one, closing(made(port)) as other:
+        play(one, history=5, live=12)
+        play(other)
+    (_, reset), (_, added), *_ = server.calls
+    assert reset is None and added["images"].shape == (5, 1, 224, 224, 3)
+    assert not added["state"].any()  # not the states of the history
+    assert [name for name, _ in server.calls] == [
+        *("reset", "add_buffer", "infer", "infer"),  # live frames are not added
+        *("reset", "infer"),  # another session empties the memory; nothing is in it at first
+    ]
+
+
 # --- what does not fit -------------------------------------------------------------------------
 
 
@@ -364,8 +379,8 @@ def test_a_fault_of_the_server_is_an_error_row_that_is_repeated(tmp_path: Path) 
 @pytest.mark.usefixtures("world")
 def test_a_server_with_one_memory_has_one_worker(tmp_path: Path) -> None:
     settings: dict[str, Any] = {"policy_options": NAMED, "conditions": ("no-history",)}
-    for params, shared in ((ALL, False), ({}, True)):
-        with servers.running(servers.MmeVlaModelServer(params)) as port:
+    for shared in (False, True):
+        with servers.running(servers.MmeVlaModelServer(use_history=not shared)) as port:
             settings["policy"] = f"vla-eval:ws://127.0.0.1:{port}"
             if not shared:
                 with pytest.raises(InvalidOptionError, match="2 workers need 2 policy servers"):

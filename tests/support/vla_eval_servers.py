@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from vla_eval.model_servers import mme_vla
 from vla_eval.model_servers.predict import PredictModelServer
 from vla_eval.model_servers.serve import serve, serve_async
 from vla_eval.specs import IMAGE_RGB, RAW
@@ -137,8 +138,25 @@ class Noting(Blind):
         return {"actions": self.answer(obs)}
 
 
-class MmeVlaModelServer(Noting):
-    """Has the name of the server that keeps one memory for all sessions."""
+class MmeVlaModelServer(mme_vla.MmeVlaModelServer):  # type: ignore[misc]
+    """vla-eval's own server without its weights: notes what its policy gets."""
+
+    def __init__(self, use_history: bool = True):
+        PredictModelServer.__init__(self, chunk_size=10)
+        self.use_history, self.state_dim, self.image_resolution = use_history, 8, 224
+        self.image_key, self.wrist_image_key, self.state_key = "image", "wrist", "state"
+        self._state_warned, self._policy = False, self
+        self.calls = list[tuple[str, Any]]()
+
+    def reset(self) -> None:
+        self.calls.append(("reset", None))
+
+    def add_buffer(self, given: Any) -> None:
+        self.calls.append(("add_buffer", given))
+
+    def infer(self, given: Any) -> Any:
+        self.calls.append(("infer", given))
+        return {"actions": np.zeros((10, 8))}
 
 
 def free_port() -> int:
