@@ -14,8 +14,8 @@ from robomme_interference_data.evaluate.policies.connection import check_server_
 from robomme_interference_data.evaluate.policies.policy import Frames, Policy, RolloutInfo
 from robomme_interference_data.simulators.base import ACTION_SIZE, Observation
 
+from .connection import VlaEvalConnection
 from .observations import ACTIONS, CAMERAS, HISTORIES, STATE, STATE_HISTORY, make_observation
-from .session import Session
 
 _TARGETS = ACTIONS.accepts or frozenset()
 _STATES = frozenset({STATE.format, "joint_positions"})
@@ -42,7 +42,7 @@ _ASKED = ("send_wrist_image", "send_state", "send_video_history")
 """What a server may ask for."""
 
 _ONE_MEMORY = ("MmeVlaModelServer",)
-"""Servers that keep one history for all sessions."""
+"""Servers that keep one history for all connections."""
 
 
 class VlaEvalPolicy(Policy):
@@ -50,8 +50,8 @@ class VlaEvalPolicy(Policy):
 
     Its hello decides what it gets: the front camera, and if it asks for them, the wrist camera,
     states, and the history. The history goes with the first observation, as vla-eval sends it.
-    Every call raises `PolicyServerError` if the server cannot be reached, reports an error, loses
-    the session or is too slow.
+    Every call raises `PolicyServerError` if the server cannot be reached, reports an error, closes
+    the connection or is too slow.
 
     Args:
         host: Name or address of the server.
@@ -62,7 +62,7 @@ class VlaEvalPolicy(Policy):
         response_s: Maximum seconds from a message to the end of its answer.
 
     Attributes:
-        one_memory: Whether the server keeps one history for all sessions.
+        one_memory: Whether the server is known to hold one memory for all its connections.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class VlaEvalPolicy(Policy):
         response_s: float = 600.0,
     ):
         check_server_options(checkpoint, connect_s=connect_s, response_s=response_s)
-        self._server = Session(host, port, connect_s=connect_s, response_s=response_s)
+        self._server = VlaEvalConnection(host, port, connect_s=connect_s, response_s=response_s)
         self._server.open()
         self._server.close()  # the first rollout may be minutes away
         hello = self._hello = self._server.metadata or {}
@@ -90,9 +90,9 @@ class VlaEvalPolicy(Policy):
         self.one_memory = self.wants_history and hello["model_server"] in _ONE_MEMORY
 
     def reset(self, info: RolloutInfo) -> None:
-        """Start an episode, in a new session if the last one was lost."""
+        """Start an episode, connecting first, or again if the connection was lost."""
         hello = None
-        # The session may have been lost since the last rollout; no memory is lost at a reset.
+        # The connection may have broken since the last rollout; no memory is lost at a reset.
         with suppress(PolicyServerError):
             if self._server.is_open:
                 self._server.end_episode()
@@ -136,7 +136,7 @@ class VlaEvalPolicy(Policy):
         return {"policy": "vla-eval", "server": name, "server_metadata": self._hello}
 
     def close(self) -> None:
-        """Close the session, which ends the episode."""
+        """Close the connection, which ends the episode."""
         self._server.close()
 
 

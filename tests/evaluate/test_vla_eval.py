@@ -1,6 +1,7 @@
 """Servers of vla-eval as policies: what they get, what is executed, and what is an error."""
 
 import asyncio
+import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -15,7 +16,12 @@ from support.policy_server import PolicyServer
 from support.runs import header, run, run_one
 from websockets.exceptions import ConnectionClosedOK
 
-from robomme_interference_data.errors import InvalidOptionError, PolicyServerError, RunError
+from robomme_interference_data.errors import (
+    InvalidOptionError,
+    MissingExtraError,
+    PolicyServerError,
+    RunError,
+)
 from robomme_interference_data.evaluate.policies.registry import make_policy
 
 servers = lazy("support.vla_eval_servers")
@@ -149,7 +155,7 @@ def test_the_faults_of_its_mme_vla_server() -> None:
     assert not added["state"].any()  # not the states of the history
     assert [name for name, _ in server.calls] == [
         *("reset", "add_buffer", "infer", "infer"),  # live frames are not added
-        *("reset", "infer"),  # another session empties the memory; nothing is in it at first
+        *("reset", "infer"),  # another client empties the memory; nothing is in it at first
     ]
 
 
@@ -203,7 +209,7 @@ def test_servers_that_fit() -> None:
 # --- errors ------------------------------------------------------------------------------------
 
 
-def test_an_error_ends_a_rollout_and_the_next_one_has_a_new_session() -> None:
+def test_an_error_ends_a_rollout_and_the_next_one_connects_again() -> None:
     def broken(obs: Any) -> Any:
         if len(server.events) < 4:
             raise KeyError("no such layer")
@@ -231,10 +237,10 @@ def test_an_error_at_the_start_of_an_episode() -> None:
         play(policy)
 
 
-def test_a_session_that_drops_in_an_episode_is_an_error() -> None:
+def test_a_connection_that_drops_in_an_episode_is_an_error() -> None:
     def drop(obs: Any) -> Any:
         if len(server.events) == 3:
-            raise ConnectionClosedOK(None, None)  # vla-eval closes the session
+            raise ConnectionClosedOK(None, None)  # vla-eval closes the connection
         return np.zeros(8)
 
     server = servers.Noting(answer=drop)
@@ -307,6 +313,16 @@ def test_another_version_of_the_protocol(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_a_server_of_another_kind(server: PolicyServer) -> None:
     with pytest.raises(PolicyServerError, match="is no server of vla-eval: .*missing"):
         made(server.port)
+
+
+def test_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    package = "robomme_interference_data.evaluate.vla_eval"
+    for name in [one for one in sys.modules if one.startswith((package, "vla_eval"))]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "vla_eval", None)
+    with pytest.raises(MissingExtraError, match="needs vla_eval") as raised:
+        made(1)
+    assert "robomme-interference-data[vla-eval]" in str(raised.value.hint)
 
 
 # --- in a run ----------------------------------------------------------------------------------
