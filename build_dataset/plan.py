@@ -157,6 +157,7 @@ def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
     make_executor(config)  # checks its settings
     numbers = None if config.episodes is None else parse_numbers(config.episodes)
     columns = _columns(config.columns)
+    unit = Unit(config.unit_frames, config.unit_stride)
     sources = tuple(
         open_source(
             text,
@@ -164,6 +165,7 @@ def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
             columns=columns,
             families_file=config.families_file,
             robomme_python=config.robomme_python,
+            every=unit.of(kind).stride if kind in UNITS else 1,
         )
         for text in config.source
     )
@@ -182,7 +184,7 @@ def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
         codec=config.codec,
         version=config.version,
         time_limit_s=config.time_limit_s,
-        unit=Unit(config.unit_frames, config.unit_stride),
+        unit=unit,
     )
 
 

@@ -32,10 +32,11 @@ class SimulatorSource(Source):
     Args:
         name: Registered name of the simulator.
         robomme_python: RoboMME's interpreter.
+        every: Draw every n-th frame only; all others have no images.
     """
 
-    def __init__(self, name: str, robomme_python: str | None = None):
-        self.name = name
+    def __init__(self, name: str, robomme_python: str | None = None, every: int = 1):
+        self.name, self._every = name, every
         self._class = simulator_class(name)
         self.time_limit_s = self._class.episode_s
         # Another version of the suite has other episodes.
@@ -72,9 +73,12 @@ class SimulatorSource(Source):
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
         chosen = choose_cameras(cameras, self._class.cameras)
         simulator = self._open(chosen)
-        lesson, first, info = simulator.reset(str(episode.id), demonstration=bool(chosen))
-        check_drawn(lesson, first, chosen)
-        frames = _play(simulator, lesson, first, chosen)
+        # Another object with these methods may know nothing of every n-th frame.
+        every = self._every if isinstance(simulator, Simulator) else 1
+        drawn = every if chosen else 0
+        lesson, first, info = simulator.reset(str(episode.id), demonstration=drawn)
+        check_drawn(lesson, first, chosen, every)
+        frames = _play(simulator, lesson, first, chosen, every)
         known = info.goals, info.seed, info.difficulty, info.simulator
         robot = Robot(fps=self._class.fps)
         return Recording(*known, True, frames, lesson.evidence, robot=robot, scene=lesson.scene)
@@ -107,20 +111,26 @@ class ShiftedSource(SimulatorSource):
 
 
 def _play(
-    simulator: Simulator, lesson: Demonstration, first: Observation, cameras: Sequence[str]
+    simulator: Simulator,
+    lesson: Demonstration,
+    first: Observation,
+    cameras: Sequence[str],
+    every: int,
 ) -> Generator[Frame]:
     recorded = len(lesson.actions) == len(lesson)
-    for index in range(len(lesson)):
-        images = {camera: lesson.images[camera][index] for camera in cameras}
+    number, seen, status = len(lesson), first, Status.ONGOING
+    for index in range(number):
+        drawn = cameras if index % every == 0 else ()
+        images = {camera: lesson.images[camera][index // every] for camera in drawn}
         action = lesson.actions[index] if recorded else None
         yield Frame(images, lesson.states[index], action, True)
-    seen, status = first, Status.ONGOING
     while status is Status.ONGOING:
-        images = {camera: seen.images[camera] for camera in cameras}
+        images = {camera: seen.images[camera] for camera in cameras if number % every == 0}
         try:
             chosen = simulator.act("oracle")
         except SimulatorCrashError:  # no plan; a demonstration ends with this frame in any case
             yield Frame(images, seen.state, None, False)
             raise
         yield Frame(images, seen.state, chosen, False)
-        seen, status = simulator.step(chosen)
+        number += 1
+        seen, status = simulator.step(chosen, observe=number % every == 0)

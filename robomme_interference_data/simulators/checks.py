@@ -44,15 +44,18 @@ def check_begun(simulator: Simulator, begun: Any) -> None:
         _refuse(simulator, wrong)
 
 
-def check_drawn(lesson: Demonstration, first: Observation, cameras: Iterable[str]) -> None:
-    """Check that a simulator drew these cameras; of the lesson all frames, or none at all."""
+def check_drawn(
+    lesson: Demonstration, first: Observation, cameras: Iterable[str], every: int = 1
+) -> None:
+    """Check that a simulator drew these cameras; every n-th frame of the lesson, or none at all."""
+    expected = len(range(0, len(lesson), every))
     for camera in cameras:
-        frames = len(lesson.images.get(camera, ())) if lesson.images else len(lesson)
-        if camera not in first.images or frames != len(lesson):
+        frames = len(lesson.images.get(camera, ())) if lesson.images else expected
+        if camera not in first.images or frames != expected:
             drawn = ", ".join(first.images) or "no camera"
             raise SimulatorError(
                 f"the simulator was to draw {camera}; it drew {drawn}, and {frames} of "
-                f"{len(lesson)} frames of the lesson",
+                f"{expected} frames of the lesson",
                 "Draw the cameras of the setting `cameras`, and all that are declared without it.",
             )
 

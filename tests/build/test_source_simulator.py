@@ -63,6 +63,17 @@ def test_an_episode_of_the_tabletop(made: list[Double]) -> None:
     assert made[0].executed == 3  # cut without a step
 
 
+def test_only_every_third_frame_is_drawn(made: list[Double]) -> None:
+    frames = list(read(open_source("tabletop", every=3)).frames)
+    whole = list(read(open_source("tabletop")).frames)
+    assert [sorted(frame.images) for frame in frames] == [
+        ["front", "wrist"] if number % 3 == 0 else [] for number in range(8)
+    ]
+    for one, other in zip(frames, whole, strict=True):
+        assert (one.state == other.state).all() and one.is_demonstration == other.is_demonstration
+        assert all((one.images[name] == other.images[name]).all() for name in one.images)
+
+
 def test_robomme_provides_demonstrations_without_actions(made: list[Double]) -> None:
     source = open_source("robomme", robomme_python="/opt/python")
     assert source.provenance == {"kind": "robomme"}

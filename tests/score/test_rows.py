@@ -346,7 +346,7 @@ def test_files_that_cannot_be_read(tmp_path: Path, capfd: pytest.CaptureFixture[
         "a.jsonl": (record.replace(b'"episode"', b"episode", 1), "cannot be read"),
         "b.jsonl": (record + b"[1]\n", "cannot be read"),
         "c.jsonl": (record + b"[" * 100_000 + b"\n", "cannot be read"),
-        "rows.txt": (b"", "not a .parquet or .csv or .jsonl file"),
+        "rows.txt": (b"", "rows.txt is not a"),
     }
     for name, (data, message) in damaged.items():
         (tmp_path / name).write_bytes(data)

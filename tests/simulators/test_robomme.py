@@ -1,6 +1,7 @@
 """The official simulator, with a stand-in for RoboMME in a separate environment."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree
 
@@ -16,6 +17,7 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators import Status
+from robomme_interference_data.simulators.robomme.render_on_demand import KeptFrames
 from robomme_interference_data.simulators.robomme.simulator import EPISODES, RoboMMESimulator
 
 HOLD = np.array([0, 0, 0, -1.5, 0, 1.5, 0.75, 1], np.float32)
@@ -102,8 +104,9 @@ def test_it_provides_robommes_subgoals(simulator: RoboMMESimulator) -> None:
         # The first picture of each camera, the first live view, one of the two steps.
         (["front", "wrist"], False, [3, 3]),
         ([], False, [1, 1]),
-        # All of the demonstration, 11 frames, and both steps; and once more the first live view.
-        (["front"], True, [14, 1]),
+        # All of the demonstration, 11 frames that are kept and 11 that are dropped, and both steps;
+        # and once more the first live view.
+        (["front"], True, [25, 1]),
     ],
 )
 def test_only_requested_cameras_are_rendered(
@@ -126,6 +129,39 @@ def test_only_requested_cameras_are_rendered(
             assert simulator.subgoal().points == ((2, 200),)
 
 
+def test_only_kept_frames_of_a_lesson_are_rendered(robomme_python: Path) -> None:
+    with RoboMMESimulator(robomme_python, cameras=["front"], subgoals=False) as simulator:
+        for every, shown, drawn in (
+            # The first picture of all, 11 kept frames, once more the live view, and a step.
+            (1, [*range(10)], 14),
+            # Of ten frames of the lesson 0, 4 and 8.
+            (4, [0, 4, 8], 6),
+            # No frame but the first, and the live view after ten: it is the eleventh kept one.
+            (10, [0], 5),
+        ):
+            lesson, first, _ = simulator.reset(f"MoveCube/test/{DRAWN}", demonstration=every)
+            assert lesson.images["front"][:, 0, 0, 0].tolist() == shown
+            assert (first.images["front"] == 10).all() and len(lesson.states) == 10
+            seen, _ = simulator.step(HOLD)
+            assert seen.state[0] == drawn
+
+
+def test_a_demonstration_that_keeps_other_frames_is_an_error() -> None:
+    environment = SimpleNamespace(elapsed_steps=[0], current_task_name="NO RECORD")
+    kept = KeptFrames(environment, every=2)
+    assert kept()  # the observation of the reset
+    drawn = []
+    for step, name in enumerate(["NO RECORD", "go", "go", "NO RECORD", "go"], 1):
+        environment.elapsed_steps, environment.current_task_name = [step], name
+        drawn.append(kept())
+    assert drawn == [False, True, False, False, True]
+    kept.check([2, 3])
+    kept.check([2, 3, 5])
+    for others in ([2, 5], [1, 2, 3], [2, 3, 5, 6]):
+        with pytest.raises(RuntimeError, match="kept other frames"):
+            kept.check(others)
+
+
 def test_the_front_camera_is_drawn_until_a_subgoal_is_located(robomme_python: Path) -> None:
     with RoboMMESimulator(robomme_python, cameras=[]) as simulator:
         simulator.reset(f"VideoRepick/test/{DRAWN}", demonstration=False)
@@ -133,8 +169,8 @@ def test_the_front_camera_is_drawn_until_a_subgoal_is_located(robomme_python: Pa
         for _ in range(3):
             seen, _ = simulator.step(HOLD)
             points.append(simulator.subgoal().points)
-    # Two pictures, when the first subgoal begins and when the second one does, at step 2.
-    assert seen.state[:2].tolist() == [2, 1]
+    # The first picture of all, and when each of the two subgoals begins, the second at step 2.
+    assert seen.state[:2].tolist() == [3, 1]
     assert [one for ((one, _),) in points] == [0, 0, 2, 2]
 
 

@@ -58,7 +58,10 @@ class Double(Simulator):
         if episode.index == UNKNOWN:
             raise UnknownNameError("no such episode", "Take another.")
         lesson = Demonstration(
-            {name: np.stack([image] * 5) for name, image in self._images(episode).items()},
+            {
+                name: np.stack([image] * 5)[:: every or 1]
+                for name, image in self._images(episode).items()
+            },
             np.arange(5, dtype=np.float32)[:, None].repeat(8, 1),
             np.ones((5 * self.actions, 8), np.float32),
         )

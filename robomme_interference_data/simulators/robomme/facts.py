@@ -39,8 +39,12 @@ class LessonLog:
 
         if self._error is not None:
             raise self._error
-        recorded = _demonstration(env)[4]["elapsed_steps"]
-        return [np.array(self._rows[int(number)], np.int64) for number in recorded]
+        return [np.array(self._rows[step], np.int64) for step in kept_steps(env)]
+
+
+def kept_steps(env: Any) -> list[int]:
+    """Return the steps since the reset of each recorded frame and of the first live view."""
+    return [int(number) for number in _demonstration(env)[4]["elapsed_steps"]]
 
 
 def read_facts(env: Any, family: str, pixel: Any) -> dict[str, Any]:

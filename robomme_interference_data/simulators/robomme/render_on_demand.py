@@ -11,16 +11,49 @@ CAMERAS = {"front": "base_camera", "wrist": "hand_camera"}
 """Camera to its name in RoboMME."""
 
 
+def always() -> bool:
+    """Return True."""
+    return True
+
+
+class KeptFrames:
+    """Whether to render the current frame of a demonstration: every n-th that RoboMME keeps.
+
+    RoboMME drops the frames of tasks with a certain name, which are up to three quarters of all.
+    """
+
+    def __init__(self, env: Any, every: int) -> None:
+        self._env, self._every = env, every
+        self._steps: list[int] = []
+
+    def __call__(self) -> bool:
+        """Count the frame if RoboMME keeps it; return whether to render it."""
+        step = int(self._env.elapsed_steps[0])
+        if step == 0:  # the observation of the reset is no frame
+            return True
+        if getattr(self._env, "current_task_name", None) == "NO RECORD":
+            return False
+        self._steps.append(step)
+        return (len(self._steps) - 1) % self._every == 0
+
+    def check(self, steps: list[int]) -> None:
+        """Raise an error if RoboMME kept others than these frames, by their steps."""
+        if steps != self._steps[: len(steps)]:
+            raise RuntimeError("RoboMME kept other frames of its demonstration than were rendered")
+
+
 class RenderOnDemand:
     """Patches ManiSkill to render only `cameras`, given by RoboMME's names; all at first.
 
-    Where `needs_front` returns True, it also renders the front camera.
+    Where `keep` returns False, it renders none of them; where `needs_front` returns True, it
+    renders the front camera in any case.
     """
 
     def __init__(self) -> None:
         from mani_skill.envs.sapien_env import BaseEnv
 
         self.cameras: Iterable[str] = CAMERAS.values()
+        self.keep: Callable[[], bool] = always
         self.needs_front: Callable[[], bool] = bool
         self._last: dict[str, Any] = {}
         render_all = BaseEnv._get_obs_sensor_data
@@ -28,7 +61,8 @@ class RenderOnDemand:
         def render(env: Any, *args: Any, **named: Any) -> dict[str, Any]:
             sensors = env._sensors
             if sensors.keys() <= self._last.keys():  # otherwise a camera has no last image yet
-                wanted = {*self.cameras, *([CAMERAS["front"]] if self.needs_front() else [])}
+                wanted = {*self.cameras} if self.keep() else set()
+                wanted |= {CAMERAS["front"]} if self.needs_front() else set()
                 env._sensors = {name: one for name, one in sensors.items() if name in wanted}
             env.scene.sensors = env._sensors
             try:

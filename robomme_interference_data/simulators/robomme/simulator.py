@@ -176,12 +176,12 @@ class RoboMMESimulator(Simulator):
             index=episode.index,
             max_steps=MAX_STEPS,
             cameras=self._cameras,
-            demonstration=every > 0,
+            every=every,
             subgoals=self._subgoals,
         )
         self._subgoal = facts["subgoal"]
         first = self._observation(arrays, self._cameras)
-        images = {camera: arrays[camera][:-1:every] for camera in self._cameras if every}
+        images = {camera: arrays[camera][:-1] for camera in self._cameras if every}
         no_actions = np.empty((0, ACTION_SIZE), np.float32)
         evidence = self._read_facts(facts, episode.family, arrays)
         lesson = Demonstration(images, arrays["states"][:-1], no_actions, *evidence)

@@ -106,14 +106,14 @@ class Episodes:
         index: int,
         max_steps: int,
         cameras: list[str],
-        demonstration: bool,
+        every: int,
         subgoals: bool,
     ) -> Answer:
         """Play a demonstration; return the facts about the episode, its frames and its states.
 
-        The last frame and state are the first live observation; without `demonstration`, it is the
-        only frame. `scene` and `moments` are what `facts.py` reads, or `scene` is None and
-        `unreadable` says why.
+        Of the demonstration, every n-th frame is drawn, none if `every` is 0. The last frame and
+        state are the first live observation. `scene` and `moments` are what `facts.py` reads, or
+        `scene` is None and `unreadable` says why.
         """
         self.close()
         builder = _builder()(
@@ -128,9 +128,13 @@ class Episodes:
         self._env = builder.make_env_for_episode(index)
         self._cameras, self._subgoals = cameras, subgoals
         self._rendering.needs_front = self._must_locate if subgoals else bool
-        self._select_cameras(demonstration)
+        self._select_cameras(every > 0)
         log = _facts.LessonLog(self._env, family)
+        kept = _rendering.KeptFrames(self._env.unwrapped, every)
+        if every:
+            self._rendering.keep = kept
         observations, info = self._env.reset()
+        self._rendering.keep = _rendering.always
         goals = info["task_goal"]
         facts = {
             "seed": int(seed),
@@ -147,10 +151,12 @@ class Episodes:
         except Exception as error:
             traceback.print_exc()
             facts |= {"scene": None, "unreadable": _text(error)}
-        if demonstration:
-            return facts, {**arrays, **self._frames(observations)}
-        images = self._rendering.images(self._env, cameras)
-        return facts, {**arrays, **{camera: [image] for camera, image in images.items()}}
+        lesson = self._frames(observations) if every else {}
+        if lesson:
+            kept.check(_facts.kept_steps(self._env)[:-1])
+        for camera, image in self._rendering.images(self._env, cameras).items():
+            arrays[camera] = [*lesson.get(camera, [])[: -1 : every or 1], image]
+        return facts, arrays
 
     def step(self, action: list[float], observe: bool) -> Answer:
         """Execute an action; return status and subgoal, the state and, if requested, the frames."""

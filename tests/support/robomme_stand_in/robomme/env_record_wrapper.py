@@ -2,7 +2,8 @@
 
 Like the real one it returns lists, prints to stdout, in color, gives another episode at a second
 reset of the same environment, makes environments of episodes that do not exist, and lets an episode
-go on for one step more than `max_steps`.
+go on for one step more than `max_steps`. Between the frames of a demonstration that it keeps there
+are frames that it drops.
 """
 
 import os
@@ -28,6 +29,7 @@ class Environment(BaseEnv):
     def __init__(self, family, index, seed, max_steps):
         self.family, self.index, self.seed, self.max_steps = family, index, seed, max_steps
         self.resets = 0
+        self.elapsed_steps = [0]
         kind = PandaStick if family in STICKS else PandaWristCam
         self.description = ElementTree.parse(kind.urdf_path).getroot()
         arm = kind([link.get("name") for link in self.description.iter("link")])
@@ -67,19 +69,22 @@ class Environment(BaseEnv):
             for t in frames:
                 self.spawned_bins[0].pose.p[0][0] = 10 if t < 2 else 0
                 self.current_task_index = int(t == frames[-1])
-                self.step([0.0] * 8)
-            self.steps = 0
-        return self._lists(frames, joints, [t / 100 for t in frames]), self._info("ongoing")
+                self.elapsed_steps[0] = 2 * (t - shift) + 1
+                self.step(None)
+        steps = [2 * number + 1 for number in range(len(frames))]
+        self.demonstration_data = (None, None, None, None, {"elapsed_steps": steps})
+        lists = self._lists(frames, joints, [t / 100 for t in frames], steps)
+        return lists, self._info("ongoing")
 
     def step(self, action):
+        if action is None:
+            return None
         print("step")
         if self.index == 41:
             time.sleep(60)
         self.steps += 1
         if self.family == "VideoRepick" and self.steps == 2:
             self.current_subgoal_segment = "put the cube at <place>"
-        if hasattr(self, "elapsed_steps"):
-            self.elapsed_steps[0] += 1
         if self.index == 43 and self.steps == 2:
             info = {"status": "error", "error_message": "caught: no such joint"}
             return None, 0.0, True, False, info
@@ -100,7 +105,7 @@ class Environment(BaseEnv):
 
     def _hide_a_cube(self):
         """Hide a cube under container 1 of 3; the last task is what the rollout has to do."""
-        self.elapsed_steps, self.current_task_index = [0], 0
+        self.current_task_index = 0
         self.spawned_bins = [Thing(number) for number in range(3)]
         self.selected_bins, self.color_names = [self.spawned_bins[1]], ["red", "green"]
         names = ("static", "pick up the container that hides the red cube")
@@ -112,16 +117,21 @@ class Environment(BaseEnv):
         sensor = Sensor(256)
         sensor.get_params = lambda: {"intrinsic_cv": intrinsic, "extrinsic_cv": extrinsic}
         self._sensors["base_camera"] = sensor
-        shown = range(1, self.index % 40 + 3 + 1)
-        self.demonstration_data = (None, None, None, None, {"elapsed_steps": [*shown]})
 
     def close(self):
         open_environments.remove(self)
 
-    def _lists(self, frames, joints, grippers):
+    def _lists(self, frames, joints, grippers, steps=()):
         stick = self.family in STICKS
         seen = []
-        for t in frames:
+        for number, t in enumerate(frames):
+            if steps:
+                self.elapsed_steps[0] = steps[number] - 1
+                self.current_task_name = "NO RECORD"
+                self._shows = {"base_camera": 255, "hand_camera": 255}
+                self._get_obs_sensor_data()
+                self.elapsed_steps[0] = steps[number]
+                self.current_task_name = "do it"
             self._shows = {"base_camera": t, "hand_camera": 100 + t % 100}
             seen.append(self._get_obs_sensor_data())
             self._locate(int(seen[-1]["base_camera"]["rgb"].numpy().flat[0]))
