@@ -57,7 +57,7 @@ def describe_policy(
                 every.append(policy_metadata(text, policies[-1]))
     policy, metadata = policies[0], dict(every[0])
     if server_addresses(text):
-        # Which kind of server this is, only a server of vla-eval itself reports.
+        # Of a vla-eval server this is known only after its hello.
         if getattr(policy, "one_memory", False):
             check_workers(text, workers)
         check_metadata(every, policy_options(text, options)["checkpoint"])

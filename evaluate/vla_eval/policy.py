@@ -141,10 +141,10 @@ class VlaEvalPolicy(Policy):
 
 
 def _encoded(image: NDArray[np.uint8]) -> dict[str, Any]:
-    """Return a copy of an image for messages, as its pixels: PNG, their default, takes longer.
+    """Return a copy of an image for messages, as raw pixels: PNG, their default, is slower.
 
-    410 history frames of two cameras are 161 MB of pixels, of which a server on the same machine
-    makes its first answer 1.4 s later; they are 4 MB of PNG, which takes 9 s to compress.
+    410 history frames of two cameras are 161 MB of pixels, and a server on the same machine has
+    answered after 1.4 s. As PNG they are 4 MB, but take 9 s to compress.
     """
     return encode_image(image, "raw")
 

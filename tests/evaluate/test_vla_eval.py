@@ -1,9 +1,6 @@
-"""Servers of vla-eval as policies: what they get, what is executed, and what is an error."""
+"""Servers of vla-eval as policies: what they get, what is executed, and their runs."""
 
-import asyncio
-import sys
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -11,46 +8,16 @@ import numpy as np
 import pytest
 from support import worlds
 from support.lazy import lazy
-from support.policy_calls import info, observation, section
-from support.policy_server import PolicyServer
+from support.policy_calls import observation, section
 from support.runs import header, run, run_one
 from websockets.exceptions import ConnectionClosedOK
 
-from robomme_interference_data.errors import (
-    InvalidOptionError,
-    MissingExtraError,
-    PolicyServerError,
-    RunError,
-)
-from robomme_interference_data.evaluate.policies.registry import make_policy
+from robomme_interference_data.errors import InvalidOptionError, RunError
 
 servers = lazy("support.vla_eval_servers")
 specs = lazy("vla_eval.specs")
 
 NAMED = ("checkpoint=mine/1",)
-ALL = {"send_wrist_image": True, "send_state": True, "send_video_history": True}
-
-
-@contextmanager
-def connected(server: Any, *options: str) -> Iterator[Any]:
-    """A policy that asks a server in a thread."""
-    with servers.running(server) as port, closing(made(port, *options)) as policy:
-        yield policy
-
-
-def made(port: int, *options: str) -> Any:
-    return make_policy(f"vla-eval:ws://127.0.0.1:{port}", (*NAMED, "connect_s=20", *options))
-
-
-def play(policy: Any, history: int = 0, live: int = 1) -> list[Any]:
-    """A rollout: the history in chunks of two frames, then live observations; the actions."""
-    policy.reset(info(history))
-    for start in range(0, history, 2):
-        frames, states = section(start, min(start + 2, history))
-        policy.add_history(frames, states, history)
-        for array in (*frames.values(), states):
-            array[:] = 0  # callers reuse their arrays
-    return [policy.act(observation(history + one), "pick") for one in range(live)]
 
 
 def expect(got: Any, **expected: Any) -> None:
@@ -64,14 +31,14 @@ def expect(got: Any, **expected: Any) -> None:
 
 
 def test_a_server_that_asks_for_everything() -> None:
-    server = servers.Noting(ALL, answer=lambda obs: obs["states"])
-    with connected(server) as policy:
+    server = servers.Noting(servers.ALL, answer=lambda obs: obs["states"])
+    with servers.connected(server) as policy:
         assert policy.cameras == policy.history_cameras == ("front", "wrist")
         assert policy.wants_history and not policy.every_frame and not policy.one_memory
-        first, second = play(policy, history=5, live=2)
+        first, second = servers.play(policy, history=5, live=2)
         np.testing.assert_array_equal(first, np.full((1, 8), 5))
         np.testing.assert_array_equal(second, np.full((1, 8), 6))
-        play(policy)
+        servers.play(policy)
     frames, states = section(0, 7)
 
     def live(index: int) -> dict[str, Any]:
@@ -118,10 +85,10 @@ def test_a_server_gets_what_it_asks_for(
     declared = {name: getattr(specs, constant) for name, constant in spec.items()}
     server = servers.Noting(params, observations=declared)
     cameras = cameras or ("front", "wrist")
-    with connected(server) as policy:
+    with servers.connected(server) as policy:
         assert (policy.cameras, policy.wants_history) == (cameras, history)
         assert policy.history_cameras == (cameras if history else ())
-        play(policy)
+        servers.play(policy)
     got = server.events[1][2]
     assert len(got["images"]) == len(cameras) and ("states" in got) is state
 
@@ -135,21 +102,25 @@ def test_a_chunk_is_given_action_by_action_or_whole() -> None:
         return np.arange(20.0)[:, None].repeat(8, 1)
 
     asked: list[Any] = []
-    with connected(servers.Noting(answer=chunk, chunk_size=3)) as policy:
-        actions = play(policy, live=7)
+    with servers.connected(servers.Noting(answer=chunk, chunk_size=3)) as policy:
+        actions = servers.play(policy, live=7)
         assert [one.tolist() for one in actions] == [[[n] * 8] for n in (0, 1, 2, 0, 1, 2, 0)]
         assert len(asked) == 3
-    with connected(servers.Noting(answer=chunk)) as policy:
-        (actions,) = play(policy)
+    with servers.connected(servers.Noting(answer=chunk)) as policy:
+        (actions,) = servers.play(policy)
         assert actions.shape == (20, 8)  # a rollout executes 16 of them
 
 
 def test_the_faults_of_its_mme_vla_server() -> None:
     """docs/how-to/vla-eval.md lists them: it is true as long as this passes."""
     server = servers.MmeVlaModelServer()
-    with servers.running(server) as port, closing(made(port)) as one, closing(made(port)) as other:
-        play(one, history=5, live=12)
-        play(other)
+    with (
+        servers.running(server) as port,
+        closing(servers.made(port)) as one,
+        closing(servers.made(port)) as other,
+    ):
+        servers.play(one, history=5, live=12)
+        servers.play(other)
     (_, reset), (_, added), *_ = server.calls
     assert reset is None and added["images"].shape == (5, 1, 224, 224, 3)
     assert not added["state"].any()  # not the states of the history
@@ -157,172 +128,6 @@ def test_the_faults_of_its_mme_vla_server() -> None:
         *("reset", "add_buffer", "infer", "infer"),  # live frames are not added
         *("reset", "infer"),  # another client empties the memory; nothing is in it at first
     ]
-
-
-# --- what does not fit -------------------------------------------------------------------------
-
-
-def dims(size: int, form: str) -> Any:
-    return specs.DimSpec("part", size, form)
-
-
-@pytest.mark.parametrize(
-    ("kind", "parts", "words"),
-    [
-        ("actions", {"position": (3, "delta_xyz")}, r"position \(3 values, delta_xyz\); expected"),
-        ("actions", {"actions": (7, "raw")}, r"actions \(7 values, raw\); expected 8 values"),
-        ("actions", {"joints": (7, "joint_delta_pos")}, "joints .*joint_delta_pos.* expected 7"),
-        ("actions", {"joints": (7, "joint_positions")}, "7 action values; expected 8"),
-        (
-            "actions",
-            {"joints": (7, "joint_positions"), "gripper": (1, "binary_close_positive")},
-            "gripper .*binary_close_positive.*expected 1 values, binary_close_negative",
-        ),
-        ("observations", {"state": (9, "raw")}, r"state \(9 values, raw\); expected 8 values"),
-        ("observations", {"state": (8, "eef_pos3_quat4_gripper1")}, "state .*eef_pos3"),
-        ("observations", {"head": (0, "rgb_hwc_uint8")}, "observation head .*expected image, "),
-        ("params", {"send_subgoal": True}, "asks for send_subgoal, which is not sent"),
-    ],
-)
-def test_a_server_that_does_not_fit_is_an_error(kind: str, parts: Any, words: str) -> None:
-    if kind != "params":
-        parts = {name: dims(*part) for name, part in parts.items()}
-    match = f"Noting.* does not fit.*{words}"
-    with (
-        servers.running(servers.Noting(**{kind: parts})) as port,
-        pytest.raises(PolicyServerError, match=match),
-    ):
-        made(port)
-
-
-def test_servers_that_fit() -> None:
-    for parts in ({"actions": (0, "raw")}, {"joints": (7, "joint_positions"), "gripper": None}):
-        actions = {
-            name: dims(*part) if part else specs.GRIPPER_CLOSE_NEG for name, part in parts.items()
-        }
-        state = {"state": specs.STATE_JOINT, "agentview": specs.IMAGE_RGB}
-        params = {"send_subgoal": False, "absolute_action": True}
-        with connected(servers.Noting(params, actions=actions, observations=state)) as policy:
-            play(policy)
-
-
-# --- errors ------------------------------------------------------------------------------------
-
-
-def test_an_error_ends_a_rollout_and_the_next_one_connects_again() -> None:
-    def broken(obs: Any) -> Any:
-        if len(server.events) < 4:
-            raise KeyError("no such layer")
-        return np.zeros(8)
-
-    server = servers.Noting(answer=broken)
-    with connected(server) as policy:
-        with pytest.raises(
-            PolicyServerError, match="observation_failed: KeyError: 'no such layer'"
-        ):
-            play(policy)
-        with pytest.raises(PolicyServerError, match="was lost"):
-            policy.act(observation(1), "pick")
-        play(policy)
-    assert len({session for session, _, _ in server.events}) == 2
-
-
-def test_an_error_at_the_start_of_an_episode() -> None:
-    class Full(servers.Noting):  # type: ignore[misc, name-defined]
-        async def on_episode_start(self, config: Any, ctx: Any) -> None:
-            raise MemoryError("full")
-
-    match = "episode_start_failed: MemoryError: full"
-    with connected(Full()) as policy, pytest.raises(PolicyServerError, match=match):
-        play(policy)
-
-
-def test_a_connection_that_drops_in_an_episode_is_an_error() -> None:
-    def drop(obs: Any) -> Any:
-        if len(server.events) == 3:
-            raise ConnectionClosedOK(None, None)  # vla-eval closes the connection
-        return np.zeros(8)
-
-    server = servers.Noting(answer=drop)
-    with connected(server) as policy:
-        with pytest.raises(PolicyServerError, match="closed the connection"):
-            play(policy, live=2)
-        play(policy, live=2)
-    names = [name for _, name, _ in server.events]
-    assert names == ["start", "observation", "observation", "end"] * 2
-
-
-def test_a_server_that_is_started_again_must_be_the_same() -> None:
-    with servers.running(servers.Noting(ALL)) as port:
-        policy = made(port)
-        play(policy)
-    with servers.running(servers.Noting(ALL), port):
-        play(policy)
-    with servers.running(servers.Noting(), port):
-        with pytest.raises(PolicyServerError, match="it began with"):
-            play(policy)
-        policy.close()
-
-
-class Twice:
-    """Answers each observation twice."""
-
-    async def on_observation(self, obs: Any, ctx: Any) -> None:
-        for _ in range(2):
-            await ctx.send_action({"actions": np.zeros(8)})
-
-
-class Silent:
-    """Never answers."""
-
-    async def on_observation(self, obs: Any, ctx: Any) -> None:
-        await asyncio.sleep(0)
-
-
-class Empty:
-    """Answers without actions."""
-
-    def predict(self, obs: Any, ctx: Any) -> Any:
-        return {"joints": np.zeros(8)}
-
-
-@pytest.mark.parametrize(
-    ("fault", "words"),
-    [
-        (Twice, r"sends action 3; expected action 4"),
-        (Silent, r"did not answer within 0\.3 s"),
-        (Empty, "answers without actions: joints"),
-    ],
-)
-def test_answers_that_do_not_fit(fault: type, words: str) -> None:
-    server = type("Odd", (fault, servers.Noting), {})()
-    with (
-        connected(server, "response_s=0.3") as policy,
-        pytest.raises(PolicyServerError, match=words),
-    ):
-        play(policy, live=2)
-
-
-def test_another_version_of_the_protocol(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vla_eval.protocol.messages.PROTOCOL_VERSION", 2)
-    match = "version 2 of vla-eval.*expected version 1"
-    with servers.running(servers.Noting()) as port, pytest.raises(PolicyServerError, match=match):
-        made(port)
-
-
-def test_a_server_of_another_kind(server: PolicyServer) -> None:
-    with pytest.raises(PolicyServerError, match="is no server of vla-eval: .*missing"):
-        made(server.port)
-
-
-def test_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    package = "robomme_interference_data.evaluate.vla_eval"
-    for name in [one for one in sys.modules if one.startswith((package, "vla_eval"))]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "vla_eval", None)
-    with pytest.raises(MissingExtraError, match="needs vla_eval") as raised:
-        made(1)
-    assert "robomme-interference-data[vla-eval]" in str(raised.value.hint)
 
 
 # --- in a run ----------------------------------------------------------------------------------

@@ -12,15 +12,21 @@ import threading
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from support.policy_calls import info, observation, section
 from vla_eval.model_servers import mme_vla
 from vla_eval.model_servers.predict import PredictModelServer
 from vla_eval.model_servers.serve import serve, serve_async
 from vla_eval.specs import IMAGE_RGB, RAW
+
+from robomme_interference_data.evaluate.policies.registry import make_policy
+
+ALL = {"send_state": True, "send_wrist_image": True, "send_video_history": True}
+"""What a server with a memory asks for."""
 
 NOTES = "VLA_EVAL_NOTES"
 """Environment variable: a folder for files that servers write."""
@@ -50,7 +56,7 @@ class Blind(PredictModelServer):
 class Remembering(Blind):
     """Repeats the lesson's pose that the simulator of `worlds` asks for, out of its memory."""
 
-    params: ClassVar = {"send_state": True, "send_wrist_image": True, "send_video_history": True}
+    params: ClassVar = ALL
 
     def __init__(self) -> None:
         super().__init__()
@@ -184,6 +190,30 @@ def running(server: Any, port: int | None = None) -> Iterator[int]:
         loop.call_soon_threadsafe(task.cancel)
         thread.join(20)
         loop.close()
+
+
+@contextmanager
+def connected(server: Any, *options: str) -> Iterator[Any]:
+    """A policy that asks a server in a thread."""
+    with running(server) as port, closing(made(port, *options)) as policy:
+        yield policy
+
+
+def made(port: int, *options: str) -> Any:
+    return make_policy(
+        f"vla-eval:ws://127.0.0.1:{port}", ("checkpoint=mine/1", "connect_s=20", *options)
+    )
+
+
+def play(policy: Any, history: int = 0, live: int = 1) -> list[Any]:
+    """A rollout: the history in chunks of two frames, then live observations; the actions."""
+    policy.reset(info(history))
+    for start in range(0, history, 2):
+        frames, states = section(start, min(start + 2, history))
+        policy.add_history(frames, states, history)
+        for array in (*frames.values(), states):
+            array[:] = 0  # callers reuse their arrays
+    return [policy.act(observation(history + one), "pick") for one in range(live)]
 
 
 @contextmanager
