@@ -5,14 +5,20 @@ import logging
 import os
 import socket
 import time
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from typing import Any
 
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidMessage, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from robomme_interference_data.errors import FormatError, PolicyServerError, ServerKeepaliveError
+from robomme_interference_data.errors import (
+    FormatError,
+    InvalidOptionError,
+    PolicyServerError,
+    ServerKeepaliveError,
+)
 from robomme_interference_data.evaluate.deadline import shutdown_after
 
 from .wire import pack, unpack
@@ -34,8 +40,6 @@ _ATTEMPT_S = 10.0
 _PAUSES_S = (0.2, 5.0)
 """The first pause between two attempts, which doubles, and the longest."""
 
-_GUIDE = "docs/how-to/policy-server.md describes how to start one."
-
 
 def _is_keepalive(error: Exception) -> bool:
     """Whether a server closed because its ping had no answer: it reads none while it computes."""
@@ -43,8 +47,19 @@ def _is_keepalive(error: Exception) -> bool:
     return closing is not None and "keepalive" in closing.reason
 
 
-class ServerConnection:
+def check_server_options(checkpoint: str | None, **positive: float) -> None:
+    """Check options of a policy that is a server: a checkpoint has a name, numbers are above 0."""
+    if checkpoint is not None and not checkpoint.strip():
+        raise InvalidOptionError.expected("checkpoint", checkpoint, "its name")
+    if not min(positive.values()) > 0:
+        given = ", ".join(f"{name} {value}" for name, value in positive.items())
+        raise InvalidOptionError(f"{given}; expected positive numbers")
+
+
+class ServerConnection(ABC):
     """A connection that is closed after any error, because the server's memory is then unknown.
+
+    A subclass has the messages of one protocol.
 
     Args:
         host: Name or address of the server.
@@ -57,7 +72,10 @@ class ServerConnection:
     Attributes:
         name: `host:port`.
         metadata: What the server reported at the last connection; None before.
+        guide: The page of the documentation about such servers.
     """
+
+    guide: str
 
     def __init__(
         self,
@@ -73,7 +91,6 @@ class ServerConnection:
         self._connect_s, self._response_s, self._check = connect_s, response_s, check
         self._connection: ClientConnection | None = None
         self._stack = ExitStack()
-        self._sent = b""
 
     @property
     def is_open(self) -> bool:
@@ -115,24 +132,11 @@ class ServerConnection:
                 )
             time.sleep(pause)
             pause = min(2 * pause, longest)
-        # The server speaks first.
-        self.metadata = self._read(self._exchange(None, left))
+        self.metadata = self._greet(left)
 
-    def request(self, message: dict[str, Any], expected: str) -> dict[str, Any]:
-        """Send a message; return its answer, a map with a value of `expected` that is not false."""
-        # Kept until the next one is packed: freeing messages of megabytes each time returns their
-        # memory to the system, and allocating it again took as long as everything else together.
-        self._sent = pack(message)
-        answer = self._read(self._exchange(self._sent, self._response_s))
-        value = answer.get(expected)
-        if value is None or value is False:
-            self.close()
-            raise PolicyServerError(
-                f"policy server {self.name} answers without {expected!r}: "
-                f"{', '.join(map(str, answer)) or 'an empty map'}",
-                "Is it an MME-VLA server? docs/how-to/policy-server.md has the order of calls.",
-            )
-        return answer
+    @abstractmethod
+    def _greet(self, seconds: float) -> dict[str, Any]:
+        """Return what the server reports of itself on a new connection, within a time limit."""
 
     def close(self) -> None:
         """Close the connection, if one is open."""
@@ -157,7 +161,7 @@ class ServerConnection:
     def _unreachable(self, reason: str, hint: str | None = None) -> PolicyServerError:
         return PolicyServerError(
             f"policy server {self.name} cannot be reached: {reason}",
-            hint or f"Start it, or check host and port; {_GUIDE}",
+            hint or f"Start it, or check host and port; {self.guide} describes how to start one.",
         )
 
     def _refusal(self, reason: object) -> PolicyServerError:
@@ -168,11 +172,16 @@ class ServerConnection:
             )
         return PolicyServerError(
             f"{self.name} is no policy server: expected a websocket, but it answers {reason}",
-            f"Check host and port; {_GUIDE}",
+            f"Check host and port; {self.guide} describes how to start one.",
         )
 
-    def _exchange(self, data: bytes | None, seconds: float) -> str | bytes:
-        """Send data, if given, and receive one message; close the connection if this fails."""
+    def _failed(self, what: str, hint: str | None) -> PolicyServerError:
+        """Close the connection; return the error of an answer that cannot be used."""
+        self.close()
+        return PolicyServerError(f"policy server {self.name} {what}", hint)
+
+    def _exchange(self, messages: Iterable[bytes], seconds: float) -> str | bytes:
+        """Send messages, and receive one; close the connection if this fails."""
         connection = self._connection
         if connection is None:
             raise PolicyServerError(
@@ -181,8 +190,8 @@ class ServerConnection:
             )
         try:
             with shutdown_after(seconds, lambda: [connection.socket]) as expired:
-                if data is not None:
-                    connection.send(data)
+                for message in messages:
+                    connection.send(message)
                 return connection.recv()
         except (ConnectionClosed, OSError) as error:
             self.close()
@@ -196,18 +205,40 @@ class ServerConnection:
             self.close()
             raise
 
+
+class OpenpiConnection(ServerConnection):
+    """A connection to a server of openpi, as MME-VLA extends it: `wire.py` has its messages."""
+
+    guide = "docs/how-to/policy-server.md"
+    _sent = b""
+
+    def _greet(self, seconds: float) -> dict[str, Any]:
+        return self._read(self._exchange([], seconds))  # the server speaks first
+
+    def request(self, message: dict[str, Any], expected: str) -> dict[str, Any]:
+        """Send a message; return its answer, a map with a value of `expected` that is not false."""
+        # Kept until the next one is packed: freeing messages of megabytes each time returns their
+        # memory to the system, and allocating it again took as long as everything else together.
+        self._sent = pack(message)
+        answer = self._read(self._exchange([self._sent], self._response_s))
+        value = answer.get(expected)
+        if value is None or value is False:
+            raise self._failed(
+                f"answers without {expected!r}: {', '.join(map(str, answer)) or 'an empty map'}",
+                f"Is it an MME-VLA server? {self.guide} has the order of calls.",
+            )
+        return answer
+
     def _read(self, data: str | bytes) -> dict[str, Any]:
         if isinstance(data, str):
             # A traceback, sent as text; the server closes with 1011 after it.
             lines = [line for line in data.splitlines() if line.strip()] or ["an empty text"]
-            what, hint = f" reports: {lines[-1].strip()}", "See the server's log for the traceback."
-        else:
-            try:
-                answer = unpack(data)
-                if isinstance(answer, dict):
-                    return answer
-                what, hint = f" answers with a {type(answer).__name__}; expected a map", None
-            except FormatError as error:
-                what, hint = f": {error.message}", None
-        self.close()
-        raise PolicyServerError(f"policy server {self.name}{what}", hint)
+            hint = "See the server's log for the traceback."
+            raise self._failed(f"reports: {lines[-1].strip()}", hint)
+        try:
+            answer = unpack(data)
+        except FormatError as error:
+            raise self._failed(f"sends no message: {error.message}", None) from error
+        if not isinstance(answer, dict):
+            raise self._failed(f"answers with a {type(answer).__name__}; expected a map", None)
+        return answer

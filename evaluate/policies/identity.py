@@ -18,6 +18,7 @@ from .registry import (
     POLICIES,
     check_workers,
     make_policy,
+    one_memory,
     policy_options,
     server_addresses,
     starts_server,
@@ -31,7 +32,7 @@ logger = logging.getLogger(__name__)
 def lock_servers(text: str, out: Path) -> Iterator[None]:
     """Keep other runs from a policy's servers in the block; `out` is this run's folder."""
     with ExitStack() as stack:
-        for host, port in server_addresses(text):
+        for host, port in server_addresses(text) if one_memory(text) else ():
             stack.enter_context(lock_server(host, port, f"the run in {out.resolve()}"))
         yield
 
@@ -43,7 +44,8 @@ def describe_policy(
 
     All servers are asked for metadata; of one that workers start, the metadata is empty.
     """
-    check_workers(text, workers)
+    if one_memory(text):
+        check_workers(text, workers)
     if starts_server(text):
         with closing(make_policy(text, options)) as policy:
             return policy, {}
@@ -55,6 +57,9 @@ def describe_policy(
                 every.append(policy_metadata(text, policies[-1]))
     policy, metadata = policies[0], dict(every[0])
     if server_addresses(text):
+        # Of a vla-eval server this is known only after its hello.
+        if getattr(policy, "one_memory", False):
+            check_workers(text, workers)
         check_metadata(every, policy_options(text, options)["checkpoint"])
         metadata["server"] = ", ".join(one["server"] for one in every)
     if policy.privileged:

@@ -25,10 +25,11 @@ _SERVER = r"(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):[0-9]{1,5}"
 
 
 def _addresses(target: str) -> tuple[tuple[str, int], ...]:
-    """Return host and port of each server of `//HOST:PORT,…`; empty for a command."""
-    if not target.startswith("//"):
+    """Return host and port of each server of `//…` or `ws://HOST:PORT,…`; empty for a command."""
+    scheme, slashes, servers = target.partition("//")
+    if scheme not in ("", "ws:") or not slashes:
         return ()
-    pairs = (one.rpartition(":") for one in target.removeprefix("//").split(","))
+    pairs = (one.rpartition(":") for one in servers.split(","))
     return tuple((host.strip("[]"), int(port)) for host, _, port in pairs)
 
 
@@ -69,6 +70,14 @@ POLICIES = Registry(
             no_effect=("server", "connect_s", "response_s"),
             valid=_valid_addresses,
         ),
+        "vla-eval": Kind(
+            "vla-eval:ws://host:port, with commas between several servers, each once",
+            "robomme_interference_data.evaluate.vla_eval.policy:VlaEvalPolicy",
+            rf"ws://{_SERVER}(?:,{_SERVER})*",
+            extra="vla-eval",
+            no_effect=("server", "connect_s", "response_s"),
+            valid=_valid_addresses,
+        ),
         "lerobot": Kind(
             "lerobot:namespace/name[@revision] or lerobot:folder",
             f"{__package__}.lerobot:LeRobotPolicy",
@@ -85,7 +94,7 @@ POLICIES = Registry(
 def server_addresses(text: str) -> tuple[tuple[str, int], ...]:
     """Return host and port of each server that a policy names, in order."""
     spec = POLICIES.parse(text)
-    return _addresses(spec.target) if spec.kind == "websocket" else ()
+    return _addresses(spec.target) if spec.kind in ("websocket", "vla-eval") else ()
 
 
 def starts_server(text: str) -> bool:
@@ -93,19 +102,25 @@ def starts_server(text: str) -> bool:
     return POLICIES.parse(text).kind == "websocket" and not server_addresses(text)
 
 
+def one_memory(text: str) -> bool:
+    """Whether each server of a policy is known to hold the memory of one rollout."""
+    return POLICIES.parse(text).kind == "websocket"
+
+
 def check_workers(text: str, workers: int) -> None:
-    """Refuse more workers than servers: a server holds the memory of one rollout."""
+    """Refuse more workers than servers that hold the memory of one rollout each."""
     servers = server_addresses(text)
     if 0 < len(servers) < workers:
+        own = ", or let each worker start its own (serve)" if one_memory(text) else ""
         raise InvalidOptionError(
-            f"{workers} workers need {workers} policy servers; {text} names {len(servers)}",
-            f"Set workers={len(servers)}, start more servers, or let each worker start its own "
-            "(serve).",
+            f"{workers} workers need {workers} policy servers, as each holds one memory; {text} "
+            f"names {len(servers)}",
+            f"Set workers={len(servers)}, or start more servers{own}.",
         )
 
 
 def make_policy(text: str, options: Sequence[str] = (), *, worker: int = 0) -> Policy:
-    """Make the policy of a worker in this process; servers are connected at the first rollout."""
+    """Make the policy of a worker in this process; most servers are connected at first use."""
     factory, given = _factory(text, worker)
     bound = bind_options(f"policy {text!r}", factory, given, options)
     try:
@@ -159,9 +174,10 @@ def _factory(text: str, worker: int) -> tuple[Factory, dict[str, Any]]:
         return factory, {"worker": worker} if takes_worker else {}
     if starts_server(text):
         return POLICIES.factory(spec, "ServedPolicy"), {"command": spec.target}
-    if spec.kind == "websocket":
-        check_workers(text, worker + 1)
-        host, port = server_addresses(text)[worker]
+    if servers := server_addresses(text):
+        if one_memory(text):
+            check_workers(text, worker + 1)
+        host, port = servers[worker % len(servers)]
         return POLICIES.factory(spec), {"host": host, "port": port}
     return POLICIES.factory(spec), dict(spec.given)
 

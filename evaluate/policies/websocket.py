@@ -28,7 +28,7 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.runtime import guard
 from robomme_interference_data.simulators.base import ACTION_SIZE, Observation
 
-from .connection import ServerConnection
+from .connection import OpenpiConnection, check_server_options
 from .policy import Frames, Policy, RolloutInfo
 from .server_lock import reserve_port
 
@@ -76,15 +76,11 @@ class WebsocketPolicy(Policy):
         connect_s: float = 600.0,
         response_s: float = 600.0,
     ):
-        if checkpoint is not None and not checkpoint.strip():
-            raise InvalidOptionError.expected("checkpoint", checkpoint, "its name")
-        if chunk_frames < 1 or not min(connect_s, response_s) > 0:
-            raise InvalidOptionError(
-                f"chunk_frames {chunk_frames}, connect_s {connect_s}, response_s {response_s}; "
-                "expected positive numbers"
-            )
+        check_server_options(
+            checkpoint, chunk_frames=chunk_frames, connect_s=connect_s, response_s=response_s
+        )
         self._chunk = chunk_frames
-        self._server = ServerConnection(
+        self._server = OpenpiConnection(
             host, port, connect_s=connect_s, response_s=response_s, check=self._check
         )
         self._history = 0  # history frames in this rollout

@@ -38,7 +38,7 @@ from robomme_interference_data.simulators.registry import (
 
 from .worker import used_cameras
 
-PANDA_POLICIES = ("replay", "noop", "websocket", "lerobot")
+PANDA_POLICIES = ("replay", "noop", "websocket", "vla-eval", "lerobot")
 """Kinds of policies that read and control RoboMME's robot: 7 joints, then the gripper."""
 
 READS_SUBGOALS = ("websocket", "python", "follow-subgoals")
@@ -53,7 +53,8 @@ def default_system(config: RunConfig) -> str:
     """
     spec = POLICIES.parse(config.policy)
     # Folders, revisions and served models have the same names for different checkpoints.
-    learned = config.policy if spec.kind in ("websocket", "lerobot", "answers") else config.subgoals
+    named = ("websocket", "vla-eval", "lerobot", "answers")
+    learned = config.policy if spec.kind in named else config.subgoals
     if learned not in (None, ORACLE):
         raise InvalidOptionError(
             f"the rows of {learned} need a name: its text does not identify it",

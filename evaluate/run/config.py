@@ -73,7 +73,8 @@ class RunConfig(WorkConfig):
         group=_POLICY,
         help="replay or recall (both also with :framesamp or :window), oracle, guess, "
         "follow-subgoals, noop, answers:FOLDER, websocket://HOST:PORT (several with commas), "
-        "websocket with --serve, lerobot:REPO[@REVISION], lerobot:FOLDER or python:module:factory.",
+        "websocket with --serve, vla-eval:ws://HOST:PORT (several with commas), "
+        "lerobot:REPO[@REVISION], lerobot:FOLDER or python:module:factory.",
     )
     buffer_set: str = setting(
         name="-", metavar="BUFFER_SET", help="Folder of the buffer set, or its NAMESPACE/NAME."

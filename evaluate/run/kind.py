@@ -88,8 +88,8 @@ def package_versions(config: RunConfig | AskConfig) -> dict[str, str]:
     RoboMME's interpreter has others: see `simulator_versions`.
     """
     names = ["robomme-interference-data", "numpy", "av", "torch"]
-    if isinstance(config, RunConfig) and config.policy.startswith("lerobot:"):
-        names.append("lerobot")
+    if isinstance(config, RunConfig):
+        names += {config.policy.partition(":")[0]} & {"lerobot", "vla-eval"}
     if config.retrieval is not None:
         names.append("transformers")
     if isinstance(config, RunConfig):

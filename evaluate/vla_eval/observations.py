@@ -28,7 +28,9 @@ ACTIONS = DimSpec(
     "actions",
     8,
     "joint_positions",
-    accepts=frozenset({"raw", "joint_positions", "absolute_joint_positions_with_grippers"}),
+    accepts=frozenset(
+        {"raw", "joint_positions", "joint_pos_abs", "absolute_joint_positions_with_grippers"}
+    ),
     description="7 absolute joint targets in rad, then the gripper, -1 (close) to 1 (open)",
 )
 
@@ -61,7 +63,8 @@ def make_observation(
         first: Whether it is the first one of its episode.
         history: Camera to its T history frames, `(H, W, 3) uint8` each; None: they are not sent.
             As in vla-eval, a history without frames has no key at all.
-        states: The states of the history frames, `(T, 8) float32`; sent with them only.
+        states: The states of the history frames, `(T, 8) float32`, sent only with them; None: they
+            are not sent.
     """
     observation: dict[str, Any] = {
         # The order counts: a server that knows no names takes the first image as the main view.
@@ -75,5 +78,6 @@ def make_observation(
     for camera, frames in (history or {}).items():
         if listed := list(frames):
             observation[HISTORIES[camera]] = listed
-            observation[STATE_HISTORY] = states
+            if states is not None:
+                observation[STATE_HISTORY] = states
     return observation

@@ -35,6 +35,7 @@ def test_a_policy_is_parsed() -> None:
         *("replay:full", "recall:full")
     ]
     addresses = ("gpu-1.lab", 8013), ("10.0.0.2", 1), ("::1", 65535)
+    assert server_addresses("vla-eval:ws://gpu-1.lab:8013,10.0.0.2:1,[::1]:65535") == addresses
     assert server_addresses("websocket://gpu-1.lab:8013,10.0.0.2:1,[::1]:65535") == addresses
 
 
@@ -49,6 +50,7 @@ def test_a_policy_is_parsed() -> None:
                 *("oracle:x", "noop:", "replay:", "websocket", "websocket:a:1", "websocket://"),
                 *("websocket://a", "websocket://a:0", "websocket://a:65536", "websocket://a:1/x"),
                 *("websocket://a:1,", "websocket://a:1,websocket://b:1", "websocket://a:1,a:1"),
+                *("vla-eval", "vla-eval:a:1", "vla-eval://a:1", "vla-eval:ws://a:0"),
                 *("lerobot", "lerobot:", "python:module", "python::make", "python:a b:make"),
             )
         ),
@@ -60,14 +62,18 @@ def test_invalid_policies_are_errors(text: str, error: type[Exception], words: s
     assert words in str(raised.value)
 
 
-@given(st.text(max_size=20) | st.from_regex(r"(websocket:/?/?|python:|lerobot:)[a-z:,1.\[\]]*"))
+@given(
+    st.text(max_size=20)
+    | st.from_regex(r"(websocket:/?/?|vla-eval:ws://|python:|lerobot:)[a-z:,1.\[\]]*")
+)
 def test_any_text_is_a_policy_or_a_clear_error(text: str) -> None:
     try:
         spec = POLICIES.parse(text)
     except (UnknownNameError, InvalidOptionError):
         return
     assert str(spec) == text
-    assert len(server_addresses(text)) == (text.count(",") + 1 if spec.kind == "websocket" else 0)
+    served = spec.kind in ("websocket", "vla-eval")
+    assert len(server_addresses(text)) == (text.count(",") + 1 if served else 0)
 
 
 def test_each_worker_has_a_server() -> None:

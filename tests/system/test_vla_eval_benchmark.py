@@ -1,13 +1,8 @@
 """`vla-eval run` with this benchmark, against vla-eval's own server on the loopback interface."""
 
 import json
-import socket
 import subprocess
 import sys
-import time
-import urllib.request
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,34 +19,13 @@ TESTS = Path(__file__).parents[1]
 BUFFERS = str(TESTS / "golden" / "buffer_set")
 CONDITIONS = ("no-history", "k0", "k1")
 benchmark = lazy("robomme_interference_data.evaluate.vla_eval.benchmark")
+servers = lazy("support.vla_eval_servers")
 
 
 @pytest.fixture(autouse=True)
 def _world(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(worlds.BUFFER_SET, BUFFERS)
     monkeypatch.setenv("PYTHONPATH", str(TESTS))
-
-
-@contextmanager
-def serving(name: str) -> Iterator[str]:
-    """A server of `support.vla_eval_servers`; gives its address."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    command = [sys.executable, "-m", "support.vla_eval_servers", name, str(port)]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as server:
-        try:
-            end = time.monotonic() + 60
-            while True:
-                try:
-                    with urllib.request.urlopen(f"http://127.0.0.1:{port}/health"):
-                        break
-                except OSError:
-                    assert time.monotonic() < end and server.poll() is None
-                    time.sleep(0.1)
-            yield f"ws://127.0.0.1:{port}"
-        finally:
-            server.kill()
 
 
 def run(folder: Path, server: str, conditions: str = "no-history,k0,k1") -> tuple[Any, Path]:
@@ -73,7 +47,7 @@ def run(folder: Path, server: str, conditions: str = "no-history,k0,k1") -> tupl
 def test_its_rows_are_those_of_evaluate(tmp_path: Path) -> None:
     policy = "python:support.shared_policies:Remembering"
     expected = runs.untimed(runs.run(tmp_path / "own", policy=policy, conditions=CONDITIONS).rows)
-    with serving("Remembering") as server:
+    with servers.serving("Remembering") as server:
         done, results = run(tmp_path / "results", server)
     assert done.returncode == 0, done.stderr
     tasks = json.loads(results.read_text())["tasks"]
@@ -95,7 +69,7 @@ def test_its_rows_are_those_of_evaluate(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_server_without_memory_gets_no_history(tmp_path: Path) -> None:
-    with serving("Blind") as server:
+    with servers.serving("Blind") as server:
         done, results = run(tmp_path / "refused", server)
         assert done.returncode != 0 and not results.exists()
         assert "did not ask for histories" in done.stderr and "no-history" in done.stderr
@@ -109,7 +83,7 @@ def test_what_fails_is_an_error_and_the_next_rollout_runs(
 ) -> None:
     (tmp_path / "MoveCube-0").write_text("raise once")
     monkeypatch.setenv(worlds.TROUBLE, str(tmp_path))
-    with serving("Refusing") as server:
+    with servers.serving("Refusing") as server:
         done, results = run(tmp_path / "results", server, "no-history,k0")
     assert done.returncode == 0, done.stderr
     statuses = {(row.family, row.condition): row.status for row in read_rows([results])}

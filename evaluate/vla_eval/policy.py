@@ -1,0 +1,184 @@
+"""Policies behind a server of vla-eval: one observation, one answer."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from vla_eval.protocol.image_codec import encode_image
+from vla_eval.specs import GRIPPER_CLOSE_NEG, IMAGE_RGB, LANGUAGE
+
+from robomme_interference_data.errors import PolicyServerError
+from robomme_interference_data.evaluate.policies.connection import check_server_options
+from robomme_interference_data.evaluate.policies.policy import Frames, Policy, RolloutInfo
+from robomme_interference_data.simulators.base import ACTION_SIZE, Observation
+
+from .connection import VlaEvalConnection
+from .observations import ACTIONS, CAMERAS, HISTORIES, STATE, STATE_HISTORY, make_observation
+
+_TARGETS = ACTIONS.accepts or frozenset()
+_STATES = frozenset({STATE.format, "joint_positions"})
+_IMAGES = frozenset({IMAGE_RGB.format})
+
+_WRISTS = ("wrist", "wrist_image")
+
+_PARTS: Mapping[str, Mapping[str, tuple[int, frozenset[str]]]] = {
+    "action": {
+        **dict.fromkeys(("actions", "action"), (ACTION_SIZE, _TARGETS)),
+        "joints": (ACTION_SIZE - 1, _TARGETS),
+        "gripper": (1, frozenset({GRIPPER_CLOSE_NEG.format})),
+    },
+    "observation": {
+        **dict.fromkeys(("image", "images", *CAMERAS.values(), *_WRISTS), (0, _IMAGES)),
+        **dict.fromkeys(HISTORIES.values(), (0, _IMAGES)),
+        **dict.fromkeys(("state", STATE_HISTORY), (ACTION_SIZE, _STATES)),
+        "language": (0, frozenset({LANGUAGE.format})),
+    },
+}
+"""What a server may declare of actions and observations: name to size and formats."""
+
+_ASKED = ("send_wrist_image", "send_state", "send_video_history")
+"""What a server may ask for."""
+
+_ONE_MEMORY = ("MmeVlaModelServer",)
+"""Servers that keep one history for all connections."""
+
+
+class VlaEvalPolicy(Policy):
+    """A server of vla-eval, by host and port.
+
+    Its hello decides what it gets: the front camera, and if it asks for them, the wrist camera,
+    states, and the history. The history goes with the first observation, as vla-eval sends it.
+    Every call raises `PolicyServerError` if the server cannot be reached, reports an error, closes
+    the connection or is too slow.
+
+    Args:
+        host: Name or address of the server.
+        port: Its port.
+        checkpoint: Which checkpoint it serves, for the record: its hello names none.
+        connect_s: Maximum seconds to wait until the server accepts connections: loading a model
+            takes minutes.
+        response_s: Maximum seconds from a message to the end of its answer.
+
+    Attributes:
+        one_memory: Whether the server is known to hold one memory for all its connections.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        *,
+        checkpoint: str,
+        connect_s: float = 600.0,
+        response_s: float = 600.0,
+    ):
+        check_server_options(checkpoint, connect_s=connect_s, response_s=response_s)
+        self._server = VlaEvalConnection(host, port, connect_s=connect_s, response_s=response_s)
+        self._server.open()
+        self._server.close()  # the first rollout may be minutes away
+        hello = self._hello = self._server.metadata or {}
+        _check_fits(self._server.name, hello)
+        asked, declared = hello.get("observation_params", {}), hello.get("observation_spec", {})
+        wrist = asked.get("send_wrist_image", any(name in declared for name in _WRISTS))
+        history = asked.get("send_video_history", HISTORIES["front"] in declared)
+        self._sends_state = bool(asked.get("send_state", "state" in declared))
+        self.cameras = ("front", "wrist") if wrist else ("front",)
+        self.history_cameras = self.cameras if history else ()
+        self.wants_history = bool(history)
+        self.one_memory = self.wants_history and hello["model_server"] in _ONE_MEMORY
+
+    def reset(self, info: RolloutInfo) -> None:
+        """Start an episode, connecting first, or again if the connection was lost."""
+        hello = None
+        # The connection may have broken since the last rollout; no memory is lost at a reset.
+        with suppress(PolicyServerError):
+            if self._server.is_open:
+                self._server.end_episode()
+                hello = self._server.hello()
+        if hello is None:
+            self._server.open()
+            hello = self._server.metadata
+        if hello != self._hello:
+            self._server.close()
+            raise PolicyServerError(
+                f"policy server {self._server.name} reports {hello}; it began with {self._hello}",
+                "Serve the same model until the run ends.",
+            )
+        self._server.start_episode({"name": info.goal, "seed": info.seed})
+        self._first = True
+        self._history: dict[str, list[Any]] = {camera: [] for camera in self.history_cameras}
+        self._states: list[NDArray[np.float32]] = []
+
+    def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
+        """Keep frames and states until the first observation."""
+        for camera, kept in self._history.items():
+            kept.extend(map(_encoded, frames[camera]))
+        self._states.append(states.copy())
+
+    def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
+        """Return the server's action, or its chunk, as `(n, 8)`; the rollout checks them."""
+        message = make_observation(
+            {camera: _encoded(observation.images[camera]) for camera in self.cameras},
+            goal,
+            state=np.asarray(observation.state, np.float32) if self._sends_state else None,
+            first=self._first,
+            history=self._history,
+            states=np.concatenate(self._states) if self._states and self._sends_state else None,
+        )
+        self._first, self._history, self._states = False, {}, []
+        return np.atleast_2d(self._server.act(message))
+
+    def metadata(self) -> dict[str, Any]:
+        """Return the server's address and its hello."""
+        name = self._server.name
+        return {"policy": "vla-eval", "server": name, "server_metadata": self._hello}
+
+    def close(self) -> None:
+        """Close the connection, which ends the episode."""
+        self._server.close()
+
+
+def _encoded(image: NDArray[np.uint8]) -> dict[str, Any]:
+    """Return a copy of an image for messages, as raw pixels: PNG, their default, is slower.
+
+    410 history frames of two cameras are 161 MB of pixels, and a server on the same machine has
+    answered after 1.4 s. As PNG they are 4 MB, but take 9 s to compress.
+    """
+    return encode_image(image, "raw")
+
+
+def _check_fits(server: str, hello: Mapping[str, Any]) -> None:
+    """Check that a server reads what rollouts send, and returns what they execute."""
+    faults = [
+        f"asks for {name}, which is not sent"
+        for name, value in hello.get("observation_params", {}).items()
+        if name.startswith("send_") and value and name not in _ASKED
+    ]
+    for what, known in _PARTS.items():
+        declared = hello.get(f"{what}_spec", {})
+        faults += _misfits(what, declared, known)
+    sizes = [part["dims"] for part in hello.get("action_spec", {}).values()]
+    if sizes and all(sizes) and sum(sizes) != ACTION_SIZE:
+        faults.append(f"declares {sum(sizes)} action values; expected {ACTION_SIZE}")
+    if faults:
+        raise PolicyServerError(
+            f"policy server {server} ({hello['model_server']}) does not fit: it "
+            f"{'; it '.join(faults)}",
+            "docs/how-to/vla-eval.md lists what is sent and what is executed.",
+        )
+
+
+def _misfits(
+    what: str, declared: Mapping[str, Any], known: Mapping[str, tuple[int, frozenset[str]]]
+) -> Iterator[str]:
+    """Yield how the parts that a server declares differ from those that are known."""
+    for name, part in declared.items():
+        given = f"declares the {what} {name} ({part['dims']} values, {part['format']})"
+        if name not in known:
+            yield f"{given}; expected {', '.join(known)}"
+            continue
+        size, formats = known[name]
+        if part["dims"] not in (0, size) or part["format"] not in formats:
+            yield f"{given}; expected {size} values, {' or '.join(sorted(formats))}"

@@ -1,0 +1,209 @@
+"""Servers of vla-eval as policies: what they get, what is executed, and their runs."""
+
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support import worlds
+from support.lazy import lazy
+from support.policy_calls import observation, section
+from support.runs import header, run, run_one
+from websockets.exceptions import ConnectionClosedOK
+
+from robomme_interference_data.errors import InvalidOptionError, RunError
+
+servers = lazy("support.vla_eval_servers")
+specs = lazy("vla_eval.specs")
+
+NAMED = ("checkpoint=mine/1",)
+
+
+def expect(got: Any, **expected: Any) -> None:
+    """Compare an observation of a server with what is expected, arrays exactly."""
+    assert got.keys() == expected.keys()
+    for name, value in expected.items():
+        np.testing.assert_equal(got[name], value, name)
+
+
+# --- what a server gets ------------------------------------------------------------------------
+
+
+def test_a_server_that_asks_for_everything() -> None:
+    server = servers.Noting(servers.ALL, answer=lambda obs: obs["states"])
+    with servers.connected(server) as policy:
+        assert policy.cameras == policy.history_cameras == ("front", "wrist")
+        assert policy.wants_history and not policy.every_frame and not policy.one_memory
+        first, second = servers.play(policy, history=5, live=2)
+        np.testing.assert_array_equal(first, np.full((1, 8), 5))
+        np.testing.assert_array_equal(second, np.full((1, 8), 6))
+        servers.play(policy)
+    frames, states = section(0, 7)
+
+    def live(index: int) -> dict[str, Any]:
+        images = {"agentview": frames["front"][index], "wrist": observation(index).images["wrist"]}
+        return {"images": images, "task_description": "pick", "states": states[index]}
+
+    (one, event, start), *rest = server.events
+    assert (event, start) == ("start", {"task": {"name": "pick", "seed": 3}})
+    expect(
+        rest[0][2],
+        **live(5),
+        episode_restart=True,
+        video_history=list(frames["front"][:5]),
+        wrist_video_history=[
+            *section(0, 2)[0]["wrist"],
+            *section(2, 4)[0]["wrist"],
+            *section(4, 5)[0]["wrist"],
+        ],
+        state_history=states[:5],
+    )
+    expect(rest[1][2], **live(6))
+    expect(rest[4][2], **live(0), episode_restart=True)  # without history no key
+    assert [name for _, name, _ in server.events] == [
+        *("start", "observation", "observation", "end"),
+        *("start", "observation", "end"),
+    ]
+    assert {session for session, _, _ in server.events} == {one}
+
+
+@pytest.mark.parametrize(
+    ("params", "spec", "cameras", "state", "history"),
+    [
+        ({}, {}, ("front",), False, False),
+        ({"send_state": True, "send_wrist_image": False}, {}, ("front",), True, False),
+        ({}, {"image": "IMAGE_RGB", "language": "LANGUAGE"}, ("front",), False, False),
+        ({}, {"wrist": "IMAGE_RGB", "state": "RAW"}, ("front", "wrist"), True, False),
+        ({"send_state": False}, {"wrist_image": "IMAGE_RGB", "state": "RAW"}, None, False, False),
+        ({}, {"video_history": "IMAGE_RGB"}, ("front",), False, True),
+    ],
+)
+def test_a_server_gets_what_it_asks_for(
+    params: Any, spec: Any, cameras: Any, state: bool, history: bool
+) -> None:
+    declared = {name: getattr(specs, constant) for name, constant in spec.items()}
+    server = servers.Noting(params, observations=declared)
+    cameras = cameras or ("front", "wrist")
+    with servers.connected(server) as policy:
+        assert (policy.cameras, policy.wants_history) == (cameras, history)
+        assert policy.history_cameras == (cameras if history else ())
+        servers.play(policy)
+    got = server.events[1][2]
+    assert len(got["images"]) == len(cameras) and ("states" in got) is state
+
+
+# --- what is executed --------------------------------------------------------------------------
+
+
+def test_a_chunk_is_given_action_by_action_or_whole() -> None:
+    def chunk(obs: Any) -> Any:
+        asked.append(obs)
+        return np.arange(20.0)[:, None].repeat(8, 1)
+
+    asked: list[Any] = []
+    with servers.connected(servers.Noting(answer=chunk, chunk_size=3)) as policy:
+        actions = servers.play(policy, live=7)
+        assert [one.tolist() for one in actions] == [[[n] * 8] for n in (0, 1, 2, 0, 1, 2, 0)]
+        assert len(asked) == 3
+    with servers.connected(servers.Noting(answer=chunk)) as policy:
+        (actions,) = servers.play(policy)
+        assert actions.shape == (20, 8)  # a rollout executes 16 of them
+
+
+def test_the_faults_of_its_mme_vla_server() -> None:
+    """docs/how-to/vla-eval.md lists them: it is true as long as this passes."""
+    server = servers.MmeVlaModelServer()
+    with (
+        servers.running(server) as port,
+        closing(servers.made(port)) as one,
+        closing(servers.made(port)) as other,
+    ):
+        servers.play(one, history=5, live=12)
+        servers.play(other)
+    (_, reset), (_, added), *_ = server.calls
+    assert reset is None and added["images"].shape == (5, 1, 224, 224, 3)
+    assert not added["state"].any()  # not the states of the history
+    assert [name for name, _ in server.calls] == [
+        *("reset", "add_buffer", "infer", "infer"),  # live frames are not added
+        *("reset", "infer"),  # another client empties the memory; nothing is in it at first
+    ]
+
+
+# --- in a run ----------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("world")
+def test_a_run_resumes_with_the_same_checkpoint_only(tmp_path: Path) -> None:
+    with servers.running(servers.Remembering()) as port:
+        settings: dict[str, Any] = {"policy": f"vla-eval:ws://127.0.0.1:{port}"}
+        result = run(tmp_path / "run", policy_options=NAMED, **settings)
+        assert {(row.condition, row.status) for row in result.rows} == {
+            *(("no-history", "fail"), ("k0", "success"))
+        }
+        identity = header(tmp_path / "run")["identity"]
+        assert (identity["policy"], identity["policy_options"]) == (
+            *("vla-eval", {"checkpoint": "mine/1"}),
+        )
+        (start,) = header(tmp_path / "run")["starts"]
+        assert start["policy"]["server"] == f"127.0.0.1:{port}"
+        assert start["versions"]["vla-eval"]
+        assert run(tmp_path / "run", policy_options=NAMED, **settings).rows == result.rows
+        with pytest.raises(RunError, match="checkpoint is 'mine/1' there, 'other' here"):
+            run(tmp_path / "run", policy_options=("checkpoint=other",), **settings)
+        for changes, words in (
+            ({"policy_options": ()}, "'checkpoint'"),
+            ({"policy_options": ("checkpoint= ",)}, "expected its name"),
+            ({"policy_options": NAMED, "system": None}, "need a name"),
+            ({"policy_options": NAMED, "system": "perceptual-framesamp-modul"}, "paper's system"),
+            ({"policy_options": NAMED, "subgoals": "oracle"}, "reads no subgoals"),
+            ({"policy_options": NAMED, "serve": "serve {port}"}, "no server to start"),
+            ({"policy_options": NAMED, "workers": 2, "policies": 1}, "cannot be shared"),
+        ):
+            with pytest.raises(InvalidOptionError, match=words):
+                run(tmp_path / "other", **settings, **changes)
+
+
+@pytest.mark.usefixtures("world")
+def test_a_server_without_memory_runs_without_history_only(tmp_path: Path) -> None:
+    with servers.running(servers.Blind()) as port:
+        settings = {"policy": f"vla-eval:ws://127.0.0.1:{port}", "policy_options": NAMED}
+        with pytest.raises(InvalidOptionError, match="takes no history, so k0 has no effect"):
+            run(tmp_path / "run", **settings)
+        (row,) = run_one(tmp_path / "run", **settings).rows
+        assert (row.status, row.steps) == ("fail", worlds.STEPS)
+
+
+@pytest.mark.usefixtures("world")
+def test_a_fault_of_the_server_is_an_error_row_that_is_repeated(tmp_path: Path) -> None:
+    def answer(obs: Any) -> Any:
+        if "VideoRepick" in obs["task_description"]:
+            return np.zeros(7)
+        if len(dropped) < 1:
+            dropped.append(obs)
+            raise ConnectionClosedOK(None, None)
+        return np.zeros(8)
+
+    dropped: list[Any] = []
+    errors = []
+    with servers.running(servers.Noting(answer=answer)) as port:
+        policy, only = f"vla-eval:ws://127.0.0.1:{port}", ("no-history",)
+        for _ in range(2):
+            result = run(tmp_path / "run", policy=policy, policy_options=NAMED, conditions=only)
+            errors.append({row.family: str(row.error) for row in result.rows if row.error})
+    first, second = errors
+    assert "PolicyServerError" in first["MoveCube"] and "closed the conn" in first["MoveCube"]
+    assert second.keys() == {"VideoRepick"}
+    assert "PolicyError" in second["VideoRepick"] and "float32 (1, 7)" in second["VideoRepick"]
+
+
+@pytest.mark.usefixtures("world")
+def test_a_server_with_one_memory_has_one_worker(tmp_path: Path) -> None:
+    settings: dict[str, Any] = {"policy_options": NAMED, "conditions": ("no-history",)}
+    for shared in (False, True):
+        with servers.running(servers.MmeVlaModelServer(use_history=not shared)) as port:
+            settings["policy"] = f"vla-eval:ws://127.0.0.1:{port}"
+            if not shared:
+                with pytest.raises(InvalidOptionError, match="2 workers need 2 policy servers"):
+                    run(tmp_path / "run", workers=2, **settings)
+            assert run(tmp_path / f"{shared}", workers=1 + shared, **settings).counts["fail"] == 2
