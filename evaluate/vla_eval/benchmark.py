@@ -30,7 +30,7 @@ from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.simulators.base import Observation
 
-from .observations import ACTION_SPEC, CAMERAS, OBSERVATION_SPEC, make_observation
+from .observations import ACTION_SPEC, CAMERAS, OBSERVATION_SPEC, encoded, make_observation
 
 SETTINGS = (
     *("conditions", "families", "episodes", "split", "simulator", "robomme_python", "shift"),
@@ -47,14 +47,14 @@ class Request:
         observation: The current observation.
         goal: The goal.
         first: Whether it is the first one of its rollout, which brings the history.
-        history: Camera to its T history frames, each `(H, W, 3) uint8`.
+        history: Camera to its T history frames, `encoded`.
         states: Their states, `(T, 8) float32`; None without history.
     """
 
     observation: Observation
     goal: str
     first: bool
-    history: dict[str, list[NDArray[np.uint8]]]
+    history: dict[str, list[dict[str, Any]]]
     states: NDArray[np.float32] | None
 
 
@@ -75,12 +75,12 @@ class ServedPolicy(Policy):
     def reset(self, info: RolloutInfo) -> None:
         """Forget the history of the last rollout."""
         self._first, self._states = True, list[NDArray[np.float32]]()
-        self._history: dict[str, list[NDArray[np.uint8]]] = {}
+        self._history: dict[str, list[dict[str, Any]]] = {}
 
     def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
         """Keep the frames until the first request."""
         for camera, images in frames.items():
-            self._history.setdefault(camera, []).extend(images)
+            self._history.setdefault(camera, []).extend(map(encoded, images))
         self._states.append(states)
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:

@@ -6,6 +6,9 @@ Its servers take images by their order, and read the state under `states`, else 
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+from vla_eval.protocol.image_codec import encode_image
 from vla_eval.specs import IMAGE_RGB, LANGUAGE, DimSpec
 
 CAMERAS = {"front": "agentview", "wrist": "wrist"}
@@ -45,6 +48,15 @@ OBSERVATION_SPEC = {
 """What it provides."""
 
 
+def encoded(image: NDArray[np.uint8]) -> dict[str, Any]:
+    """Return a copy of an image for messages, as raw pixels.
+
+    vla-eval's default, PNG, is smaller, but to compress a whole history takes longer than to send
+    its pixels.
+    """
+    return dict(encode_image(image, "raw"))
+
+
 def make_observation(
     images: Mapping[str, Any],
     goal: str,
@@ -61,14 +73,16 @@ def make_observation(
         goal: The goal in words.
         state: The current state, `(8,) float32`; None: it is not sent.
         first: Whether it is the first one of its episode.
-        history: Camera to its T history frames, `(H, W, 3) uint8` each; None: they are not sent.
+        history: Camera to its T history frames, `encoded`; None: they are not sent.
             As in vla-eval, a history without frames has no key at all.
         states: The states of the history frames, `(T, 8) float32`, sent only with them; None: they
             are not sent.
     """
     observation: dict[str, Any] = {
         # The order counts: a server that knows no names takes the first image as the main view.
-        "images": {name: images[camera] for camera, name in CAMERAS.items() if camera in images},
+        "images": {
+            name: encoded(images[camera]) for camera, name in CAMERAS.items() if camera in images
+        },
         "task_description": goal,
     }
     if state is not None:

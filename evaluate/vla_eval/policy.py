@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from vla_eval.protocol.image_codec import encode_image
 from vla_eval.specs import GRIPPER_CLOSE_NEG, IMAGE_RGB, LANGUAGE
 
 from robomme_interference_data.errors import PolicyServerError
@@ -15,7 +14,15 @@ from robomme_interference_data.evaluate.policies.policy import Frames, Policy, R
 from robomme_interference_data.simulators.base import ACTION_SIZE, Observation
 
 from .connection import VlaEvalConnection
-from .observations import ACTIONS, CAMERAS, HISTORIES, STATE, STATE_HISTORY, make_observation
+from .observations import (
+    ACTIONS,
+    CAMERAS,
+    HISTORIES,
+    STATE,
+    STATE_HISTORY,
+    encoded,
+    make_observation,
+)
 
 _TARGETS = ACTIONS.accepts or frozenset()
 _STATES = frozenset({STATE.format, "joint_positions"})
@@ -114,13 +121,13 @@ class VlaEvalPolicy(Policy):
     def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
         """Keep frames and states until the first observation."""
         for camera, kept in self._history.items():
-            kept.extend(map(_encoded, frames[camera]))
+            kept.extend(map(encoded, frames[camera]))
         self._states.append(states.copy())
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the server's action, or its chunk, as `(n, 8)`; the rollout checks them."""
         message = make_observation(
-            {camera: _encoded(observation.images[camera]) for camera in self.cameras},
+            {camera: observation.images[camera] for camera in self.cameras},
             goal,
             state=np.asarray(observation.state, np.float32) if self._sends_state else None,
             first=self._first,
@@ -138,15 +145,6 @@ class VlaEvalPolicy(Policy):
     def close(self) -> None:
         """Close the connection, which ends the episode."""
         self._server.close()
-
-
-def _encoded(image: NDArray[np.uint8]) -> dict[str, Any]:
-    """Return a copy of an image for messages, as raw pixels: PNG, their default, is slower.
-
-    410 history frames of two cameras are 161 MB of pixels, and a server on the same machine has
-    answered after 1.4 s. As PNG they are 4 MB, but take 9 s to compress.
-    """
-    return encode_image(image, "raw")
 
 
 def _check_fits(server: str, hello: Mapping[str, Any]) -> None:

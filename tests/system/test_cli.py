@@ -56,7 +56,7 @@ def test_commands_are_listed_in_groups(run: Run) -> None:
         *("Data", "doctor", "build", "new-buffer-set", "verify", "audit", "fetch"),
         *("Look", "conditions", "list", "show", "question", "simulate"),
         *("Retrieval", "index", "retrieve", "retrieval-score", "calibrate"),
-        *("Rollouts", "ceiling", "shortcuts", "evaluate", "ask", "merge"),
+        *("Rollouts", "ceiling", "shortcuts", "evaluate", "ask", "merge", "vla-eval-config"),
         *("Scores", "score", "compare", "power"),
         *("Publish", "card", "publish", "publish-results"),
     ]

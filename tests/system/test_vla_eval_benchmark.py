@@ -12,7 +12,12 @@ from support.lazy import lazy
 from typer.testing import CliRunner
 
 from robomme_interference_data.cli.main import app
-from robomme_interference_data.errors import InvalidOptionError, RunError, UnknownNameError
+from robomme_interference_data.errors import (
+    InterferenceError,
+    InvalidOptionError,
+    RunError,
+    UnknownNameError,
+)
 from robomme_interference_data.evaluate.score.rows.reading import read_rows
 
 TESTS = Path(__file__).parents[1]
@@ -95,6 +100,34 @@ def test_what_fails_is_an_error_and_the_next_rollout_runs(
     }
     text = results.read_text()
     assert "this goal is odd" in text and "the world fell apart" in text
+
+
+def test_the_configuration(tmp_path: Path) -> None:
+    command = ["vla-eval-config", BUFFERS, "--system", "mine", "--simulator", "robomme"]
+    command += ["--families", "MoveCube,PatternLock", "--conditions", "k1,k0", "--episodes", "0"]
+    assert CliRunner().invoke(app, [*command, "--out", str(tmp_path / "c.yaml")]).exit_code == 0
+    expected = f"""server:
+  url: ws://localhost:8000
+  timeout: 600.0
+output_dir: results
+benchmarks:
+- benchmark: robomme_interference_data.evaluate.vla_eval.benchmark:RoboMMEInterference
+  episodes_per_task: 1
+  params:
+    buffer_set: {BUFFERS}
+    system: mine
+    simulator: robomme
+    conditions:
+    - k0
+    - k1
+    episodes: '0'
+    families:
+    - MoveCube
+    - PatternLock
+"""
+    assert (tmp_path / "c.yaml").read_text() == expected
+    refused = CliRunner().invoke(app, [*command, "--conditions", "k5"])
+    assert isinstance(refused.exception, InterferenceError) and "k5" in str(refused.exception)
 
 
 def make(**settings: Any) -> Any:
