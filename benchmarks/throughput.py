@@ -5,27 +5,32 @@
 
 Rollouts are processes that give a policy front and wrist images, wait for its actions, and sleep
 while a simulator with processors of its own would execute them: 16 steps of 1 ms, or of 4 ms as on
-tabletop, from half to one and a half times as long, drawn for each chunk. Three ways:
+tabletop, from half to one and a half times as long, drawn for each chunk. Four ways:
 
 - each rollout has its own policy, in its process, as without --policies;
 - all share one policy in a process, as with --policies 1, whose batches wait for 10 or 30 ms;
+- all share a server of vla-eval, with --policy vla-eval:ws://…, whose batches wait for 10 ms;
 - one process acts for all at once and waits until all have executed their actions, as lerobot-eval
   with asynchronous environments: the vector's steps are in lockstep, and sleep for the slowest.
 
 The fake model takes 50 ms, and 5 ms more for each further observation of a batch, during which it
 holds a lock across processes: models in several processes share one GPU in turns, too. The other
-model is a small ACT with random weights on this CPU, whose cores all processes share.
+model is a small ACT with random weights on this CPU, whose cores all processes share; vla-eval's
+server of LeRobot policies gives one action at a time, and makes no batches.
 """
 
 import argparse
 import dataclasses
 import fcntl
 import itertools
+import logging
 import os
+import socket
 import tempfile
 import time
-from collections.abc import Sequence
-from contextlib import closing
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -49,6 +54,8 @@ DEVICE = "BENCHMARK_DEVICE"
 """Environment variable: the file that the fake model locks."""
 
 GOAL = "push the button"
+
+FAKE = "python:throughput:Fake"
 
 
 class Fake(BatchPolicy):
@@ -76,6 +83,47 @@ class Fake(BatchPolicy):
     def metadata(self) -> dict[str, Any]:
         """Return its name."""
         return {"policy": "fake"}
+
+
+def serve(port: int) -> None:
+    """Serve the fake model with vla-eval."""
+    from vla_eval.model_servers import serve as serving
+
+    logging.getLogger("vla_eval").setLevel(logging.ERROR)  # it reports its load
+    from vla_eval.model_servers.predict import PredictModelServer
+
+    class FakeServer(PredictModelServer):  # type: ignore[misc]
+        def get_observation_params(self) -> dict[str, bool]:
+            return {"send_state": True, "send_wrist_image": True}
+
+        def get_action_spec(self) -> dict[str, Any]:
+            return {}
+
+        get_observation_spec = get_action_spec
+
+        def predict(self, obs: Any, ctx: Any) -> Any:
+            return self.predict_batch([obs], [ctx])[0]
+
+        def predict_batch(self, obs_batch: Any, ctx_batch: Any) -> Any:
+            every = [Fake()] * len(obs_batch)
+            return [{"actions": one} for one in Fake().act_batch(every, (), ())]
+
+    fake = FakeServer(chunk_size=None, max_batch_size=8, max_wait_time=0.01)
+    serving.serve(fake, "127.0.0.1", port)
+
+
+@contextmanager
+def served() -> Iterator[str]:
+    """Serve the fake model with vla-eval in the block; gives the policy that asks it."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    process = get_context("spawn").Process(target=serve, args=(port,), daemon=True)
+    process.start()
+    try:
+        yield f"vla-eval:ws://127.0.0.1:{port}"
+    finally:
+        process.kill()
 
 
 class Rollouts:
@@ -178,7 +226,13 @@ def measure(
         waiting = dataclasses.replace(config, batch_wait_timeout_s=timeout_s)
         with policy_processes(waiting) as addresses:
             shared.append(processes(waiting, addresses, chunk_s, seconds))
-    return [own, *shared, lockstep(config, chunk_s, seconds)]
+    vla_eval = float("nan")  # its server of LeRobot policies gives one action at a time
+    if text == FAKE:
+        named = ("checkpoint=benchmark",)
+        with served() as asked:
+            given = dataclasses.replace(config, policy=asked, policy_options=named, policies=None)
+            vla_eval = processes(given, (), chunk_s, seconds)
+    return [own, *shared, vla_eval, lockstep(config, chunk_s, seconds)]
 
 
 def main() -> None:
@@ -198,7 +252,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         os.environ[DEVICE] = str(Path(folder, "device"))
         Path(folder, "device").touch()
-        policies: dict[str, tuple[str, tuple[str, ...]]] = {"fake": ("python:throughput:Fake", ())}
+        policies: dict[str, tuple[str, tuple[str, ...]]] = {"fake": (FAKE, ())}
         if "act" in options.models:
             from support.lerobot_policies import save_policy
 
@@ -211,6 +265,7 @@ def main() -> None:
                 for _ in range(options.rounds)
             ]
             rates = [f"{median(column):.1f}" for column in zip(*rounds, strict=True)]
+            rates = ["–" if rate == "nan" else rate for rate in rates]
             ratio = median(one[2] / one[0] for one in rounds)
             aim = "≥ 3" if (model, chunk_ms, workers) == ("fake", 16, 8) else ""
             rows.append([model, str(chunk_ms), str(workers), *rates, f"{ratio:.2f}", aim])
@@ -221,7 +276,7 @@ def main() -> None:
             "for all, with waits of 30 ms, to one for each.",
             (
                 *("<model", ">simulator ms", ">rollouts", ">one each"),
-                *(">one for all, 10 ms", ">30 ms", ">lockstep", ">ratio", ">aim"),
+                *(">one for all, 10 ms", ">30 ms", ">vla-eval", ">lockstep", ">ratio", ">aim"),
             ),
             rows,
         )
