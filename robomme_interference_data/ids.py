@@ -126,6 +126,15 @@ def count_numbers(text: str) -> int:
     return sum(map(len, _spans(text)))
 
 
+def nth_number(text: str, n: int) -> int | None:
+    """Return the n-th number, from 0, of such a text without listing them; None if it has fewer."""
+    for span in _spans(text):
+        if n < len(span):
+            return span[n]
+        n -= len(span)
+    return None
+
+
 def _spans(text: str) -> list[range]:
     spans, count = [], 0
     for part in text.split(","):

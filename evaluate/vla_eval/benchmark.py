@@ -1,9 +1,9 @@
 """RoboMME-Interference as a benchmark of vla-eval: `vla-eval run` plays it against its servers."""
 
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from queue import SimpleQueue
+from threading import Thread
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -15,21 +15,22 @@ from vla_eval.types import Observation as ServerObservation
 
 from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.data.loading import load_buffer_set
-from robomme_interference_data.errors import InvalidOptionError, RunError, UnknownNameError
+from robomme_interference_data.errors import InvalidOptionError, RunError, UnknownNameError, counted
 from robomme_interference_data.evaluate.policies.policy import Frames, Policy, RolloutInfo
 from robomme_interference_data.evaluate.rollout.kind import Rollouts
 from robomme_interference_data.evaluate.rollout.worker import RolloutTask
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.evaluation import plan_run
 from robomme_interference_data.evaluate.run.kind import Job, Run
+from robomme_interference_data.evaluate.run.log import row_line, row_of
 from robomme_interference_data.evaluate.run.plan import WorkItem
-from robomme_interference_data.evaluate.systems import name_system
-from robomme_interference_data.ids import EpisodeId, parse_numbers
+from robomme_interference_data.ids import EpisodeId, count_numbers, nth_number
 from robomme_interference_data.runtime.worker import Worker
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.simulators.base import Observation
 
+from .configuration import check_label
 from .observations import ACTION_SPEC, CAMERAS, OBSERVATION_SPEC, encoded, make_observation
 
 SETTINGS = (
@@ -58,11 +59,11 @@ class Request:
     states: NDArray[np.float32] | None
 
 
-class ServedPolicy(Policy):
-    """Passes on what a rollout asks, and waits for the answer; each has its own thread.
+class HarnessPolicy(Policy):
+    """Passes requests of a rollout to another thread, and waits for the answers.
 
     Attributes:
-        asked: `Request` by `Request`, then the finished rollout.
+        requests: `Request` by `Request`, then the row of the rollout, or what it raised.
         answers: Actions, `(n, 8) float32`, or None to end the rollout.
     """
 
@@ -70,7 +71,7 @@ class ServedPolicy(Policy):
         self.cameras = tuple(CAMERAS)[: 1 + wrist]
         self.history_cameras = self.cameras if history else ()
         self.wants_history = history
-        self.asked, self.answers = SimpleQueue[Any](), SimpleQueue[Any]()
+        self.requests, self.answers = SimpleQueue[Any](), SimpleQueue[Any]()
 
     def reset(self, info: RolloutInfo) -> None:
         """Forget the history of the last rollout."""
@@ -86,7 +87,7 @@ class ServedPolicy(Policy):
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the answer to a request."""
         states = np.concatenate(self._states) if self._states else None
-        self.asked.put(Request(observation, goal, self._first, self._history, states))
+        self.requests.put(Request(observation, goal, self._first, self._history, states))
         self._first, self._history, self._states = False, {}, []
         if (actions := self.answers.get()) is None:
             raise RunError("vla-eval ended the rollout")
@@ -114,8 +115,8 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
             apply.
 
     Raises:
-        InvalidOptionError: Settings do not fit each other, the buffer set or the simulator; or a
-            condition has a history, and the server did not ask for it.
+        InvalidOptionError: Settings have other types, or do not fit each other, the buffer set or
+            the simulator; or a condition has a history, and the server did not ask for it.
         UnknownNameError: A setting is unknown; or a family, condition or episode.
     """
 
@@ -139,19 +140,12 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
         super().__init__()
         if unknown := sorted({*settings} - {*SETTINGS}):
             raise UnknownNameError.among("setting", unknown[0], "the benchmark", SETTINGS)
-        if name_system(system).paper:
-            raise InvalidOptionError(
-                f"a server of vla-eval is not the paper's system {system}",
-                "Set `system` to a name of your own; docs/how-to/vla-eval.md says what differs.",
-            )
+        chosen = {name: _typed(name, value) for name, value in settings.items()}
+        check_label(system)
         opened = load_buffer_set(buffer_set)
-        chosen: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value
-            for name, value in settings.items()
-        }
         options = {"wrist": send_wrist_image, "history": send_video_history}
         config = RunConfig(
-            policy=f"python:{__name__}:{ServedPolicy.__name__}",
+            policy=f"python:{__name__}:{HarnessPolicy.__name__}",
             policy_options=tuple(f"{name}={value}".lower() for name, value in options.items()),
             buffer_set=opened.location,
             out=Path(),  # vla-eval writes the results
@@ -170,19 +164,21 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
         self._plan, _ = plan_run(kind)
         self._run = Run(kind.config, kind.system, opened.name, opened.revision)
         self._send_state = send_state
-        self._policy = ServedPolicy(**options)
+        self._policy = HarnessPolicy(**options)
         self._rollouts = RolloutTask(self._run, policy=self._policy)
         # A rollout asks its policy for actions, and vla-eval asks its benchmark for observations:
-        # each has its own thread.
-        self._thread = ThreadPoolExecutor(1, "rollout")
-        self._running: Future[Any] | None = None
+        # each has its own thread. A simulator that hangs does not keep the process from its end.
+        self._jobs = SimpleQueue[Job | None]()
+        self._thread = Thread(target=self._work, name="rollouts", daemon=True)
+        self._thread.start()
+        self._running = False
 
     def get_tasks(self) -> list[Task]:
         """Return the tasks, with what identifies the rows of each."""
         tasks = []
         for group, numbers in self._plan.episodes.items():
             for condition in self._plan.conditions:
-                episode = EpisodeId.parse(f"{group}/{parse_numbers(numbers)[0]}")
+                episode = EpisodeId.parse(f"{group}/{nth_number(numbers, 0)}")
                 key = self._run.key(WorkItem(condition, episode)) | {"episode": numbers}
                 name = f"{episode.family}/{condition}"
                 tasks.append({"name": name, "suite": episode.family, **key})
@@ -204,17 +200,17 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
     def reset(self, task: Task) -> "Request":
         """Begin the rollout of an episode; return what the server gets first."""
         self._stop()
-        numbers = parse_numbers(task["episode"])
-        index = task["episode_idx"]
-        if index >= len(numbers):
+        numbers, index = task["episode"], task["episode_idx"]
+        if (number := nth_number(numbers, index)) is None:
+            count = count_numbers(numbers)
             raise InvalidOptionError(
-                f"{task['name']} has {len(numbers)} episodes, and vla-eval asks for number {index}",
-                f"Set `episodes_per_task` to {len(numbers)}.",
+                f"{task['name']} has {counted(count, 'episode')}, and vla-eval asks for number "
+                f"{index}, from 0",
+                f"Set `episodes_per_task` to {count}.",
             )
-        episode = EpisodeId(task["family"], task["split"], numbers[index])
-        job = Job(WorkItem(task["condition"], episode))
-        self._running = self._thread.submit(self._rollouts, job, Worker(0))
-        self._running.add_done_callback(self._policy.asked.put)
+        episode = EpisodeId(task["family"], task["split"], number)
+        self._jobs.put(Job(WorkItem(task["condition"], episode)))
+        self._running = True
         return cast("Request", self._next().obs)
 
     def step(self, action: Action) -> StepResult:
@@ -239,29 +235,57 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
         """Return the row of the rollout."""
         if not step_result.done:
             raise RunError(
-                f"vla-eval ended the rollout before its end, after {MAX_STEPS} actions at most",
-                "Leave out `max_steps` in its configuration.",
+                "`max_steps` of vla-eval's configuration ended the rollout; expected at least the "
+                f"{MAX_STEPS} of the benchmark",
+                "Leave it out.",
             )
         return step_result.info
 
     def cleanup(self) -> None:
         """End the simulator."""
         self._stop()
-        self._thread.submit(self._rollouts.close).result()
-        self._thread.shutdown()
+        self._jobs.put(None)
+        self._thread.join()
+
+    def _work(self) -> None:
+        """Run one rollout after the other, in the second thread."""
+        while (job := self._jobs.get()) is not None:
+            try:
+                row, _ = self._rollouts(job, Worker())
+                self._policy.requests.put(row_of(row_line(row)))  # raises what no file can hold
+            except Exception as error:
+                self._policy.requests.put(error)
+            except BaseException as error:  # such as SystemExit: the other thread must not wait
+                self._policy.requests.put(RunError(f"the rollout raised {error!r}"))
+        self._rollouts.close()
 
     def _next(self) -> StepResult:
         """Wait for the rollout to ask for an action, or to end."""
-        asked = self._policy.asked.get()
-        if isinstance(asked, Request):
-            return StepResult(asked, 0.0, False, {})
-        row, _ = asked.result()  # raises what the rollout raised
-        return StepResult(None, float(row.success), True, to_dict(row))
+        request = self._policy.requests.get()
+        if isinstance(request, Request):
+            return StepResult(request, 0.0, False, {})
+        self._running = False
+        if isinstance(request, Exception):
+            raise request
+        return StepResult(None, float(request.success), True, to_dict(request))
 
     def _stop(self) -> None:
         """Stop a rollout whose server failed."""
-        if self._running is not None and not self._running.done():
+        if self._running:
             self._policy.answers.put(None)
-            while isinstance(self._policy.asked.get(), Request):
+            while isinstance(self._policy.requests.get(), Request):
                 pass
-        self._running = None
+        self._running = False
+
+
+def _typed(name: str, value: Any) -> Any:
+    """Return a setting out of YAML as `RunConfig` has it."""
+    default = next(one.default for one in fields(RunConfig) if one.name == name)
+    kind, expected = {
+        tuple: (list, "a list, such as [k0] or [MoveCube]"),
+        bool: (bool, "true or false"),
+        int: (int, "a whole number"),
+    }.get(type(default), (str, "text, in quotes if it is a number"))
+    if type(value) is not kind:
+        raise InvalidOptionError.expected(name, value, expected, "Correct it in `params`.")
+    return tuple(value) if kind is list else value

@@ -1,5 +1,6 @@
 """The command `vla-eval-config`."""
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -32,8 +33,7 @@ def vla_eval_config(
     robomme-interference vla-eval-config my-buffers --system my-model \
       --conditions k0,k7 --out config.yaml
     vla-eval run --no-docker -c config.yaml
-    robomme-interference score results/RoboMMEInterference_aggregate.json \
-      --out scores/my-model
+    robomme-interference score results/*_aggregate.json --out scores/my-model
     ```
     """
     from .configuration import configuration
@@ -52,4 +52,4 @@ def vla_eval_config(
         return
     with atomic_path(out) as partial:
         partial.write_text(text + "\n")
-    print_status(f"Run: vla-eval run --no-docker -c {out}")
+    print_status(f"Run: vla-eval run --no-docker -c {shlex.quote(str(out))}")

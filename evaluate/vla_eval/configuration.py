@@ -7,6 +7,7 @@ from typing import Any
 import yaml
 
 from robomme_interference_data.data.loading import load_buffer_set
+from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.run.plan import plan_work
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.ids import count_numbers
@@ -15,6 +16,15 @@ BENCHMARK = f"{__package__}.benchmark:RoboMMEInterference"
 
 _ANSWER_S = 600.0
 """Seconds for an answer: the first one comes after the whole history was sent and taken in."""
+
+
+def check_label(system: str) -> None:
+    """Check that a system is a name, and not one of the paper's."""
+    if name_system(system).paper:
+        raise InvalidOptionError(
+            f"a server of vla-eval is not the paper's system {system}",
+            "Set `system` to a name of your own; docs/how-to/vla-eval.md lists what differs.",
+        )
 
 
 def configuration(
@@ -36,8 +46,9 @@ def configuration(
     Raises:
         UnknownNameError: The buffer set lacks a family, condition or episode.
         InvalidIdError: `system` is not a name.
+        InvalidOptionError: It is a system of the paper.
     """
-    name_system(system)
+    check_label(system)
     opened = load_buffer_set(buffer_set)
     plan = plan_work(
         opened.episode_ids,

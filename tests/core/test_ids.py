@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from robomme_interference_data import EpisodeId
 from robomme_interference_data.constants import FAMILIES, SPLITS
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError
-from robomme_interference_data.ids import count_numbers, format_numbers, parse_numbers
+from robomme_interference_data.ids import count_numbers, format_numbers, nth_number, parse_numbers
 
 IDS = st.builds(
     EpisodeId,
@@ -70,7 +70,10 @@ def test_canonical_order() -> None:
 
 @given(st.sets(st.integers(0, 300), min_size=1))
 def test_numbers_round_trip(numbers: set[int]) -> None:
-    assert parse_numbers(format_numbers(sorted(numbers))) == tuple(sorted(numbers))
+    text, expected = format_numbers(sorted(numbers)), sorted(numbers)
+    assert parse_numbers(text) == tuple(expected)
+    nth = [nth_number(text, n) for n in range(len(numbers) + 1)]
+    assert nth == [*expected, None]
     assert format_numbers([0, 1, 2, 5]) == "0-2,5"
 
 

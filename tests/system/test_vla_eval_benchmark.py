@@ -126,8 +126,9 @@ benchmarks:
     - PatternLock
 """
     assert (tmp_path / "c.yaml").read_text() == expected
-    refused = CliRunner().invoke(app, [*command, "--conditions", "k5"])
-    assert isinstance(refused.exception, InterferenceError) and "k5" in str(refused.exception)
+    for option, value in (("--conditions", "k5"), ("--system", "perceptual-framesamp-modul")):
+        refused = CliRunner().invoke(app, [*command, option, value])
+        assert isinstance(refused.exception, InterferenceError) and value in str(refused.exception)
 
 
 def make(**settings: Any) -> Any:
@@ -144,6 +145,10 @@ def test_bad_settings_are_refused() -> None:
         make(condition=["k0"])
     with pytest.raises(UnknownNameError, match="'k5'"):
         make(conditions=["k5"], send_video_history=True)
+    # YAML has other types than a command line.
+    for name, value in {"conditions": "k0", "families": None, "episodes": 0}.items():
+        with pytest.raises(InvalidOptionError, match=f"{name} {value!r}; expected"):
+            make(**{name: value})
 
 
 def test_an_episode_beyond_the_last_and_one_that_is_cut_short() -> None:
@@ -156,9 +161,22 @@ def test_an_episode_beyond_the_last_and_one_that_is_cut_short() -> None:
     assert sorted(first["images"]) == ["agentview"] and "video_history" not in first
     result = played.step({"actions": first["states"]})
     assert not result.done
-    with pytest.raises(RunError, match="before its end"):
+    with pytest.raises(RunError, match="max_steps"):
         played.get_step_result(result)
     played.cleanup()  # while the rollout waits for an action
+
+
+def test_a_simulator_that_exits_breaks_one_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+    played = make(conditions=["no-history"], families=["MoveCube"], episodes="0")
+    (task,) = played.get_tasks()
+    with monkeypatch.context() as patch:
+        patch.setattr(worlds.World, "step", lambda *_, **__: sys.exit("gone"))
+        first = played.make_obs(played.reset({**task, "episode_idx": 0}), task)
+        with pytest.raises(RunError, match="gone"):
+            played.step({"actions": first["states"]})
+    again = played.make_obs(played.reset({**task, "episode_idx": 0}), task)
+    assert again["episode_restart"]
+    played.cleanup()
 
 
 def test_a_chunk_is_carried_out_action_by_action() -> None:

@@ -15,7 +15,7 @@ import pyarrow.json as pa_json
 from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD, RUN_TABLES
 from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
 from robomme_interference_data.evaluate.run.log import MOST_BYTES, RunHeader, whole_lines
-from robomme_interference_data.ids import parse_numbers
+from robomme_interference_data.ids import nth_number
 from robomme_interference_data.schema.codec import arrow_schema
 from robomme_interference_data.schema.rollouts import KEY_COLUMNS, Rollout, Status
 from robomme_interference_data.storage.files import parse_json, read_bytes, read_header
@@ -183,20 +183,26 @@ def _read_vla_eval(path: Path, names: Sequence[str], has_system: bool) -> Part:
     nothing about the policy, though vla-eval counts it as no success.
     """
     results = parse_json(read_bytes(path, MOST_BYTES), str(path))
-    rows = []
+    rows: dict[int, list[Any]] = {}
+    malformed: dict[int, str] = {}
     try:
-        for episode in (one for task in results["tasks"] for one in task["episodes"]):
+        episodes = [one for task in results["tasks"] for one in task["episodes"]]
+        _check_count(len(episodes))
+        for line, episode in enumerate(episodes, 1):
             row = episode["metrics"]
             if episode.get("failure_reason"):
-                number = parse_numbers(episode["episode"])[episode["episode_idx"]]
+                number = nth_number(episode["episode"], episode["episode_idx"])
+                if number is None:
+                    malformed[line] = f"{episode['name']} has fewer episodes: see episodes_per_task"
+                    continue
                 row = {**episode, "episode": number, "status": Status.ERROR, "success": None}
-            rows.append({name: row.get(name) for name in names})
-            if any(isinstance(value, list | dict) for value in rows[-1].values()):
-                raise ValueError("a column holds lists or maps; expected text and numbers")
-            _check_count(len(rows))
-    except (KeyError, TypeError, AttributeError, IndexError) as error:
-        raise FormatError.damaged(
-            path, f"it holds no results of vla-eval: {type(error).__name__} {error}"
+            rows[line] = [row[name] if name in KEY_COLUMNS else row.get(name) for name in names]
+            if any(isinstance(value, list | dict) for value in rows[line]):
+                raise TypeError
+    except (KeyError, TypeError, AttributeError, IndexError):
+        raise FormatError(
+            f"{path} holds no results of this benchmark in vla-eval",
+            "Expected a file of `vla-eval run` or `vla-eval export`: see docs/how-to/vla-eval.md.",
         ) from None
-    columns = {name: [row[name] for row in rows] for name in names}
-    return Part(columns, range(1, len(rows) + 1))
+    columns = {name: [row[at] for row in rows.values()] for at, name in enumerate(names)}
+    return Part(columns, list(rows), malformed)

@@ -64,9 +64,9 @@ class RenderOnDemand:
         def render(env: Any, *args: Any, **named: Any) -> dict[str, Any]:
             sensors = env._sensors
             if sensors.keys() <= self._last.keys():  # otherwise a camera has no last image yet
-                wanted = {*self.cameras} if self.keep() else set()
-                wanted |= {CAMERAS["front"]} if self.needs_front() else set()
-                env._sensors = {name: one for name, one in sensors.items() if name in wanted}
+                drawn = {*self.cameras} if self.keep() else set()
+                drawn |= {CAMERAS["front"]} if self.needs_front() else set()
+                env._sensors = {name: one for name, one in sensors.items() if name in drawn}
             env.scene.sensors = env._sensors
             try:
                 if env._sensors:

@@ -129,8 +129,7 @@ class Episodes:
         self._select_cameras(every > 0)
         log = _facts.LessonLog(self._env, family)
         kept = _rendering.KeptFrames(self._env.unwrapped, every)
-        if every:
-            self._rendering.keep = kept
+        self._rendering.keep = kept if every else _rendering.always
         observations, info = self._env.reset()
         self._rendering.keep = _rendering.always
         goals = info["task_goal"]
