@@ -278,14 +278,18 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
         self._running = False
 
 
+_TYPES: dict[type, tuple[type, str]] = {
+    tuple: (list, "a list, such as [k0] or [MoveCube]"),
+    bool: (bool, "true or false"),
+    int: (int, "a whole number"),
+}
+"""Type of a setting's default to its type in YAML; that of all others is text."""
+
+
 def _typed(name: str, value: Any) -> Any:
     """Return a setting out of YAML as `RunConfig` has it."""
     default = next(one.default for one in fields(RunConfig) if one.name == name)
-    kind, expected = {
-        tuple: (list, "a list, such as [k0] or [MoveCube]"),
-        bool: (bool, "true or false"),
-        int: (int, "a whole number"),
-    }.get(type(default), (str, "text, in quotes if it is a number"))
+    kind, expected = _TYPES.get(type(default), (str, "text, in quotes if it is a number"))
     if type(value) is not kind:
         raise InvalidOptionError.expected(name, value, expected, "Correct it in `params`.")
-    return tuple(value) if kind is list else value
+    return tuple(value) if isinstance(value, list) else value
