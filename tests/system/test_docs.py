@@ -90,6 +90,7 @@ ELSEWHERE = (
     "siglip",  # weights
     "lerobot:",  # a checkpoint
     "theirs/",  # published results
+    "_aggregate.json",  # results of vla-eval, which have a test of their own
     "python:retrace",  # have tests of their own
     "python:memory_policy",  # has a test of its own
     "lamp",  # has a test of its own
