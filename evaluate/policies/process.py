@@ -6,18 +6,18 @@ that it served are repeated, and those that ask next wait until it has loaded th
 """
 
 import logging
+import os
 import pickle
-import socket
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import dataclass
-from multiprocessing.connection import Client, Connection, wait
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, replace
+from multiprocessing import AuthenticationError
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, cast, get_type_hints
 
 import numpy as np
@@ -30,18 +30,19 @@ from robomme_interference_data.errors import (
     WorkerError,
 )
 from robomme_interference_data.evaluate.run.config import RunConfig
-from robomme_interference_data.runtime.executor import Worker
-from robomme_interference_data.runtime.process import CLOSE_S, ProcessScheduler, WorkerProcess
+from robomme_interference_data.runtime.executor import Session, Worker, make_executor
+from robomme_interference_data.runtime.process import CLOSE_S
 from robomme_interference_data.simulators.base import Observation
 
 from .batching import Answer, Batcher, attempt
 from .policy import Frames, Policy, RolloutInfo
 from .registry import check_members, make_policy
+from .sockets import Address, Directory, accept
 
 logger = logging.getLogger(__name__)
 
-_OPEN, _STOP = "open", "stop"
-"""The first message of a session, and the one that ends the process; others name a method."""
+_OPEN = "open"
+"""The first message of a session; others name a method."""
 
 
 class SharedPolicy(Policy):
@@ -98,48 +99,52 @@ class SharedPolicy(Policy):
         return value
 
 
-def connect(address: str) -> Connection:
-    """Request a session from the process that listens at a socket's path."""
+def connect(address: Address) -> Connection:
+    """Request a session from a policy's process."""
     with _death():
-        connection = Client(address)
+        connection = address.connect()
         _send(connection, (_OPEN, ()))
         return connection
 
 
 @dataclass(frozen=True)
 class ServePolicy:
-    """What a policy's process does: a task of an executor, the number of a listener.
+    """What a policy's process does: a task of an executor, its address.
 
     The first session makes the policy. If that fails, its connection gets the error, and the next
     session makes it again.
     """
 
     config: RunConfig
-    listeners: Sequence[socket.socket]
 
-    def __call__(self, task: int, worker: Worker) -> None:
-        """Answer all connections until one sends the message that ends the process."""
-        config, listener = self.config, self.listeners[task]
+    def __call__(self, task: Address, worker: Worker) -> None:
+        """Answer all connections until the run ends."""
+        config, number = self.config, task.number
+        if config.executor == "processes" and config.policies != 1:
+            choose_gpu(number)  # on a cluster Ray does it
         batcher: Batcher[Connection] = Batcher(
-            lambda: make_policy(config.policy, config.policy_options, worker=task),  # type: ignore[arg-type, return-value]
+            lambda: make_policy(config.policy, config.policy_options, worker=number),  # type: ignore[arg-type, return-value]
             config.max_batch_size,
             config.batch_wait_timeout_s,
         )
         clients: list[Connection] = []
-        with closing(batcher):
+        with closing(batcher), task.listen() as (listener, ended):
             while True:
-                ready: list[Any] = wait([listener, *clients], batcher.due_s(time.monotonic()))
+                ready: list[Any] = wait(
+                    [ended, listener, *clients], batcher.due_s(time.monotonic())
+                )
+                if ended in ready:
+                    return
                 with worker.limit(config.rollout_timeout_s, "a call of the policy"):
                     for client in ready:
                         if client is listener:
-                            clients.append(Connection(listener.accept()[0].detach()))
+                            if (new := accept(listener, task.key)) is not None:
+                                clients.append(new)
                             continue
                         request, end = attempt(_receive, client)
                         if end is not None:  # its worker ended, or closed it
                             clients.remove(client)
                             batcher.drop(client)
-                        elif request[0] == _STOP:
-                            return
                         elif request[0] == _OPEN:
                             _reply(client, attempt(self._open, batcher, client))
                         elif answer := batcher.call(client, request):
@@ -162,24 +167,21 @@ class ServePolicy:
         return {name: getattr(session, name) for name in get_type_hints(Policy)}
 
 
-class _PolicyScheduler(ProcessScheduler):
-    """Keeps the policy's processes running."""
+def choose_gpu(number: int) -> None:
+    """Let this process use one of the machine's GPUs; before it imports torch.
 
-    def __init__(self, function: ServePolicy, workers: int):
-        super().__init__(function, workers)
-        self._started = set[int]()
-
-    def start(self, number: int) -> WorkerProcess:
-        """Start a process, or start it again."""
-        if number in self._started:
-            logger.warning("The policy's process %d died; it is started again", number)
-        self._started.add(number)
-        return super().start(number)
+    The processes share the GPUs evenly.
+    """
+    chosen = os.environ.get("CUDA_VISIBLE_DEVICES")
+    found = sorted(Path("/proc/driver/nvidia/gpus").glob("*")) if chosen is None else []
+    gpus = chosen.split(",") if chosen else [*map(str, range(len(found)))]
+    if len(gpus) > 1:
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpus[number % len(gpus)]
 
 
 @contextmanager
-def policy_processes(config: RunConfig) -> Iterator[tuple[str, ...]]:
-    """Run the policy's processes in the block; yield the paths of their sockets.
+def policy_processes(config: RunConfig) -> Iterator[tuple[Address, ...]]:
+    """Run the policy's processes in the block, where workers run; yield their addresses.
 
     When the block begins, each has loaded the policy.
 
@@ -187,30 +189,28 @@ def policy_processes(config: RunConfig) -> Iterator[tuple[str, ...]]:
         PolicyError: The policy cannot be made.
         ServerDiedError: A process died while it made it.
     """
-    numbers, failures = range(config.policies or 0), list[WorkerError]()
+    failures = list[WorkerError]()
+    count = config.policies or 0
+    executor = make_executor(replace(config, workers=count, gpus_per_worker=config.gpus_per_policy))
     with ExitStack() as stack:
-        folder = Path(stack.enter_context(TemporaryDirectory(prefix="robomme-interference-")))
-        addresses = tuple(str(folder / str(number)) for number in numbers)
-        # They outlive the processes: who connects while one is started again waits for it.
-        listeners = [stack.enter_context(socket.socket(socket.AF_UNIX)) for _ in numbers]
-        for listener, address in zip(listeners, addresses, strict=True):
-            listener.bind(address)
-            listener.listen()
-        scheduler = _PolicyScheduler(ServePolicy(config, listeners), len(numbers))
-        stack.enter_context(closing(scheduler))
+        session = stack.enter_context(executor.session(ServePolicy(config)))
+        directory = Directory(executor.host)
+        addresses = tuple(map(directory.address, range(count)))
 
         def supervise() -> None:
             try:
-                for _ in scheduler.run(numbers, attempts=sys.maxsize):
-                    pass
+                for outcome in session.run(addresses, attempts=sys.maxsize):
+                    if outcome.error is not None:
+                        failures.append(WorkerError(f"the policy's process: {outcome.error}"))
+                        break
             except WorkerError as error:  # a process cannot start
                 failures.append(error)
-                for listener in listeners:
-                    listener.close()  # whoever waits gets an error
+            directory.close()  # whoever waits gets an error
 
         thread = threading.Thread(target=supervise, daemon=True)
         thread.start()
-        stack.callback(_stop, thread, scheduler, addresses)
+        stack.callback(_join, thread, session)
+        stack.callback(directory.close)
         with ExitStack() as first:
             try:  # connect to all before waiting for one: they load at the same time
                 connections = [first.enter_context(connect(address)) for address in addresses]
@@ -221,16 +221,12 @@ def policy_processes(config: RunConfig) -> Iterator[tuple[str, ...]]:
         yield addresses
 
 
-def _stop(thread: threading.Thread, scheduler: _PolicyScheduler, addresses: Sequence[str]) -> None:
-    """End the policy's processes; kill those that do not end in time, such as in a long call."""
+def _join(thread: threading.Thread, session: Session) -> None:
+    """Wait for processes that end; kill those that do not in time, such as in a long call."""
+    thread.join(CLOSE_S)
     while thread.is_alive():
-        for address in addresses:
-            with suppress(OSError), Client(address) as client:
-                _send(client, (_STOP, ()))
+        session.kill()  # those that replace them find no directory, and end
         thread.join(CLOSE_S)
-        if thread.is_alive():
-            for process in [*scheduler.workers]:
-                process.kill()  # the one that replaces it gets the message
 
 
 @contextmanager
@@ -238,8 +234,10 @@ def _death() -> Iterator[None]:
     """Convert the end of a connection into the error of a process that ended."""
     try:
         yield
-    except (EOFError, OSError) as error:
-        raise ServerDiedError("the policy's process ended", "Its output is above.") from error
+    except (AuthenticationError, EOFError, OSError) as error:
+        reason = f": {error}" if str(error) else ""
+        problem = f"the policy's process ended{reason}"
+        raise ServerDiedError(problem, "Its output is above.") from error
 
 
 def _reply(client: Connection, answer: Answer) -> None:

@@ -26,6 +26,7 @@ from robomme_interference_data.evaluate.systems import (
     name_system,
 )
 from robomme_interference_data.retrieval.select import Rule
+from robomme_interference_data.runtime.executor import is_share
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.simulators.base import ACTION_SIZE
 from robomme_interference_data.simulators.registry import (
@@ -133,11 +134,16 @@ def _check_policies(config: RunConfig, policy: Policy) -> None:
     """Check the settings of shared policies, and that the policy can be shared."""
     if config.policies is None:
         own = "policies that are not shared"
-        check_unused(config, ("max_batch_size", "batch_wait_timeout_s"), own, "Set `policies`.")
+        unused = ("max_batch_size", "batch_wait_timeout_s", "gpus_per_policy")
+        check_unused(config, unused, own, "Set `policies`.")
         return
+    if config.executor == "processes":
+        own = "policies on this machine, which share its GPUs"
+        check_unused(config, ("gpus_per_policy",), own, 'Set `executor` to "ray".')
     for name, valid, expected in (
         ("policies", 1 <= config.policies <= config.workers, f"1 to `workers`, {config.workers}"),
         ("max_batch_size", config.max_batch_size >= 1, "1 or more"),
+        ("gpus_per_policy", is_share(config.gpus_per_policy), "0 to 1, or a whole number"),
         ("batch_wait_timeout_s", 0 <= config.batch_wait_timeout_s < math.inf, "0 or more"),
     ):
         if not valid:
@@ -150,8 +156,6 @@ def _check_policies(config: RunConfig, policy: Policy) -> None:
         fault = "it needs the simulator, which runs in the worker"
     elif missing:
         fault = f"it has no {' and no '.join(missing)}"
-    elif config.executor != "processes":
-        fault = "its process and the workers must be on one machine"
     if fault is not None:
         raise InvalidOptionError(
             f"the policy {config.policy} cannot be shared by workers (`policies`): {fault}",

@@ -18,6 +18,7 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.evaluate.policies.answers import Answers
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import make_policy
+from robomme_interference_data.evaluate.policies.sockets import Address
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.kind import Job, Run, RunTask
 from robomme_interference_data.evaluate.run.plan import WorkItem
@@ -70,7 +71,7 @@ class RolloutTask(RunTask[RunConfig]):
         self,
         run: Run[RunConfig],
         answers: Answers | None = None,
-        addresses: Sequence[str] = (),
+        addresses: Sequence[Address] = (),
         policy: Policy | None = None,
     ):
         super().__init__(run)

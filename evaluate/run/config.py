@@ -119,6 +119,9 @@ class RunConfig(WorkConfig):
         group=_POLICY,
         help="Maximum seconds that an idle shared policy waits for a larger batch.",
     )
+    gpus_per_policy: float = setting(
+        0.0, group=_POLICY, help="Share of a GPU that Ray reserves for each shared policy."
+    )
     subgoals: str | None = setting(
         None,
         group=_SUBGOALS,

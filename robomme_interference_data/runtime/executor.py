@@ -56,6 +56,11 @@ class WorkersConfig:
     )
 
 
+def is_share(gpus: float) -> bool:
+    """Whether Ray can reserve so much of a GPU, or so many GPUs."""
+    return 0 <= gpus < float("inf") and (gpus <= 1 or gpus % 1 == 0)
+
+
 def make_executor(config: WorkersConfig) -> "Executor":
     """Return the executor that the settings describe."""
     if config.executor == "processes":
@@ -89,9 +94,17 @@ class Session(Protocol):
     def run(self) -> Callable[..., Generator[Outcome]]:
         """Call the session's function on every task; see `Executor.run`."""
 
+    def kill(self) -> None:
+        """Kill all worker processes; another thread may be in `run`, which starts them again."""
+
 
 class Executor(ABC):
     """Runs tasks."""
+
+    @property
+    def host(self) -> str:
+        """The address under which workers reach this machine, in a session."""
+        return "127.0.0.1"
 
     @abstractmethod
     def session(self, function: Task) -> AbstractContextManager[Session]:
@@ -139,6 +152,9 @@ class Serial(Executor):
 @dataclass(frozen=True)
 class _SerialSession:
     function: Task
+
+    def kill(self) -> None:
+        """There is no other process."""
 
     def run(
         self,

@@ -28,7 +28,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from robomme_interference_data.errors import InvalidOptionError, WorkerError, first_line
 
-from .executor import Executor, Session, describe
+from .executor import Executor, Session, describe, is_share
 from .process import CLOSE_S, START_S, end_if_starting
 from .scheduler import Scheduler
 from .worker import Outcome, ProcessWorker, Task, read_remains, unpickle_outcome
@@ -72,16 +72,21 @@ class RayWorkers(Executor):
     gpus: float = 0.0
 
     def __post_init__(self) -> None:
-        whole = self.gpus <= 1 or self.gpus % 1 == 0
         is_address = re.fullmatch(r"auto|local|[^/]+:\d{1,5}", self.address)
         for name, value, valid, expected in (
             ("workers", self.workers, self.workers >= 1, "1 or more"),
             ("cpus_per_worker", self.cpus, 0 <= self.cpus < float("inf"), "0 or more"),
-            ("gpus_per_worker", self.gpus, self.gpus >= 0 and whole, "0 to 1, or a whole number"),
+            ("gpus_per_worker", self.gpus, is_share(self.gpus), "0 to 1, or a whole number"),
             ("ray_address", self.address, is_address, "auto, local or HOST:PORT"),
         ):
             if not valid:
                 raise InvalidOptionError.expected(name, value, expected)
+
+    @property
+    def host(self) -> str:
+        """The address under which the cluster's nodes reach this machine, in a session."""
+        util: Any = ray.util
+        return str(util.get_node_ip_address())
 
     @contextmanager
     def session(self, function: Task) -> Iterator[Session]:
@@ -199,9 +204,11 @@ class _RayWorker:
         died = outcome.error or RuntimeError("the worker process died")
         return replace(outcome, error=died, node=_name(self._node))
 
-    def stop(self) -> None:
+    def kill(self) -> None:
         """Kill it; its guard kills the processes that it started."""
         ray.kill(self.actor)
+
+    stop = kill
 
 
 class _RayScheduler(Scheduler[_RayWorker]):

@@ -34,8 +34,11 @@ class Handle(Protocol):
         """Return the outcome, which has arrived."""
         ...
 
+    def kill(self) -> None:
+        """Kill the worker; if it has a task, the outcome is that of a worker that died."""
+
     def stop(self) -> None:
-        """Kill the worker."""
+        """Kill the worker, and release what it used."""
 
 
 @dataclass
@@ -116,6 +119,11 @@ class Scheduler[H: Handle](ABC):
         finally:
             for worker in busy:
                 self._drop(worker)
+
+    def kill(self) -> None:
+        """Kill all workers; another thread may be in `run`, which starts their tasks again."""
+        for worker in [*self.workers]:
+            worker.kill()
 
     def _drop(self, worker: H, *, replaced: bool = True) -> None:
         worker.stop()

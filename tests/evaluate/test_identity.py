@@ -47,7 +47,7 @@ FREE = {
     RunConfig: {
         *("out", "robomme_python", "videos", "check_lesson", "simulator_timeout_s"),
         *("history_chunk", "serve"),
-        *("policies", "max_batch_size", "batch_wait_timeout_s"),
+        *("policies", "max_batch_size", "batch_wait_timeout_s", "gpus_per_policy"),
     },
     AskConfig: {"out"},
 }

@@ -18,6 +18,7 @@ from support.buffer_sets import GOLDEN, contents
 from support.made_up import MadeUpSource
 from support.ray_cluster import add_node, running_cluster
 from support.serve_policy import command
+from support.shared_policies import FAULT
 from support.worker_calls import Marked, behave, wait_until_gone
 
 from robomme_interference_data.build_dataset.build import build_dataset
@@ -35,9 +36,13 @@ ROLLOUTS = 2 * len(CONDITIONS)
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[Any]:
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """A cluster of one's own, for nodes are taken away; its workers know the tests' world."""
-    variables = {worlds.BUFFER_SET: str(GOLDEN), worlds.PAUSE: "0.03"}
+    variables = {
+        worlds.BUFFER_SET: str(GOLDEN),
+        worlds.PAUSE: "0.03",
+        FAULT: str(tmp_path_factory.mktemp("faults")),
+    }
     with pytest.MonkeyPatch.context() as patch:
         for name, value in variables.items():
             patch.setenv(name, value)
@@ -45,10 +50,12 @@ def cluster() -> Iterator[Any]:
             yield made
 
 
-def driver(out: Path, address: str) -> subprocess.Popen[str]:
+def driver(
+    out: Path, address: str, policy: str = f"--policy {runs.CHEAT} --workers 3"
+) -> subprocess.Popen[str]:
     """The command, as a user runs it."""
-    words = f"evaluate {GOLDEN} --policy {runs.CHEAT} --simulator {runs.WORLD} --system mine"
-    words += " --workers 3 --families VideoRepick,MoveCube"
+    words = f"evaluate {GOLDEN} {policy} --simulator {runs.WORLD} --system mine"
+    words += " --families VideoRepick,MoveCube"
     words += f" --executor ray --ray-address {address} --json"
     command = [sys.executable, "-m", "robomme_interference_data.cli.main", *words.split()]
     return subprocess.Popen(
@@ -72,6 +79,13 @@ def workers_of(cluster: Any) -> list[int]:
             if "WorkerActor" in " ".join(each.cmdline()):
                 found.append(each.pid)
     return found
+
+
+def wait_until_no_worker_is_left(cluster: Any) -> None:
+    deadline = time.monotonic() + 30
+    while left := workers_of(cluster):
+        assert time.monotonic() < deadline, f"still running: {left}"
+        time.sleep(0.1)
 
 
 def test_a_node_and_the_driver_are_killed_and_no_row_is_lost(
@@ -107,10 +121,7 @@ def test_ctrl_c_gives_all_workers_back(cluster: Any, tmp_path: Path) -> None:
     running.send_signal(signal.SIGINT)
     _, err = running.communicate(timeout=60)
     assert running.returncode == 130 and "resume with:" in err
-    deadline = time.monotonic() + 30
-    while left := workers_of(cluster):
-        assert time.monotonic() < deadline, f"still running: {left}"
-        time.sleep(0.1)
+    wait_until_no_worker_is_left(cluster)
     assert 1 <= len(read_record(tmp_path / "run")) < ROLLOUTS
 
 
@@ -125,6 +136,20 @@ def test_each_worker_of_a_node_starts_its_server(cluster: Any, tmp_path: Path) -
     wait_until_gone(pids)
     logs = [path.read_text() for path in (tmp_path / "run" / "servers").iterdir()]
     assert len({log.split()[2] for log in logs}) == 2  # a port for each
+
+
+def test_a_policy_is_shared_on_a_cluster_and_started_again(cluster: Any, tmp_path: Path) -> None:
+    policy = "python:support.shared_policies:Remembering"
+    runs.run(tmp_path / "own", policy=policy, conditions=CONDITIONS)
+    Path(os.environ[FAULT], "die").touch()
+    shared = f"--policy {policy} --policy-option fault=die --workers 2 --policies 1"
+    running = driver(tmp_path / "run", cluster.address, shared)
+    answer, err = running.communicate(timeout=300)
+    assert running.returncode == 0 and len(json.loads(answer)) == ROLLOUTS, err
+    assert "process 0 was started again" in err
+    assert runs.finished_rows(tmp_path / "run") == runs.finished_rows(tmp_path / "own")
+    assert "2" in Path(os.environ[FAULT], "batches").read_text().split()
+    wait_until_no_worker_is_left(cluster)
 
 
 def test_a_node_that_differs_is_one_error_that_says_how(cluster: Any) -> None:
