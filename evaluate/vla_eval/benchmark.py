@@ -140,8 +140,13 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
         super().__init__()
         if unknown := sorted({*settings} - {*SETTINGS}):
             raise UnknownNameError.among("setting", unknown[0], "the benchmark", SETTINGS)
-        chosen = {name: _typed(name, value) for name, value in settings.items()}
-        check_label(system)
+        defaults = {one.name: one.default for one in fields(RunConfig)}
+        chosen = {name: _typed(name, value, defaults[name]) for name, value in settings.items()}
+        _typed("buffer_set", buffer_set, "")
+        _typed("send_wrist_image", send_wrist_image, False)
+        _typed("send_state", send_state, False)
+        _typed("send_video_history", send_video_history, False)
+        check_label(_typed("system", system, ""))
         opened = load_buffer_set(buffer_set)
         options = {"wrist": send_wrist_image, "history": send_video_history}
         config = RunConfig(
@@ -286,9 +291,8 @@ _TYPES: dict[type, tuple[type, str]] = {
 """Type of a setting's default to its type in YAML; that of all others is text."""
 
 
-def _typed(name: str, value: Any) -> Any:
-    """Return a setting out of YAML as `RunConfig` has it."""
-    default = next(one.default for one in fields(RunConfig) if one.name == name)
+def _typed(name: str, value: Any, default: Any) -> Any:
+    """Return a setting out of YAML if it has the type of its default; a list as a tuple."""
     kind, expected = _TYPES.get(type(default), (str, "text, in quotes if it is a number"))
     if type(value) is not kind:
         raise InvalidOptionError.expected(name, value, expected, "Correct it in `params`.")

@@ -146,7 +146,8 @@ def test_bad_settings_are_refused() -> None:
     with pytest.raises(UnknownNameError, match="'k5'"):
         make(conditions=["k5"], send_video_history=True)
     # YAML has other types than a command line.
-    for name, value in {"conditions": "k0", "families": None, "episodes": 0}.items():
+    others = {"conditions": "k0", "families": None, "episodes": 0, "system": 5, "send_state": "yes"}
+    for name, value in others.items():
         with pytest.raises(InvalidOptionError, match=f"{name} {value!r}; expected"):
             make(**{name: value})
 
