@@ -108,13 +108,18 @@ class HubFiles:
     for the tag of a version, such as `data-1.0.0`: a published version never changes.
     """
 
-    folder = ""
-
-    def __init__(self, repo_id: str, revision: str | None = None, repo_type: str = "dataset"):
+    def __init__(
+        self,
+        repo_id: str,
+        revision: str | None = None,
+        repo_type: str = "dataset",
+        folder: str = "",
+    ):
         check_endpoint()
         self.repo_id = repo_id
         self.revision = revision or "main"
         self.repo_type = repo_type
+        self.folder = f"{folder}/" if folder else ""
 
     @classmethod
     def parse(cls, location: str, repo_type: str = "dataset", revision: str | None = None) -> Self:
@@ -130,15 +135,11 @@ class HubFiles:
             raise InvalidOptionError(
                 f"{location!r} and revision {revision!r}", "Give the revision once."
             )
-        files = cls(repo_id, at or revision, repo_type)
-        files.folder = f"{folder[1:]}/" if folder else ""
-        return files
+        return cls(repo_id, at or revision, repo_type, folder[1:])
 
     def inside(self, folder: str) -> "HubFiles":
         """Return the files of a folder of the repository, at the same commit."""
-        inner = HubFiles(self.repo_id, self.commit, self.repo_type)
-        inner.folder = f"{self.folder}{folder}/"
-        return inner
+        return HubFiles(self.repo_id, self.commit, self.repo_type, f"{self.folder}{folder}")
 
     @cached_property
     def commit(self) -> str:
@@ -155,7 +156,7 @@ class HubFiles:
 
     @property
     def location(self) -> str:
-        """`namespace/name[/folder]@commit`; see `Files.location`."""
+        """`namespace/name[/folder]@commit`: the argument of `locate` for the same files."""
         return f"{self.name}@{self.commit}"
 
     @property
@@ -164,7 +165,7 @@ class HubFiles:
         return f"{self.repo_id}/{self.folder}".removesuffix("/")
 
     def path(self, relative: str) -> Path:
-        """Return the file's path in the cache, downloading it if necessary; see `Files.path`.
+        """Return the file's path in the cache, downloading it if necessary.
 
         A downloaded file is compared with the digest that the Hub has of it.
         """
@@ -180,7 +181,7 @@ class HubFiles:
         return path
 
     def fetch(self, paths: Iterable[str]) -> None:
-        """Download files that are not in the cache, with a progress bar; see `Files.fetch`.
+        """Download files that are not in the cache, several at a time, with a progress bar.
 
         `snapshot_download` would first list the whole repository: for one buffer of a large
         dataset, more bytes and requests than the buffer's metadata.
