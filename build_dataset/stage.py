@@ -24,8 +24,8 @@ from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.records import EpisodeRecord, SpanDigests, lesson_spans
 from robomme_interference_data.storage.arrays import (
     FeatureDigests,
-    SpanDigester,
     combine,
+    digest_spans,
     write_array,
 )
 from robomme_interference_data.storage.encode import Codec, VideoEncoder, get_codec
@@ -235,15 +235,11 @@ class _Writer:
 
     def decode(self, spans: Sequence[tuple[int, int]]) -> list[dict[str, str]]:
         """Decode the videos; return digests over spans of frames, vectors among them."""
-        digests = SpanDigester(spans)
-        for name in self._encoders:
-            images = iter_frames(self._folder / f"{name}.mp4", 0, self.length, self._fps)
-            for index, image in enumerate(images):
-                digests.update(name, index, image)
-        for name, values in self._vectors.items():
-            for index, value in enumerate(values):
-                digests.update(name, index, value)
-        return digests.digests()
+        videos = {
+            name: iter_frames(self._folder / f"{name}.mp4", 0, self.length, self._fps)
+            for name in self._encoders
+        }
+        return digest_spans(spans, [*videos.items(), *self._vectors.items()])
 
     def _begin(
         self, images: dict[str, NDArray[np.uint8]], vectors: dict[str, NDArray[np.float32]]
