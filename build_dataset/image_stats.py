@@ -8,9 +8,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import EPISODES_DIR
-from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.errors import FormatError, MissingFileError
-from robomme_interference_data.storage.parquet import RowSpan, reading
+from robomme_interference_data.errors import FormatError
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 
@@ -58,16 +56,6 @@ class ImageStats:
             "count": np.array([int(total[0])]),
             **quantiles,
         }
-
-
-def episode_table(dataset: Dataset) -> pa.Table:
-    """Return LeRobot's table of the episodes with its statistics, by episode index."""
-    paths = [dataset.files.path(path) for path in dataset.files.list(EPISODES_DIR, ".parquet")]
-    if not paths:
-        raise MissingFileError(f"{EPISODES_DIR} is missing in {dataset.files.describe()}")
-    tables = [RowSpan(path).table() for path in paths]
-    with reading(paths[0]):  # files with columns of different types
-        return pa.concat_tables(tables).sort_by("episode_index")
 
 
 def episode_statistics(table: pa.Table) -> list[Statistics]:
