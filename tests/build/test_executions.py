@@ -14,7 +14,7 @@ from support.recordings import EPISODES, write_frames, write_h5
 
 from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.build_dataset.config import BuildConfig
-from robomme_interference_data.build_dataset.frame_selection import FRAME_SELECTORS, NothingToStore
+from robomme_interference_data.build_dataset.frame_selection import NothingToStore, select_execution
 from robomme_interference_data.build_dataset.manifests import in_folder, plan_manifests
 from robomme_interference_data.build_dataset.plan import plan_build
 from robomme_interference_data.build_dataset.sources import Frame, open_source
@@ -107,7 +107,7 @@ def test_episodes_without_an_execution(
     frames: list[Frame], error: type[Exception], message: str
 ) -> None:
     with pytest.raises(error, match=message):
-        list(FRAME_SELECTORS[EXECUTIONS](frames))
+        list(select_execution(frames))
 
 
 def test_a_source_without_actions_is_one_error(tmp_path: Path) -> None:

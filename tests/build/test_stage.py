@@ -15,7 +15,11 @@ from numpy.typing import NDArray
 from support.made_up import MadeUpSource, picture
 
 from robomme_interference_data.build_dataset import stage
-from robomme_interference_data.build_dataset.frame_selection import FRAME_SELECTORS, NothingToStore
+from robomme_interference_data.build_dataset.frame_selection import (
+    NothingToStore,
+    select_demonstration,
+    select_unit,
+)
 from robomme_interference_data.build_dataset.image_stats import ImageStats
 from robomme_interference_data.build_dataset.lerobot_writer import StoredEpisode
 from robomme_interference_data.build_dataset.plan import BuildPlan
@@ -27,12 +31,7 @@ from robomme_interference_data.build_dataset.stage import (
     read_staged,
     staged_name,
 )
-from robomme_interference_data.constants import (
-    CONTRADICTIONS,
-    DEMONSTRATIONS,
-    DISTRACTORS,
-    RAW_DISTRACTORS,
-)
+from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, RAW_DISTRACTORS, UNITS
 from robomme_interference_data.errors import BuildError, SourceError
 from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.schema.records import EvidenceSpan, SpanDigests
@@ -216,10 +215,13 @@ def steps(frames: Any) -> list[int]:
     return [int(frame.state[0]) for frame in frames]
 
 
-def test_contradictions_and_raw_units() -> None:
-    assert steps(FRAME_SELECTORS[CONTRADICTIONS](marks(3, 100))) == [0, 1, 2, 3]
+def select(kind: str, frames: Iterator[Frame]) -> Iterator[Frame]:
+    return select_unit(frames, kind) if kind in UNITS else select_demonstration(frames)
+
+
+def test_raw_units() -> None:
     for length in (249, 255, 256, 400):
-        raw = steps(FRAME_SELECTORS[RAW_DISTRACTORS](marks(None, length)))
+        raw = steps(select(RAW_DISTRACTORS, marks(None, length)))
         assert raw == list(range(min(length, 256)))
 
 
@@ -230,7 +232,7 @@ def test_nothing_is_read_beyond_the_last_frame_that_is_needed(
     for kind, needed in ((DISTRACTORS, 249), (DEMONSTRATIONS, (lesson or 0) + 1)):
         read = marks(lesson, length)
         try:
-            found = steps(FRAME_SELECTORS[kind](read))
+            found = steps(select(kind, read))
         except (NothingToStore, SourceError):
             assert length < needed or not lesson
             continue
@@ -248,6 +250,6 @@ def test_nothing_is_read_beyond_the_last_frame_that_is_needed(
 )
 def test_nothing_to_store(kind: str, lesson: int | None, length: int, reason: str) -> None:
     with pytest.raises(NothingToStore, match=reason):
-        list(FRAME_SELECTORS[kind](marks(lesson, length)))
+        list(select(kind, marks(lesson, length)))
     with pytest.raises(SourceError, match=r"does not mark(.|\n)*can be built without"):
-        list(FRAME_SELECTORS[DEMONSTRATIONS](marks(None, 10)))
+        list(select_demonstration(marks(None, 10)))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.build_dataset.build import build_dataset
-from robomme_interference_data.build_dataset.frame_selection import FRAME_SELECTORS
+from robomme_interference_data.build_dataset.frame_selection import select_frames
 from robomme_interference_data.build_dataset.manifests import (
     in_folder,
     plan_manifests,
@@ -72,7 +72,7 @@ def dataset(root: Path, name: str) -> Dataset:
 def _stored(kind: str, episode: EpisodeId) -> tuple[Frame, ...]:
     source = SampleSource(size=32)
     [listed] = [one for one in source.episodes() if one.id == episode]
-    return tuple(FRAME_SELECTORS[kind](source.read(listed, None).frames))
+    return tuple(select_frames(kind, source.read(listed, None)))
 
 
 def stored_frames(kind: str, episode: EpisodeId, camera: str) -> NDArray[np.uint8]:
