@@ -1,7 +1,5 @@
 """Whole builds in one process: output, resuming, extending, and invalid inputs."""
 
-import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +21,6 @@ from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import (
     BuildError,
-    FormatError,
     InterferenceError,
     InvalidIdError,
     InvalidOptionError,
@@ -170,15 +167,6 @@ def test_dataset_with_other_settings_is_unchanged(
         build(built, other, **options)
     assert "settings" not in message or "Choose another `buffer_set`" in str(caught.value.hint)
     assert contents(built) == before
-
-
-@pytest.mark.parametrize("changes", [{"skipped": None}, {"skipped": [{}]}, None])
-def test_a_report_that_is_damaged(built: Path, tmp_path: Path, changes: Any) -> None:
-    out = shutil.copytree(built, tmp_path / "out")
-    path = out / "meta/build_report.json"
-    path.write_text("{}" if changes is None else json.dumps(read_json(path) | changes))
-    with pytest.raises(FormatError, match=r"build_report\.json"):
-        build(out, MadeUpSource({"A/train/1": (260, 5)}, provenance=TABLETOP))
 
 
 def test_episodes_of_other_cameras_mix_in_those_that_all_have(tmp_path: Path) -> None:

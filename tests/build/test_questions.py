@@ -20,7 +20,6 @@ from support.machine import full_disk
 from support.tabletop import QUERIES, TABLETOP, copy_tabletop, scene_of
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.build_dataset import question_pictures
 from robomme_interference_data.build_dataset.question_pictures import picture
 from robomme_interference_data.build_dataset.questions import (
     make_questions,
@@ -340,16 +339,3 @@ def test_a_full_disk_leaves_what_was_there(root: Path, run: Any) -> None:
     assert code == 1 and "disk space" in err and "Traceback" not in err
     assert (root / QUESTIONS_PATH).read_bytes() == b"as it was"
     assert len(list(root.iterdir())) == 4
-
-
-def test_stopped_it_leaves_what_was_there(
-    root: Path, run: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-
-    def stopped(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(question_pictures, "picture", stopped)
-    code, _, err = run("build", "questions", root)
-    assert code == 130 and f"resume with:\nrobomme-interference build questions {root}" in err
-    assert not (root / QUESTIONS_PATH).exists()

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.buffer_sets import violations
 from support.made_up import MadeUpSource
 
 from robomme_interference_data import load_buffer_set
@@ -18,7 +19,6 @@ from robomme_interference_data.build_dataset.manifests import (
 )
 from robomme_interference_data.build_dataset.plan import BuildPlan, plan_build
 from robomme_interference_data.build_dataset.sources.base import Frame
-from robomme_interference_data.build_dataset.verify import verify_buffer_set
 from robomme_interference_data.cards.dataset_facts import buffer_set_facts
 from robomme_interference_data.cards.publication import Publication
 from robomme_interference_data.cards.render import card_text
@@ -60,10 +60,6 @@ def build(root: Path, kind: str, lengths: dict[str, Any], unit: Unit = SHORT) ->
     tasks = tuple((0, one) for one in source.episodes())
     plan = BuildPlan(kind, (source,), tasks, unit=unit)
     build_dataset(plan, root / kind, Serial(), WorkProgress(quiet=True))
-
-
-def violations(root: Path) -> list[str]:
-    return [f"{one.where}: {one.what}" for one in verify_buffer_set(load_buffer_set(root))]
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.frame_selection import select_frames
 from robomme_interference_data.build_dataset.manifests import (
@@ -19,6 +20,7 @@ from robomme_interference_data.build_dataset.manifests import (
 from robomme_interference_data.build_dataset.plan import BuildPlan, list_episodes
 from robomme_interference_data.build_dataset.sources import Frame, Source
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
+from robomme_interference_data.build_dataset.verify import verify_buffer_set
 from robomme_interference_data.constants import SUMS_PATH
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.ids import EpisodeId
@@ -52,6 +54,12 @@ def plan_again(root: Path, conditions: Iterable[str] = CONDITIONS, **options: An
     """Plan the buffers of a buffer set and replace its manifests."""
     for _ in write_manifests(plan_manifests(in_folder(root), tuple(conditions), **options), root):
         pass
+
+
+def violations(root: Path, *, decode: bool = True) -> list[str]:
+    """Return what `verify` finds in a buffer set."""
+    found = verify_buffer_set(load_buffer_set(root), decode=decode)
+    return [f"{one.where}: {one.what}" for one in found]
 
 
 def contents(root: Path) -> dict[str, bytes]:
