@@ -74,17 +74,17 @@ def episode_statistics(table: pa.Table) -> list[Statistics]:
     return episodes
 
 
-def before_scaling(name: str, values: NDArray[Any]) -> NDArray[Any]:
+def before_scaling(name: str, values: NDArray[Any]) -> tuple[float, ...]:
     """Return the values of an image statistic before LeRobot divided them by 255, bit for bit.
 
     LeRobot divides again when it writes an extended dataset; of a lossy one, the frames that the
     statistics were computed from no longer exist.
     """
     if name == "count":
-        return values
+        return tuple(values.tolist())
     scaled = []
     for value in values.tolist():
         near = value * 255
         steps = (near, math.nextafter(near, math.inf), math.nextafter(near, -math.inf))
         scaled.append(next((one for one in steps if one / 255 == value), near))
-    return np.array(scaled)
+    return tuple(scaled)

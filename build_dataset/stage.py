@@ -33,7 +33,7 @@ from robomme_interference_data.storage.files import canonical_json, read_header,
 from robomme_interference_data.storage.video import iter_frames
 
 from .frame_selection import NothingToStore, select_frames
-from .image_stats import STATISTICS, ImageStats
+from .image_stats import ImageStats
 from .lerobot_writer import StoredEpisode
 from .plan import BuildPlan
 from .sources import Frame, Recording, Robot, SourceEpisode
@@ -60,19 +60,12 @@ class Staged:
     def stored(self, folder: Path) -> StoredEpisode:
         """Return the episode, which yields something, with its files in `folder`."""
         assert self.record is not None and self.robot is not None
-        # LeRobot's columns follow this order.
-        stats = {
-            feature: {name: np.array(values[name]) for name in STATISTICS}
-            for feature, values in self.stats.items()
-        }
-        for values in stats.values():
-            values["count"] = values["count"].astype(np.int64)
-        videos = {feature: folder / f"{feature}.mp4" for feature in stats}
+        videos = {feature: folder / f"{feature}.mp4" for feature in self.stats}
         return StoredEpisode(
             self.record,
             self.features,
             videos,
-            stats,
+            self.stats,
             lambda name: np.load(folder / f"{name}.npy"),
             self.robot,
         )
