@@ -199,12 +199,6 @@ def test_no_dataset_under_a_name_that_is_not_utf_8(tmp_path: Path) -> None:
     assert not any(tmp_path.iterdir())
 
 
-def test_nothing_to_store(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match="no episode yields distractors: 2 unusable"):
-        build(tmp_path / "out", MadeUpSource({"A/train/0": (9, None), "B/train/0": (8, None)}))
-    assert not (tmp_path / "out").exists()
-
-
 def made_up(*names: str) -> MadeUpSource:
     return MadeUpSource(dict.fromkeys(names, (9, None)))
 

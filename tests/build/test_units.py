@@ -94,6 +94,7 @@ def test_only_short_episodes_are_an_error_that_names_the_options(tmp_path: Path)
     with pytest.raises(SourceError, match="11 raw frames; a unit needs 249") as caught:
         build(tmp_path, DISTRACTORS, TRAIN, Unit(32, 8))
     assert "`unit_frames` and `unit_stride`" in str(caught.value.hint)
+    assert not (tmp_path / DISTRACTORS).exists()
     config = BuildConfig(("sample",), tmp_path, unit_frames=0)
     with pytest.raises(InvalidOptionError, match="unit_frames 0; expected a positive number"):
         plan_build(DISTRACTORS, config)
