@@ -12,7 +12,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
-from hashlib import sha1
 from pathlib import Path
 from typing import Any, Self
 
@@ -247,10 +246,13 @@ class HubFiles:
         The client checks only their length. It names files in its cache by their digests: Git's of
         small ones, SHA-256 of large ones.
         """
+        from huggingface_hub.utils.sha import git_hash
+
         damaged = []
+        digests = {40: lambda blob: git_hash(blob.read_bytes()), 64: sha256_file}
         for relative, path in downloaded.items():
             blob = path.resolve()
-            digest = {40: _git_sha1, 64: sha256_file}.get(len(blob.name))
+            digest = digests.get(len(blob.name))
             if digest is not None and digest(blob) != blob.name:
                 path.unlink()
                 blob.unlink(missing_ok=True)
@@ -272,11 +274,6 @@ class HubFiles:
     def _known_revision(self) -> str:
         revision: str = self.__dict__.get("commit", self.revision)
         return revision
-
-
-def _git_sha1(path: Path) -> str:
-    data = path.read_bytes()
-    return sha1(b"blob %d\0" % len(data) + data).hexdigest()
 
 
 @dataclass(frozen=True)
