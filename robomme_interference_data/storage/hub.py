@@ -236,9 +236,8 @@ class HubFiles:
         return LocalFiles(self.snapshot(f"{folder}/*{suffix}")).list(folder, suffix)
 
     def describe(self) -> str:
-        """Return `namespace/name@revision`, with the commit as revision once it is known."""
-        repository = f"{self.repo_id}@{self._known_revision}"
-        return f"{repository}, {self.folder}" if self.folder else repository
+        """Return `namespace/name[/folder]@revision`; the commit once it is known."""
+        return f"{self.name}@{self._known_revision}"
 
     def _check(self, downloaded: dict[str, Path]) -> None:
         """Remove downloaded files whose digest differs from the Hub's, and raise.
