@@ -16,7 +16,7 @@ from .image_stats import Statistics, before_scaling, episode_statistics
 from .lerobot_writer import StoredEpisode
 from .plan import BuildPlan
 from .sources.base import Robot
-from .sources.columns import value_names
+from .sources.columns import recorded_robot
 
 _ADVICE = "Choose another `buffer_set`, or remove the folder first."
 
@@ -64,10 +64,8 @@ def open_existing(out: Path, plan: BuildPlan) -> ExistingDataset | None:
                 f"{out} exists and was built from {before}, not from {source.provenance}", _ADVICE
             )
     statistics = episode_statistics(LeRobotFiles(dataset.files, statistics=True).table)
-    info, features = dataset.lerobot.info, dataset.lerobot.features
-    names = {name: value_names(features[name]) for name in (STATE, ACTION) if name in features}
-    robot = Robot(info["fps"], info.get("robot_type"), {n: v for n, v in names.items() if v})
-    robot = robot.with_names(dataset.features)
+    vectors = {name: name for name in (STATE, ACTION) if name in dataset.features}
+    robot = recorded_robot(dataset.lerobot, vectors).with_names(dataset.features)
     episodes = map(partial(_stored, dataset, robot), dataset.records(), statistics)
     report = read_header(out / REPORT_PATH, BuildReport)
     return ExistingDataset(dataset, tuple(episodes), report.reasons)
