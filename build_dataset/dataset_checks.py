@@ -36,9 +36,10 @@ from robomme_interference_data.schema.shifts import SHIFTS
 from robomme_interference_data.storage.arrays import combine
 from robomme_interference_data.storage.encode import CODECS
 from robomme_interference_data.storage.files import all_files, read_header, read_json, sha256_file
+from robomme_interference_data.storage.lerobot import LeRobotFiles
 
 from .identity import BuildReport, identity_of, listed_files, report_of
-from .image_stats import ImageStats, Statistics, episode_statistics, episode_table
+from .image_stats import ImageStats, Statistics, episode_statistics
 from .lerobot_checks import lerobot_violations
 
 UNLISTED = "is not listed"
@@ -80,14 +81,15 @@ def dataset_violations(
     yield from _identity(name, dataset, records, header, unit)
     yield from _report(name, dataset, records)
     yield from (Violation(f"{name}/{where}", what) for where, what in lerobot_violations(dataset))
-    statistics = None if progress is None else episode_statistics(episode_table(dataset))
     for record in records:
+        yield from _record(f"{name} {record.episode_id}", name, record, unit)
+    if progress is None:
+        return
+    statistics = episode_statistics(LeRobotFiles(dataset.files, statistics=True).table)
+    for record, stored in zip(records, statistics, strict=True):
         where = f"{name} {record.episode_id}"
-        yield from _record(where, name, record, unit)
-        if progress is not None and statistics is not None:
-            stored = statistics[record.episode_index]
-            yield from caught(where, _episode(where, dataset, record, stored))
-            progress.advance(record.length)
+        yield from caught(where, _episode(where, dataset, record, stored))
+        progress.advance(record.length)
 
 
 def _files(name: str, dataset: Dataset, header: ManifestHeader) -> Iterator[Violation]:
@@ -140,12 +142,11 @@ def _identity(
 def _report(name: str, dataset: Dataset, records: list[EpisodeRecord]) -> Iterator[Violation]:
     where = f"{name}/{REPORT_PATH}"
     report = read_header(dataset.files.path(REPORT_PATH), BuildReport)
-    skipped = {str(one.episode_id): one.why for one in report.skipped}
-    if read_json(dataset.files.path(REPORT_PATH)) != report_of(dataset.identity, skipped):
+    if read_json(dataset.files.path(REPORT_PATH)) != report_of(dataset.identity, report.reasons):
         yield Violation(where, "does not have the counts of the dataset, or is not in order")
-    if stored := skipped.keys() & {str(record.episode_id) for record in records}:
+    if stored := report.reasons.keys() & {str(record.episode_id) for record in records}:
         yield Violation(where, f"{min(stored)} is skipped, and in the dataset")
-    if any(visible(reason) != reason for reason in skipped.values()):
+    if any(visible(reason) != reason for reason in report.reasons.values()):
         yield Violation(where, "has control characters")
 
 

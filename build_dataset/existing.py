@@ -9,13 +9,14 @@ from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import BuildError
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.files import LocalFiles, read_header
+from robomme_interference_data.storage.lerobot import LeRobotFiles
 
 from .identity import BuildReport
-from .image_stats import Statistics, before_scaling, episode_statistics, episode_table
+from .image_stats import Statistics, before_scaling, episode_statistics
 from .lerobot_writer import StoredEpisode
 from .plan import BuildPlan
 from .sources.base import Robot
-from .sources.columns import value_names
+from .sources.columns import recorded_robot
 
 _ADVICE = "Choose another `buffer_set`, or remove the folder first."
 
@@ -62,15 +63,12 @@ def open_existing(out: Path, plan: BuildPlan) -> ExistingDataset | None:
             raise BuildError(
                 f"{out} exists and was built from {before}, not from {source.provenance}", _ADVICE
             )
-    statistics = episode_statistics(episode_table(dataset))
-    info, features = dataset.lerobot.info, dataset.lerobot.features
-    names = {name: value_names(features[name]) for name in (STATE, ACTION) if name in features}
-    robot = Robot(info["fps"], info.get("robot_type"), {n: v for n, v in names.items() if v})
-    robot = robot.with_names(dataset.features)
+    statistics = episode_statistics(LeRobotFiles(dataset.files, statistics=True).table)
+    vectors = {name: name for name in (STATE, ACTION) if name in dataset.features}
+    robot = recorded_robot(dataset.lerobot, vectors).with_names(dataset.features)
     episodes = map(partial(_stored, dataset, robot), dataset.records(), statistics)
     report = read_header(out / REPORT_PATH, BuildReport)
-    skipped = {str(one.episode_id): one.why for one in report.skipped}
-    return ExistingDataset(dataset, tuple(episodes), skipped)
+    return ExistingDataset(dataset, tuple(episodes), report.reasons)
 
 
 def _stored(

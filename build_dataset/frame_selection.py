@@ -8,20 +8,11 @@ frames and another stride. No frame after the last needed one is read. An execut
 frame: its first one is the query frame of the demonstration.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 
-from robomme_interference_data.constants import (
-    CONTRADICTIONS,
-    DEMONSTRATIONS,
-    EXECUTIONS,
-    PAPER_UNIT,
-    SHIFTED,
-    UNITS,
-    Unit,
-)
+from robomme_interference_data.constants import EXECUTIONS, LESSONS, PAPER_UNIT, UNITS, Unit
 from robomme_interference_data.errors import InvalidOptionError, SourceError, counted
 
 from .sources.base import Frame, Recording
@@ -92,29 +83,23 @@ def select_execution(frames: Iterable[Frame]) -> Iterator[Frame]:
         raise NothingToStore(f"{counted(live, 'live frame')}; an execution needs 2")
 
 
-FRAME_SELECTORS: dict[str, Callable[[Iterable[Frame]], Iterator[Frame]]] = {
-    DEMONSTRATIONS: select_demonstration,
-    CONTRADICTIONS: select_demonstration,
-    SHIFTED: iter,
-    EXECUTIONS: select_execution,
-    **{kind: partial(select_unit, kind=kind) for kind in UNITS},
-}
-"""Kind of dataset to the frames that it stores of an episode."""
-
-
 def select_frames(kind: str, recording: Recording, unit: Unit = PAPER_UNIT) -> Iterator[Frame]:
     """Yield the frames that a kind of dataset stores of a recording; `unit` is the distractors'.
 
     Each frame of an execution has the action that was executed after it, so that policies can be
     trained and tested on it; an observation after the last action is left out.
     """
-    select = partial(select_unit, kind=kind, unit=unit) if kind in UNITS else FRAME_SELECTORS[kind]
-    frames = select(recording.frames)
-    if kind != EXECUTIONS:
-        return _with_actions_of_all(frames)
-    if not recording.action_first:
-        return frames
-    return (replace(frame, action=after.action) for frame, after in pairwise(frames))
+    frames: Iterator[Frame] = recording.frames
+    if kind == EXECUTIONS:
+        frames = select_execution(frames)
+        if not recording.action_first:
+            return frames
+        return (replace(frame, action=after.action) for frame, after in pairwise(frames))
+    if kind in UNITS:
+        frames = select_unit(frames, kind, unit)
+    elif kind in LESSONS:
+        frames = select_demonstration(frames)
+    return _with_actions_of_all(frames)
 
 
 def _with_actions_of_all(frames: Iterable[Frame]) -> Iterator[Frame]:

@@ -128,6 +128,11 @@ class BuildReport:
     counts: Annotated[dict[str, Any], "What the identity counts, and `skipped` episodes."]
     skipped: Annotated[tuple[SkippedEpisode, ...], "Episodes that yielded nothing, by id."]
 
+    @property
+    def reasons(self) -> dict[str, str]:
+        """Id to reason of the skipped episodes."""
+        return {str(one.episode_id): one.why for one in self.skipped}
+
 
 def report_of(identity: DatasetIdentity, skipped: dict[str, str]) -> dict[str, Any]:
     """Return the build report of a dataset as plain values; see `complete_dataset`."""

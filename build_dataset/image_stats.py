@@ -8,9 +8,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import EPISODES_DIR
-from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.errors import FormatError, MissingFileError
-from robomme_interference_data.storage.parquet import RowSpan, reading
+from robomme_interference_data.errors import FormatError
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 
@@ -60,16 +58,6 @@ class ImageStats:
         }
 
 
-def episode_table(dataset: Dataset) -> pa.Table:
-    """Return LeRobot's table of the episodes with its statistics, by episode index."""
-    paths = [dataset.files.path(path) for path in dataset.files.list(EPISODES_DIR, ".parquet")]
-    if not paths:
-        raise MissingFileError(f"{EPISODES_DIR} is missing in {dataset.files.describe()}")
-    tables = [RowSpan(path).table() for path in paths]
-    with reading(paths[0]):  # files with columns of different types
-        return pa.concat_tables(tables).sort_by("episode_index")
-
-
 def episode_statistics(table: pa.Table) -> list[Statistics]:
     """Return the statistics of each episode in LeRobot's table, images on the scale 0 to 1."""
     columns = [name for name in table.column_names if name.startswith("stats/")]
@@ -86,17 +74,17 @@ def episode_statistics(table: pa.Table) -> list[Statistics]:
     return episodes
 
 
-def before_scaling(name: str, values: NDArray[Any]) -> NDArray[Any]:
+def before_scaling(name: str, values: NDArray[Any]) -> tuple[float, ...]:
     """Return the values of an image statistic before LeRobot divided them by 255, bit for bit.
 
     LeRobot divides again when it writes an extended dataset; of a lossy one, the frames that the
     statistics were computed from no longer exist.
     """
     if name == "count":
-        return values
+        return tuple(values.tolist())
     scaled = []
     for value in values.tolist():
         near = value * 255
         steps = (near, math.nextafter(near, math.inf), math.nextafter(near, -math.inf))
         scaled.append(next((one for one in steps if one / 255 == value), near))
-    return np.array(scaled)
+    return tuple(scaled)

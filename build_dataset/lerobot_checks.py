@@ -24,7 +24,7 @@ from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.files import read_json
 from robomme_interference_data.storage.lerobot import LeRobotFiles
 
-from .image_stats import QUANTILES, STATISTICS, Statistics, episode_statistics, episode_table
+from .image_stats import QUANTILES, STATISTICS, Statistics, episode_statistics
 
 _TOLERANCE_S = 1e-4
 """LeRobot's own tolerance of timestamps, in seconds."""
@@ -36,8 +36,8 @@ _FRAME_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_in
 def lerobot_violations(dataset: Dataset) -> Iterator[tuple[str, str]]:
     """Yield each violation: the file or episode, and what is wrong."""
     yield from _info(dataset)
-    table = episode_table(dataset)
-    yield from _columns(dataset, table.column_names)
+    table = LeRobotFiles(dataset.files, statistics=True).table
+    yield from _columns(dataset, table)
     statistics = episode_statistics(table)
     yield from _total_statistics(dataset, statistics)
     tasks = dataset.lerobot.tasks
@@ -77,7 +77,7 @@ def lerobot_violations(dataset: Dataset) -> Iterator[tuple[str, str]]:
         first += record.length
 
 
-def _columns(dataset: Dataset, names: list[str]) -> Iterator[tuple[str, str]]:
+def _columns(dataset: Dataset, table: pa.Table) -> Iterator[tuple[str, str]]:
     """Check that both episode tables have the declared columns, and the same values."""
     videos = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
     records = arrow_schema(EpisodeRecord, sorted(dataset.features))
@@ -90,8 +90,8 @@ def _columns(dataset: Dataset, names: list[str]) -> Iterator[tuple[str, str]]:
     }
     features = (*dataset.features, *_FRAME_COLUMNS)
     statistics = {f"stats/{feature}/{name}" for feature in features for name in STATISTICS}
-    copy, table = dataset.lerobot.table, LeRobotFiles(dataset.files).table
-    yield from _names(EPISODES_DIR, names, lean | statistics)
+    copy = dataset.lerobot.table
+    yield from _names(EPISODES_DIR, table.column_names, lean | statistics)
     yield from _names(RECORDS_PATH, copy.column_names, lean)
     for name in lean & {*copy.column_names} & {*table.column_names}:
         if copy[name] != table[name]:

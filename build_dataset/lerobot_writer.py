@@ -25,6 +25,7 @@ from robomme_interference_data.errors import MissingExtraError
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.encode import Codec
 
+from .image_stats import STATISTICS
 from .sources.base import Robot
 
 _ONE_EPISODE_MB = 1e-6
@@ -41,7 +42,7 @@ class StoredEpisode:
     record: EpisodeRecord
     features: dict[str, tuple[int, ...]]
     videos: dict[str, Path]
-    stats: dict[str, dict[str, NDArray[Any]]]
+    stats: dict[str, dict[str, tuple[float, ...]]]
     vectors: Callable[[str], NDArray[np.float32]]
     robot: Robot
 
@@ -138,7 +139,10 @@ class _EncodedVideos:
             # LeRobot moves the file away and removes its folder.
             copy = Path(tempfile.mkdtemp(dir=self._folder)) / "episode.mp4"
             shutil.copyfile(self.next.videos[feature], copy)
-            videos[feature] = (copy, self.next.stats[feature])
+            values = self.next.stats[feature]
+            stats = {name: np.array(values[name]) for name in STATISTICS}  # in LeRobot's order
+            stats["count"] = stats["count"].astype(np.int64)
+            videos[feature] = (copy, stats)
         return videos
 
     def cancel_episode(self) -> None:

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
@@ -15,7 +15,6 @@ from robomme_interference_data.constants import (
     PAPER_UNIT,
     SHIFTED,
     SPLITS,
-    UNIT_FRAMES,
     UNITS,
     Unit,
 )
@@ -23,7 +22,6 @@ from robomme_interference_data.errors import BuildError, InvalidOptionError, Sou
 from robomme_interference_data.ids import EpisodeId, parse_numbers
 from robomme_interference_data.runtime.executor import make_executor
 from robomme_interference_data.schema.conditions import datasets_of, in_order
-from robomme_interference_data.schema.manifest import SessionEntry
 
 from .config import NO_CAMERAS, AllConfig, BuildConfig, NewConfig, PlanConfig, position_limit
 
@@ -122,23 +120,22 @@ def _check_plans(
 
 @dataclass(frozen=True)
 class _UnreadSessions:
-    """Sessions of a query before its data is read: drawing them checks that units suffice."""
+    """Sources of a query's sessions, before data is read: drawing checks that units suffice."""
 
     query: EpisodeId
     pool: "UnitPool"
 
-    def lesson(self, part: str = "lesson") -> SessionEntry:
-        source = self.query
-        return SessionEntry("lesson", source.family, source, "", "", 0, 0, UNIT_FRAMES, 1, "")
+    def lesson(self, part: str = "lesson") -> Any:
+        return self.query
 
-    def contradiction(self) -> SessionEntry:
-        return self.lesson()
+    def contradiction(self) -> Any:
+        return self.query
 
-    def units(self, k: int, dataset: str = DISTRACTORS) -> Sequence[SessionEntry]:
-        return [self.lesson() for _ in self.pool.draw(self.query, k)]
+    def units(self, k: int, dataset: str = DISTRACTORS) -> Sequence[Any]:
+        return self.pool.draw(self.query, k)
 
-    def own_units(self, k: int) -> Sequence[SessionEntry]:
-        return [self.lesson() for _ in self.pool.draw_own(self.query, k)]
+    def own_units(self, k: int) -> Sequence[Any]:
+        return self.pool.draw_own(self.query, k)
 
 
 def plan_build(kind: str, config: BuildConfig) -> BuildPlan:

@@ -24,8 +24,8 @@ from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.records import EpisodeRecord, SpanDigests, lesson_spans
 from robomme_interference_data.storage.arrays import (
     FeatureDigests,
-    SpanDigester,
     combine,
+    digest_spans,
     write_array,
 )
 from robomme_interference_data.storage.encode import Codec, VideoEncoder, get_codec
@@ -33,7 +33,7 @@ from robomme_interference_data.storage.files import canonical_json, read_header,
 from robomme_interference_data.storage.video import iter_frames
 
 from .frame_selection import NothingToStore, select_frames
-from .image_stats import STATISTICS, ImageStats
+from .image_stats import ImageStats
 from .lerobot_writer import StoredEpisode
 from .plan import BuildPlan
 from .sources import Frame, Recording, Robot, SourceEpisode
@@ -60,19 +60,12 @@ class Staged:
     def stored(self, folder: Path) -> StoredEpisode:
         """Return the episode, which yields something, with its files in `folder`."""
         assert self.record is not None and self.robot is not None
-        # LeRobot's columns follow this order.
-        stats = {
-            feature: {name: np.array(values[name]) for name in STATISTICS}
-            for feature, values in self.stats.items()
-        }
-        for values in stats.values():
-            values["count"] = values["count"].astype(np.int64)
-        videos = {feature: folder / f"{feature}.mp4" for feature in stats}
+        videos = {feature: folder / f"{feature}.mp4" for feature in self.stats}
         return StoredEpisode(
             self.record,
             self.features,
             videos,
-            stats,
+            self.stats,
             lambda name: np.load(folder / f"{name}.npy"),
             self.robot,
         )
@@ -235,15 +228,11 @@ class _Writer:
 
     def decode(self, spans: Sequence[tuple[int, int]]) -> list[dict[str, str]]:
         """Decode the videos; return digests over spans of frames, vectors among them."""
-        digests = SpanDigester(spans)
-        for name in self._encoders:
-            images = iter_frames(self._folder / f"{name}.mp4", 0, self.length, self._fps)
-            for index, image in enumerate(images):
-                digests.update(name, index, image)
-        for name, values in self._vectors.items():
-            for index, value in enumerate(values):
-                digests.update(name, index, value)
-        return digests.digests()
+        videos = {
+            name: iter_frames(self._folder / f"{name}.mp4", 0, self.length, self._fps)
+            for name in self._encoders
+        }
+        return digest_spans(spans, [*videos.items(), *self._vectors.items()])
 
     def _begin(
         self, images: dict[str, NDArray[np.uint8]], vectors: dict[str, NDArray[np.float32]]

@@ -59,10 +59,7 @@ def verify_buffer_set(
         decode: Whether to decode all data, which takes most of the time.
         progress: Shows how many frames are decoded.
     """
-    return _buffer_set(buffer_set, decode, progress or WorkProgress(quiet=True))
-
-
-def _buffer_set(buffer_set: BufferSet, decode: bool, progress: WorkProgress) -> Iterator[Violation]:
+    progress = progress or WorkProgress(quiet=True)
     header, root = buffer_set.header, buffer_set.files.snapshot("*")
     for path in all_files(root / MANIFESTS):
         # Hidden rows belong to manifests whose replacement was interrupted; the next build removes

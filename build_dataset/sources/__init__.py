@@ -55,8 +55,8 @@ def open_source(specification: str, *, shifted: bool = False, **options: Any) ->
             f"the source {specification} cannot show its episodes under shifts",
             f"Use {' or '.join(able)}, with demonstrations built from it.",
         )
-    factory = SOURCES.factory(spec, "ShiftedSource" if shifted else None)
-    accepted = signature_of(factory).parameters
+    factory = SOURCES.factory(spec)
+    accepted, options = signature_of(factory).parameters, options | {"shifted": shifted}
     known = {name: value for name, value in options.items() if name in accepted}
     source: Source = factory(**spec.given, **known)
     return source

@@ -12,6 +12,9 @@ from robomme_interference_data.errors import (
     nearest,
 )
 from robomme_interference_data.simulators.base import CAMERAS
+from robomme_interference_data.storage.lerobot import LeRobotFiles
+
+from .base import Robot
 
 _CAMERA = re.compile(r"[A-Za-z0-9][\w-]*", re.ASCII)
 _USUAL = {
@@ -76,7 +79,18 @@ def camera_names(columns: Mapping[str, str]) -> tuple[str, ...]:
     return tuple(name for name in columns if name in CAMERAS or name not in _USUAL)
 
 
-def value_names(feature: Mapping[str, Any]) -> tuple[str, ...] | None:
+def recorded_robot(lerobot: LeRobotFiles, columns: Mapping[str, str]) -> Robot:
+    """Return a dataset's robot; `columns` maps `observation.state` and `action` to its columns."""
+    kind = lerobot.info.get("robot_type")
+    names = {feature: _value_names(lerobot.features[name]) for feature, name in columns.items()}
+    return Robot(
+        fps=max(1, round(lerobot.fps)),
+        type=kind if isinstance(kind, str) else None,
+        names={feature: found for feature, found in names.items() if found},
+    )
+
+
+def _value_names(feature: Mapping[str, Any]) -> tuple[str, ...] | None:
     """Return the names of a vector's values, if the dataset has one for each."""
     names = feature.get("names")
     if isinstance(names, dict) and len(names) == 1:  # older datasets: {"motors": [...]}

@@ -25,8 +25,8 @@ from robomme_interference_data.storage.hub import HubFiles, locate
 from robomme_interference_data.storage.lerobot import LeRobotFiles
 from robomme_interference_data.storage.parquet import RowSpan
 
-from .base import Recording, Robot, Source, SourceEpisode, compose, demonstration_length, file_state
-from .columns import camera_names, find_columns, value_names
+from .base import Recording, Source, SourceEpisode, compose, demonstration_length, file_state
+from .columns import camera_names, find_columns, recorded_robot
 from .families import ids_by_block, ids_by_columns, read_families
 from .images import decode_images, info_is_exact
 from .robomme_families import BLOCKS, ROBOMME, families_for_goal
@@ -120,6 +120,8 @@ class LeRobotSource(Source):
             evidence = spans_of_texts(
                 rows.part(rows.start, rows.start + lesson).texts(columns["subgoal"])
             )
+        vectors = {STATE: "state", ACTION: "action"}
+        named = {feature: columns[name] for feature, name in vectors.items() if name in columns}
         streams = {camera: self._images(index, rows, columns[camera], exact) for camera in chosen}
         return Recording(
             goals=metadata.wordings,
@@ -129,7 +131,7 @@ class LeRobotSource(Source):
             exact=exact,
             frames=compose(streams, states, actions, lesson),
             evidence=evidence,
-            robot=self._robot,
+            robot=recorded_robot(self._lerobot, named),
         )
 
     @cached_property
@@ -145,20 +147,6 @@ class LeRobotSource(Source):
         if self._families_file is None:
             return [{}] * len(self._lerobot)
         return read_families(self._families_file, len(self._lerobot))
-
-    @property
-    def _robot(self) -> Robot:
-        columns, kind = self._columns, self._lerobot.info.get("robot_type")
-        names = {
-            feature: value_names(self._lerobot.features[columns[name]])
-            for feature, name in ((STATE, "state"), (ACTION, "action"))
-            if name in columns
-        }
-        return Robot(
-            fps=max(1, round(self._lerobot.fps)),
-            type=kind if isinstance(kind, str) else None,
-            names={feature: found for feature, found in names.items() if found},
-        )
 
     @property
     def _where(self) -> str:

@@ -33,10 +33,13 @@ class SimulatorSource(Source):
         name: Registered name of the simulator.
         robomme_python: RoboMME's interpreter.
         every: Draw every n-th frame only; all others have no images.
+        shifted: Give the first live view under each shift instead of the episode.
     """
 
-    def __init__(self, name: str, robomme_python: str | None = None, every: int = 1):
-        self.name, self._every = name, every
+    def __init__(
+        self, name: str, robomme_python: str | None = None, every: int = 1, shifted: bool = False
+    ):
+        self.name, self._every, self._shifted = name, every, shifted
         self._class = simulator_class(name)
         self.time_limit_s = self._class.episode_s
         # Another version of the suite has other episodes.
@@ -75,12 +78,16 @@ class SimulatorSource(Source):
         simulator = self._open(chosen)
         # Another object with these methods may know nothing of every n-th frame.
         every = self._every if isinstance(simulator, Simulator) else 1
-        drawn = every if chosen else 0
+        drawn = every if chosen and not self._shifted else 0
         lesson, first, info = simulator.reset(str(episode.id), demonstration=drawn)
-        check_drawn(lesson, first, chosen, every)
-        frames = _play(simulator, lesson, first, chosen, every)
         known = info.goals, info.seed, info.difficulty, info.simulator
         robot = Robot(fps=self._class.fps)
+        if self._shifted:
+            views = simulator.views(SHIFTS)
+            frames = (Frame(seen.images, seen.state, None, False) for seen in views)
+            return Recording(*known, True, frames, robot=robot)
+        check_drawn(lesson, first, chosen, every)
+        frames = _play(simulator, lesson, first, chosen, every)
         return Recording(*known, True, frames, lesson.evidence, robot=robot, scene=lesson.scene)
 
     @override
@@ -97,17 +104,6 @@ class SimulatorSource(Source):
             self._simulator = make_simulator(self.name, **settings)
             self._cameras = cameras
         return self._simulator
-
-
-class ShiftedSource(SimulatorSource):
-    """The first live views of a simulator's episodes under each shift, instead of its frames."""
-
-    @override
-    def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
-        simulator = self._open(choose_cameras(cameras, self._class.cameras))
-        _, _, info = simulator.reset(str(episode.id), demonstration=False)
-        frames = (Frame(seen.images, seen.state, None, False) for seen in simulator.views(SHIFTS))
-        return Recording(info.goals, info.seed, info.difficulty, info.simulator, True, frames)
 
 
 def _play(

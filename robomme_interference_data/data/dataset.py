@@ -34,7 +34,7 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import from_dict, to_dict
 from robomme_interference_data.schema.manifest import SessionEntry
 from robomme_interference_data.schema.records import DatasetIdentity, EpisodeRecord
-from robomme_interference_data.storage.arrays import SpanDigester, combine
+from robomme_interference_data.storage.arrays import combine, digest_spans
 from robomme_interference_data.storage.files import (
     Files,
     digest_json,
@@ -286,18 +286,12 @@ class Dataset:
         `watch` is called with each feature and value on the way.
         """
         first, last = min(start for start, _ in spans), max(stop for _, stop in spans)
-        running = SpanDigester(spans)
-        for name in self.features:
-            values: Iterable[NDArray[Any]] = (
-                self.iter_frames(episode_index, name, first, last)
-                if name.startswith(CAMERA_PREFIX)
-                else self.read_vectors(episode_index, name, first, last)
-            )
-            for index, value in enumerate(values, first):
-                running.update(name, index, value)
-                if watch is not None:
-                    watch(name, value)
-        return running.digests()
+
+        def values(name: str) -> Iterable[NDArray[Any]]:
+            read = self.iter_frames if name.startswith(CAMERA_PREFIX) else self.read_vectors
+            return read(episode_index, name, first, last)
+
+        return digest_spans(spans, ((name, values(name)) for name in self.features), first, watch)
 
     def sums(self) -> dict[str, str]:
         """Return the recorded SHA-256 by relative path of every file except embedding indexes.

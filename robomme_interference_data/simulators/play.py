@@ -3,18 +3,20 @@
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from robomme_interference_data.constants import FPS
 from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.storage.encode import CLIP, VideoEncoder
+from robomme_interference_data.storage.files import atomic_path
 
 from .base import Simulator
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    Add = Callable[[Mapping[str, NDArray[np.uint8]], tuple[int, int, int]], None]
+Images = Mapping[str, NDArray[np.uint8]]
+Color = tuple[int, int, int]
 
 NO_POLICY = "none"
 """Plays the demonstration only."""
@@ -49,21 +51,15 @@ def play(simulator: Simulator, episode: str, policy: str, video: Path | None) ->
 
 
 @contextmanager
-def _recording(video: Path | None) -> "Iterator[Add]":
+def _recording(video: Path | None) -> Iterator[Callable[[Images, Color], None]]:
     """Yield a function that adds the images of all cameras, side by side, to a video."""
     if video is None:
         yield lambda images, color: None
         return
-
-    import numpy as np
-
-    from robomme_interference_data.storage.encode import CLIP, VideoEncoder
-    from robomme_interference_data.storage.files import atomic_path
-
     with atomic_path(video) as path:
         encoder: VideoEncoder | None = None
 
-        def add(images: "Mapping[str, NDArray[np.uint8]]", color: tuple[int, int, int]) -> None:
+        def add(images: Images, color: Color) -> None:
             nonlocal encoder
             views = np.concatenate(list(images.values()), axis=1)
             bar = np.full((16, views.shape[1], 3), color, np.uint8)

@@ -10,7 +10,7 @@ import hashlib
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -114,18 +114,26 @@ class FeatureDigests:
         return {name: running.copy().hexdigest() for name, running in self._running.items()}
 
 
-class SpanDigester:
-    """Running digests of spans `(start, stop)` of an episode, which may overlap."""
+def digest_spans(
+    spans: Sequence[tuple[int, int]],
+    features: Iterable[tuple[str, Iterable[NDArray[Any]]]],
+    first: int = 0,
+    watch: Callable[[str, NDArray[Any]], None] | None = None,
+) -> list[dict[str, str]]:
+    """Return the digests by feature of spans `(start, stop)` of an episode, which may overlap.
 
-    def __init__(self, spans: Iterable[tuple[int, int]]):
-        self._spans = [(start, stop, FeatureDigests()) for start, stop in spans]
-
-    def update(self, feature: str, index: int, value: NDArray[Any]) -> None:
-        """Add a feature's value at a frame, in order."""
-        for start, stop, running in self._spans:
-            if start <= index < stop:
-                running.update(feature, value)
-
-    def digests(self) -> list[dict[str, str]]:
-        """Return the digests of each span, by feature."""
-        return [running.current() for _, _, running in self._spans]
+    Args:
+        spans: The spans.
+        features: Each feature and its values, one after the other.
+        first: The frame of the first value.
+        watch: Called with each feature and value on the way.
+    """
+    running = [FeatureDigests() for _ in spans]
+    for name, values in features:
+        for index, value in enumerate(values, first):
+            for (start, stop), digests in zip(spans, running, strict=True):
+                if start <= index < stop:
+                    digests.update(name, value)
+            if watch is not None:
+                watch(name, value)
+    return [digests.current() for digests in running]

@@ -10,10 +10,13 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, NoReturn, Protocol
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from robomme_interference_data.constants import FORMAT_VERSION
 from robomme_interference_data.errors import FormatError, MissingFileError
+
+if TYPE_CHECKING:
+    from .hub import HubFiles
 
 _MAX_JSON_BYTES = 16 << 20
 """Our files have some thousand bytes, and Python takes forty times as many for some values."""
@@ -25,47 +28,19 @@ _MAX_DEPTH = 64
 """Nesting of JSON: Python can read more than it can always print, compare or write."""
 
 
-class Files(Protocol):
-    """The only way in which this package accesses the files of a dataset or buffer set.
-
-    A path is always relative, with `/`, such as `meta/info.json`. Paths come from data files that
-    are not trusted: no path leaves the dataset, and no link does.
-    """
-
-    def path(self, relative: str) -> Path:
-        """Return where the file is on this machine, fetching it first if necessary."""
-        ...
-
-    def list(self, folder: str, suffix: str = "") -> list[str]:
-        """Return the sorted relative paths of all files under a folder; empty if none."""
-        ...
-
-    def fetch(self, paths: Iterable[str]) -> None:
-        """Bring files that are about to be read to this machine, several at a time."""
-        ...
-
-    def snapshot(self, *patterns: str) -> Path:
-        """Fetch the files that match a pattern; return the folder of all files."""
-        ...
-
-    @property
-    def location(self) -> str:
-        """The argument of `locate` for the same files: a folder, or `namespace/name@commit`."""
-        ...
-
-    def describe(self) -> str:
-        """Return the location for messages."""
-        ...
-
-
 @dataclass(frozen=True)
 class LocalFiles:
-    """Files in a folder on this machine."""
+    """Files in a folder on this machine.
+
+    This and `hub.HubFiles` are the only way in which this package accesses the files of a dataset
+    or buffer set. A path is always relative, with `/`, such as `meta/info.json`. Paths come from
+    data files that are not trusted: no path leaves the dataset, and no link does.
+    """
 
     root: Path
 
     def path(self, relative: str) -> Path:
-        """Return the file's path; see `Files.path`."""
+        """Return where the file is on this machine."""
         path = self.root / check_relative(relative, self.describe())
         # A link may lead inside the folder. In a snapshot of the Hub's cache, or a folder of one,
         # it may also lead to the cache's `blobs`.
@@ -92,7 +67,7 @@ class LocalFiles:
         return path
 
     def list(self, folder: str, suffix: str = "") -> list[str]:
-        """Return the files under a folder; see `Files.list`."""
+        """Return the sorted relative paths of all files under a folder; empty if none."""
         matches = (self.root / folder).rglob(f"*{suffix}")
         return sorted(p.relative_to(self.root).as_posix() for p in matches if p.is_file())
 
@@ -105,12 +80,15 @@ class LocalFiles:
 
     @property
     def location(self) -> str:
-        """The folder."""
+        """The argument of `locate` for the same files."""
         return str(self.root)
 
     def describe(self) -> str:
-        """Return the folder."""
+        """Return the location for messages."""
         return str(self.root)
+
+
+type Files = LocalFiles | HubFiles
 
 
 def all_files(root: Path) -> list[str]:

@@ -12,7 +12,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
-from hashlib import sha1
 from pathlib import Path
 from typing import Any, Self
 
@@ -108,13 +107,18 @@ class HubFiles:
     for the tag of a version, such as `data-1.0.0`: a published version never changes.
     """
 
-    folder = ""
-
-    def __init__(self, repo_id: str, revision: str | None = None, repo_type: str = "dataset"):
+    def __init__(
+        self,
+        repo_id: str,
+        revision: str | None = None,
+        repo_type: str = "dataset",
+        folder: str = "",
+    ):
         check_endpoint()
         self.repo_id = repo_id
         self.revision = revision or "main"
         self.repo_type = repo_type
+        self.folder = f"{folder}/" if folder else ""
 
     @classmethod
     def parse(cls, location: str, repo_type: str = "dataset", revision: str | None = None) -> Self:
@@ -130,15 +134,11 @@ class HubFiles:
             raise InvalidOptionError(
                 f"{location!r} and revision {revision!r}", "Give the revision once."
             )
-        files = cls(repo_id, at or revision, repo_type)
-        files.folder = f"{folder[1:]}/" if folder else ""
-        return files
+        return cls(repo_id, at or revision, repo_type, folder[1:])
 
     def inside(self, folder: str) -> "HubFiles":
         """Return the files of a folder of the repository, at the same commit."""
-        inner = HubFiles(self.repo_id, self.commit, self.repo_type)
-        inner.folder = f"{self.folder}{folder}/"
-        return inner
+        return HubFiles(self.repo_id, self.commit, self.repo_type, f"{self.folder}{folder}")
 
     @cached_property
     def commit(self) -> str:
@@ -155,7 +155,7 @@ class HubFiles:
 
     @property
     def location(self) -> str:
-        """`namespace/name[/folder]@commit`; see `Files.location`."""
+        """`namespace/name[/folder]@commit`: the argument of `locate` for the same files."""
         return f"{self.name}@{self.commit}"
 
     @property
@@ -164,7 +164,7 @@ class HubFiles:
         return f"{self.repo_id}/{self.folder}".removesuffix("/")
 
     def path(self, relative: str) -> Path:
-        """Return the file's path in the cache, downloading it if necessary; see `Files.path`.
+        """Return the file's path in the cache, downloading it if necessary.
 
         A downloaded file is compared with the digest that the Hub has of it.
         """
@@ -180,7 +180,7 @@ class HubFiles:
         return path
 
     def fetch(self, paths: Iterable[str]) -> None:
-        """Download files that are not in the cache, with a progress bar; see `Files.fetch`.
+        """Download files that are not in the cache, several at a time, with a progress bar.
 
         `snapshot_download` would first list the whole repository: for one buffer of a large
         dataset, more bytes and requests than the buffer's metadata.
@@ -236,9 +236,8 @@ class HubFiles:
         return LocalFiles(self.snapshot(f"{folder}/*{suffix}")).list(folder, suffix)
 
     def describe(self) -> str:
-        """Return `namespace/name@revision`, with the commit as revision once it is known."""
-        repository = f"{self.repo_id}@{self._known_revision}"
-        return f"{repository}, {self.folder}" if self.folder else repository
+        """Return `namespace/name[/folder]@revision`; the commit once it is known."""
+        return f"{self.name}@{self._known_revision}"
 
     def _check(self, downloaded: dict[str, Path]) -> None:
         """Remove downloaded files whose digest differs from the Hub's, and raise.
@@ -246,10 +245,13 @@ class HubFiles:
         The client checks only their length. It names files in its cache by their digests: Git's of
         small ones, SHA-256 of large ones.
         """
+        from huggingface_hub.utils.sha import git_hash
+
         damaged = []
+        digests = {40: lambda blob: git_hash(blob.read_bytes()), 64: sha256_file}
         for relative, path in downloaded.items():
             blob = path.resolve()
-            digest = {40: _git_sha1, 64: sha256_file}.get(len(blob.name))
+            digest = digests.get(len(blob.name))
             if digest is not None and digest(blob) != blob.name:
                 path.unlink()
                 blob.unlink(missing_ok=True)
@@ -271,11 +273,6 @@ class HubFiles:
     def _known_revision(self) -> str:
         revision: str = self.__dict__.get("commit", self.revision)
         return revision
-
-
-def _git_sha1(path: Path) -> str:
-    data = path.read_bytes()
-    return sha1(b"blob %d\0" % len(data) + data).hexdigest()
 
 
 @dataclass(frozen=True)

@@ -56,12 +56,12 @@ class LeRobotFiles:
     """A LeRobot dataset: its metadata, and values and frames of its episodes.
 
     `tables` are the paths of its episode tables, if known: on the Hub, listing the files takes
-    longer than fetching these.
+    longer than fetching these. Only with `statistics`, `table` has all of their columns.
     """
 
-    def __init__(self, files: Files, tables: Sequence[str] = ()):
+    def __init__(self, files: Files, tables: Sequence[str] = (), *, statistics: bool = False):
         self.files = files
-        self._tables = tables
+        self._tables, self._statistics = tables, statistics
         self._rows: dict[int, dict[str, Any]] = {}
         try:
             path = files.path(INFO_PATH)
@@ -108,7 +108,7 @@ class LeRobotFiles:
 
     @cached_property
     def table(self) -> pa.Table:
-        """The per-episode columns by episode index, without statistics."""
+        """The per-episode columns by episode index."""
         table = self._v30_table() if self.version == "v3.0" else self._v21_table()
         where = self.files.describe()
         for name in ("episode_index", "length"):
@@ -205,9 +205,12 @@ class LeRobotFiles:
         tables = []
         for path in paths:
             file = open_parquet(path)
-            columns = [field.name for field in file.schema_arrow if is_plain(field.type)]
-            columns = [name for name in columns if not name.startswith("stats/")]
-            tables.append(read_table(file, path, columns))
+            columns = [
+                field.name
+                for field in file.schema_arrow
+                if is_plain(field.type) and not field.name.startswith("stats/")
+            ]
+            tables.append(read_table(file, path, None if self._statistics else columns))
             if sum(table.nbytes for table in tables) > _MAX_TABLE_BYTES:
                 what = f"the episode tables have over {_MAX_TABLE_BYTES:,} bytes"
                 raise FormatError.damaged(path, what)

@@ -1,7 +1,5 @@
 """Whole builds in one process: output, resuming, extending, and invalid inputs."""
 
-import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +21,6 @@ from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import (
     BuildError,
-    FormatError,
     InterferenceError,
     InvalidIdError,
     InvalidOptionError,
@@ -172,15 +169,6 @@ def test_dataset_with_other_settings_is_unchanged(
     assert contents(built) == before
 
 
-@pytest.mark.parametrize("changes", [{"skipped": None}, {"skipped": [{}]}, None])
-def test_a_report_that_is_damaged(built: Path, tmp_path: Path, changes: Any) -> None:
-    out = shutil.copytree(built, tmp_path / "out")
-    path = out / "meta/build_report.json"
-    path.write_text("{}" if changes is None else json.dumps(read_json(path) | changes))
-    with pytest.raises(FormatError, match=r"build_report\.json"):
-        build(out, MadeUpSource({"A/train/1": (260, 5)}, provenance=TABLETOP))
-
-
 def test_episodes_of_other_cameras_mix_in_those_that_all_have(tmp_path: Path) -> None:
     one = MadeUpSource({"A/train/0": (260, None)})
     both = MadeUpSource({"B/train/0": (260, None)}, cameras=("front", "wrist"))
@@ -209,12 +197,6 @@ def test_no_dataset_under_a_name_that_is_not_utf_8(tmp_path: Path) -> None:
     with pytest.raises(InvalidOptionError, match="a path in UTF-8"):
         build(tmp_path / "caf\udce9" / "out", MadeUpSource(TRAIN))
     assert not any(tmp_path.iterdir())
-
-
-def test_nothing_to_store(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match="no episode yields distractors: 2 unusable"):
-        build(tmp_path / "out", MadeUpSource({"A/train/0": (9, None), "B/train/0": (8, None)}))
-    assert not (tmp_path / "out").exists()
 
 
 def made_up(*names: str) -> MadeUpSource:

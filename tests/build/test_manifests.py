@@ -16,7 +16,6 @@ from robomme_interference_data.build_dataset.manifests import (
     write_manifests,
 )
 from robomme_interference_data.build_dataset.verify import verify_buffer_set
-from robomme_interference_data.data.query_sessions import QuerySessions, SessionSource
 from robomme_interference_data.errors import (
     BuildError,
     FormatError,
@@ -24,7 +23,6 @@ from robomme_interference_data.errors import (
     MissingFileError,
     SourceError,
 )
-from robomme_interference_data.schema.conditions import parse_condition
 
 FAMILIES = ("MoveCube", "InsertPeg", "PatternLock", "Drawer")
 
@@ -184,18 +182,7 @@ def test_an_interrupted_build_leaves_the_old_manifests_or_the_new_ones(
     assert len(load_buffer_set(root)) == len(QUERIES)
 
 
-def test_a_buffer_is_planned_without_manifests() -> None:
-    buffer_set = load_buffer_set(GOLDEN)
-    record = buffer_set.query(QUERIES[1]).record
-    sessions = QuerySessions(SessionSource(buffer_set.datasets), record)
-    for name in CONDITIONS:
-        assert sessions.buffer(parse_condition(name)) == buffer_set.manifest(QUERIES[1], name)
-
-
-def test_manifests_are_replaced_but_unknown_files_are_kept(tmp_path: Path) -> None:
-    root = copy_buffer_set(tmp_path / "buffer_set")
-    assert sum(write_manifests(plan_manifests(in_folder(root), ("k0",)), root)) == len(QUERIES)
-    assert load_buffer_set(root).conditions == ("k0",)
+def test_unknown_files_are_kept(tmp_path: Path) -> None:
     other = made_up(tmp_path / "other")
     (other / "manifests").mkdir()
     (other / "manifests" / "notes.txt").write_text("mine")

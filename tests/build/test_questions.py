@@ -1,10 +1,7 @@
 """Questions about the past: fair ones, the same ones every time, with marks where things are."""
 
 import math
-import os
 import statistics
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -14,19 +11,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from support.machine import full_disk
 from support.tabletop import QUERIES, TABLETOP, copy_tabletop, scene_of
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.build_dataset import question_pictures
 from robomme_interference_data.build_dataset.question_pictures import picture
-from robomme_interference_data.build_dataset.questions import (
-    make_questions,
-    planned_questions,
-    write_questions,
-)
+from robomme_interference_data.build_dataset.questions import make_questions, planned_questions
 from robomme_interference_data.constants import DEMONSTRATIONS, FAMILIES, QUESTIONS_PATH
 from robomme_interference_data.data.questions import Question, digest_questions, read_questions
 from robomme_interference_data.errors import BuildError
@@ -232,23 +223,6 @@ def test_the_golden_questions_come_out_again() -> None:
         assert np.mean(np.abs(before.astype(int) - now)) < 1
 
 
-def test_same_bytes_for_any_hash_seed(tmp_path: Path) -> None:
-    code = (
-        "import sys\n"
-        "from pathlib import Path\n"
-        "from robomme_interference_data import load_buffer_set\n"
-        "from robomme_interference_data.build_dataset.questions import *\n"
-        "questions = list(make_questions(load_buffer_set(sys.argv[1])))\n"
-        "write_questions(reversed(questions[::-1]), Path(sys.argv[2]))\n"
-    )
-    command = [sys.executable, "-c", code, str(TABLETOP), str(tmp_path / "other")]
-    subprocess.run(command, env=os.environ | {"PYTHONHASHSEED": "4711"}, check=True, timeout=60)
-    questions = list(make_questions(load_buffer_set(TABLETOP)))
-    here = write_questions(questions, tmp_path / "here")
-    assert here.read_bytes() == (tmp_path / "other" / QUESTIONS_PATH).read_bytes()
-    assert pq.ParquetFile(here).num_row_groups == len(questions)
-
-
 def test_the_digest_is_of_all_that_is_asked() -> None:
     first, second = list(make_questions(buffer_set_of(*QUERIES[:2])))
     digest = digest_questions([first, second])
@@ -340,16 +314,3 @@ def test_a_full_disk_leaves_what_was_there(root: Path, run: Any) -> None:
     assert code == 1 and "disk space" in err and "Traceback" not in err
     assert (root / QUESTIONS_PATH).read_bytes() == b"as it was"
     assert len(list(root.iterdir())) == 4
-
-
-def test_stopped_it_leaves_what_was_there(
-    root: Path, run: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-
-    def stopped(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(question_pictures, "picture", stopped)
-    code, _, err = run("build", "questions", root)
-    assert code == 130 and f"resume with:\nrobomme-interference build questions {root}" in err
-    assert not (root / QUESTIONS_PATH).exists()

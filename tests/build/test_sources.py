@@ -139,12 +139,6 @@ def test_the_docs_know_all_kinds() -> None:
         assert "| `" + kind.form.replace(" or ", "` or `") in table
 
 
-@pytest.mark.parametrize("kind", ["frames", "robomme-h5"])
-def test_a_folder_that_does_not_exist(kind: str, tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match="missing"):
-        open_source(f"{kind}:{tmp_path / 'missing'}")
-
-
 @given(st.integers(0, 30), st.integers(0, 30))
 def test_a_demonstration_comes_first_and_in_one_piece(lesson: int, rest: int) -> None:
     flags = [True] * lesson + [False] * rest

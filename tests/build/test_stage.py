@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 from collections.abc import Generator, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,11 @@ from numpy.typing import NDArray
 from support.made_up import MadeUpSource, picture
 
 from robomme_interference_data.build_dataset import stage
-from robomme_interference_data.build_dataset.frame_selection import FRAME_SELECTORS, NothingToStore
+from robomme_interference_data.build_dataset.frame_selection import (
+    NothingToStore,
+    select_demonstration,
+    select_unit,
+)
 from robomme_interference_data.build_dataset.image_stats import ImageStats
 from robomme_interference_data.build_dataset.lerobot_writer import StoredEpisode
 from robomme_interference_data.build_dataset.plan import BuildPlan
@@ -27,12 +32,7 @@ from robomme_interference_data.build_dataset.stage import (
     read_staged,
     staged_name,
 )
-from robomme_interference_data.constants import (
-    CONTRADICTIONS,
-    DEMONSTRATIONS,
-    DISTRACTORS,
-    RAW_DISTRACTORS,
-)
+from robomme_interference_data.constants import DISTRACTORS
 from robomme_interference_data.errors import BuildError, SourceError
 from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.schema.records import EvidenceSpan, SpanDigests
@@ -212,42 +212,38 @@ def marks(lesson: int | None, length: int) -> Generator[Frame]:
         yield Frame({}, np.array([step], np.float32), None, shown)
 
 
+SELECT_UNIT = partial(select_unit, kind=DISTRACTORS)
+
+
 def steps(frames: Any) -> list[int]:
     return [int(frame.state[0]) for frame in frames]
-
-
-def test_contradictions_and_raw_units() -> None:
-    assert steps(FRAME_SELECTORS[CONTRADICTIONS](marks(3, 100))) == [0, 1, 2, 3]
-    for length in (249, 255, 256, 400):
-        raw = steps(FRAME_SELECTORS[RAW_DISTRACTORS](marks(None, length)))
-        assert raw == list(range(min(length, 256)))
 
 
 @given(lesson=st.none() | st.integers(0, 400), length=st.integers(0, 400))
 def test_nothing_is_read_beyond_the_last_frame_that_is_needed(
     lesson: int | None, length: int
 ) -> None:
-    for kind, needed in ((DISTRACTORS, 249), (DEMONSTRATIONS, (lesson or 0) + 1)):
+    for select, needed in ((SELECT_UNIT, 249), (select_demonstration, (lesson or 0) + 1)):
         read = marks(lesson, length)
         try:
-            found = steps(FRAME_SELECTORS[kind](read))
+            found = steps(select(read))
         except (NothingToStore, SourceError):
             assert length < needed or not lesson
             continue
-        assert found == list(range(0, needed, 8 if kind == DISTRACTORS else 1))
+        assert found == list(range(0, needed, 8 if select is SELECT_UNIT else 1))
         assert steps(read) == list(range(needed, length))  # what is left
 
 
 @pytest.mark.parametrize(
-    ("kind", "lesson", "length", "reason"),
+    ("select", "lesson", "length", "reason"),
     [
-        (DISTRACTORS, None, 248, "248 raw frames; a unit needs 249"),
-        (DEMONSTRATIONS, 0, 100, "no demonstration frame"),
-        (DEMONSTRATIONS, 100, 100, "no live observation after the demonstration"),
+        (SELECT_UNIT, None, 248, "248 raw frames; a unit needs 249"),
+        (select_demonstration, 0, 100, "no demonstration frame"),
+        (select_demonstration, 100, 100, "no live observation after the demonstration"),
     ],
 )
-def test_nothing_to_store(kind: str, lesson: int | None, length: int, reason: str) -> None:
+def test_nothing_to_store(select: Any, lesson: int | None, length: int, reason: str) -> None:
     with pytest.raises(NothingToStore, match=reason):
-        list(FRAME_SELECTORS[kind](marks(lesson, length)))
+        list(select(marks(lesson, length)))
     with pytest.raises(SourceError, match=r"does not mark(.|\n)*can be built without"):
-        list(FRAME_SELECTORS[DEMONSTRATIONS](marks(None, 10)))
+        list(select_demonstration(marks(None, 10)))

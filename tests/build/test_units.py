@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.buffer_sets import violations
 from support.made_up import MadeUpSource
 
 from robomme_interference_data import load_buffer_set
@@ -18,7 +19,6 @@ from robomme_interference_data.build_dataset.manifests import (
 )
 from robomme_interference_data.build_dataset.plan import BuildPlan, plan_build
 from robomme_interference_data.build_dataset.sources.base import Frame
-from robomme_interference_data.build_dataset.verify import verify_buffer_set
 from robomme_interference_data.cards.dataset_facts import buffer_set_facts
 from robomme_interference_data.cards.publication import Publication
 from robomme_interference_data.cards.render import card_text
@@ -62,10 +62,6 @@ def build(root: Path, kind: str, lengths: dict[str, Any], unit: Unit = SHORT) ->
     build_dataset(plan, root / kind, Serial(), WorkProgress(quiet=True))
 
 
-def violations(root: Path) -> list[str]:
-    return [f"{one.where}: {one.what}" for one in verify_buffer_set(load_buffer_set(root))]
-
-
 @pytest.mark.slow
 def test_a_buffer_set_of_short_units(tmp_path: Path) -> None:
     for kind, lengths in ((DEMONSTRATIONS, QUERIES), (DISTRACTORS, TRAIN)):
@@ -98,6 +94,7 @@ def test_only_short_episodes_are_an_error_that_names_the_options(tmp_path: Path)
     with pytest.raises(SourceError, match="11 raw frames; a unit needs 249") as caught:
         build(tmp_path, DISTRACTORS, TRAIN, Unit(32, 8))
     assert "`unit_frames` and `unit_stride`" in str(caught.value.hint)
+    assert not (tmp_path / DISTRACTORS).exists()
     config = BuildConfig(("sample",), tmp_path, unit_frames=0)
     with pytest.raises(InvalidOptionError, match="unit_frames 0; expected a positive number"):
         plan_build(DISTRACTORS, config)

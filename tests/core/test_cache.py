@@ -1,7 +1,6 @@
 """The cache of decoded frames: bounded, shared, and never trusted when damaged."""
 
 import os
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from hashlib import sha256
 from pathlib import Path
@@ -57,26 +56,10 @@ def test_put_replaces_and_another_shape_or_type_counts_as_absent(tmp_path: Path)
     assert cache.get(name(2), SHAPE) is None
     (tmp_path / f"{name(3)}.npy").mkdir()
     assert cache.get(name(3), SHAPE) is None
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda data: b"",
-        lambda data: data[:-1],
-        lambda data: b"PK\x03\x04" + data,  # looks like an .npz
-        lambda data: data.replace(b"(4, 8", b"(((("),
-    ],
-)
-def test_damaged_files_count_as_absent(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
-    cache = DecodedCache(tmp_path)
-    cache.put(name(1), frames(1))
     path = tmp_path / f"{name(1)}.npy"
-    damaged = damage(path.read_bytes())
-    assert damaged != path.read_bytes()
-    path.write_bytes(damaged)
+    path.write_bytes(path.read_bytes()[:-1])  # damaged
     assert cache.get(name(1), SHAPE) is None
-    cache.put(name(1), frames(1))  # and are written anew
+    cache.put(name(1), frames(1))  # and written anew
     np.testing.assert_array_equal(cache.get(name(1), SHAPE), frames(1))
 
 

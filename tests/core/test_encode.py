@@ -100,13 +100,6 @@ def test_clips_are_the_same_whatever_memory_held_before(
     assert len(found) == 1
 
 
-def test_a_container_can_be_named(tmp_path: Path) -> None:
-    encoder = VideoEncoder(tmp_path / "clip.partial", CLIP, 10, 16, 16, container="mp4")
-    encoder.add(noise(0, 16, 16))
-    encoder.close()
-    assert b"ftyp" in (tmp_path / "clip.partial").read_bytes()[:16]
-
-
 # --- what cannot be encoded ----------------------------------------------------------------------
 
 

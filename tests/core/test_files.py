@@ -20,7 +20,6 @@ from robomme_interference_data.storage.files import (
     read_sums,
     write_json,
 )
-from robomme_interference_data.storage.staging import file_lock
 
 values = st.recursive(
     st.none()
@@ -117,6 +116,9 @@ def test_links_are_followed_inside_only(tmp_path: Path) -> None:
     for relative in ("meta/out", "folder/secret"):
         with pytest.raises(FormatError, match="link that leads out"):
             LocalFiles(root).path(relative)
+    (root / "round").symlink_to("round")
+    with pytest.raises(MissingFileError, match="is missing"):
+        LocalFiles(root).path("round")
     (tmp_path / "link").symlink_to(root)  # the folder itself may be one
     assert LocalFiles(tmp_path / "link").path("real").read_text() == "here"
 
@@ -183,18 +185,6 @@ def test_json_has_a_bounded_depth() -> None:
             parse_json(nested(depth), "here")
     many = b'{"a":[' + b"{}," * 1000 + b"{}]}"
     assert len(parse_json(many, "here")["a"]) == 1001
-
-
-def test_a_lock_is_held_by_one(tmp_path: Path) -> None:
-    busy = FormatError("busy")
-    with (
-        file_lock(tmp_path / "lock", busy),
-        pytest.raises(FormatError, match="busy"),
-        file_lock(tmp_path / "lock", busy),
-    ):
-        pass
-    with file_lock(tmp_path / "lock", busy):  # free again
-        pass
 
 
 def test_atomic_path_replaces(tmp_path: Path) -> None:

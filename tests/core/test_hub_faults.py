@@ -140,10 +140,3 @@ def test_stopped_while_fetching(hub: HubServer, tmp_path: Path, run: Run) -> Non
     paths = [one.path for one in hub.asked if one.method == "GET" and one.status == 200]
     files = [path for path in paths if not path.startswith("/api/")]
     assert len(files) - len({*files}) <= 8  # unfinished downloads start again
-
-
-def test_an_open_buffer_set_makes_no_requests(hub: HubServer) -> None:
-    buffer_set = load_buffer_set(BUFFER_SET, revision=VERSION)
-    buffer_set.load(QUERY, "k3")
-    hub.down = True
-    buffer_set.load(QUERY, "k3", verify=True)

@@ -128,14 +128,6 @@ def test_invalid_paths(root: Path, which: str, path: str, message: str) -> None:
         read_all(root)
 
 
-def test_a_link_that_goes_round_is_missing(root: Path) -> None:
-    data = next(root.glob("data/*/*.parquet"))
-    data.unlink()
-    data.symlink_to(data.name)
-    with pytest.raises(MissingFileError, match="is missing"):
-        read_all(root)
-
-
 # --- damage --------------------------------------------------------------------------------------
 
 

@@ -25,12 +25,6 @@ DOUBLE = "support.simulator_doubles:make"
 ACTION = np.zeros(8, np.float32)
 
 
-def test_a_simulator_is_made_by_its_name() -> None:
-    made = make_simulator(DOUBLE, cameras=("wrist",))
-    lesson, _, _ = made.reset("MoveCube/test/9")
-    assert list(lesson.images) == ["wrist"]
-
-
 @pytest.mark.parametrize(
     ("name", "error", "message"),
     [

@@ -111,7 +111,7 @@ def test_an_interpreter_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setenv("HOME", str(tmp_path))
     local = tmp_path / "python"  # there is another one on the path
     local.symlink_to(sys.executable)
-    for given_path in ("./python", str(local), Path("python"), "~/python"):
+    for given_path in ("./python", local, "~/python"):
         assert find_python(given_path) == str(local)
     assert find_python("python3") != str(local)
     monkeypatch.setenv("ROBOMME_PYTHON", "./python")

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.build import build_dataset
-from robomme_interference_data.build_dataset.frame_selection import FRAME_SELECTORS
+from robomme_interference_data.build_dataset.frame_selection import select_frames
 from robomme_interference_data.build_dataset.manifests import (
     in_folder,
     plan_manifests,
@@ -19,6 +20,7 @@ from robomme_interference_data.build_dataset.manifests import (
 from robomme_interference_data.build_dataset.plan import BuildPlan, list_episodes
 from robomme_interference_data.build_dataset.sources import Frame, Source
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
+from robomme_interference_data.build_dataset.verify import verify_buffer_set
 from robomme_interference_data.constants import SUMS_PATH
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.ids import EpisodeId
@@ -54,6 +56,12 @@ def plan_again(root: Path, conditions: Iterable[str] = CONDITIONS, **options: An
         pass
 
 
+def violations(root: Path, *, decode: bool = True) -> list[str]:
+    """Return what `verify` finds in a buffer set."""
+    found = verify_buffer_set(load_buffer_set(root), decode=decode)
+    return [f"{one.where}: {one.what}" for one in found]
+
+
 def contents(root: Path) -> dict[str, bytes]:
     """Return all files under a folder."""
     return {
@@ -72,7 +80,7 @@ def dataset(root: Path, name: str) -> Dataset:
 def _stored(kind: str, episode: EpisodeId) -> tuple[Frame, ...]:
     source = SampleSource(size=32)
     [listed] = [one for one in source.episodes() if one.id == episode]
-    return tuple(FRAME_SELECTORS[kind](source.read(listed, None).frames))
+    return tuple(select_frames(kind, source.read(listed, None)))
 
 
 def stored_frames(kind: str, episode: EpisodeId, camera: str) -> NDArray[np.uint8]:

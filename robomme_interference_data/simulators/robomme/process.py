@@ -160,10 +160,7 @@ def find_python(python: str | os.PathLike[str] | None) -> str:
             "the robomme simulator needs RoboMME's own Python, and none is given", _INSTALL
         )
     # As text: `Path` would remove a leading "./" and leave the name of a program.
-    path = os.path.expanduser(given)  # noqa: PTH111
-    if isinstance(python, os.PathLike):
-        path = os.path.abspath(path)  # noqa: PTH100
-    if (executable := shutil.which(path)) is None:
+    if (executable := shutil.which(os.path.expanduser(given))) is None:  # noqa: PTH111
         raise InvalidOptionError(f"{given} is not an executable file", _INSTALL)
     # Not resolved: the interpreter of a virtual environment is a link.
     return os.path.abspath(executable)  # noqa: PTH100
