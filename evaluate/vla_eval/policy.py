@@ -10,19 +10,11 @@ from vla_eval.specs import GRIPPER_CLOSE_NEG, IMAGE_RGB, LANGUAGE
 
 from robomme_interference_data.errors import PolicyServerError
 from robomme_interference_data.evaluate.policies.connection import check_server_options
-from robomme_interference_data.evaluate.policies.policy import Frames, Policy, RolloutInfo
+from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.simulators.base import ACTION_SIZE, Observation
 
 from .connection import VlaEvalConnection
-from .observations import (
-    ACTIONS,
-    CAMERAS,
-    HISTORIES,
-    STATE,
-    STATE_HISTORY,
-    encoded,
-    make_observation,
-)
+from .observations import ACTIONS, CAMERAS, HISTORIES, STATE, STATE_HISTORY, ObservingPolicy
 
 _TARGETS = ACTIONS.accepts or frozenset()
 _STATES = frozenset({STATE.format, "joint_positions"})
@@ -52,7 +44,7 @@ _ONE_MEMORY = ("MmeVlaModelServer",)
 """Servers that keep one history for all connections."""
 
 
-class VlaEvalPolicy(Policy):
+class VlaEvalPolicy(ObservingPolicy):
     """A server of vla-eval, by host and port.
 
     Its hello decides what it gets: the front camera, and if it asks for them, the wrist camera,
@@ -90,7 +82,7 @@ class VlaEvalPolicy(Policy):
         asked, declared = hello.get("observation_params", {}), hello.get("observation_spec", {})
         wrist = asked.get("send_wrist_image", any(name in declared for name in _WRISTS))
         history = asked.get("send_video_history", HISTORIES["front"] in declared)
-        self._sends_state = bool(asked.get("send_state", "state" in declared))
+        self.sends_state = bool(asked.get("send_state", "state" in declared))
         self.cameras = ("front", "wrist") if wrist else ("front",)
         self.history_cameras = self.cameras if history else ()
         self.wants_history = bool(history)
@@ -114,28 +106,11 @@ class VlaEvalPolicy(Policy):
                 "Serve the same model until the run ends.",
             )
         self._server.start_episode({"name": info.goal, "seed": info.seed})
-        self._first = True
-        self._history: dict[str, list[Any]] = {camera: [] for camera in self.history_cameras}
-        self._states: list[NDArray[np.float32]] = []
-
-    def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
-        """Keep frames and states until the first observation."""
-        for camera, kept in self._history.items():
-            kept.extend(map(encoded, frames[camera]))
-        self._states.append(states.copy())
+        super().reset(info)
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the server's action, or its chunk, as `(n, 8)`; the rollout checks them."""
-        message = make_observation(
-            {camera: observation.images[camera] for camera in self.cameras},
-            goal,
-            state=np.asarray(observation.state, np.float32) if self._sends_state else None,
-            first=self._first,
-            history=self._history,
-            states=np.concatenate(self._states) if self._states and self._sends_state else None,
-        )
-        self._first, self._history, self._states = False, {}, []
-        return np.atleast_2d(self._server.act(message))
+        return np.atleast_2d(self._server.act(self.message(observation, goal)))
 
     def metadata(self) -> dict[str, Any]:
         """Return the server's address and its hello."""
