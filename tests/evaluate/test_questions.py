@@ -40,7 +40,7 @@ pytestmark = pytest.mark.usefixtures("fast_retries")
 
 MOVE = QUERIES[FAMILIES.index("MoveCube") * 2]
 UNIT = 32
-IMAGE = np.empty(0, np.uint8)
+NO_HISTORY: Any = None  # guesses read none
 ONE: dict[str, Any] = {"families": ("MoveCube",), "episodes": "0"}
 FOUR = {"families": ("MoveCube", "PatternLock")}
 FINE = ""  # no fault
@@ -101,7 +101,7 @@ def test_guesses_are_right_by_chance() -> None:
     hits, expected, variance = 0, 0.0, 0.0
     for episode, question in questions().items():
         for seed in range(100):
-            prompted = Prompted(question, buffer_set.query(episode), seed, None, lambda: IMAGE)
+            prompted = Prompted(question, buffer_set.query(episode), seed, None, NO_HISTORY)
             hits += guess(prompted) == question.letters[question.right]
             expected += question.chance
             variance += question.chance * (1 - question.chance)
