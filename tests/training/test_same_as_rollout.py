@@ -14,7 +14,7 @@ from support.runs import config
 from support.worlds import BUFFER_SET
 
 from robomme_interference_data import BufferSet, load_buffer_set
-from robomme_interference_data.constants import ACTION, EXECUTIONS, STATE
+from robomme_interference_data.constants import EXECUTIONS, STATE
 from robomme_interference_data.evaluate import Observation, Policy, RolloutInfo
 from robomme_interference_data.evaluate.rollout.rollout import run_rollout
 from robomme_interference_data.evaluate.run.kind import Run
@@ -151,13 +151,3 @@ def test_same_frames_states_and_positions(
             small = torch.from_numpy(resize(frames[name], 24))
             assert torch.equal(item[f"memory.images.{name}"][:count], small[:-1])
             assert torch.equal(item[f"observation.images.{name}"], small[-1])
-
-
-def test_actions_are_those_of_the_recording(buffers: Path, tmp_path: Path) -> None:
-    data = HistoryDataset(buffers, ["k0"], chunk=20, image_size=8, store=tmp_path, quiet=True)
-    live = load_buffer_set(buffers).datasets[EXECUTIONS]
-    actions = live.read_vectors(live.index_of(EPISODE), ACTION, 0, 212)
-    item = data[data.index_of(EPISODE, 200)]
-    np.testing.assert_array_equal(item["action"][:12], actions[200:])
-    np.testing.assert_array_equal(item["action"][12:], np.repeat(actions[-1:], 8, 0))
-    assert item["action_is_pad"].tolist() == [False] * 12 + [True] * 8
