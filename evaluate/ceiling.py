@@ -5,7 +5,7 @@ frame, and draws one of the answers that agree. Its expected success is 1 / (agr
 function of manifests and records: nothing is decoded or simulated, and there is no rollout.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from robomme_interference_data.data.buffer import Buffer
@@ -23,23 +23,8 @@ from robomme_interference_data.viz.tables import Table
 
 from .run.config import CeilingConfig, non_default_retrieval, nothing_to_retrieve
 
-
-@dataclass(frozen=True)
-class Left:
-    """The evidence that a memory keeps of one buffer.
-
-    Attributes:
-        family: Family of the query.
-        condition: Name of the condition.
-        evidence_kept: Share of the lesson's evidence spans of which it keeps a frame; None without
-            a lesson, or if evidence is unknown.
-        success: Chance that the ideal observer succeeds; None if the possible answers are unknown.
-    """
-
-    family: str
-    condition: str
-    evidence_kept: float | None
-    success: float | None
+_Kept = tuple[float | None, float | None]
+"""Share of the evidence that a memory keeps, and the ideal observer's chance."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +35,10 @@ class Ceiling:
         family: The family, or `ALL`.
         condition: Name of the condition.
         queries: Number of queries.
-        evidence_kept, success: Means of those of `Left` over the queries with a value, or None.
+        evidence_kept: Mean share of the lesson's evidence spans of which the memory keeps a frame,
+            over the queries whose lesson is given and whose evidence is known; None without any.
+        success: Mean chance that the ideal observer succeeds, over the queries whose possible
+            answers are known; None without any.
     """
 
     family: str
@@ -77,13 +65,18 @@ def ceiling(buffer_set: BufferSet, config: CeilingConfig) -> list[Ceiling]:
         )
     queries_with_evidence(buffer_set)
     names = [one.name for one in in_order(config.conditions or buffer_set.conditions)]
-    every = [
-        left_in_memory(buffer, config.memory, given, config.frames)
+    cells: dict[tuple[str, str], list[_Kept]] = {}
+    for buffer in (one for name in names for one in buffer_set.buffers(condition=name)):
+        if (given := _given(buffer_set, buffer, config)) is not None:
+            kept = _kept(buffer, config.memory, given, config.frames)
+            for family in (buffer.episode_id.family, ALL):
+                cells.setdefault((family, buffer.condition), []).append(kept)
+    return [
+        Ceiling(family, name, len(group), *map(_mean, zip(*group, strict=True)))
+        for family in (*buffer_set.families, ALL)
         for name in names
-        for buffer in buffer_set.buffers(condition=name)
-        if (given := _given(buffer_set, buffer, config)) is not None
+        if (group := cells.get((family, name)))
     ]
-    return [*_cells(every, buffer_set.families), *_cells(every, (ALL,))]
 
 
 def queries_with_evidence(buffer_set: BufferSet) -> list[Query]:
@@ -102,17 +95,16 @@ def queries_with_evidence(buffer_set: BufferSet) -> list[Query]:
     return known
 
 
-def left_in_memory(buffer: Buffer, memory: str, given: Sequence[int], frames: int = 1) -> Left:
-    """Return the evidence that a memory keeps at the first step, given frames of a buffer.
+def _kept(buffer: Buffer, memory: str, given: Sequence[int], frames: int) -> _Kept:
+    """Return what a memory keeps at the first step, given frames of a buffer.
 
     A part of the answer is known from that many kept `frames` on.
     """
-    cell = buffer.episode_id.family, buffer.condition
     if buffer.evidence is None:
-        return Left(*cell, None, None)
+        return None, None
     kept = Memory(memory).kept(given)
     success = chance(buffer.query, known_parts(buffer.evidence, kept, frames))
-    return Left(*cell, evidence_kept(buffer.evidence, kept), success)
+    return evidence_kept(buffer.evidence, kept), success
 
 
 def chance(query: Query, known: dict[int, str]) -> float | None:
@@ -140,18 +132,6 @@ def _given(buffer_set: BufferSet, buffer: Buffer, config: CeilingConfig) -> Sequ
         shift=parse_shift(config.shift),
     )
     return chosen.tolist()
-
-
-def _cells(every: Sequence[Left], families: Iterable[str]) -> Iterator[Ceiling]:
-    for family in families:
-        groups: dict[str, list[Left]] = {}
-        for one in every:
-            if family in (ALL, one.family):
-                groups.setdefault(one.condition, []).append(one)
-        for condition, group in groups.items():
-            kept = _mean(one.evidence_kept for one in group)
-            success = _mean(one.success for one in group)
-            yield Ceiling(family, condition, len(group), kept, success)
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

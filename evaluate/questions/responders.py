@@ -1,26 +1,24 @@
 """Responders to questions: the ideal observer, chance, or a model."""
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.questions import Question
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.evaluate.models.model import Video
+from robomme_interference_data.evaluate.models.model import Reply, Video
 from robomme_interference_data.evaluate.models.prompts import as_text
 from robomme_interference_data.evaluate.models.registry import MODELS
 from robomme_interference_data.evaluate.run.config import AskConfig
+from robomme_interference_data.evaluate.subgoals.writer import History
 from robomme_interference_data.simulators.registry import recorded_scene
 from robomme_interference_data.storage.encode import decode_image
 
 from .prompt import load_prompt, read_letter
-
-CAMERA = "front"
 
 CONTROLS = ("none", "blank", "text")
 """What a model does not see: nothing; the content of the history frames; all images."""
@@ -28,30 +26,18 @@ CONTROLS = ("none", "blank", "text")
 
 @dataclass(frozen=True)
 class Prompted:
-    """A question, with the parts of the answer that kept frames show; `frames` decodes these."""
+    """A question, with the history frames that are kept, and the parts of the answer they show."""
 
     question: Question
     query: Query
     seed: int
     known: Mapping[int, str] | None
-    frames: Callable[[], NDArray[np.uint8]]
+    history: History
 
     def draw(self, letters: str) -> str:
         """Draw one of some letters, a function of episode and seed."""
         lot = hashlib.sha256(f"{self.query.episode_id}/{self.seed}".encode()).digest()
         return letters[int.from_bytes(lot) % len(letters)]
-
-
-@dataclass(frozen=True)
-class Answer:
-    """An answer, for the row and the transcript; the letter is None if no option was named."""
-
-    letter: str | None
-    prompt: str | None = None
-    text: str | None = None
-    tokens: int | None = None
-    calls: int | None = None
-    seconds: float | None = None
 
 
 def guess(prompted: Prompted) -> str:
@@ -88,24 +74,23 @@ class ModelResponder:
         self.images = None if config.control == "text" else self._model.images
         self._prompt, self._sha256 = load_prompt(config.prompt)
 
-    def answer(self, prompted: Prompted) -> Answer:
-        """Ask the model."""
+    def answer(self, prompted: Prompted) -> tuple[str | None, str, Reply]:
+        """Ask the model; return the letter that it names, if any, the prompt, and the reply."""
         views: dict[str, list[Any]] = {"<history>": [], "<picture>": []}
         if self._control != "text":
             try:
                 views["<picture>"] = [decode_image(prompted.question.picture)]
             except FormatError as error:
                 raise error.about(f"the question of {prompted.question.episode_id}") from None
-            frames = prompted.frames()
-            if self._control == "blank":
-                frames = np.full_like(frames, 128)
-            if len(frames):
+            if len(prompted.history):
+                frames = prompted.history.frames(range(len(prompted.history)))
+                if self._control == "blank":
+                    frames = np.full_like(frames, 128)
                 views["<history>"] = [Video(frames, prompted.query.dataset.fps)]
         messages = self._prompt.fill(prompted.query.goal, prompted.question, views)
         reply = self._model.reply(messages)
         letter = read_letter(reply.text, prompted.question.letters)
-        prompt = as_text(messages[-1].parts)
-        return Answer(letter, prompt, reply.text, reply.tokens, reply.calls, reply.seconds)
+        return letter, as_text(messages[-1].parts), reply
 
     def metadata(self) -> dict[str, Any]:
         """Return the model's metadata, and the SHA-256 of the prompt's file."""

@@ -5,9 +5,6 @@ from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.data.questions import Question, digest_questions, read_questions
 from robomme_interference_data.evaluate.run.config import AskConfig
@@ -18,13 +15,14 @@ from robomme_interference_data.evaluate.run.kind import (
     history_columns,
     model_columns,
 )
+from robomme_interference_data.evaluate.subgoals.writer import History
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.evidence import known_parts
 from robomme_interference_data.schema.rollouts import Rollout, Status
 from robomme_interference_data.schema.sampling import Memory, evidence_kept
 
-from .responders import CAMERA, OWN, Answer, ModelResponder, Prompted
+from .responders import OWN, ModelResponder, Prompted
 
 
 class AskTask(RunTask[AskConfig]):
@@ -62,40 +60,33 @@ class AskTask(RunTask[AskConfig]):
         if self.selector is not None and len(buffer):
             given = self.selector.select(buffer, query.frame(self.selector.camera)).tolist()
         kept = Memory(config.sampling, config.frames).kept(given)
-
-        def frames() -> NDArray[np.uint8]:
-            if not kept:
-                return np.empty((0, 1, 1, 3), np.uint8)
-            chunks = self.history.stream(buffer, 64, (CAMERA,), kept)
-            return np.concatenate([chunk.frames[CAMERA] for chunk in chunks])
-
         evidence = buffer.evidence
         known = None if evidence is None else known_parts(evidence, kept)
-        prompted = Prompted(question, query, config.model_seed, known, frames)
-        if self._responder is None:
-            answer = Answer(OWN[config.model](prompted))
-        else:
-            answer = self._responder.answer(prompted)
+        history = History(buffer, kept, self.history)
+        prompted = Prompted(question, query, config.model_seed, known, history)
         right = question.letters[question.right]
         columns: dict[str, Any] = {}
-        if answer.calls is not None and answer.seconds is not None:
-            columns = model_columns(answer.calls, [answer.tokens], answer.letter is None)
-            columns["model_s"] = round(answer.seconds, 4)
+        if self._responder is None:
+            letter: str | None = OWN[config.model](prompted)
+        else:
+            letter, prompt, reply = self._responder.answer(prompted)
+            columns = model_columns(reply.calls, [reply.tokens], letter is None)
+            columns["model_s"] = round(reply.seconds, 4)
             line = {
-                **{"question": question.text, "prompt": answer.prompt, "text": answer.text},
-                **{"answer": answer.letter, "right": right},
+                **{"question": question.text, "prompt": prompt, "text": reply.text},
+                **{"answer": letter, "right": right},
             }
             worker.send_file(*item.transcript("answers", [line]))
         row = self.run.row(
             item,
-            Status.SUCCESS if answer.letter == right else Status.FAIL,
+            Status.SUCCESS if letter == right else Status.FAIL,
             seed=query.seed,
             difficulty=query.difficulty,
             goal=query.goal,
             steps=0,
             **history_columns(buffer, given, self.selector),
             evidence_kept=None if evidence is None else evidence_kept(evidence, kept),
-            answer=answer.letter,
+            answer=letter,
             chance=question.chance,
             **columns,
             wall_s=round(time.perf_counter() - began, 4),

@@ -1,4 +1,4 @@
-"""Rollouts as a kind of run: the checks before it starts, and what identifies it."""
+"""Rollouts as kinds of runs, simulated and offline: the checks before one, and its identity."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -6,9 +6,12 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
+from robomme_interference_data.constants import EXECUTIONS
 from robomme_interference_data.data.buffer_set import BufferSet
+from robomme_interference_data.data.loading import open_dataset
 from robomme_interference_data.errors import (
     InterferenceError,
+    InvalidOptionError,
     PolicyServerError,
     SimulatorCrashError,
 )
@@ -27,7 +30,7 @@ from robomme_interference_data.evaluate.policies.registry import (
     with_server,
 )
 from robomme_interference_data.evaluate.policies.sockets import Address
-from robomme_interference_data.evaluate.run.config import RunConfig
+from robomme_interference_data.evaluate.run.config import RunConfig, check_unused
 from robomme_interference_data.evaluate.run.kind import Run, RunKind
 from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
 from robomme_interference_data.evaluate.subgoals.registry import (
@@ -36,10 +39,15 @@ from robomme_interference_data.evaluate.subgoals.registry import (
     subgoals_identity,
     with_published,
 )
+from robomme_interference_data.evaluate.subgoals.writer import ORACLE
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.runtime.executor import Session
 from robomme_interference_data.simulators.base import Simulator
-from robomme_interference_data.simulators.registry import simulator_class, simulator_versions
+from robomme_interference_data.simulators.registry import (
+    RECORDINGS,
+    simulator_class,
+    simulator_versions,
+)
 
 from .checks import check_plan, check_settings, check_system, condition_refusal, default_system
 from .worker import Opening, RolloutTask
@@ -133,6 +141,29 @@ class Rollouts(RunKind[RunConfig]):
             "subgoals": subgoals_identity(config, self._subgoal_metadata),
             **policy_identity(config.policy, config.policy_options, self._policy_metadata),
         }
+
+
+_UNUSED = ("simulator", "shift", "check_lesson", "videos")
+"""Settings of simulators."""
+
+
+class Offline(Rollouts):
+    """Rollouts along recorded executions: the policy acts, and the recording goes on."""
+
+    def __init__(self, config: RunConfig, buffer_set: BufferSet):
+        check_unused(config, _UNUSED, "an offline evaluation", "Leave it out.")
+        if config.subgoals == ORACLE:
+            raise InvalidOptionError(
+                f"subgoals of {ORACLE} need a simulator", "Set a model, or leave out `offline`."
+            )
+        super().__init__(dataclasses.replace(config, simulator=RECORDINGS), buffer_set)
+
+    def check(self, plan: Plan, items: Sequence[WorkItem]) -> None:
+        """Check every item, and that its episode has an execution."""
+        super().check(plan, items)
+        executions = open_dataset(self.buffer_set, EXECUTIONS)
+        for episode in dict.fromkeys(item.episode for item in items):
+            executions.index_of(episode)  # raises
 
 
 def _opened(session: Session, opening: Opening, time_limit: float | None) -> Any:

@@ -22,12 +22,8 @@ from robomme_interference_data.evaluate.policies.sockets import Address
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.kind import Job, Run, RunTask
 from robomme_interference_data.evaluate.run.plan import WorkItem
-from robomme_interference_data.evaluate.subgoals.writer import (
-    CAMERA,
-    ORACLE,
-    OracleWriter,
-    SubgoalWriter,
-)
+from robomme_interference_data.evaluate.subgoals.registry import make_writer
+from robomme_interference_data.evaluate.subgoals.writer import CAMERA, ORACLE, SubgoalWriter
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
@@ -166,13 +162,8 @@ class RolloutTask(RunTask[RunConfig]):
             self.close()  # the rollout of this episode becomes an error row
 
     def _open_writer(self) -> SubgoalWriter | None:
-        config = self.run.config
-        if self._writer is None and config.subgoals == ORACLE:
-            self._writer = OracleWriter()
-        elif self._writer is None and config.subgoals is not None:
-            from robomme_interference_data.evaluate.subgoals.registry import make_writer
-
-            self._writer = make_writer(config)
+        if self._writer is None:
+            self._writer = make_writer(self.run.config)
         return self._writer
 
     def _roll(self, job: Job, worker: Worker, clip: Any) -> Rollout:

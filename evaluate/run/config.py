@@ -195,7 +195,6 @@ class AskConfig(WorkConfig):
     """The simulator in their rows: they are not rollouts."""
 
     shift: ClassVar[str] = NO_SHIFT
-    videos: ClassVar[bool] = False
 
 
 @dataclass(frozen=True)

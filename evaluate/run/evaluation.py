@@ -152,13 +152,9 @@ def _kind(config: RunConfig | AskConfig, buffer_set: BufferSet) -> RunKind[Any]:
         from robomme_interference_data.evaluate.questions.kind import Questions
 
         return Questions(config, buffer_set)
-    if config.offline:
-        from robomme_interference_data.evaluate.offline.kind import Offline
+    from robomme_interference_data.evaluate.rollout.kind import Offline, Rollouts
 
-        return Offline(config, buffer_set)
-    from robomme_interference_data.evaluate.rollout.kind import Rollouts
-
-    return Rollouts(config, buffer_set)
+    return (Offline if config.offline else Rollouts)(config, buffer_set)
 
 
 def _run_items(

@@ -17,7 +17,7 @@ class HistoryReader:
 
     def __init__(self, datasets: Mapping[str, Dataset]):
         self._datasets = datasets
-        self._verified: set[tuple[str, str, int, int, int, tuple[str, ...]]] = set()
+        self._verified: set[tuple[SessionEntry, tuple[str, ...]]] = set()
 
     def stream(
         self, buffer: Buffer, size: int, cameras: Sequence[str], given: Sequence[int]
@@ -30,11 +30,7 @@ class HistoryReader:
         frames = np.asarray(given, np.int64)
         new = {}
         for session in buffer.sessions:
-            entry = session.entry
-            key = (
-                *(entry.dataset, entry.revision, entry.episode_index, entry.start, entry.stop),
-                tuple(sorted(cameras)),
-            )
+            key = session.entry, tuple(sorted(cameras))
             read = ((frames >= session.start) & (frames < session.stop)).any()
             if read and key not in self._verified:
                 new[key] = session, FeatureDigests()

@@ -1,6 +1,6 @@
 """RoboMME-Interference as a benchmark of vla-eval: `vla-eval run` plays it against its servers."""
 
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread
@@ -16,7 +16,6 @@ from vla_eval.types import Observation as ServerObservation
 from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import InvalidOptionError, RunError, UnknownNameError, counted
-from robomme_interference_data.evaluate.policies.policy import Frames, Policy, RolloutInfo
 from robomme_interference_data.evaluate.rollout.kind import Rollouts
 from robomme_interference_data.evaluate.rollout.worker import RolloutTask
 from robomme_interference_data.evaluate.run.config import RunConfig
@@ -31,7 +30,7 @@ from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.simulators.base import Observation
 
 from .configuration import check_label
-from .observations import ACTION_SPEC, CAMERAS, OBSERVATION_SPEC, encoded, make_observation
+from .observations import ACTION_SPEC, CAMERAS, OBSERVATION_SPEC, ObservingPolicy
 
 SETTINGS = (
     *("conditions", "families", "episodes", "split", "simulator", "robomme_python", "shift"),
@@ -40,55 +39,23 @@ SETTINGS = (
 """Settings of `evaluate` that the benchmark takes too."""
 
 
-@dataclass(frozen=True)
-class Request:
-    """What a rollout asks an action for.
-
-    Attributes:
-        observation: The current observation.
-        goal: The goal.
-        first: Whether it is the first one of its rollout, which brings the history.
-        history: Camera to its T history frames, `encoded`.
-        states: Their states, `(T, 8) float32`; None without history.
-    """
-
-    observation: Observation
-    goal: str
-    first: bool
-    history: dict[str, list[dict[str, Any]]]
-    states: NDArray[np.float32] | None
-
-
-class HarnessPolicy(Policy):
+class HarnessPolicy(ObservingPolicy):
     """Passes requests of a rollout to another thread, and waits for the answers.
 
     Attributes:
-        requests: `Request` by `Request`, then the row of the rollout, or what it raised.
+        requests: Observations as servers get them, then the row of the rollout, or what it raised.
         answers: Actions, `(n, 8) float32`, or None to end the rollout.
     """
 
-    def __init__(self, wrist: bool = False, history: bool = False):
+    def __init__(self, wrist: bool = False, history: bool = False, state: bool = True):
         self.cameras = tuple(CAMERAS)[: 1 + wrist]
         self.history_cameras = self.cameras if history else ()
-        self.wants_history = history
+        self.wants_history, self.sends_state = history, state
         self.requests, self.answers = SimpleQueue[Any](), SimpleQueue[Any]()
-
-    def reset(self, info: RolloutInfo) -> None:
-        """Forget the history of the last rollout."""
-        self._first, self._states = True, list[NDArray[np.float32]]()
-        self._history: dict[str, list[dict[str, Any]]] = {}
-
-    def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
-        """Keep the frames until the first request."""
-        for camera, images in frames.items():
-            self._history.setdefault(camera, []).extend(map(encoded, images))
-        self._states.append(states)
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the answer to a request."""
-        states = np.concatenate(self._states) if self._states else None
-        self.requests.put(Request(observation, goal, self._first, self._history, states))
-        self._first, self._history, self._states = False, {}, []
+        self.requests.put(self.message(observation, goal))
         if (actions := self.answers.get()) is None:
             raise RunError("vla-eval ended the rollout")
         return cast("NDArray[np.float32]", actions)
@@ -148,7 +115,7 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
         _typed("send_video_history", send_video_history, False)
         check_label(_typed("system", system, ""))
         opened = load_buffer_set(buffer_set)
-        options = {"wrist": send_wrist_image, "history": send_video_history}
+        options = {"wrist": send_wrist_image, "history": send_video_history, "state": send_state}
         config = RunConfig(
             policy=f"python:{__name__}:{HarnessPolicy.__name__}",
             policy_options=tuple(f"{name}={value}".lower() for name, value in options.items()),
@@ -168,7 +135,6 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
             )
         self._plan, _ = plan_run(kind)
         self._run = Run(kind.config, kind.system, opened.name, opened.revision)
-        self._send_state = send_state
         self._policy = HarnessPolicy(**options)
         self._rollouts = RolloutTask(self._run, policy=self._policy)
         # A rollout asks its policy for actions, and vla-eval asks its benchmark for observations:
@@ -200,9 +166,11 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
     def get_observation_spec(self) -> dict[str, DimSpec]:
         """Return what an observation holds."""
         names = ["language", *(CAMERAS[camera] for camera in self._policy.cameras)]
-        return {name: OBSERVATION_SPEC[name] for name in names + ["state"] * self._send_state}
+        return {
+            name: OBSERVATION_SPEC[name] for name in names + ["state"] * self._policy.sends_state
+        }
 
-    def reset(self, task: Task) -> "Request":
+    def reset(self, task: Task) -> ServerObservation:
         """Begin the rollout of an episode; return what the server gets first."""
         self._stop()
         numbers, index = task["episode"], task["episode_idx"]
@@ -216,7 +184,7 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
         episode = EpisodeId(task["family"], task["split"], number)
         self._jobs.put(Job(WorkItem(task["condition"], episode)))
         self._running = True
-        return cast("Request", self._next().obs)
+        return self._next().obs
 
     def step(self, action: Action) -> StepResult:
         """Execute a server's action, or a chunk of them."""
@@ -224,17 +192,9 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
         self._policy.answers.put(np.atleast_2d(np.asarray(values, np.float32)))
         return self._next()
 
-    def make_obs(self, raw_obs: "Request", task: Task) -> ServerObservation:
-        """Return what the server gets."""
-        observation, state = raw_obs.observation, self._send_state
-        return make_observation(
-            {camera: observation.images[camera] for camera in self._policy.cameras},
-            raw_obs.goal,
-            state=observation.state if state else None,
-            first=raw_obs.first,
-            history=raw_obs.history,
-            states=raw_obs.states if state else None,
-        )
+    def make_obs(self, raw_obs: ServerObservation, task: Task) -> ServerObservation:
+        """Return what the server gets: the rollout's policy made it."""
+        return raw_obs
 
     def get_step_result(self, step_result: StepResult) -> EpisodeResult:
         """Return the row of the rollout."""
@@ -267,7 +227,7 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
     def _next(self) -> StepResult:
         """Wait for the rollout to ask for an action, or to end."""
         request = self._policy.requests.get()
-        if isinstance(request, Request):
+        if isinstance(request, dict):
             return StepResult(request, 0.0, False, {})
         self._running = False
         if isinstance(request, Exception):
@@ -278,7 +238,7 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
         """Stop a rollout whose server failed."""
         if self._running:
             self._policy.answers.put(None)
-            while isinstance(self._policy.requests.get(), Request):
+            while isinstance(self._policy.requests.get(), dict):
                 pass
         self._running = False
 

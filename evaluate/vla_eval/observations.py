@@ -3,13 +3,15 @@
 Its servers take images by their order, and read the state under `states`, else `state`.
 """
 
-from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from vla_eval.protocol.image_codec import encode_image
 from vla_eval.specs import IMAGE_RGB, LANGUAGE, DimSpec
+
+from robomme_interference_data.evaluate.policies.policy import Frames, Policy, RolloutInfo
+from robomme_interference_data.simulators.base import Observation
 
 CAMERAS = {"front": "agentview", "wrist": "wrist"}
 """Camera to its name in an observation's `images`, and in an observation spec."""
@@ -57,41 +59,43 @@ def encoded(image: NDArray[np.uint8]) -> dict[str, Any]:
     return dict(encode_image(image, "raw"))
 
 
-def make_observation(
-    images: Mapping[str, Any],
-    goal: str,
-    *,
-    state: Any = None,
-    first: bool = False,
-    history: Mapping[str, Iterable[Any]] | None = None,
-    states: Any = None,
-) -> dict[str, Any]:
-    """Return an observation as vla-eval's servers read it.
+class ObservingPolicy(Policy):
+    """A policy that makes the observations of vla-eval's servers; the first brings the history.
 
-    Args:
-        images: Camera (`front`, `wrist`) to its current `(H, W, 3) uint8` RGB image.
-        goal: The goal in words.
-        state: The current state, `(8,) float32`; None: it is not sent.
-        first: Whether it is the first one of its episode.
-        history: Camera to its T history frames, `encoded`; None: they are not sent.
-            As in vla-eval, a history without frames has no key at all.
-        states: The states of the history frames, `(T, 8) float32`, sent only with them; None: they
-            are not sent.
+    Attributes:
+        sends_state: Whether servers get states, the live ones and those of the history.
     """
-    observation: dict[str, Any] = {
-        # The order counts: a server that knows no names takes the first image as the main view.
-        "images": {
-            name: encoded(images[camera]) for camera, name in CAMERAS.items() if camera in images
-        },
-        "task_description": goal,
-    }
-    if state is not None:
-        observation["states"] = state
-    if first:
-        observation["episode_restart"] = True
-    for camera, frames in (history or {}).items():
-        if listed := list(frames):
-            observation[HISTORIES[camera]] = listed
-            if states is not None:
-                observation[STATE_HISTORY] = states
-    return observation
+
+    sends_state: bool
+
+    def reset(self, info: RolloutInfo) -> None:
+        """Forget the history of the last rollout."""
+        self._first, self._states = True, list[NDArray[np.float32]]()
+        self._history: dict[str, list[dict[str, Any]]] = {}
+
+    def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
+        """Keep frames and states until the first observation."""
+        for camera in self.history_cameras:
+            self._history.setdefault(camera, []).extend(map(encoded, frames[camera]))
+        self._states.append(states.copy())
+
+    def message(self, observation: Observation, goal: str) -> dict[str, Any]:
+        """Return an observation as vla-eval's servers read it.
+
+        As in vla-eval, a history without frames has no key at all.
+        """
+        message: dict[str, Any] = {
+            # The order counts: a server that knows no names takes the first image as the main view.
+            "images": {CAMERAS[name]: encoded(observation.images[name]) for name in self.cameras},
+            "task_description": goal,
+        }
+        if self.sends_state:
+            message["states"] = np.asarray(observation.state, np.float32)
+        if self._first:
+            message["episode_restart"] = True
+        for camera, frames in self._history.items():
+            message[HISTORIES[camera]] = frames
+            if self.sends_state:
+                message[STATE_HISTORY] = np.concatenate(self._states)
+        self._first, self._history = False, {}
+        return message

@@ -1,49 +1,42 @@
 """Policies behind a server of vla-eval: one observation, one answer."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from vla_eval.specs import GRIPPER_CLOSE_NEG, IMAGE_RGB, LANGUAGE
+from vla_eval.specs import GRIPPER_CLOSE_NEG, IMAGE_RGB, LANGUAGE, DimSpec
 
 from robomme_interference_data.errors import PolicyServerError
 from robomme_interference_data.evaluate.policies.connection import check_server_options
-from robomme_interference_data.evaluate.policies.policy import Frames, Policy, RolloutInfo
+from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.simulators.base import ACTION_SIZE, Observation
 
 from .connection import VlaEvalConnection
-from .observations import (
-    ACTIONS,
-    CAMERAS,
-    HISTORIES,
-    STATE,
-    STATE_HISTORY,
-    encoded,
-    make_observation,
-)
-
-_TARGETS = ACTIONS.accepts or frozenset()
-_STATES = frozenset({STATE.format, "joint_positions"})
-_IMAGES = frozenset({IMAGE_RGB.format})
+from .observations import ACTIONS, CAMERAS, HISTORIES, STATE, STATE_HISTORY, ObservingPolicy
 
 _WRISTS = ("wrist", "wrist_image")
 
-_PARTS: Mapping[str, Mapping[str, tuple[int, frozenset[str]]]] = {
+_IMAGES = ("image", "images", *CAMERAS.values(), *_WRISTS, *HISTORIES.values())
+
+_PARTS: Mapping[str, Mapping[str, DimSpec]] = {
     "action": {
-        **dict.fromkeys(("actions", "action"), (ACTION_SIZE, _TARGETS)),
-        "joints": (ACTION_SIZE - 1, _TARGETS),
-        "gripper": (1, frozenset({GRIPPER_CLOSE_NEG.format})),
+        **dict.fromkeys(("actions", "action"), ACTIONS),
+        "joints": replace(ACTIONS, dims=ACTION_SIZE - 1),
+        "gripper": GRIPPER_CLOSE_NEG,
     },
     "observation": {
-        **dict.fromkeys(("image", "images", *CAMERAS.values(), *_WRISTS), (0, _IMAGES)),
-        **dict.fromkeys(HISTORIES.values(), (0, _IMAGES)),
-        **dict.fromkeys(("state", STATE_HISTORY), (ACTION_SIZE, _STATES)),
-        "language": (0, frozenset({LANGUAGE.format})),
+        **dict.fromkeys(_IMAGES, IMAGE_RGB),
+        **dict.fromkeys(
+            ("state", STATE_HISTORY),
+            replace(STATE, accepts=frozenset({STATE.format, "joint_positions"})),
+        ),
+        "language": LANGUAGE,
     },
 }
-"""What a server may declare of actions and observations: name to size and formats."""
+"""What a server may declare of actions and observations."""
 
 _ASKED = ("send_wrist_image", "send_state", "send_video_history")
 """What a server may ask for."""
@@ -52,7 +45,7 @@ _ONE_MEMORY = ("MmeVlaModelServer",)
 """Servers that keep one history for all connections."""
 
 
-class VlaEvalPolicy(Policy):
+class VlaEvalPolicy(ObservingPolicy):
     """A server of vla-eval, by host and port.
 
     Its hello decides what it gets: the front camera, and if it asks for them, the wrist camera,
@@ -90,7 +83,7 @@ class VlaEvalPolicy(Policy):
         asked, declared = hello.get("observation_params", {}), hello.get("observation_spec", {})
         wrist = asked.get("send_wrist_image", any(name in declared for name in _WRISTS))
         history = asked.get("send_video_history", HISTORIES["front"] in declared)
-        self._sends_state = bool(asked.get("send_state", "state" in declared))
+        self.sends_state = bool(asked.get("send_state", "state" in declared))
         self.cameras = ("front", "wrist") if wrist else ("front",)
         self.history_cameras = self.cameras if history else ()
         self.wants_history = bool(history)
@@ -114,28 +107,11 @@ class VlaEvalPolicy(Policy):
                 "Serve the same model until the run ends.",
             )
         self._server.start_episode({"name": info.goal, "seed": info.seed})
-        self._first = True
-        self._history: dict[str, list[Any]] = {camera: [] for camera in self.history_cameras}
-        self._states: list[NDArray[np.float32]] = []
-
-    def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
-        """Keep frames and states until the first observation."""
-        for camera, kept in self._history.items():
-            kept.extend(map(encoded, frames[camera]))
-        self._states.append(states.copy())
+        super().reset(info)
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the server's action, or its chunk, as `(n, 8)`; the rollout checks them."""
-        message = make_observation(
-            {camera: observation.images[camera] for camera in self.cameras},
-            goal,
-            state=np.asarray(observation.state, np.float32) if self._sends_state else None,
-            first=self._first,
-            history=self._history,
-            states=np.concatenate(self._states) if self._states and self._sends_state else None,
-        )
-        self._first, self._history, self._states = False, {}, []
-        return np.atleast_2d(self._server.act(message))
+        return np.atleast_2d(self._server.act(self.message(observation, goal)))
 
     def metadata(self) -> dict[str, Any]:
         """Return the server's address and its hello."""
@@ -155,8 +131,15 @@ def _check_fits(server: str, hello: Mapping[str, Any]) -> None:
         if name.startswith("send_") and value and name not in _ASKED
     ]
     for what, known in _PARTS.items():
-        declared = hello.get(f"{what}_spec", {})
-        faults += _misfits(what, declared, known)
+        for name, part in hello.get(f"{what}_spec", {}).items():
+            given = f"declares the {what} {name} ({part['dims']} values, {part['format']})"
+            if name not in known:
+                faults.append(f"{given}; expected {', '.join(known)}")
+                continue
+            size, formats = known[name].dims, known[name].accepts or {known[name].format}
+            if part["dims"] not in (0, size) or part["format"] not in formats:
+                expected = f"{size} values, {' or '.join(sorted(formats))}"
+                faults.append(f"{given}; expected {expected}")
     sizes = [part["dims"] for part in hello.get("action_spec", {}).values()]
     if sizes and all(sizes) and sum(sizes) != ACTION_SIZE:
         faults.append(f"declares {sum(sizes)} action values; expected {ACTION_SIZE}")
@@ -166,17 +149,3 @@ def _check_fits(server: str, hello: Mapping[str, Any]) -> None:
             f"{'; it '.join(faults)}",
             "docs/how-to/vla-eval.md lists what is sent and what is executed.",
         )
-
-
-def _misfits(
-    what: str, declared: Mapping[str, Any], known: Mapping[str, tuple[int, frozenset[str]]]
-) -> Iterator[str]:
-    """Yield how the parts that a server declares differ from those that are known."""
-    for name, part in declared.items():
-        given = f"declares the {what} {name} ({part['dims']} values, {part['format']})"
-        if name not in known:
-            yield f"{given}; expected {', '.join(known)}"
-            continue
-        size, formats = known[name]
-        if part["dims"] not in (0, size) or part["format"] not in formats:
-            yield f"{given}; expected {size} values, {' or '.join(sorted(formats))}"

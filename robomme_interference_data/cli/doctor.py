@@ -15,7 +15,7 @@ from importlib import metadata, util
 from packaging.requirements import Requirement
 
 from robomme_interference_data.errors import InterferenceError, first_line
-from robomme_interference_data.viz.tables import Column, Table
+from robomme_interference_data.viz.tables import Table
 
 DISTRIBUTION = "robomme-interference-data"
 
@@ -68,8 +68,7 @@ def report(rows: Sequence[Check]) -> Table:
         lines.append((states[row.ok], row.name, row.detail))
         if row.fix is not None:
             lines.append(("", "", f"fix: {row.fix}"))
-    columns = (Column("state"), Column("part"), Column("result"))
-    return Table("doctor", "", columns, tuple(lines))
+    return Table.make("doctor", "", "state part result", lines)
 
 
 def extras() -> list[str]:

@@ -7,18 +7,18 @@ reports where it hung.
 
 import platform
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, fields, replace
 from importlib import metadata
-from typing import Any, Protocol
+from typing import Any
 
-from robomme_interference_data.errors import InvalidOptionError, WorkerRetiredError
+from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.lazy import load_extra
 from robomme_interference_data.schema.settings import setting
 
 from .process import ProcessScheduler, end_if_starting
-from .scheduler import ATTEMPTS
+from .scheduler import Scheduler
 from .worker import Outcome, Task, Worker, attempt
 
 __all__ = [
@@ -87,15 +87,8 @@ def describe(function: Task) -> dict[str, str]:
     return versions | getattr(function, "describe", dict)()
 
 
-class Session(Protocol):
-    """Workers that keep their copies of a function, and its resources, between runs."""
-
-    @property
-    def run(self) -> Callable[..., Generator[Outcome]]:
-        """Call the session's function on every task; see `Executor.run`."""
-
-    def kill(self) -> None:
-        """Kill all worker processes; another thread may be in `run`, which starts them again."""
+Session = Scheduler[Any]
+"""Workers that keep their copies of a function, and its resources, between runs."""
 
 
 class Executor(ABC):
@@ -143,37 +136,40 @@ class Serial(Executor):
     @contextmanager
     def session(self, function: Task) -> Iterator[Session]:
         """Release the function's resources when the block ends; see `Executor.session`."""
-        try:
-            yield _SerialSession(function)
-        finally:
-            getattr(function, "close", lambda: None)()
+        with closing(_SerialScheduler(function, 1)) as scheduler:
+            yield scheduler
 
 
-@dataclass(frozen=True)
-class _SerialSession:
-    function: Task
+class _Inline:
+    """The worker of `Serial`: a task runs when it is sent."""
+
+    number, ready = 0, True
+
+    def __init__(self, function: Task):
+        self._function, self._worker = function, Worker()
+
+    def send(self, task: Any, time_limit: float | None) -> None:
+        outcome = attempt(self._function, task, self._worker)
+        self._outcome = replace(outcome, files=self._worker.take_files())
+
+    def receive(self) -> Outcome:
+        return self._outcome
 
     def kill(self) -> None:
         """There is no other process."""
 
-    def run(
-        self,
-        tasks: Iterable[Any],
-        *,
-        time_limit: float | None = None,
-        attempts: int = ATTEMPTS,
-        again: tuple[type[Exception], ...] = (),
-    ) -> Generator[Outcome]:
-        worker = Worker()
-        for task in tasks:
-            for number in range(1, attempts + 1):
-                outcome = attempt(self.function, task, worker)
-                outcome = replace(outcome, attempts=number, files=worker.take_files())
-                if isinstance(outcome.error, WorkerRetiredError):
-                    raise outcome.error
-                if not isinstance(outcome.error, again):
-                    break
-            yield outcome
+    stop = kill
+
+
+class _SerialScheduler(Scheduler[_Inline]):
+    def start(self, number: int) -> _Inline:
+        return _Inline(self.function)
+
+    def wait(self, workers: Sequence[_Inline]) -> Iterable[_Inline]:
+        return workers
+
+    def close(self) -> None:
+        getattr(self.function, "close", lambda: None)()
 
 
 @dataclass(frozen=True)

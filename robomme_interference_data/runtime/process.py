@@ -124,13 +124,9 @@ class WorkerProcess:
 class ProcessScheduler(Scheduler[WorkerProcess]):
     """Runs tasks in worker processes."""
 
-    def __init__(self, function: Task, workers: int):
-        super().__init__(workers)
-        self._function = function
-
     def start(self, number: int) -> WorkerProcess:
         """Start a worker process."""
-        return WorkerProcess(self._function, number)
+        return WorkerProcess(self.function, number)
 
     def wait(self, workers: Sequence[WorkerProcess]) -> Iterable[WorkerProcess]:
         """Wait for outcomes; a worker that died has one, too."""

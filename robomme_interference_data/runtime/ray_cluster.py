@@ -215,7 +215,7 @@ class _RayScheduler(Scheduler[_RayWorker]):
     """Runs tasks on the cluster."""
 
     def __init__(self, function: Task, config: RayWorkers):
-        super().__init__(config.workers)
+        super().__init__(function, config.workers)
         actor: Any = WorkerActor
         dumps: Any = cloudpickle.dumps
         options = {"num_cpus": config.cpus, "num_gpus": config.gpus, "max_restarts": 0}

@@ -8,9 +8,7 @@ from typing import Any, Protocol
 
 from robomme_interference_data.errors import WorkerRetiredError
 
-from .worker import Outcome
-
-ATTEMPTS = 2
+from .worker import Outcome, Task
 
 _LOSSES = 5
 """How often the worker of a task may be lost with its node."""
@@ -62,9 +60,10 @@ class QueuedTask:
 
 
 class Scheduler[H: Handle](ABC):
-    """Runs tasks on at most so many workers, which it starts when there is work for them."""
+    """Calls a function on tasks, with at most so many workers, started when there is work."""
 
-    def __init__(self, workers: int):
+    def __init__(self, function: Task, workers: int):
+        self.function = function
         self._numbers = deque(range(workers))  # of workers that do not run
         self.workers: list[H] = []
 
@@ -85,7 +84,7 @@ class Scheduler[H: Handle](ABC):
         tasks: Iterable[Any],
         *,
         time_limit: float | None = None,
-        attempts: int = ATTEMPTS,
+        attempts: int = 2,
         again: tuple[type[Exception], ...] = (),
     ) -> Generator[Outcome]:
         """Yield the outcomes of tasks as they arrive; see `Executor.run`."""

@@ -5,7 +5,7 @@ A *row* is a frame of any dataset of the buffer set: rows of the datasets follow
 
 import hashlib
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -115,7 +115,7 @@ class Rows:
 
 
 class Histories:
-    """The histories of queries: the planned ones, or with units drawn anew.
+    """The histories of buffers: of planned ones, or with units drawn anew.
 
     Args:
         buffer_set: The buffer set.
@@ -126,23 +126,16 @@ class Histories:
     def __init__(self, buffer_set: BufferSet, rows: Rows, retrieval: Retrieval | None):
         self._set, self._rows, self._retrieval = buffer_set, rows, retrieval
 
-    def planned(
-        self, conditions: Sequence[str], episodes: Collection[EpisodeId], shift: Shift | None
-    ) -> Iterator[tuple[tuple[EpisodeId, str], History]]:
-        """Yield the planned histories of episodes, with their episode and condition."""
-        for buffer in self._set.buffers(condition=conditions):
-            if buffer.episode_id in episodes:
-                yield (buffer.episode_id, buffer.condition), self._history(buffer, shift)
-
     def draw(
         self, source: SessionSource, episode: EpisodeId, condition: str, shift: Shift | None
     ) -> History:
         """Return the history of a query with sessions of another source than the manifests."""
         query = self._set.query(episode)
         manifest = QuerySessions(source, query.record).buffer(parse_condition(condition))
-        return self._history(Buffer(manifest, query, self._set.datasets), shift)
+        return self.of(Buffer(manifest, query, self._set.datasets), shift)
 
-    def _history(self, buffer: Buffer, shift: Shift | None) -> History:
+    def of(self, buffer: Buffer, shift: Shift | None) -> History:
+        """Return the history of a buffer's query, as the retrieval step leaves it."""
         parts: list[NDArray[np.int64]] = [np.empty(0, np.int64)]
         for entry in buffer.manifest.sessions:
             first = self._rows.first(entry.dataset, entry.episode_index)

@@ -243,7 +243,8 @@ class HistoryDataset:
             both = torch.from_numpy(values)
             item[name] = both[self._size]
             item[f"memory.{name.removeprefix('observation.')}"] = both[: self._size]
-        item["memory.position"] = _padded(kept, self._size)
+        padded = np.pad(kept, (0, self._size - len(kept)))
+        item["memory.position"] = torch.from_numpy(padded)
         item["memory.is_pad"] = torch.arange(self._size) >= len(kept)
         evidence = np.zeros((self._size, self._parts), bool)
         for start, stop, part in history.evidence or ():
@@ -306,24 +307,15 @@ class HistoryDataset:
         """Return the planned histories."""
         used = frozenset(self.episode_ids)
         return {
-            (episode, name, shift): history
+            (buffer.episode_id, buffer.condition, shift): self._histories.of(buffer, changed)
             for shift, changed in self._shift_of.items()
-            for (episode, name), history in self._histories.planned(
-                self._conditions.names, used, changed
-            )
+            for buffer in self.buffer_set.buffers(condition=self._conditions.names)
+            if buffer.episode_id in used
         }
 
     def _shifted_row(self, episode: EpisodeId, shift: Shift) -> int:
         views = self.buffer_set.datasets[SHIFTED]
         return self._rows.first(SHIFTED, views.index_of(episode)) + SHIFTS.index(shift)
-
-
-def _padded(values: NDArray[np.int64], size: int) -> "torch.Tensor":
-    import torch
-
-    out = torch.zeros(size, dtype=torch.int64)
-    out[: len(values)] = torch.from_numpy(values)
-    return out
 
 
 def _from_zero(option: str, given: int) -> int:

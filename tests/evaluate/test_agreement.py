@@ -17,11 +17,6 @@ from robomme_interference_data.simulators.base import Observation
 pytestmark = pytest.mark.usefixtures("world")
 
 
-def test_check_lesson_passes_if_everything_is_equal() -> None:
-    for condition, status in (("k0", "success"), ("no-history", "fail")):
-        assert roll(condition, Cheat(), check_lesson=True).status == status
-
-
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
@@ -99,7 +94,7 @@ def test_differences_between_machines_and_sources_pass() -> None:
 
 def test_a_cheat_succeeds_with_the_lesson() -> None:
     policy = Cheat()
-    row = roll("k0", policy)
+    row = roll("k0", policy, check_lesson=True)
     assert (row.status, row.success, row.steps) == ("success", True, 1)
     assert policy.info.simulator is None  # only privileged policies get it
 

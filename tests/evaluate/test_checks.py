@@ -41,9 +41,7 @@ from robomme_interference_data.evaluate.rollout.checks import (
 from robomme_interference_data.evaluate.rollout.worker import simulator_options
 from robomme_interference_data.evaluate.run.plan import plan_work
 from robomme_interference_data.evaluate.systems import name_system
-from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Serial
-from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.registry import SIMULATORS
 
 pytestmark = pytest.mark.usefixtures("world")
@@ -155,21 +153,6 @@ def test_the_simulator_is_made_before_the_folder_and_only_for_remaining_rollouts
     assert len(made) == 2
     with pytest.raises(NoRendererError):
         run_one(tmp_path / "whole", conditions=("no-history", "k0"), **sample)
-
-
-def test_families_that_the_simulator_lacks_are_errors(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Other(Simulator):
-        @classmethod
-        def episodes(cls) -> list[EpisodeId]:
-            return [EpisodeId("PatternLock", "test", 0)]
-
-    buffer_set = load_buffer_set(config().buffer_set)
-    monkeypatch.setitem(SIMULATORS, "sample", Other)
-    settings = config(simulator="sample", policy="noop")
-    plan = plan_work(buffer_set.episode_ids, conditions=("k0",))
-    with pytest.raises(InvalidOptionError, match="sample does not play the family") as raised:
-        check_plan(settings, name_system("noop"), buffer_set, plan, plan.items())
-    assert "It plays PatternLock." in (raised.value.hint or "")
 
 
 def test_only_cameras_in_use_are_rendered() -> None:

@@ -189,25 +189,6 @@ def test_a_run_resumes(buffers: Path, tmp_path: Path) -> None:
     assert [row for row in whole.rows if row.condition == "k0"] == list(first.rows)
 
 
-def test_errors_are_rows_and_run_again(
-    buffers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The policy returns NaN once."""
-    from support import own_policies
-
-    given = [np.full((1, 8), np.nan)]
-    monkeypatch.setattr(
-        own_policies.Still, "act", lambda self, *_: given.pop() if given else self.action
-    )
-    still = {"policy": "python:support.own_policies:Still", "conditions": ("no-history",)}
-    broken = evaluate(buffers, tmp_path, **still)
-    assert (broken.counts["error"], broken.counts["measured"]) == (1, 1)
-    [error] = [row for row in broken.rows if row.status == "error"]
-    assert error.action_l1 is None and "expected (n, 8) actions" in str(error.error)
-    again = evaluate(buffers, tmp_path, **still)
-    assert (again.counts["error"], again.counts["measured"]) == (0, 2)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -197,38 +197,3 @@ def test_the_released_client() -> None:
     for one in PUBLISHED.values():
         code = (Path(clone) / FOLDER / one.file).read_text()
         assert read_client(code, one).sha256 == one.sha256
-
-
-@pytest.mark.slow
-def test_the_tokens_that_qwen3_vl_reads(client: Path) -> None:
-    """Its own processor, with a tokenizer of letters, on the frames that ms-swift takes.
-
-    ms-swift takes two frames a second, but 4 to 10, evenly: of 48 frames at 30 a second, frames 0,
-    16, 31 and 47. Two of them make one picture, with the mean of their times, 0.27 and 1.3 s; a
-    picture of 32 × 32 pixels is one token.
-    """
-    pytest.importorskip("transformers", reason="needs the extra vlm")
-    from support.vision_language import qwen3_vl_processor
-
-    processor = qwen3_vl_processor()
-    [first, *_] = asked(client, "memer", "k0", [json.dumps({"current_subtask": "go"})] * 3)
-    with av.open(io.BytesIO(first.videos[0])) as container:
-        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-    taken = np.linspace(0, len(frames) - 1, 4).round().astype(int).tolist()
-    text = written(first).partition("|")[2]
-    picture = "<|vision_start|><|%s_pad|><|vision_end|>"
-    read = processor(
-        text=[text.replace("<image>", picture % "image").replace("<video>", "<|video_pad|>")],
-        images=[first.images[0].copy()],
-        videos=[np.stack([frames[index] for index in taken]).transpose(0, 3, 1, 2)],
-        video_metadata=[{"fps": 30, "frames_indices": taken, "total_num_frames": len(frames)}],
-        do_sample_frames=False,
-        do_resize=False,
-    )
-    shown = "".join(processor.tokenizer.convert_ids_to_tokens(read["input_ids"][0]))
-    goal = buffer_set_here().query(EPISODE).goal
-    times = "".join(f"<{time} seconds>{picture % 'video'}" for time in ("0.3", "1.3"))
-    assert shown == (
-        f"There was a video: {times}\nGoal: {goal}\nKept:[]\nNow: [{picture % 'image'}]\n\n"
-        "Step and frames?"
-    )

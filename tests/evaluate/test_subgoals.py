@@ -1,7 +1,6 @@
 """Subgoals: what a model is shown, when they are written, who gets them, and their settings."""
 
 import json
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,17 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.chat_server import (
-    BROKEN,
-    BUSY,
-    CLOSED,
-    DRIPS,
-    EMPTY,
-    GARBAGE,
-    REFUSED,
-    SLOW,
-    ChatServer,
-)
+from support.chat_server import BROKEN, BUSY, CLOSED, EMPTY, GARBAGE, REFUSED, SLOW, ChatServer
 from support.own_policies import Told
 from support.policy_server import PolicyServer
 from support.runs import config, header, roll, run, run_one
@@ -32,7 +21,6 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     ModelError,
     RunError,
-    UnknownNameError,
 )
 from robomme_interference_data.evaluate.models.model import ChatModel, Message, Part, Reply, Video
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
@@ -121,13 +109,6 @@ def test_the_history_has_the_pace_of_its_recordings(monkeypatch: pytest.MonkeyPa
         written(begun(model, frames=frames), 0, 0)
         [video] = [part for part in model.asked[0] if isinstance(part, Video)]
         assert video.fps == pytest.approx(pace)
-
-
-def test_the_history_may_have_another_pace() -> None:
-    model = Scripted("go")
-    written(begun(model, frames=5, fps=30), 0, 0)
-    [video] = [part for part in model.asked[0] if isinstance(part, Video)]
-    assert (len(video.frames), video.fps) == (5, 30)
 
 
 def test_without_history_the_prompt_has_the_word_none() -> None:
@@ -238,13 +219,6 @@ def test_a_run_with_a_faulty_endpoint_loses_no_row(tmp_path: Path) -> None:
     assert len([*(tmp_path / "subgoals").iterdir()]) == 4
 
 
-def test_an_answer_that_never_ends_is_an_error_row(tmp_path: Path) -> None:
-    options = ("repeats=0", "connect_s=0.2", "response_s=0.1")
-    with ChatServer(faults=[DRIPS]) as server:
-        [row] = run_one(tmp_path, **behind(server, subgoal_options=options)).rows
-    assert row.status == "error" and "no answer in time" in str(row.error)
-
-
 @pytest.mark.parametrize("executor", [Serial(), Processes(1)], ids=["serial", "processes"])
 def test_an_error_row_has_the_steps_and_calls_before_it(tmp_path: Path, executor: Executor) -> None:
     options = ("repeats=0", "frames=4")
@@ -277,15 +251,6 @@ def test_a_missing_model_is_an_error_before_the_run(tmp_path: Path) -> None:
     with ChatServer(model="large") as server, pytest.raises(ModelError, match="no model 'tiny'"):
         run_one(tmp_path / "run", **behind(server))
     assert not (tmp_path / "run").exists()
-
-
-def test_a_run_works_if_subgoals_cannot_be_written_to_disk(tmp_path: Path) -> None:
-    assert run_one(tmp_path, policy=TOLD, subgoals="oracle").counts["fail"] == 1
-    shutil.rmtree(tmp_path / "subgoals")
-    (tmp_path / "subgoals").write_text("a file")
-    assert run(tmp_path, policy=TOLD, subgoals="oracle").counts["fail"] == 4
-    log = (tmp_path / "errors.log").read_text()
-    assert "subgoals/MoveCube_test_0_k0.jsonl could not be written" in log
 
 
 # --- settings ------------------------------------------------------------------------------------
@@ -321,12 +286,6 @@ def test_settings_that_fit_together_and_others(
         with pytest.raises(InterferenceError) as raised:
             check_system(settings, system)
         assert words in raised.value.message
-
-
-def test_an_unknown_prompt() -> None:
-    settings = config(policy=TOLD, subgoal_prompt="nowhere.toml", **MODEL)
-    with pytest.raises(UnknownNameError, match="no prompt"):
-        make_writer(settings)
 
 
 def test_an_unknown_option_lists_those_of_model_and_prompt() -> None:

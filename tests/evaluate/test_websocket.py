@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from support.policy_calls import INFER, RESET, added, client, info, observation, rollout, section
 from support.policy_server import PolicyServer
-from support.runs import run
 
 from robomme_interference_data.errors import FormatError, PolicyServerError
 from robomme_interference_data.evaluate.policies.wire import pack, unpack
@@ -262,18 +261,3 @@ def test_every_answer_is_checked(server: PolicyServer, call: str, answer: Any, t
     server.before = lambda message: answer if call in message else None
     with client(server) as policy, pytest.raises(PolicyServerError, match=text):
         rollout(policy, 2, [2], [])
-
-
-def test_a_run_with_a_server(tmp_path: Path, world: None, server: PolicyServer) -> None:
-    """With history and without: the server checks the order of its calls."""
-    named = {"system": "perceptual-framesamp-modul", "policy_options": ("checkpoint=a",)}
-    conditions = ("no-history", "k1")
-    result = run(tmp_path / "run", policy=server.url, conditions=conditions, **named)
-    # Before the first rollout, the run checks whether the server has a memory.
-    assert server.calls[:2] == [RESET, {"call": "infer", "prompt": "nothing"}]
-    del server.calls[:2]
-    # The policy does not move, so every episode ends after 40 steps: three chunks of actions.
-    assert [(row.status, row.error) for row in result.rows] == [("fail", None)] * 4
-    assert {call.get("exec_start_idx") for call in server.calls} == {None, 0, 80}
-    kinds = [call["call"] for call in server.calls]
-    assert (kinds.count("reset"), kinds.count("infer")) == (4, 4 * 3)

@@ -1,6 +1,6 @@
 """Simulators as users write them, for `--simulator support.own_simulators:…`; most have a slip."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -9,7 +9,13 @@ from support.worlds import World
 
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.rollouts import Status
-from robomme_interference_data.simulators.base import Begun, Observation, Simulator
+from robomme_interference_data.simulators.base import (
+    Begun,
+    Demonstration,
+    EpisodeInfo,
+    Observation,
+    Simulator,
+)
 
 
 class Played(Simulator):
@@ -35,80 +41,40 @@ class Played(Simulator):
         return self.world.step(action, observe)
 
 
-class Narrow(Played):
-    """Has states of 7 values, consistently."""
+def slip(change: Callable[[Demonstration, Observation, EpisodeInfo], Any], **declared: Any) -> Any:
+    """Return a simulator with a slip: something else begins than what `Played` returns."""
 
-    def _begin(self, episode: EpisodeId, every: int) -> Begun:
-        lesson, first, info = super()._begin(episode, every)
-        return (
-            replace(lesson, states=lesson.states[:, :7]),
-            Observation(first.images, first.state[:7]),
-            info,
-        )
+    def begin(self: Played, episode: EpisodeId, every: int) -> Any:
+        return change(*Played._begin(self, episode, every))
+
+    return type("Slip", (Played,), {"_begin": begin, **declared})
 
 
-class Uneven(Played):
-    """Has live states of 7 values after a lesson of 8."""
+def image_slip(change: Callable[[Any], Any]) -> Any:
+    """Return a simulator that changes its first images."""
 
-    def _begin(self, episode: EpisodeId, every: int) -> Begun:
-        lesson, first, info = super()._begin(episode, every)
-        return lesson, Observation(first.images, first.state[:7]), info
+    def changed(first: Observation) -> Observation:
+        return replace(first, images={name: change(one) for name, one in first.images.items()})
 
-
-class Doubled(Played):
-    """Has states of float64, as many environments do."""
-
-    def _begin(self, episode: EpisodeId, every: int) -> Begun:
-        lesson, first, info = super()._begin(episode, every)
-        return lesson, Observation(first.images, first.state.astype(float)), info
+    return slip(lambda lesson, first, info: (lesson, changed(first), info))
 
 
-class Blindfolded(Played):
-    """Draws nothing that it is asked for."""
-
-    def __init__(self, cameras: tuple[str, ...] = ()) -> None:
-        super().__init__(())
+def shorter(first: Observation) -> Observation:
+    return replace(first, state=first.state[:7])
 
 
-class Small(Played):
-    """Draws images of another size than the recorded ones."""
-
-    def _begin(self, episode: EpisodeId, every: int) -> Begun:
-        lesson, first, info = super()._begin(episode, every)
-        images = {name: image[::2, ::2] for name, image in first.images.items()}
-        return lesson, Observation(images, first.state), info
-
-
-class Floating(Played):
-    """Draws images of floats."""
-
-    def _begin(self, episode: EpisodeId, every: int) -> Begun:
-        lesson, first, info = super()._begin(episode, every)
-        images = {name: image / 255 for name, image in first.images.items()}
-        return lesson, Observation(images, first.state), info
-
-
-class Unnamed(Played):
-    """Draws a camera that it does not declare."""
-
-    cameras = ("front", "wrist")
-
-    def _begin(self, episode: EpisodeId, every: int) -> Begun:
-        lesson, first, info = super()._begin(episode, every)
-        return lesson, Observation({"top": first.images["front"]}, first.state), info
-
-
-class TwoArms(Played):
-    """Declares actions of 14 values, and gives a lesson of 8."""
-
-    action_size = 14
-
-
-class Pair(Played):
-    """Returns no facts about the episode."""
-
-    def _begin(self, episode: EpisodeId, every: int) -> Any:
-        return super()._begin(episode, every)[:2]
+Narrow = slip(lambda o, f, i: (replace(o, states=o.states[:, :7]), shorter(f), i))
+Uneven = slip(lambda o, f, i: (o, shorter(f), i))
+Doubled = slip(lambda o, f, i: (o, replace(f, state=f.state.astype(float)), i))
+Unnamed = slip(
+    lambda o, f, i: (o, replace(f, images={"top": f.images["front"]}), i),
+    cameras=("front", "wrist"),
+)
+Blindfolded = slip(lambda o, f, i: (o, replace(f, images={}), i))
+TwoArms = slip(lambda *given: given, action_size=14)  # and a lesson with actions of 8 values
+Pair = slip(lambda o, f, i: (o, f))
+Small = image_slip(lambda image: image[::2, ::2])
+Floating = image_slip(lambda image: image / 255)
 
 
 class Elsewhere(Played):

@@ -12,9 +12,6 @@ from transformers import (
     LlavaForConditionalGeneration,
     LlavaProcessor,
     PreTrainedTokenizerFast,
-    Qwen2VLImageProcessor,
-    Qwen3VLProcessor,
-    Qwen3VLVideoProcessor,
 )
 
 _TEMPLATE = (
@@ -68,25 +65,6 @@ def save_tiny_model(folder: Path, seed: int = 0) -> Path:
     model.save_pretrained(folder)
     processor.save_pretrained(folder)
     return folder
-
-
-def qwen3_vl_processor() -> Qwen3VLProcessor:
-    """Return Qwen3-VL's processor; each letter is a token, as are the special ones."""
-    special = [f"<|{name}|>" for name in ("vision_start", "vision_end", "image_pad", "video_pad")]
-    letters = ["\n", *map(chr, range(32, 127))]
-    vocabulary = {name: number for number, name in enumerate(["<unk>", *letters])}
-    tokenizer = Tokenizer(models.WordLevel(vocabulary, unk_token="<unk>"))
-    tokenizer.pre_tokenizer = pre_tokenizers.Split("", "isolated")
-    fast = PreTrainedTokenizerFast(
-        tokenizer_object=tokenizer,
-        unk_token="<unk>",
-        pad_token="<unk>",
-        additional_special_tokens=special,
-    )
-    sizes = {"patch_size": 16, "temporal_patch_size": 2, "merge_size": 2}
-    return Qwen3VLProcessor(
-        Qwen2VLImageProcessor(**sizes), fast, Qwen3VLVideoProcessor(**sizes), chat_template="-"
-    )
 
 
 def save_tiny_adapter(model: Path, folder: Path) -> Path:

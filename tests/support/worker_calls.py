@@ -11,6 +11,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from robomme_interference_data.errors import (
     InterferenceError,
     SimulatorCrashError,
@@ -112,12 +114,9 @@ class Marked:
 def is_alive(pid: int) -> bool:
     """Whether a process runs; one that ended and that nobody waited for does not."""
     try:
-        if Path("/proc/self/stat").exists():
-            return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-        os.kill(pid, 0)
-    except (FileNotFoundError, ProcessLookupError):
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
         return False
-    return True
 
 
 def wait_until_gone(pids: list[int], seconds: float = 30) -> None:

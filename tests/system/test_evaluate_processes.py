@@ -10,6 +10,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 from support import runs, worlds
 from support.policy_server import Memory, PolicyServer
@@ -20,16 +21,10 @@ from robomme_interference_data.errors import WorkerRetiredError
 from robomme_interference_data.evaluate.run.log import read_record
 from robomme_interference_data.runtime.executor import Processes
 
-TESTS = Path(__file__).parent.parent
+pytestmark = pytest.mark.usefixtures("world")
+
 CONDITIONS = ("no-history", "k0", "k1", "k3", "k7")
 ROLLOUTS = 10  # two episodes, five conditions
-
-
-@pytest.fixture(autouse=True)
-def _world(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv(worlds.BUFFER_SET, str(TESTS / "golden" / "buffer_set"))
-    monkeypatch.setenv(worlds.TROUBLE, str(tmp_path))
-    monkeypatch.setenv("PYTHONPATH", str(TESTS))
 
 
 def start(
@@ -54,18 +49,6 @@ def finish(out: Path) -> None:
     assert running.returncode == 0, err
 
 
-def children(pid: int) -> list[int]:
-    found = []
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            text = path.read_text()
-        except OSError:
-            continue
-        if int(text.rpartition(")")[2].split()[1]) == pid:
-            found.append(int(path.parent.name))
-    return found
-
-
 @pytest.fixture
 def undisturbed(tmp_path: Path) -> list[dict[str, Any]]:
     """What one process writes."""
@@ -81,7 +64,7 @@ def test_the_command_may_be_killed_or_stopped_at_any_moment(
     for already, number in zip((1, 3), sent, strict=True):
         running = start(out, 0.02)
         runs.wait_for_rows(out, already, running)
-        workers = children(running.pid)
+        workers = [one.pid for one in psutil.Process(running.pid).children()]
         if number == signal.SIGKILL:
             running.kill()
         else:

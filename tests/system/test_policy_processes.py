@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 from support import runs, worlds
 from support.lazy import lazy
-from support.shared_policies import FAULT
 from support.worker_calls import wait_until_gone
 
 from robomme_interference_data.errors import InvalidOptionError, PolicyError, ServerDiedError
@@ -24,37 +24,16 @@ from robomme_interference_data.evaluate.policies.process import (
 )
 from robomme_interference_data.runtime.executor import Processes
 
-TESTS = Path(__file__).parent.parent
+pytestmark = pytest.mark.usefixtures("world")
+
 SHARED = "python:support.shared_policies:"
 CONDITIONS = ("no-history", "k0", "k1")
 small = lazy("support.lerobot_policies")
 
 
-@pytest.fixture(autouse=True)
-def _world(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv(worlds.BUFFER_SET, str(TESTS / "golden" / "buffer_set"))
-    monkeypatch.setenv(FAULT, str(tmp_path))
-    monkeypatch.setenv("PYTHONPATH", str(TESTS))
-
-
 def run(out: Path, policy: str = "Remembering", **changes: Any) -> Any:
     shared = {"workers": 2, "policies": 1, "conditions": CONDITIONS}
     return runs.run(out, Processes(2), **{"policy": SHARED + policy, **shared, **changes})
-
-
-def descendants(pid: int) -> set[int]:
-    """All processes that descend from a process."""
-    parents = {}
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            parents[int(path.parent.name)] = int(path.read_text().rpartition(")")[2].split()[1])
-        except OSError:
-            continue
-    found, new = set[int](), {pid}
-    while new:
-        found |= new
-        new = {child for child, parent in parents.items() if parent in new} - found
-    return found - {pid}
 
 
 @pytest.mark.slow
@@ -153,11 +132,11 @@ def test_no_process_outlives_the_command(tmp_path: Path, sent: signal.Signals) -
         start_new_session=True,
     )
     runs.wait_for_rows(tmp_path / "run", 1, running)
-    started = descendants(running.pid)
+    started = [one.pid for one in psutil.Process(running.pid).children(recursive=True)]
     assert len(started) >= 8  # two workers, two policies, and a guard beside each
     os.kill(running.pid, sent)
     _, err = running.communicate(timeout=60)
-    wait_until_gone([*started])
+    wait_until_gone(started)
     if sent == signal.SIGINT:
         assert running.returncode == 130 and "Traceback" not in err
         assert json.loads((tmp_path / "run" / "run.json").read_text())["status"] == "incomplete"

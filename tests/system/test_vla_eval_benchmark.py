@@ -20,17 +20,13 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.evaluate.score.rows.reading import read_rows
 
+pytestmark = pytest.mark.usefixtures("world")
+
 TESTS = Path(__file__).parents[1]
 BUFFERS = str(TESTS / "golden" / "buffer_set")
 CONDITIONS = ("no-history", "k0", "k1")
 benchmark = lazy("robomme_interference_data.evaluate.vla_eval.benchmark")
 servers = lazy("support.vla_eval_servers")
-
-
-@pytest.fixture(autouse=True)
-def _world(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(worlds.BUFFER_SET, BUFFERS)
-    monkeypatch.setenv("PYTHONPATH", str(TESTS))
 
 
 def run(folder: Path, server: str, conditions: str = "no-history,k0,k1") -> tuple[Any, Path]:
@@ -83,11 +79,8 @@ def test_a_server_without_memory_gets_no_history(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_fails_is_an_error_and_the_next_rollout_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_fails_is_an_error_and_the_next_rollout_runs(tmp_path: Path) -> None:
     (tmp_path / "MoveCube-0").write_text("raise once")
-    monkeypatch.setenv(worlds.TROUBLE, str(tmp_path))
     with servers.serving("Refusing") as server:
         done, results = run(tmp_path / "results", server, "no-history,k0")
     assert done.returncode == 0, done.stderr

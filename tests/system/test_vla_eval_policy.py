@@ -6,25 +6,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import runs, worlds
+from support import runs
 from support.lazy import lazy
 
 from robomme_interference_data.errors import InvalidOptionError, WorkerRetiredError
 from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.runtime.executor import Processes
 
-TESTS = Path(__file__).parents[1]
+pytestmark = pytest.mark.usefixtures("world")
+
 CONDITIONS = ("no-history", "k0", "k1")
 NAMED = ("checkpoint=mine/1",)
 servers = lazy("support.vla_eval_servers")
 small = lazy("support.lerobot_policies")
-
-
-@pytest.fixture(autouse=True)
-def _world(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv(worlds.BUFFER_SET, str(TESTS / "golden" / "buffer_set"))
-    monkeypatch.setenv("VLA_EVAL_NOTES", str(tmp_path))
-    monkeypatch.setenv("PYTHONPATH", str(TESTS))
 
 
 def expected_rows(folder: Path) -> list[dict[str, Any]]:

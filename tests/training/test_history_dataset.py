@@ -12,7 +12,6 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from support.buffer_sets import GOLDEN, QUERIES, copy_buffer_set, plan_again
 from support.retrieval import make_index
 from support.shifted import add_shifted
@@ -56,11 +55,6 @@ def make(buffers: Path, tmp_path_factory: pytest.TempPathFactory) -> Make:
     return call
 
 
-def seen(images: torch.Tensor) -> NDArray[np.uint8]:
-    """Images of an item, as numpy's."""
-    return images.numpy()
-
-
 # --- what an item holds ------------------------------------------------------------------------
 
 
@@ -85,10 +79,10 @@ def test_memory_is_of_the_buffer_and_the_execution(
         frames += [one.copy() for one in live.iter_frames(number, camera, 0, LIVE)]
         small = resize(np.stack(frames), 16)
         images = item[f"memory.images.{camera}"]
-        np.testing.assert_array_equal(seen(images[: len(kept)]), small[kept])
+        np.testing.assert_array_equal(images[: len(kept)], small[kept])
         assert not images[len(kept) :].any()
         current = item[f"observation.images.{camera}"]
-        np.testing.assert_array_equal(seen(current), small[len(buffer) + moment])
+        np.testing.assert_array_equal(current, small[len(buffer) + moment])
     states = np.concatenate([buffer.states, live.read_vectors(number, STATE, 0, LIVE)])
     np.testing.assert_array_equal(item["memory.state"][: len(kept)], states[kept])
     np.testing.assert_array_equal(item["observation.state"], states[len(buffer) + moment])
@@ -218,7 +212,7 @@ def test_sessions_drawn_anew_keep_the_rules(make: Make, buffers: Path) -> None:
         data.set_epoch(epoch)
         for number, query in enumerate(data.episode_ids):
             images = data[number]["memory.images.front"]
-            starts = [seen(images[lesson + 32 * place]).tobytes() for place in range(5)]
+            starts = [images[lesson + 32 * place].numpy().tobytes() for place in range(5)]
             sources = [by_frame[start] for start in starts]
             assert len({*sources}) == 5 and {one.index for one in sources} == {0}
             assert query.family not in {one.family for one in sources}

@@ -13,16 +13,14 @@ from support.retrieval import make_index
 from support.runs import config
 from support.worlds import BUFFER_SET
 
-from robomme_interference_data import BufferSet, load_buffer_set
-from robomme_interference_data.constants import ACTION, EXECUTIONS, STATE
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.evaluate import Observation, Policy, RolloutInfo
 from robomme_interference_data.evaluate.rollout.rollout import run_rollout
 from robomme_interference_data.evaluate.run.kind import Run
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.retrieval.selector import Selector
-from robomme_interference_data.schema.rollouts import Status
-from robomme_interference_data.simulators.base import Demonstration, EpisodeInfo
+from robomme_interference_data.simulators.recordings import Recordings
 from robomme_interference_data.training import HistoryDataset, Memory, resize
 
 EPISODE = EpisodeId("MoveCube", "test", 0)
@@ -35,41 +33,6 @@ def buffers(executed_buffers: Path, tmp_path_factory: pytest.TempPathFactory) ->
     plan_again(root, ("no-history", "k0", "k3", "before-k3"))
     make_index(root)
     return root
-
-
-class Player:
-    """A simulator that plays an execution again, whatever the policy does."""
-
-    def __init__(self, buffer_set: BufferSet):
-        self.query, live = buffer_set.query(EPISODE), buffer_set.datasets[EXECUTIONS]
-        index = live.index_of(EPISODE)
-        count = live.record(index).length
-        frames = {
-            name: list(map(np.copy, live.iter_frames(index, name, 0, count))) for name in CAMERAS
-        }
-        states = live.read_vectors(index, STATE, 0, count)
-        self.seen = [
-            Observation({name: frames[name][step] for name in CAMERAS}, states[step])
-            for step in range(count)
-        ]
-
-    def reset(
-        self, episode_id: str, demonstration: bool = True
-    ) -> tuple[Demonstration, Observation, EpisodeInfo]:
-        record, self.steps = self.query.record, 0
-        info = EpisodeInfo(record.goals, str(record.difficulty), record.seed or 0, "sample")
-        lesson = Demonstration(
-            {}, np.zeros((self.query.lesson_frames, 8), np.float32), np.zeros((0, 8), np.float32)
-        )
-        return lesson, self.seen[0], info
-
-    def step(self, action: NDArray[np.float32], observe: bool = True) -> tuple[Observation, Status]:
-        self.steps += 1
-        last = self.steps == len(self.seen) - 1
-        return self.seen[self.steps], Status.FAIL if last else Status.ONGOING
-
-    def close(self) -> None:
-        pass
 
 
 class Watching(Policy):
@@ -125,7 +88,7 @@ def test_same_frames_states_and_positions(
     run_rollout(
         Run(config(), "mine", buffer_set.name, buffer_set.revision),
         WorkItem(condition, EPISODE),
-        simulator=Player(buffer_set),  # type: ignore[arg-type]
+        simulator=Recordings(str(buffers), CAMERAS),
         policy=policy,
         buffer_set=buffer_set,
         selector=Selector(retrieval) if retrieval else None,
@@ -151,13 +114,3 @@ def test_same_frames_states_and_positions(
             small = torch.from_numpy(resize(frames[name], 24))
             assert torch.equal(item[f"memory.images.{name}"][:count], small[:-1])
             assert torch.equal(item[f"observation.images.{name}"], small[-1])
-
-
-def test_actions_are_those_of_the_recording(buffers: Path, tmp_path: Path) -> None:
-    data = HistoryDataset(buffers, ["k0"], chunk=20, image_size=8, store=tmp_path, quiet=True)
-    live = load_buffer_set(buffers).datasets[EXECUTIONS]
-    actions = live.read_vectors(live.index_of(EPISODE), ACTION, 0, 212)
-    item = data[data.index_of(EPISODE, 200)]
-    np.testing.assert_array_equal(item["action"][:12], actions[200:])
-    np.testing.assert_array_equal(item["action"][12:], np.repeat(actions[-1:], 8, 0))
-    assert item["action_is_pad"].tolist() == [False] * 12 + [True] * 8
