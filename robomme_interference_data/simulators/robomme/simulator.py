@@ -42,7 +42,7 @@ without images it stays at 2.3 GB. A new process takes 1.5 GB, and 10 s.
 class RoboMMESimulator(Simulator):
     """The official simulator; see `Simulator`. The constructor starts RoboMME's process.
 
-    RoboMME plays the demonstration at every reset, in a new environment: 5 to 125 s on two cores.
+    RoboMME plays the demonstration at every reset, in a new environment.
     It does not return the demonstration's actions, so `Demonstration.actions` is `(0, 8)`. In the
     families with a stick (`PatternLock`, `RouteStick`) the gripper's opening is always 0, and its
     action has no effect. Its built-in policies act with the motion planners that play the
