@@ -24,18 +24,18 @@ from common import (
     demo_buffers,
     in_fresh_process,
     interleave,
-    machine,
     megabytes,
     peak_memory,
     positive,
-    table,
+    print_machine,
+    print_table,
+    run,
 )
 from numpy.typing import NDArray
 
 from robomme_interference_data import Buffer, BufferSet, DecodedCache, load_buffer_set
 from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
 from robomme_interference_data.constants import FRONT
-from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.schema.conditions import parse_condition
 
 TIMES_LONGER = 4
@@ -55,17 +55,14 @@ class Span:
 def main() -> None:
     """Measure and print."""
     options = parse_options()
-    try:
-        require_lerobot()
-        buffer_set = options.buffer_set or demo_buffers()
-        buffer = choose_buffer(
-            load_buffer_set(buffer_set, threads=1), options.episode, options.condition
-        )
-        print(machine("av", "lerobot"), end="\n\n", flush=True)
-        print(time_loading(buffer_set, buffer, options), end="\n\n", flush=True)
-        print(measure_streaming(buffer_set, buffer, options.chunk))
-    except InterferenceError as error:
-        sys.exit(str(error))
+    require_lerobot()
+    buffer_set = options.buffer_set or demo_buffers()
+    buffer = choose_buffer(
+        load_buffer_set(buffer_set, threads=1), options.episode, options.condition
+    )
+    print_machine("av", "lerobot")
+    time_loading(buffer_set, buffer, options)
+    measure_streaming(buffer_set, buffer, options.chunk)
 
 
 def parse_options() -> argparse.Namespace:
@@ -99,8 +96,8 @@ def choose_buffer(buffer_set: BufferSet, episode: str | None, condition: str | N
     return buffer_set.load(episode, name)
 
 
-def time_loading(folder: Path, buffer: Buffer, options: argparse.Namespace) -> str:
-    """Time all ways of loading the front frames; return the table."""
+def time_loading(folder: Path, buffer: Buffer, options: argparse.Namespace) -> None:
+    """Time all ways of loading the front frames; print the table."""
     buffer_set = load_buffer_set(folder, threads=1)
     key, threads = (buffer.episode_id, buffer.condition), options.threads
     spans = spans_of(buffer, buffer_set)
@@ -166,7 +163,7 @@ def time_loading(folder: Path, buffer: Buffer, options: argparse.Namespace) -> s
         f"{len(buffer.sessions)} sessions; medians "
         f"of {options.rounds} rounds; LeRobotDataset timed on {len(chosen)} frames and scaled."
     )
-    return table(title, COLUMNS, rows)
+    print_table(title, COLUMNS, rows)
 
 
 def check_equal(found: list[NDArray[np.uint8]], wanted: list[NDArray[np.uint8]]) -> None:
@@ -237,8 +234,8 @@ def lerobot_reader(
     return read, frames
 
 
-def measure_streaming(folder: Path, buffer: Buffer, chunk: int) -> str:
-    """Measure the peak memory of streaming buffers of all lengths; return the table."""
+def measure_streaming(folder: Path, buffer: Buffer, chunk: int) -> None:
+    """Measure the peak memory of streaming buffers of all lengths; print the table."""
     buffer_set = load_buffer_set(folder)
     names = [
         name
@@ -258,7 +255,7 @@ def measure_streaming(folder: Path, buffer: Buffer, chunk: int) -> str:
         f"Peak memory of Buffer.stream(chunk={chunk}), front camera, over what the process holds "
         f"before; largest / smallest {max(peaks) / min(peaks):.2f} (aim: flat)."
     )
-    return table(title, ("<buffer", ">frames", ">decoded MB", ">peak MB"), rows)
+    print_table(title, ("<buffer", ">frames", ">decoded MB", ">peak MB"), rows)
 
 
 def stream_peak(
@@ -277,4 +274,4 @@ def stream_peak(
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

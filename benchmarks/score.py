@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from common import interleave, machine, positive, table
+from common import interleave, positive, print_machine, print_table
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.config import Settings
@@ -53,7 +53,7 @@ def main() -> None:
         return time_command(options.rounds)
     if not find_spec("pandas"):
         sys.exit("pandas is needed to compare with: pip install pandas")
-    print(machine("pyarrow", "pandas", "numpy", "scipy"), end="\n\n")
+    print_machine("pyarrow", "pandas", "numpy", "scipy")
     with tempfile.TemporaryDirectory(prefix="interference-score-") as name:
         folder = Path(name)
         rows = write_rows(folder / "grid.parquet")
@@ -63,19 +63,17 @@ def main() -> None:
             [f"{grid():,}", way, f"{times.median(way):.2f}", f"{times.ratio(way, 'score'):.1f}"]
             for way in WAYS
         ]
-        print(
-            table(
-                f"The full grid, all tables, {options.draws:,} bootstrap draws; medians of "
-                f"{options.rounds} rounds.",
-                [">rows", "<way", ">s", ">× score"],
-                lines,
-            )
+        print_table(
+            f"The full grid, all tables, {options.draws:,} bootstrap draws; medians of "
+            f"{options.rounds} rounds.",
+            [">rows", "<way", ">s", ">× score"],
+            lines,
         )
 
 
 def time_command(rounds: int) -> None:
     """Time `score` as a command on the full grid, tables, figures and report, and print."""
-    print(machine("pyarrow", "numpy", "matplotlib"), end="\n\n")
+    print_machine("pyarrow", "numpy", "matplotlib")
     seconds, busy = [], []
     with tempfile.TemporaryDirectory(prefix="interference-score-") as name:
         rows = write_rows(Path(name) / "grid.parquet")
@@ -93,7 +91,7 @@ def time_command(rounds: int) -> None:
             busy.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
     line = [f"{grid():,}", f"{median(seconds):.1f}", f"{median(busy):.1f}"]
     title = f"The command, tables, figures and report; medians of {rounds} rounds."
-    print(table(title, [">rows", ">s", ">processor s"], [line]))
+    print_table(title, [">rows", ">s", ">processor s"], [line])
 
 
 def grid() -> int:
