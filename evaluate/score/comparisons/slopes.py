@@ -18,12 +18,13 @@ from robomme_interference_data.stats.bootstrap import (
     known_interval,
     slope_weights,
 )
+from robomme_interference_data.stats.significance import holm
 from robomme_interference_data.stats.signs import sign_flips, vector_sign_flips
 from robomme_interference_data.viz.tables import Table
 
 from .contrast import Contrast
 from .pairs import Pairs
-from .tables import corrected, provisional, provisional_note
+from .tables import provisional, provisional_note
 
 
 def _falling(outcomes: Outcomes, *systems: str) -> list[str]:
@@ -71,8 +72,7 @@ def _decays(outcomes: Outcomes, draws: int) -> list[tuple[object, ...]]:
     slopes = np.stack([v @ _weights(c) for v, c in zip(values, found.values(), strict=True)], 1)
     ps = [one.p for one in sign_flips(slopes.round(12), key, draws)]
     fits = _fits(values, list(found.values()), key, draws)
-    alike = [0] * len(found)
-    tests = zip(ps, corrected(ps, alike), fits, corrected(fits, alike), strict=True)
+    tests = zip(ps, holm(ps), fits, holm(fits), strict=True)
     rows = list[tuple[object, ...]]()
     for (system, conditions), each, four in zip(found.items(), slopes.T, tests, strict=True):
         here = outcomes.has_episode[outcomes.systems.index(system)]
@@ -119,7 +119,7 @@ def interactions_of(outcomes: Outcomes, draws: int = DRAWS) -> list[Contrast]:
     changes = np.stack([(after - before).round(12) for before, after in slopes], axis=1)
     tests = sign_flips(changes, outcomes.simulator, draws)
     fits = _fits(apart, [conditions for *_, conditions in pairs], outcomes.simulator, draws)
-    both_fits = list(zip(fits, corrected(fits, [0] * len(fits)), strict=True))
+    both_fits = list(zip(fits, holm(fits), strict=True))
     found = []
     for (one, other, conditions), sides, step, test, fit in zip(
         pairs, slopes, changes.T, tests, both_fits, strict=True

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.errors import MissingExtraError
 from robomme_interference_data.evaluate.score.comparisons.tables import (
-    corrected,
     provisional,
     provisional_note,
 )
@@ -21,6 +20,7 @@ from robomme_interference_data.evaluate.systems import is_reference
 from robomme_interference_data.schema.conditions import NO_HISTORY, parse_condition
 from robomme_interference_data.stats.bootstrap import MIN_EPISODES, Floats
 from robomme_interference_data.stats.intervals import LEVEL, z_of
+from robomme_interference_data.stats.significance import holm
 from robomme_interference_data.viz.tables import Table
 
 HISTORY, SESSIONS = "history", "sessions"
@@ -176,7 +176,7 @@ def _rows(outcomes: Outcomes) -> Iterator[tuple[object, ...]]:
         whole = all(bool(outcomes.complete[outcomes.cell(system, c)]) for c in conditions)
         found += [(system, term, fit, place, whole) for place, term in enumerate(terms)]
     ps = [math.erfc(abs(f.effects[at] / f.errors[at]) / 2**0.5) for _, _, f, at, _ in found]
-    tests = zip(found, ps, corrected(ps, [0] * len(ps)), strict=True)
+    tests = zip(found, ps, holm(ps), strict=True)
     for (system, term, fit, at, whole), p, p_holm in tests:
         low, high = _bounds(fit.effects[at], fit.errors[at], z_of(LEVEL))
         sample = _bounds(fit.effects[at], fit.sample_errors[at], _student(fit.families - 1))

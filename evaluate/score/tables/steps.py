@@ -7,12 +7,12 @@ import numpy as np
 
 from robomme_interference_data.evaluate.score.comparisons.contrast import START
 from robomme_interference_data.evaluate.score.comparisons.tables import (
-    corrected,
     provisional,
     provisional_note,
 )
 from robomme_interference_data.evaluate.score.outcomes import Outcomes, steps_to_success
 from robomme_interference_data.stats.bootstrap import DRAWS, Interval
+from robomme_interference_data.stats.significance import holm
 from robomme_interference_data.stats.signs import SignFlips, sign_flips
 from robomme_interference_data.viz.tables import Table
 
@@ -48,7 +48,7 @@ def _rows(outcomes: Outcomes, draws: int) -> list[tuple[object, ...]]:
         flips = sign_flips(np.stack(changes, axis=1), outcomes.simulator, draws)
         tests = dict(zip(compared, flips, strict=True))
     ps = [one.p for one in tests.values()]
-    holms = dict(zip(tests, corrected(ps, [0] * len(ps)), strict=True))
+    holms = dict(zip(tests, holm(ps), strict=True))
     rows = list[tuple[object, ...]]()
     for s, c in cells:
         known = steps[s, c][~np.isnan(steps[s, c])]
