@@ -49,7 +49,7 @@ def main() -> None:
     folder = options.buffer_set or demo_buffers()
     buffer_set = load_buffer_set(folder)
     print_machine("av", "lerobot")
-    measure_bytes(buffer_set, choose_buffer(buffer_set, None, None))
+    measure_bytes(buffer_set, choose_buffer(buffer_set))
     time_lerobot(folder, options)
 
 

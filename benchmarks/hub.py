@@ -73,7 +73,7 @@ def time_loading(hub: Hub, real: Path, made: Path, options: argparse.Namespace) 
     rows = []
     for name, repo, root in (("real videos", REAL, real), ("made up", WHOLE, made)):
         buffer_set = load_buffer_set(root)
-        buffer = choose_buffer(buffer_set, None, None)
+        buffer = choose_buffer(buffer_set)
         wanted = (repo, str(buffer.episode_id), buffer.condition)
         runs = []
         for _ in range(options.rounds):

@@ -57,9 +57,7 @@ def main() -> None:
     options = parse_options()
     require_lerobot()
     buffer_set = options.buffer_set or demo_buffers()
-    buffer = choose_buffer(
-        load_buffer_set(buffer_set, threads=1), options.episode, options.condition
-    )
+    buffer = choose_buffer(load_buffer_set(buffer_set, threads=1))
     print_machine("av", "lerobot")
     time_loading(buffer_set, buffer, options)
     measure_streaming(buffer_set, buffer, options.chunk)
@@ -69,10 +67,6 @@ def parse_options() -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     add_buffer_set(parser)
-    parser.add_argument(
-        "--episode", help="query episode; by default the one with the median lesson length"
-    )
-    parser.add_argument("--condition", help="by default the one with the most sessions")
     parser.add_argument("--rounds", type=positive, default=7, help="timed repetitions")
     parser.add_argument(
         "--threads", type=positive, default=2, help="threads of the second measurement"
@@ -87,13 +81,11 @@ def parse_options() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def choose_buffer(buffer_set: BufferSet, episode: str | None, condition: str | None) -> Buffer:
-    """Return the buffer to measure."""
-    name = condition or max(buffer_set.conditions, key=lambda name: parse_condition(name).k)
-    if episode is None:
-        lengths = {m.history_frames: m.episode_id for m in buffer_set.manifests(condition=name)}
-        episode = str(lengths[statistics.median_low(lengths)])
-    return buffer_set.load(episode, name)
+def choose_buffer(buffer_set: BufferSet) -> Buffer:
+    """Return the buffer to measure: the most sessions, and of these the median length."""
+    name = max(buffer_set.conditions, key=lambda name: parse_condition(name).k)
+    lengths = {m.history_frames: m.episode_id for m in buffer_set.manifests(condition=name)}
+    return buffer_set.load(lengths[statistics.median_low(lengths)], name)
 
 
 def time_loading(folder: Path, buffer: Buffer, options: argparse.Namespace) -> None:

@@ -1,8 +1,5 @@
 """How fast rows are scored, against pandas computing the same tables.
 
-    python benchmarks/score.py            # the full grid; minutes
-    python benchmarks/score.py --command  # the command alone, figures and report included
-
 Each way reads the rows, checks them, and writes the same rates, intervals, exact tests and
 bootstrap intervals. With pandas the bootstrap is done twice: as one would write it down, a call of
 scipy.stats.bootstrap for each statistic, and by hand, all statistics of a system from one set of
@@ -11,17 +8,13 @@ draws. pandas is no dependency of the package: install it for this.
 
 import argparse
 import math
-import resource
-import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from functools import partial
 from importlib.util import find_spec
 from operator import mul
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import numpy as np
@@ -47,10 +40,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--rounds", type=positive, default=3, help="repetitions of the full grid")
     parser.add_argument("--draws", type=positive, default=10_000, help="of each bootstrap")
-    parser.add_argument("--command", action="store_true", help="time the command alone")
     options = parser.parse_args()
-    if options.command:
-        return time_command(options.rounds)
     if not find_spec("pandas"):
         sys.exit("pandas is needed to compare with: pip install pandas")
     print_machine("pyarrow", "pandas", "numpy", "scipy")
@@ -69,29 +59,6 @@ def main() -> None:
             [">rows", "<way", ">s", ">× score"],
             lines,
         )
-
-
-def time_command(rounds: int) -> None:
-    """Time `score` as a command on the full grid, tables, figures and report, and print."""
-    print_machine("pyarrow", "numpy", "matplotlib")
-    seconds, busy = [], []
-    with tempfile.TemporaryDirectory(prefix="interference-score-") as name:
-        rows = write_rows(Path(name) / "grid.parquet")
-        program = Path(sys.executable).with_name("robomme-interference")
-        for _ in range(rounds):
-            before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-            subprocess.run(
-                [program, "score", rows, "--out", Path(name) / "out"],
-                check=True,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-            )
-            seconds.append(time.perf_counter() - began)
-            after = resource.getrusage(resource.RUSAGE_CHILDREN)
-            busy.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
-    line = [f"{grid():,}", f"{median(seconds):.1f}", f"{median(busy):.1f}"]
-    title = f"The command, tables, figures and report; medians of {rounds} rounds."
-    print_table(title, [">rows", ">s", ">processor s"], [line])
 
 
 def grid() -> int:
