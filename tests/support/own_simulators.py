@@ -27,7 +27,11 @@ class Played(Simulator):
     def _begin(self, episode: EpisodeId, every: int) -> Begun:
         lesson, first, info = self.world.reset(str(episode), bool(every))
         images = {name: image for name, image in first.images.items() if name in self.drawn}
-        return lesson, Observation(images, first.state), info
+        return lesson, self.shown(Observation(images, first.state)), info
+
+    def shown(self, first: Observation) -> Observation:
+        """Return the first live observation as the simulator shows it."""
+        return first
 
     def _execute(
         self, episode: EpisodeId, action: Any, observe: bool
@@ -35,32 +39,26 @@ class Played(Simulator):
         return self.world.step(action, observe)
 
 
-class Narrow(Played):
+class Uneven(Played):
+    """Has live states of 7 values after a lesson of 8."""
+
+    def shown(self, first: Observation) -> Observation:
+        return Observation(first.images, first.state[:7])
+
+
+class Narrow(Uneven):
     """Has states of 7 values, consistently."""
 
     def _begin(self, episode: EpisodeId, every: int) -> Begun:
         lesson, first, info = super()._begin(episode, every)
-        return (
-            replace(lesson, states=lesson.states[:, :7]),
-            Observation(first.images, first.state[:7]),
-            info,
-        )
-
-
-class Uneven(Played):
-    """Has live states of 7 values after a lesson of 8."""
-
-    def _begin(self, episode: EpisodeId, every: int) -> Begun:
-        lesson, first, info = super()._begin(episode, every)
-        return lesson, Observation(first.images, first.state[:7]), info
+        return replace(lesson, states=lesson.states[:, :7]), first, info
 
 
 class Doubled(Played):
     """Has states of float64, as many environments do."""
 
-    def _begin(self, episode: EpisodeId, every: int) -> Begun:
-        lesson, first, info = super()._begin(episode, every)
-        return lesson, Observation(first.images, first.state.astype(float)), info
+    def shown(self, first: Observation) -> Observation:
+        return Observation(first.images, first.state.astype(float))
 
 
 class Blindfolded(Played):
@@ -73,19 +71,15 @@ class Blindfolded(Played):
 class Small(Played):
     """Draws images of another size than the recorded ones."""
 
-    def _begin(self, episode: EpisodeId, every: int) -> Begun:
-        lesson, first, info = super()._begin(episode, every)
-        images = {name: image[::2, ::2] for name, image in first.images.items()}
-        return lesson, Observation(images, first.state), info
+    def shown(self, first: Observation) -> Observation:
+        return replace(first, images={name: one[::2, ::2] for name, one in first.images.items()})
 
 
 class Floating(Played):
     """Draws images of floats."""
 
-    def _begin(self, episode: EpisodeId, every: int) -> Begun:
-        lesson, first, info = super()._begin(episode, every)
-        images = {name: image / 255 for name, image in first.images.items()}
-        return lesson, Observation(images, first.state), info
+    def shown(self, first: Observation) -> Observation:
+        return replace(first, images={name: one / 255 for name, one in first.images.items()})
 
 
 class Unnamed(Played):
@@ -93,9 +87,8 @@ class Unnamed(Played):
 
     cameras = ("front", "wrist")
 
-    def _begin(self, episode: EpisodeId, every: int) -> Begun:
-        lesson, first, info = super()._begin(episode, every)
-        return lesson, Observation({"top": first.images["front"]}, first.state), info
+    def shown(self, first: Observation) -> Observation:
+        return Observation({"top": first.images["front"]}, first.state)
 
 
 class TwoArms(Played):
