@@ -20,7 +20,7 @@ from robomme_interference_data.viz.tables import Table
 
 from .contrast import Contrast
 from .pairs import pair
-from .tables import CELLS, TableSpec, comparison_table, provisional
+from .tables import CELLS, TableSpec, comparison_table
 
 DRAWS = 2000
 """Random signs, and draws of families and episodes."""
@@ -85,7 +85,6 @@ def families_table(every: Iterable[Outcomes], contrasts: Sequence[Contrast]) -> 
         holms = holm([p for *_, p in numbers])
         for (one, _, count), estimates, p_holm in zip(found, numbers, holms, strict=True):
             ps = {"p_families": estimates[-1], "p_families_holm": p_holm}
-            ps = {name: provisional(p, one.complete) for name, p in ps.items()}
             more = {"families": count, **dict(zip(_COLUMNS, estimates, strict=True)), **ps}
             rows.append(replace(one, table="families", more=more))
     return comparison_table("families", rows, _SPEC)

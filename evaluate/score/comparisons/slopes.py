@@ -24,7 +24,7 @@ from robomme_interference_data.viz.tables import Table
 
 from .contrast import Contrast
 from .pairs import Pairs
-from .tables import provisional, provisional_note
+from .tables import provisional_note
 
 
 def _falling(outcomes: Outcomes, *systems: str) -> list[str]:
@@ -81,7 +81,7 @@ def _decays(outcomes: Outcomes, draws: int) -> list[tuple[object, ...]]:
         known = known_interval(fall, changing)
         whole = all(bool(outcomes.complete[outcomes.cell(system, c)]) for c in conditions)
         names = (key, system, " ".join(conditions), len(changing))
-        rows.append((*names, *known, *(provisional(p, whole) for p in four), whole))
+        rows.append((*names, *known, *four, whole))
     return rows
 
 
@@ -134,9 +134,6 @@ def interactions_of(outcomes: Outcomes, draws: int = DRAWS) -> list[Contrast]:
         names = (outcomes.simulator, one, conditions[-1], (other, conditions[-1]), "interaction")
         complete = all(bool(outcomes.complete[cell]) for cell in every)
         more: dict[str, object] = {"conditions": " ".join(conditions)}
-        more |= {
-            name: provisional(p, complete)
-            for name, p in zip(("p_fit", "p_fit_holm"), fit, strict=True)
-        }
+        more |= dict(zip(("p_fit", "p_fit_holm"), fit, strict=True))
         found.append(Contrast(*names, compared, complete, more=more))
     return found

@@ -12,7 +12,7 @@ from robomme_interference_data.evaluate.score import power
 from robomme_interference_data.stats.intervals import cohens_h
 from robomme_interference_data.stats.significance import ALPHA, holm
 from robomme_interference_data.stats.signs import simultaneous
-from robomme_interference_data.viz.tables import Provisional, Table
+from robomme_interference_data.viz.tables import Table
 
 from .contrast import Contrast
 
@@ -37,8 +37,8 @@ _VALUES: dict[str, tuple[str, Callable[[Contrast], Any]]] = {
     "interval": ("text", lambda c: c.pairs.interval),
     **{name: ("count", partial(_count, name)) for name in ("pairs", "gained", "lost")},
     "flips": ("rate", lambda c: c.pairs.flips),
-    "p": ("p", lambda c: provisional(c.pairs.p, c.complete)),
-    "p_mid": ("p", lambda c: provisional(c.pairs.p_mid, c.complete)),
+    "p": ("p", lambda c: c.pairs.p),
+    "p_mid": ("p", lambda c: c.pairs.p_mid),
     "cohens_h": ("ratio", lambda c: cohens_h(c.pairs.second, c.pairs.first)),
     "retention": ("ratio", lambda c: c.retention.value),
     "retention_low": ("ratio", lambda c: c.retention.low),
@@ -156,7 +156,7 @@ def comparison_table(
     for one, p_holm in zip(found, holms, strict=True):
         tests = one.more.get("tests", groups[spec.group(one)])
         joint = one.pairs.at(simultaneous(tests, spec.alpha))
-        more = {"p_holm": provisional(p_holm, one.complete), **one.more}
+        more = {"p_holm": p_holm, **one.more}
         more |= {"joint_low": joint.low, "joint_high": joint.high}
         rows.append(tuple(more[key] if key in more else _VALUES[key][1](one) for _, key in columns))
     correct = _CORRECT.format(among=spec.among)
@@ -174,11 +174,6 @@ def _column(text: str) -> tuple[str, str]:
     name, _, kind = shown.partition(":")
     value = value or name
     return f"{name}:{kind or _VALUES[value][0]}", value
-
-
-def provisional(p: float, complete: bool) -> float:
-    """Return a p-value, marked as provisional if a cell is incomplete."""
-    return p if complete else Provisional(p)
 
 
 def provisional_note(complete: Iterable[object]) -> str:

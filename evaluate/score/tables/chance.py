@@ -3,11 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping
 
-from robomme_interference_data.evaluate.score.comparisons.tables import (
-    corrected,
-    provisional,
-    provisional_note,
-)
+from robomme_interference_data.evaluate.score.comparisons.tables import corrected, provisional_note
 from robomme_interference_data.evaluate.score.outcomes import Outcomes
 from robomme_interference_data.stats.intervals import above_chance
 from robomme_interference_data.stats.significance import ALPHA, poisson_binomial
@@ -41,7 +37,7 @@ def chance_table(outcomes: Mapping[str, Outcomes], cells: Iterable[Cell]) -> Tab
         (
             *(cell.simulator, cell.system, cell.condition, cell.n, cell.rate, cell.chance),
             *(above_chance(one, cell.chance) for one in (cell.rate, *cell.interval)),
-            *(provisional(one, cell.complete) for one in p),
+            *p,
             cell.complete,
         )
         for cell, *p in tests

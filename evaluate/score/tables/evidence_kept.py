@@ -7,11 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.evaluate.score.comparisons.pairs import pair
-from robomme_interference_data.evaluate.score.comparisons.tables import (
-    corrected,
-    provisional,
-    provisional_note,
-)
+from robomme_interference_data.evaluate.score.comparisons.tables import corrected, provisional_note
 from robomme_interference_data.evaluate.score.outcomes import Outcomes, Statuses, counting, rate_of
 from robomme_interference_data.evaluate.systems import is_reference, known_system
 from robomme_interference_data.stats.strata import mantel_haenszel
@@ -103,8 +99,7 @@ def _effects(cells: _Cells) -> Table:
     rows = [
         (
             *(*cell, one, other, compared.strata, *n, compared.second, compared.first),
-            *(*compared.change, provisional(compared.p, complete), provisional(p, complete)),
-            complete,
+            *(*compared.change, compared.p, p, complete),
         )
         for (cell, one, other, n, compared, complete), p in zip(found, ps, strict=True)
     ]

@@ -11,10 +11,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.errors import MissingExtraError
-from robomme_interference_data.evaluate.score.comparisons.tables import (
-    provisional,
-    provisional_note,
-)
+from robomme_interference_data.evaluate.score.comparisons.tables import provisional_note
 from robomme_interference_data.evaluate.score.outcomes import Outcomes, counting
 from robomme_interference_data.evaluate.systems import is_reference
 from robomme_interference_data.schema.conditions import NO_HISTORY, parse_condition
@@ -181,8 +178,8 @@ def _rows(outcomes: Outcomes) -> Iterator[tuple[object, ...]]:
         low, high = _bounds(fit.effects[at], fit.errors[at], z_of(LEVEL))
         sample = _bounds(fit.effects[at], fit.sample_errors[at], _student(fit.families - 1))
         names = (outcomes.simulator, system, term, fit.episodes, fit.families)
-        both = (provisional(one, whole) for one in (p, p_holm))
-        yield (*names, math.exp(fit.effects[at]), low, high, *both, fit.spread[at], *sample, whole)
+        ratio, spread = math.exp(fit.effects[at]), fit.spread[at]
+        yield (*names, ratio, low, high, p, p_holm, spread, *sample, whole)
 
 
 def _student(degrees: int) -> float:

@@ -6,10 +6,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from robomme_interference_data.evaluate.score.comparisons.contrast import START
-from robomme_interference_data.evaluate.score.comparisons.tables import (
-    provisional,
-    provisional_note,
-)
+from robomme_interference_data.evaluate.score.comparisons.tables import provisional_note
 from robomme_interference_data.evaluate.score.outcomes import Outcomes, steps_to_success
 from robomme_interference_data.stats.bootstrap import DRAWS, Interval
 from robomme_interference_data.stats.significance import holm
@@ -60,6 +57,5 @@ def _rows(outcomes: Outcomes, draws: int) -> list[tuple[object, ...]]:
             continue
         whole = whole and bool(outcomes.complete[s, start])
         pairs = int((~np.isnan(steps[s, c] - steps[s, start])).sum())
-        p = (provisional(one, whole) for one in (test.p, holms[s, c]))
-        rows.append((*names, *own, pairs, *test.at(), *p, whole))
+        rows.append((*names, *own, pairs, *test.at(), test.p, holms[s, c], whole))
     return rows
