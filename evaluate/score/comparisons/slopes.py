@@ -69,7 +69,9 @@ def _decays(outcomes: Outcomes, draws: int) -> list[tuple[object, ...]]:
     if not found:
         return []
     values = [_values(outcomes, system, conditions) for system, conditions in found.items()]
-    slopes = np.stack([v @ _weights(c) for v, c in zip(values, found.values(), strict=True)], 1)
+    slopes = np.stack(
+        [v @ slope_weights(_numbers(c)) for v, c in zip(values, found.values(), strict=True)], 1
+    )
     ps = [one.p for one in sign_flips(slopes.round(12), key, draws)]
     fits = _fits(values, list(found.values()), key, draws)
     tests = zip(ps, holm(ps), fits, holm(fits), strict=True)
@@ -83,10 +85,6 @@ def _decays(outcomes: Outcomes, draws: int) -> list[tuple[object, ...]]:
         names = (key, system, " ".join(conditions), len(changing))
         rows.append((*names, *known, *four, whole))
     return rows
-
-
-def _weights(conditions: Sequence[str]) -> Floats:
-    return slope_weights(_numbers(conditions))
 
 
 def _fits(
@@ -112,7 +110,7 @@ def interactions_of(outcomes: Outcomes, draws: int = DRAWS) -> list[Contrast]:
             continue
         both = [_values(outcomes, name, conditions) for name in (other, one)]
         pairs.append((one, other, conditions))
-        slopes.append([values @ _weights(conditions) for values in both])
+        slopes.append([values @ slope_weights(_numbers(conditions)) for values in both])
         apart.append(both[1] - both[0])
     if not pairs:
         return []
