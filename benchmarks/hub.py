@@ -34,7 +34,6 @@ from robomme_interference_data.cards.publish import (
     publish_buffer_set,
 )
 from robomme_interference_data.cards.publisher import Publisher
-from robomme_interference_data.constants import RECORDS_PATH
 from robomme_interference_data.data.fetch import FetchConfig, fetch, plan_fetch
 
 CONDITIONS = ("k0", "k1", "k3", "k7")
@@ -61,7 +60,6 @@ def main() -> None:
         time_publishing(hub, made, options)
         hub.run(publish, real, REAL)
         time_loading(hub, real, made, options)
-        metadata_table(made, options)
         time_fetching(hub, options)
 
 
@@ -116,21 +114,6 @@ def first_frame(repo: str, episode: str, condition: str) -> None:
     """Load a buffer and decode its first frame."""
     buffer = load_buffer(episode, condition, buffer_set=repo, revision=VERSION, cameras=["front"])
     next(iter(buffer.stream(1, cameras=("front",))))
-
-
-def metadata_table(made: Path, options: argparse.Namespace) -> None:
-    """Print what the metadata of the made-up buffer set consists of."""
-    rows = []
-    for path in sorted(made.glob("manifests/*")):
-        rows.append([path.relative_to(made).as_posix(), _kilobytes(path.stat().st_size)])
-    for folder in sorted(one.parent.parent for one in made.glob("*/meta/info.json")):
-        for path in (folder / RECORDS_PATH, *sorted(folder.glob("meta/in*.json"))):
-            rows.append([path.relative_to(made).as_posix(), _kilobytes(path.stat().st_size)])
-    title = (
-        f"Metadata that a buffer needs, of the made-up buffer set: {options.queries:,} "
-        f"demonstrations and {options.units:,} units."
-    )
-    print_table(title, ("<file", ">kB"), rows)
 
 
 # --- a whole buffer set ---------------------------------------------------------------------
@@ -233,10 +216,6 @@ def upload_plainly(root: Path, repo: str) -> None:
         ("manifests", repo, "manifests"),
     ):
         api.upload_folder(repo_id=name, folder_path=root / folder, path_in_repo=inside, **kind)
-
-
-def _kilobytes(size: float) -> str:
-    return f"{size / 1e3:,.1f}"
 
 
 def _rounds(options: argparse.Namespace) -> str:

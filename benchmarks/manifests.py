@@ -25,7 +25,7 @@ from common import (
     print_table,
     run,
 )
-from support.made_up import write_metadata
+from support.made_up import record, write_metadata
 
 from robomme_interference_data.build_dataset.manifests import (
     in_folder,
@@ -41,10 +41,8 @@ from robomme_interference_data.constants import (
     MANIFEST_ROWS,
     MANIFESTS,
     STATE,
-    UNIT_FRAMES,
     WRIST,
 )
-from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import arrow_schema, to_dict
 from robomme_interference_data.schema.manifest import BufferManifest
 from robomme_interference_data.schema.records import EpisodeRecord, SpanDigests
@@ -129,20 +127,17 @@ def made_up(kind: str, index: int) -> EpisodeRecord:
     """Return the record of an episode that was never recorded."""
     units = kind == DISTRACTORS
     number, family = divmod(index, len(FAMILIES))
-    name = EpisodeId(FAMILIES[family], "train" if units else "test", number)
     spans = {name: sha256(f"{index} {name}".encode()).hexdigest() for name in _SPANS}
     digests = {name: sha256(f"{kind} {index} {name}".encode()).hexdigest() for name in SHAPES}
-    lesson = 50 + 13 * index % 700
-    return EpisodeRecord(
-        episode_index=index,
-        episode_id=name,
-        length=UNIT_FRAMES if units else lesson + 1,
+    return record(
+        kind,
+        f"{FAMILIES[family]}/{'train' if units else 'test'}/{number}",
+        index,
+        lesson=50 + 13 * index % 700,
         goals=("watch the video carefully, then do the task again", "do it again"),
         seed=index,
         difficulty="easy",
         simulator="made-up",
-        exec_start_idx=None if units else lesson,
-        exact=True,
         feature_sha256=digests,
         span_sha256=None if units else SpanDigests(**spans),
     )
