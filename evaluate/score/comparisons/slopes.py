@@ -24,7 +24,7 @@ from robomme_interference_data.viz.tables import Table
 
 from .contrast import Contrast
 from .pairs import Pairs
-from .tables import provisional_note
+from .tables import tested
 
 
 def _falling(outcomes: Outcomes, *systems: str) -> list[str]:
@@ -47,7 +47,7 @@ def _numbers(conditions: Iterable[str]) -> list[int]:
 def decay_table(every: Iterable[Outcomes], draws: int = DRAWS) -> Table:
     """Return each system's log-linear decay over the sessions in the buffer."""
     rows = [row for outcomes in every for row in _decays(outcomes, draws)]
-    return Table.make(
+    return tested(
         "decay",
         "Decay over sessions",
         "simulator system conditions n:count slope:points low:points high:points p:p p_holm:p "
@@ -58,8 +58,7 @@ def decay_table(every: Iterable[Outcomes], draws: int = DRAWS) -> Table:
         f"if at least {MIN_EPISODES} episodes contribute to the slope. p: sign-flip test of no "
         "trend. p fit: whether the rates depart from the line, by sign flips of the episodes' "
         "departures; if they do, the slope describes the fall only on average. p holm and "
-        "p fit holm: after Holm's correction among the systems of a simulator."
-        + provisional_note(row[-1] for row in rows),
+        "p fit holm: after Holm's correction among the systems of a simulator.",
     )
 
 
@@ -74,16 +73,15 @@ def _decays(outcomes: Outcomes, draws: int) -> list[tuple[object, ...]]:
     )
     ps = [one.p for one in sign_flips(slopes.round(12), key, draws)]
     fits = _fits(values, list(found.values()), key, draws)
-    tests = zip(ps, holm(ps), fits, holm(fits), strict=True)
     rows = list[tuple[object, ...]]()
-    for (system, conditions), each, four in zip(found.items(), slopes.T, tests, strict=True):
+    for (system, conditions), each, *both in zip(found.items(), slopes.T, ps, fits, strict=True):
         here = outcomes.has_episode[outcomes.systems.index(system)]
         [fall] = bootstrap(each[here, None], key, draws)
         changing = each[~np.isnan(each)]
         known = known_interval(fall, changing)
         whole = all(bool(outcomes.complete[outcomes.cell(system, c)]) for c in conditions)
         names = (key, system, " ".join(conditions), len(changing))
-        rows.append((*names, *known, *four, whole))
+        rows.append((*names, *known, *both, whole))
     return rows
 
 

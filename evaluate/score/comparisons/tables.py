@@ -176,9 +176,21 @@ def _column(text: str) -> tuple[str, str]:
     return f"{name}:{kind or _VALUES[value][0]}", value
 
 
-def provisional_note(complete: Iterable[object]) -> str:
-    """Return the end of a note if some rows are not complete, else nothing."""
-    return "" if all(complete) else " p†: provisional, because a cell is incomplete."
+def tested(name: str, title: str, columns: str, rows: Iterable[Sequence[Any]], note: str) -> Table:
+    """Return a table of tests of one simulator each, the first column; the last is `complete`.
+
+    Rows lack the columns `…_holm`: p of the column before, after Holm's correction within the
+    simulator. The note explains marks of rows that are not complete.
+    """
+    found = [list(row) for row in rows]
+    for place, column in enumerate(columns.split()):
+        if column.endswith("_holm:p"):
+            ps = corrected([row[place - 1] for row in found], [row[0] for row in found])
+            for row, p in zip(found, ps, strict=True):
+                row.insert(place, p)
+    if not all(row[-1] for row in found):
+        note += " p†: provisional, because a cell is incomplete."
+    return Table.make(name, title, columns, map(tuple, found), note)
 
 
 def corrected(p_values: Sequence[float], groups: Sequence[Hashable]) -> list[float]:
