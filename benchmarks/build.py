@@ -16,7 +16,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import av
-from common import Times, interleave, machine, positive, table
+from common import Times, interleave, positive, print_machine, print_table, run
 
 from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.frame_selection import select_demonstration
@@ -32,7 +32,6 @@ from robomme_interference_data.build_dataset.sources import (
 )
 from robomme_interference_data.build_dataset.stage import StageTask
 from robomme_interference_data.constants import CAMERA_PREFIX, DEMONSTRATIONS, FPS
-from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.runtime.executor import Executor, Processes, Serial, Worker
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.storage.arrays import FeatureDigests
@@ -71,14 +70,11 @@ def _each(frames: list[Frame]) -> Generator[Frame]:
 def main() -> None:
     """Measure and print."""
     options = parse_options()
-    try:
-        require_lerobot()
-        with tempfile.TemporaryDirectory(prefix="interference-build-") as folder:
-            source = open_source(options.source or recordings(Path(folder) / "recordings"))
-            print(machine("av", "lerobot"), end="\n\n", flush=True)
-            print(measure(source, Path(folder), options))
-    except InterferenceError as error:
-        sys.exit(str(error))
+    require_lerobot()
+    with tempfile.TemporaryDirectory(prefix="interference-build-") as folder:
+        source = open_source(options.source or recordings(Path(folder) / "recordings"))
+        print_machine("av", "lerobot")
+        measure(source, Path(folder), options)
 
 
 def parse_options() -> argparse.Namespace:
@@ -107,8 +103,8 @@ def recordings(folder: Path) -> str:
     return "sample:" + ",".join(FAMILIES)
 
 
-def measure(source: Source, folder: Path, options: argparse.Namespace) -> str:
-    """Time the steps of a build on all demonstrations of a source; return the table."""
+def measure(source: Source, folder: Path, options: argparse.Namespace) -> None:
+    """Time the steps of a build on all demonstrations of a source; print the table."""
     codec, workers = get_codec(options.codec), options.workers
     episodes = tuple(episode for _, episode in list_episodes([source]))
     held = Held({str(episode.id): read(source, episode) for episode in episodes})
@@ -164,7 +160,7 @@ def measure(source: Source, folder: Path, options: argparse.Namespace) -> str:
         "s, once a build, and is left out."
     )
     columns = ("<step", ">ms a frame", ">frames/s", ">of bare", ">aim")
-    return table(title, columns, rows)
+    print_table(title, columns, rows)
 
 
 def row(times: Times, count: int, way: str, text: str, cores: int, aim: str) -> list[str]:
@@ -238,4 +234,4 @@ def encode_hashed(
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -23,7 +23,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import psutil
-from common import Times, add_buffer_set, demo_buffers, machine, positive, table
+from common import Times, add_buffer_set, demo_buffers, positive, print_machine, print_table
 from nothing import Nothing
 
 from evaluate import seconds_a_rollout
@@ -112,11 +112,11 @@ def main() -> None:
     parser.add_argument("--rounds", type=positive, default=3)
     given: Any = parser.parse_args()
     given.buffer_set = given.buffer_set or demo_buffers()
-    print(machine("ray"))
+    print_machine("ray")
 
     columns = ["<rollouts", ">rows/s", ">ms of the driver", ">of a core at 17 rows/s", ">MB grown"]
     title = f"Rollouts that do nothing, {given.workers} workers"
-    print(f"\n{table(title, columns, [drive(given.rollouts, given.workers)])}")
+    print_table(title, columns, [drive(given.rollouts, given.workers)])
 
     ways = {"processes": Processes(given.workers), "ray": RayWorkers(given.workers, "local")}
     taken: dict[str, list[float]] = {name: [] for name in ways}
@@ -133,7 +133,7 @@ def main() -> None:
         f"`replay`, {given.replayed} rollouts, {given.workers} workers, once started; "
         f"medians of {given.rounds} rounds, aim ≤ 1.1"
     )
-    print(f"\n{table(title, ['<executor', '>s a rollout', '>ratio'], rows)}")
+    print_table(title, ["<executor", ">s a rollout", ">ratio"], rows)
 
     each = durations(tuple(given.reset), tuple(given.steps_s))
     rollouts = CELLS * len(FAMILIES) * EPISODES
@@ -147,7 +147,7 @@ def main() -> None:
     columns = ["<workers", ">ideal, h", ">plan's order, h", ">longest first, h"]
     columns += [">plan's order / ideal", ">longest first / ideal"]
     title = f"The full grid, {len(plan):,} rollouts of {sum(plan) / len(plan):.0f} s on average"
-    print(f"\n{table(title, columns, rows)}")
+    print_table(title, columns, rows)
 
 
 if __name__ == "__main__":

@@ -20,21 +20,18 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
-__all__ = [
-    "Times",
-    "add_buffer_set",
-    "demo_buffers",
-    "in_fresh_process",
-    "interleave",
-    "machine",
-    "megabytes",
-    "peak_memory",
-    "positive",
-    "table",
-]
+from robomme_interference_data.errors import InterferenceError
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
+
+
+def run(main: Callable[[], None]) -> None:
+    """Run a benchmark; an error of the package ends it with its message alone."""
+    try:
+        main()
+    except InterferenceError as error:
+        sys.exit(str(error))
 
 
 def add_buffer_set(parser: argparse.ArgumentParser) -> None:
@@ -72,16 +69,20 @@ class Times:
         return statistics.median(one / other for one, other in pairs)
 
 
-def interleave(ways: Mapping[str, Callable[[], object]], rounds: int) -> Times:
+def interleave(
+    ways: Mapping[str, Callable[[], object]],
+    rounds: int,
+    clock: Callable[[], float] = time.perf_counter,
+) -> Times:
     """Time several ways in turn, A B C, C B A, A B C, …, after one round of warm-up."""
     seconds: dict[str, list[float]] = {name: [] for name in ways}
     order = list(ways)
     for number in range(rounds + 1):
         for name in order:
             gc.disable()  # a collection would fall on whichever way happens to run
-            began = time.perf_counter()
+            began = clock()
             ways[name]()
-            ended = time.perf_counter()
+            ended = clock()
             gc.enable()
             if number > 0:
                 seconds[name].append(ended - began)
@@ -108,8 +109,8 @@ def peak_memory() -> int:
     return peak if sys.platform == "darwin" else peak * 1024
 
 
-def machine(*distributions: str) -> str:
-    """Return the processor, and the versions of Python and of distributions, in one line."""
+def print_machine(*distributions: str) -> None:
+    """Print the processor, and the versions of Python and of distributions."""
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
@@ -117,7 +118,7 @@ def machine(*distributions: str) -> str:
         model = found[1] if found else model
     versions = [f"{name} {metadata.version(name)}" for name in distributions]
     python = f"Python {platform.python_version()}"
-    return ", ".join([f"{os.cpu_count()} cores ({model})", python, *versions])
+    print(", ".join([f"{os.cpu_count()} cores ({model})", python, *versions]), flush=True)
 
 
 def megabytes(size: float) -> str:
@@ -132,8 +133,8 @@ def positive(text: str) -> int:
     return int(text)
 
 
-def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Lay out a Markdown table.
+def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a Markdown table.
 
     Args:
         title: Sentence above the table.
@@ -148,4 +149,4 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> 
         for line in lines
     ]
     rules = ["-" * (w - 1) + {"<": "-", ">": ":"}[s] for s, w in zip(sides, widths, strict=True)]
-    return "\n".join([title, "", laid[0], f"| {' | '.join(rules)} |", *laid[1:]])
+    print("\n".join(["", title, "", laid[0], f"| {' | '.join(rules)} |", *laid[1:]]), flush=True)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import add_buffer_set, demo_buffers, interleave, machine, positive, table
+from common import add_buffer_set, demo_buffers, interleave, positive, print_machine, print_table
 from numpy.typing import NDArray
 
 from robomme_interference_data import BufferSet, DecodedCache, load_buffer_set
@@ -79,31 +79,24 @@ def main() -> None:
     options = parse_options()
     folder = options.buffer_set or demo_buffers()
     buffer_set = load_buffer_set(folder, threads=1)
-    print(machine("mani-skill", "av"), end="\n\n", flush=True)
+    print_machine("mani-skill", "av")
     rows = []
     with tempfile.TemporaryDirectory() as kept, TabletopSimulator(cameras=CAMERAS) as simulator:
         cached = load_buffer_set(folder, cache=DecodedCache(Path(kept)), threads=1)
         for name in options.episodes:
             episode = EpisodeId.parse(name)
             rows.append(overhead(episode, simulator, buffer_set, cached, options.rounds))
-    print(
-        table(
-            "A rollout of the oracle's actions, front and wrist drawn at every step, one process; "
-            f"medians of {options.rounds} rounds; ratios are against the bare loop, aim at k0 "
-            "≤ 1.05.",
-            ("<episode", ">steps", ">bare s", ">no-history", ">k0", ">k0 --cache", ">frames"),
-            rows,
-        ),
-        end="\n\n",
-        flush=True,
+    print_table(
+        "A rollout of the oracle's actions, front and wrist drawn at every step, one process; "
+        f"medians of {options.rounds} rounds; ratios are against the bare loop, aim at k0 ≤ 1.05.",
+        ("<episode", ">steps", ">bare s", ">no-history", ">k0", ">k0 --cache", ">frames"),
+        rows,
     )
-    print(
-        table(
-            f"`replay`, {options.rollouts} rollouts; the first of each worker, which "
-            "starts its simulator, is left out. Aim ≥ 1.8.",
-            ("<workers", ">s a rollout", ">ratio"),
-            workers(folder, options.rollouts),
-        )
+    print_table(
+        f"`replay`, {options.rollouts} rollouts; the first of each worker, which starts its "
+        "simulator, is left out. Aim ≥ 1.8.",
+        ("<workers", ">s a rollout", ">ratio"),
+        workers(folder, options.rollouts),
     )
 
 

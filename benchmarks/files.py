@@ -7,15 +7,24 @@ lerobot's aggregate_datasets concatenates them.
 
 import argparse
 import os
-import sys
 import tempfile
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import av
 import av.logging
-from common import add_buffer_set, demo_buffers, interleave, machine, megabytes, positive, table
+from common import (
+    add_buffer_set,
+    demo_buffers,
+    interleave,
+    megabytes,
+    positive,
+    print_machine,
+    print_table,
+    run,
+)
 from load import Span, choose_buffer, open_lerobot, spans_of
 
 from robomme_interference_data import Buffer, BufferSet, load_buffer_set
@@ -27,7 +36,6 @@ from robomme_interference_data.constants import (
     DISTRACTORS,
     STATE,
 )
-from robomme_interference_data.errors import InterferenceError
 
 
 def main() -> None:
@@ -37,34 +45,24 @@ def main() -> None:
     parser.add_argument("--items", type=positive, default=100, help="items read in a round")
     parser.add_argument("--rounds", type=positive, default=5, help="timed repetitions")
     options = parser.parse_args()
-    try:
-        require_lerobot()
-        folder = options.buffer_set or demo_buffers()
-        buffer_set = load_buffer_set(folder)
-        print(machine("av", "lerobot"), end="\n\n", flush=True)
-        print(
-            measure_bytes(buffer_set, choose_buffer(buffer_set, None, None)), end="\n\n", flush=True
-        )
-        print(time_lerobot(folder, options))
-    except InterferenceError as error:
-        sys.exit(str(error))
+    require_lerobot()
+    folder = options.buffer_set or demo_buffers()
+    buffer_set = load_buffer_set(folder)
+    print_machine("av", "lerobot")
+    measure_bytes(buffer_set, choose_buffer(buffer_set))
+    time_lerobot(folder, options)
 
 
-def measure_bytes(buffer_set: BufferSet, buffer: Buffer) -> str:
-    """Compare the files that a buffer needs with what lies in its spans; return the table."""
+def measure_bytes(buffer_set: BufferSet, buffer: Buffer) -> None:
+    """Compare the files that a buffer needs with what lies in its spans; print the table."""
     videos = [
         span
         for camera in buffer.cameras
         for span in spans_of(buffer, buffer_set, CAMERA_PREFIX + camera)
     ]
-    inside, data = sum(map(packet_bytes, videos)), set()
-    for session in buffer.sessions:
-        entry, dataset = session.entry, buffer_set.datasets[session.entry.dataset]
-        data.add(dataset.lerobot.rows(entry.episode_index).path)
-        for feature in {STATE, ACTION} & dataset.features.keys():
-            inside += dataset.read_vectors(
-                entry.episode_index, feature, entry.start, entry.stop
-            ).nbytes
+    inside = span_bytes(buffer, buffer_set, videos)
+    entries = [session.entry for session in buffer.sessions]
+    data = {buffer_set.datasets[e.dataset].lerobot.rows(e.episode_index).path for e in entries}
     sizes = [
         sum(path.stat().st_size for path in files) for files in ({v.path for v in videos}, data)
     ]
@@ -74,7 +72,18 @@ def measure_bytes(buffer_set: BufferSet, buffer: Buffer) -> str:
     )
     cells = [megabytes(size) for size in (*sizes, inside)]
     columns = (">video files, MB", ">data files, MB", ">in spans, MB", ">ratio", ">aim")
-    return table(title, columns, [[*cells, f"{sum(sizes) / inside:.3f}", "≤ 1.1"]])
+    print_table(title, columns, [[*cells, f"{sum(sizes) / inside:.3f}", "≤ 1.1"]])
+
+
+def span_bytes(buffer: Buffer, buffer_set: BufferSet, videos: Iterable[Span]) -> int:
+    """Return the bytes of the video packets and the numbers of a buffer's spans."""
+    inside = sum(map(packet_bytes, videos))
+    for session in buffer.sessions:
+        entry, dataset = session.entry, buffer_set.datasets[session.entry.dataset]
+        for feature in {STATE, ACTION} & dataset.features.keys():
+            numbers = dataset.read_vectors(entry.episode_index, feature, entry.start, entry.stop)
+            inside += numbers.nbytes
+    return inside
 
 
 def packet_bytes(span: Span) -> int:
@@ -95,8 +104,8 @@ def read(dataset: Any, order: list[int]) -> None:
         dataset[index]
 
 
-def time_lerobot(folder: Path, options: argparse.Namespace) -> str:
-    """Time LeRobotDataset on the datasets as they are and concatenated; return the table."""
+def time_lerobot(folder: Path, options: argparse.Namespace) -> None:
+    """Time LeRobotDataset on the datasets as they are and concatenated; print the table."""
     os.environ["TQDM_DISABLE"] = "1"
     from lerobot.datasets.aggregate import aggregate_datasets
 
@@ -133,8 +142,8 @@ def time_lerobot(folder: Path, options: argparse.Namespace) -> str:
         f"dataset; medians of {options.rounds} rounds."
     )
     columns = ("<dataset", ">a file an episode", ">concatenated", ">ratio", ">aim")
-    return table(title, columns, rows)
+    print_table(title, columns, rows)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -8,17 +8,24 @@ and published whole is made up, as the number of its files counts, not their siz
 
 import argparse
 import re
-import sys
 from pathlib import Path
 from statistics import median
 
-from common import add_buffer_set, demo_buffers, machine, megabytes, positive, table
-from files import packet_bytes
+from common import (
+    add_buffer_set,
+    demo_buffers,
+    megabytes,
+    positive,
+    print_machine,
+    print_table,
+    run,
+)
+from files import span_bytes
 from load import choose_buffer, spans_of
 from loopback_hub import Hub, Run, running
 from made_buffer_set import write_buffer_set
 
-from robomme_interference_data import Buffer, load_buffer, load_buffer_set
+from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
 from robomme_interference_data.cards.publication import PublishConfig
 from robomme_interference_data.cards.publish import (
@@ -27,9 +34,7 @@ from robomme_interference_data.cards.publish import (
     publish_buffer_set,
 )
 from robomme_interference_data.cards.publisher import Publisher
-from robomme_interference_data.constants import ACTION, RECORDS_PATH, STATE
 from robomme_interference_data.data.fetch import FetchConfig, fetch, plan_fetch
-from robomme_interference_data.errors import InterferenceError
 
 CONDITIONS = ("k0", "k1", "k3", "k7")
 REAL, WHOLE, PLAIN = "someone/real", "someone/whole", "someone/plain"
@@ -46,32 +51,27 @@ def main() -> None:
     parser.add_argument("--latency", type=positive, default=50, help="of every answer, ms")
     parser.add_argument("--rounds", type=positive, default=1, help="repetitions")
     options = parser.parse_args()
-    try:
-        require_lerobot()
-        real = options.buffer_set or demo_buffers()
-        with running(options.latency / 1000) as (hub, folder):
-            print(machine("huggingface-hub"), end="\n\n", flush=True)
-            made = folder / "buffer_set"
-            write_buffer_set(made, options.queries, options.units, CONDITIONS)
-            published = time_publishing(hub, made, options)
-            hub.run(publish, real, REAL)
-            print(time_loading(hub, real, made, options), end="\n\n", flush=True)
-            print(metadata_table(made, options), end="\n\n", flush=True)
-            print(time_fetching(hub, options), end="\n\n", flush=True)
-            print(published)
-    except InterferenceError as error:
-        sys.exit(str(error))
+    require_lerobot()
+    real = options.buffer_set or demo_buffers()
+    with running(options.latency / 1000) as (hub, folder):
+        print_machine("huggingface-hub")
+        made = folder / "buffer_set"
+        write_buffer_set(made, options.queries, options.units, CONDITIONS)
+        time_publishing(hub, made, options)
+        hub.run(publish, real, REAL)
+        time_loading(hub, real, made, options)
+        time_fetching(hub, options)
 
 
 # --- one buffer ----------------------------------------------------------------------------------
 
 
-def time_loading(hub: Hub, real: Path, made: Path, options: argparse.Namespace) -> str:
-    """Load one buffer of each buffer set into an empty cache, and again; return the table."""
+def time_loading(hub: Hub, real: Path, made: Path, options: argparse.Namespace) -> None:
+    """Load one buffer of each buffer set into an empty cache, and again; print the table."""
     rows = []
     for name, repo, root in (("real videos", REAL, real), ("made up", WHOLE, made)):
         buffer_set = load_buffer_set(root)
-        buffer = choose_buffer(buffer_set, None, None)
+        buffer = choose_buffer(buffer_set)
         wanted = (repo, str(buffer.episode_id), buffer.condition)
         runs = []
         for _ in range(options.rounds):
@@ -81,7 +81,11 @@ def time_loading(hub: Hub, real: Path, made: Path, options: argparse.Namespace) 
         last = runs[-1].asked
         files = [one for one in last if SPAN_FILES.search(one.path)]
         bytes_of_files = sum(one.sent for one in files)
-        ratio = f"{bytes_of_files / span_bytes(buffer, root):.2f}" if repo == REAL else ""
+        ratio = (
+            f"{bytes_of_files / span_bytes(buffer, buffer_set, spans_of(buffer, buffer_set)):.2f}"
+            if repo == REAL
+            else ""
+        )
         rows.append(
             [
                 f"{name}, {len(buffer_set):,} buffers",
@@ -103,7 +107,7 @@ def time_loading(hub: Hub, real: Path, made: Path, options: argparse.Namespace) 
     )
     columns = ("<split", ">requests for metadata", ">kB", ">requests for files", ">MB", ">× spans")
     columns += (">s", ">requests again", ">s again")
-    return table(title, columns, rows)
+    print_table(title, columns, rows)
 
 
 def first_frame(repo: str, episode: str, condition: str) -> None:
@@ -112,38 +116,11 @@ def first_frame(repo: str, episode: str, condition: str) -> None:
     next(iter(buffer.stream(1, cameras=("front",))))
 
 
-def span_bytes(buffer: Buffer, root: Path) -> int:
-    """Return the bytes of the front video packets and the numbers of a buffer's spans."""
-    buffer_set = load_buffer_set(root)
-    inside = sum(packet_bytes(span) for span in spans_of(buffer, buffer_set))
-    for session in buffer.sessions:
-        entry, dataset = session.entry, buffer_set.datasets[session.entry.dataset]
-        for feature in {STATE, ACTION} & dataset.features.keys():
-            numbers = dataset.read_vectors(entry.episode_index, feature, entry.start, entry.stop)
-            inside += numbers.nbytes
-    return inside
-
-
-def metadata_table(made: Path, options: argparse.Namespace) -> str:
-    """Tell what the metadata of the made-up buffer set consists of; return the table."""
-    rows = []
-    for path in sorted(made.glob("manifests/*")):
-        rows.append([path.relative_to(made).as_posix(), _kilobytes(path.stat().st_size)])
-    for folder in sorted(one.parent.parent for one in made.glob("*/meta/info.json")):
-        for path in (folder / RECORDS_PATH, *sorted(folder.glob("meta/in*.json"))):
-            rows.append([path.relative_to(made).as_posix(), _kilobytes(path.stat().st_size)])
-    title = (
-        f"Metadata that a buffer needs, of the made-up buffer set: {options.queries:,} "
-        f"demonstrations and {options.units:,} units."
-    )
-    return table(title, ("<file", ">kB"), rows)
-
-
 # --- a whole buffer set ---------------------------------------------------------------------
 
 
-def time_fetching(hub: Hub, options: argparse.Namespace) -> str:
-    """Fetch the made-up buffer set by both ways in turn; return the table."""
+def time_fetching(hub: Hub, options: argparse.Namespace) -> None:
+    """Fetch the made-up buffer set by both ways in turn; print the table."""
     ways = {"robomme-interference fetch": fetch_whole, "snapshot_download": snapshot}
     runs: dict[str, list[Run]] = {name: [] for name in ways}
     for number in range(options.rounds):
@@ -169,7 +146,7 @@ def time_fetching(hub: Hub, options: argparse.Namespace) -> str:
         f"fetched whole into an empty cache; {_rounds(options)}."
     )
     columns = ("<way", ">files of episodes", ">requests", ">MB", ">s", ">ratio", ">aim")
-    return table(title, columns, rows)
+    print_table(title, columns, rows)
 
 
 def fetch_whole(repo: str) -> None:
@@ -188,8 +165,8 @@ def snapshot(repo: str) -> None:
 # --- publish -------------------------------------------------------------------------------------
 
 
-def time_publishing(hub: Hub, made: Path, options: argparse.Namespace) -> str:
-    """Publish the made-up buffer set twice, and upload its files plainly; return the table."""
+def time_publishing(hub: Hub, made: Path, options: argparse.Namespace) -> None:
+    """Publish the made-up buffer set twice, and upload its files plainly; print the table."""
     hub.fresh_cache()
     first, again = (hub.run(publish, made, WHOLE) for _ in range(2))
     plain = hub.run(upload_plainly, made, PLAIN)
@@ -216,7 +193,7 @@ def time_publishing(hub: Hub, made: Path, options: argparse.Namespace) -> str:
         "each once."
     )
     columns = ("<way", ">large files", ">commits", ">requests", ">bytes sent", ">s", ">ratio")
-    return table(title, (*columns, ">aim"), rows)
+    print_table(title, (*columns, ">aim"), rows)
 
 
 def publish(root: Path, repo: str) -> None:
@@ -241,13 +218,9 @@ def upload_plainly(root: Path, repo: str) -> None:
         api.upload_folder(repo_id=name, folder_path=root / folder, path_in_repo=inside, **kind)
 
 
-def _kilobytes(size: float) -> str:
-    return f"{size / 1e3:,.1f}"
-
-
 def _rounds(options: argparse.Namespace) -> str:
     return f"medians of {options.rounds} rounds; latency {options.latency} ms"
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

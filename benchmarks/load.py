@@ -24,18 +24,18 @@ from common import (
     demo_buffers,
     in_fresh_process,
     interleave,
-    machine,
     megabytes,
     peak_memory,
     positive,
-    table,
+    print_machine,
+    print_table,
+    run,
 )
 from numpy.typing import NDArray
 
 from robomme_interference_data import Buffer, BufferSet, DecodedCache, load_buffer_set
 from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
 from robomme_interference_data.constants import FRONT
-from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.schema.conditions import parse_condition
 
 TIMES_LONGER = 4
@@ -55,27 +55,18 @@ class Span:
 def main() -> None:
     """Measure and print."""
     options = parse_options()
-    try:
-        require_lerobot()
-        buffer_set = options.buffer_set or demo_buffers()
-        buffer = choose_buffer(
-            load_buffer_set(buffer_set, threads=1), options.episode, options.condition
-        )
-        print(machine("av", "lerobot"), end="\n\n", flush=True)
-        print(time_loading(buffer_set, buffer, options), end="\n\n", flush=True)
-        print(measure_streaming(buffer_set, buffer, options.chunk))
-    except InterferenceError as error:
-        sys.exit(str(error))
+    require_lerobot()
+    buffer_set = options.buffer_set or demo_buffers()
+    buffer = choose_buffer(load_buffer_set(buffer_set, threads=1))
+    print_machine("av", "lerobot")
+    time_loading(buffer_set, buffer, options)
+    measure_streaming(buffer_set, buffer, options.chunk)
 
 
 def parse_options() -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     add_buffer_set(parser)
-    parser.add_argument(
-        "--episode", help="query episode; by default the one with the median lesson length"
-    )
-    parser.add_argument("--condition", help="by default the one with the most sessions")
     parser.add_argument("--rounds", type=positive, default=7, help="timed repetitions")
     parser.add_argument(
         "--threads", type=positive, default=2, help="threads of the second measurement"
@@ -90,17 +81,15 @@ def parse_options() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def choose_buffer(buffer_set: BufferSet, episode: str | None, condition: str | None) -> Buffer:
-    """Return the buffer to measure."""
-    name = condition or max(buffer_set.conditions, key=lambda name: parse_condition(name).k)
-    if episode is None:
-        lengths = {m.history_frames: m.episode_id for m in buffer_set.manifests(condition=name)}
-        episode = str(lengths[statistics.median_low(lengths)])
-    return buffer_set.load(episode, name)
+def choose_buffer(buffer_set: BufferSet) -> Buffer:
+    """Return the buffer to measure: the most sessions, and of these the median length."""
+    name = max(buffer_set.conditions, key=lambda name: parse_condition(name).k)
+    lengths = {m.history_frames: m.episode_id for m in buffer_set.manifests(condition=name)}
+    return buffer_set.load(lengths[statistics.median_low(lengths)], name)
 
 
-def time_loading(folder: Path, buffer: Buffer, options: argparse.Namespace) -> str:
-    """Time all ways of loading the front frames; return the table."""
+def time_loading(folder: Path, buffer: Buffer, options: argparse.Namespace) -> None:
+    """Time all ways of loading the front frames; print the table."""
     buffer_set = load_buffer_set(folder, threads=1)
     key, threads = (buffer.episode_id, buffer.condition), options.threads
     spans = spans_of(buffer, buffer_set)
@@ -166,7 +155,7 @@ def time_loading(folder: Path, buffer: Buffer, options: argparse.Namespace) -> s
         f"{len(buffer.sessions)} sessions; medians "
         f"of {options.rounds} rounds; LeRobotDataset timed on {len(chosen)} frames and scaled."
     )
-    return table(title, COLUMNS, rows)
+    print_table(title, COLUMNS, rows)
 
 
 def check_equal(found: list[NDArray[np.uint8]], wanted: list[NDArray[np.uint8]]) -> None:
@@ -237,8 +226,8 @@ def lerobot_reader(
     return read, frames
 
 
-def measure_streaming(folder: Path, buffer: Buffer, chunk: int) -> str:
-    """Measure the peak memory of streaming buffers of all lengths; return the table."""
+def measure_streaming(folder: Path, buffer: Buffer, chunk: int) -> None:
+    """Measure the peak memory of streaming buffers of all lengths; print the table."""
     buffer_set = load_buffer_set(folder)
     names = [
         name
@@ -258,7 +247,7 @@ def measure_streaming(folder: Path, buffer: Buffer, chunk: int) -> str:
         f"Peak memory of Buffer.stream(chunk={chunk}), front camera, over what the process holds "
         f"before; largest / smallest {max(peaks) / min(peaks):.2f} (aim: flat)."
     )
-    return table(title, ("<buffer", ">frames", ">decoded MB", ">peak MB"), rows)
+    print_table(title, ("<buffer", ">frames", ">decoded MB", ">peak MB"), rows)
 
 
 def stream_peak(
@@ -277,4 +266,4 @@ def stream_peak(
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -11,17 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from manifests import made_up
+from manifests import made_up, written
 from numpy.typing import NDArray
 
 from robomme_interference_data.build_dataset.identity import complete_dataset, identity_of
 from robomme_interference_data.build_dataset.image_stats import STATISTICS
 from robomme_interference_data.build_dataset.lerobot_writer import StoredEpisode, write_lerobot
-from robomme_interference_data.build_dataset.manifests import (
-    in_folder,
-    plan_manifests,
-    write_manifests,
-)
 from robomme_interference_data.build_dataset.sources import Robot
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
@@ -45,8 +40,7 @@ def write_buffer_set(root: Path, queries: int, units: int, conditions: Sequence[
     """Write the buffer set: a video and a data file of its own for each camera of each episode."""
     for kind, count in ((DEMONSTRATIONS, queries), (DISTRACTORS, units)):
         _write_dataset(root / kind, kind, count)
-    for _ in write_manifests(plan_manifests(in_folder(root), conditions), root):
-        pass
+    written(root, conditions)
 
 
 def _write_dataset(root: Path, kind: str, count: int) -> None:

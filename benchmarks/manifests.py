@@ -6,10 +6,9 @@ dictionaries and `pyarrow.Table.from_pylist`, with the same draw.
 """
 
 import argparse
-import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from hashlib import sha256
 from itertools import batched
 from pathlib import Path
@@ -17,8 +16,16 @@ from statistics import median
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from common import in_fresh_process, machine, megabytes, peak_memory, positive, table
-from support.made_up import write_metadata
+from common import (
+    in_fresh_process,
+    megabytes,
+    peak_memory,
+    positive,
+    print_machine,
+    print_table,
+    run,
+)
+from support.made_up import record, write_metadata
 
 from robomme_interference_data.build_dataset.manifests import (
     in_folder,
@@ -34,11 +41,8 @@ from robomme_interference_data.constants import (
     MANIFEST_ROWS,
     MANIFESTS,
     STATE,
-    UNIT_FRAMES,
     WRIST,
 )
-from robomme_interference_data.errors import InterferenceError
-from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import arrow_schema, to_dict
 from robomme_interference_data.schema.manifest import BufferManifest
 from robomme_interference_data.schema.records import EpisodeRecord, SpanDigests
@@ -57,40 +61,37 @@ def main() -> None:
     parser.add_argument("--rounds", type=positive, default=3, help="repetitions of each size")
     options = parser.parse_args()
     rows = []
-    try:
-        for size in options.queries:
-            with tempfile.TemporaryDirectory(prefix="interference-manifests-") as name:
-                root = Path(name)
-                write_dataset(root / DISTRACTORS, DISTRACTORS, options.units)
-                write_dataset(root / DEMONSTRATIONS, DEMONSTRATIONS, size)
-                runs = [
-                    [in_fresh_process(timed, way, root) for way in (written, plainly)]
-                    for _ in range(options.rounds)
+    for size in options.queries:
+        with tempfile.TemporaryDirectory(prefix="interference-manifests-") as name:
+            root = Path(name)
+            write_dataset(root / DISTRACTORS, DISTRACTORS, options.units)
+            write_dataset(root / DEMONSTRATIONS, DEMONSTRATIONS, size)
+            runs = [
+                [in_fresh_process(timed, way, root) for way in (written, plainly)]
+                for _ in range(options.rounds)
+            ]
+            seconds = [median(run[way][0] for run in runs) for way in (0, 1)]
+            ratio = median(run[0][0] / run[1][0] for run in runs)
+            memory = max(run[0][1] for run in runs)
+            size_bytes = (root / MANIFESTS / MANIFEST_ROWS).stat().st_size
+            rows.append(
+                [
+                    f"{size:,}",
+                    f"{size * len(CONDITIONS):,}",
+                    f"{seconds[0]:.1f}",
+                    f"{seconds[1]:.1f}",
+                    f"{ratio:.2f}",
+                    megabytes(memory),
+                    megabytes(size_bytes),
                 ]
-                seconds = [median(run[way][0] for run in runs) for way in (0, 1)]
-                ratio = median(run[0][0] / run[1][0] for run in runs)
-                memory = max(run[0][1] for run in runs)
-                size_bytes = (root / MANIFESTS / MANIFEST_ROWS).stat().st_size
-                rows.append(
-                    [
-                        f"{size:,}",
-                        f"{size * len(CONDITIONS):,}",
-                        f"{seconds[0]:.1f}",
-                        f"{seconds[1]:.1f}",
-                        f"{ratio:.2f}",
-                        megabytes(memory),
-                        megabytes(size_bytes),
-                    ]
-                )
-    except InterferenceError as error:
-        sys.exit(str(error))
-    print(machine("pyarrow"), end="\n\n")
+            )
+    print_machine("pyarrow")
     title = (
         f"Buffers of made-up queries under {len(CONDITIONS)} conditions, {options.units:,} units; "
         f"medians of {options.rounds} runs."
     )
     heads = (">queries", ">buffers", ">s", ">row by row, s", ">ratio", ">peak MB", ">file MB")
-    print(table(title, heads, rows))
+    print_table(title, heads, rows)
 
 
 def timed(way: Callable[[Path], None], root: Path) -> tuple[float, int]:
@@ -100,11 +101,10 @@ def timed(way: Callable[[Path], None], root: Path) -> tuple[float, int]:
     return time.perf_counter() - began, peak_memory() - before
 
 
-def written(root: Path) -> None:
-    """Write the manifests as `build manifests` does."""
-    for _ in write_manifests(
-        plan_manifests(in_folder(root), CONDITIONS, position_limit=None), root
-    ):
+def written(root: Path, conditions: Sequence[str] = CONDITIONS) -> None:
+    """Write the manifests as `build manifests` does, without a limit of positions."""
+    plan = plan_manifests(in_folder(root), conditions, position_limit=None)
+    for _ in write_manifests(plan, root):
         pass
 
 
@@ -127,24 +127,21 @@ def made_up(kind: str, index: int) -> EpisodeRecord:
     """Return the record of an episode that was never recorded."""
     units = kind == DISTRACTORS
     number, family = divmod(index, len(FAMILIES))
-    name = EpisodeId(FAMILIES[family], "train" if units else "test", number)
     spans = {name: sha256(f"{index} {name}".encode()).hexdigest() for name in _SPANS}
     digests = {name: sha256(f"{kind} {index} {name}".encode()).hexdigest() for name in SHAPES}
-    lesson = 50 + 13 * index % 700
-    return EpisodeRecord(
-        episode_index=index,
-        episode_id=name,
-        length=UNIT_FRAMES if units else lesson + 1,
+    return record(
+        kind,
+        f"{FAMILIES[family]}/{'train' if units else 'test'}/{number}",
+        index,
+        lesson=50 + 13 * index % 700,
         goals=("watch the video carefully, then do the task again", "do it again"),
         seed=index,
         difficulty="easy",
         simulator="made-up",
-        exec_start_idx=None if units else lesson,
-        exact=True,
         feature_sha256=digests,
         span_sha256=None if units else SpanDigests(**spans),
     )
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

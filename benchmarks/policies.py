@@ -20,10 +20,10 @@ from common import (
     add_buffer_set,
     demo_buffers,
     interleave,
-    machine,
     megabytes,
     positive,
-    table,
+    print_machine,
+    print_table,
 )
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
@@ -39,7 +39,6 @@ from robomme_interference_data.evaluate.rollout.rollout import read_ahead
 
 CHUNK = 16
 ANSWER = pack({"reset_finished": True, "add_buffer_finished": True})
-COLUMNS = ("<feeding", ">ms", ">MB/s", ">ratio")
 BARE = "bare send of the same bytes"
 FED = "WebsocketPolicy"
 READ = "WebsocketPolicy, server unpacks"
@@ -60,35 +59,30 @@ def main() -> None:
     with servers() as ports:
         times, size = measure(ports, images, states, options.rounds)
         decoding = measure_decoding(ports[1], buffer, options.rounds)
-    print(machine("websockets", "msgpack"), end="\n\n", flush=True)
+    print_machine("websockets", "msgpack")
     messages = -(-len(images) // CHUNK)
-    print(
-        table(
-            f"A k7 buffer of {frames:,} frames and the first live observation, front camera, "
-            f"{megabytes(size)} MB in {messages} messages; medians of {options.rounds} rounds.",
-            COLUMNS,
+    print_table(
+        f"A k7 buffer of {frames:,} frames and the first live observation, front camera, "
+        f"{megabytes(size)} MB in {messages} messages; medians of {options.rounds} rounds.",
+        ("<feeding", ">ms", ">MB/s", ">ratio"),
+        [
             [
-                [
-                    way,
-                    f"{times.median(way) * 1e3:.0f}",
-                    f"{size / 1e6 / times.median(way):,.0f}",
-                    f"{times.ratio(way, BARE):.2f}",
-                ]
-                for way in (BARE, FED, READ)
-            ],
-        ),
-        end="\n\n",
+                way,
+                f"{times.median(way) * 1e3:.0f}",
+                f"{size / 1e6 / times.median(way):,.0f}",
+                f"{times.ratio(way, BARE):.2f}",
+            ]
+            for way in (BARE, FED, READ)
+        ],
     )
-    print(
-        table(
-            f"The {buffer.condition} buffer of {options.episode}, {len(buffer):,} frames, decoded "
-            f"and fed to the server that unpacks; medians of {options.rounds} rounds.",
-            ("<decoding and feeding", ">ms", ">ratio"),
-            [
-                [way, f"{decoding.median(way) * 1e3:.0f}", f"{decoding.ratio(way, IN_TURN):.2f}"]
-                for way in (IN_TURN, AHEAD)
-            ],
-        )
+    print_table(
+        f"The {buffer.condition} buffer of {options.episode}, {len(buffer):,} frames, decoded "
+        f"and fed to the server that unpacks; medians of {options.rounds} rounds.",
+        ("<decoding and feeding", ">ms", ">ratio"),
+        [
+            [way, f"{decoding.median(way) * 1e3:.0f}", f"{decoding.ratio(way, IN_TURN):.2f}"]
+            for way in (IN_TURN, AHEAD)
+        ],
     )
 
 

@@ -11,7 +11,6 @@ import argparse
 import json
 import os
 import shutil
-import sys
 import tempfile
 from collections.abc import Callable
 from functools import partial
@@ -21,17 +20,20 @@ from unittest.mock import patch
 
 import numpy as np
 import pyarrow.parquet as pq
-from common import Times, add_buffer_set, demo_buffers, interleave, machine, positive, table
-from manifests import write_dataset
+from common import (
+    Times,
+    add_buffer_set,
+    demo_buffers,
+    interleave,
+    positive,
+    print_machine,
+    print_table,
+    run,
+)
+from manifests import write_dataset, written
 
 from robomme_interference_data import Dataset, load_buffer_set
-from robomme_interference_data.build_dataset.manifests import (
-    in_folder,
-    plan_manifests,
-    write_manifests,
-)
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, INFO_PATH, RECORDS_PATH
-from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.retrieval.encoders import Encoder, make_encoder
 from robomme_interference_data.retrieval.grade import cells, grade
 from robomme_interference_data.retrieval.index import build_index
@@ -89,20 +91,17 @@ def main() -> None:
     parser.add_argument("--queries", type=positive, default=450, help="queries that are graded")
     parser.add_argument("--size", type=positive, default=1152, help="values in an embedding")
     options = parser.parse_args()
-    try:
-        buffer_set = options.buffer_set or demo_buffers()
-        with tempfile.TemporaryDirectory(prefix="interference-retrieval-") as name:
-            folder = Path(name)
-            encoders = [
-                make_encoder("thumbnail"),
-                make_encoder(f"siglip:{save_model(options.model, folder)}", device=options.device),
-            ]
-            print(machine("torch", "transformers", "numpy"), end="\n\n", flush=True)
-            print(index_table(buffer_set, encoders, folder, options), end="\n\n", flush=True)
-            made = made_up_buffer_set(folder / "made-up", options)
-            print(lookup_table(made, buffer_set, encoders, options))
-    except InterferenceError as error:
-        sys.exit(str(error))
+    buffer_set = options.buffer_set or demo_buffers()
+    with tempfile.TemporaryDirectory(prefix="interference-retrieval-") as name:
+        folder = Path(name)
+        encoders = [
+            make_encoder("thumbnail"),
+            make_encoder(f"siglip:{save_model(options.model, folder)}", device=options.device),
+        ]
+        print_machine("torch", "transformers", "numpy")
+        index_table(buffer_set, encoders, folder, options)
+        made = made_up_buffer_set(folder / "made-up", options)
+        lookup_table(made, buffer_set, encoders, options)
 
 
 def save_model(name: str, folder: Path) -> Path:
@@ -122,7 +121,7 @@ def save_model(name: str, folder: Path) -> Path:
 
 def index_table(
     buffer_set: Path, encoders: list[Encoder], folder: Path, options: argparse.Namespace
-) -> str:
+) -> None:
     """Time the index of some units against decoding, and against the forward pass."""
     root = folder / DISTRACTORS
     shutil.copytree(buffer_set / DISTRACTORS, root, ignore=shutil.ignore_patterns("index"))
@@ -154,7 +153,7 @@ def index_table(
         f"{sum(lengths)} frames of distractor units, decoded by {threads} threads beside the "
         f"encoder ({encoders[1].computed_in}); medians of {options.rounds} rounds."
     )
-    return table(title, RATES, rows)
+    print_table(title, RATES, rows)
 
 
 def forward_pass(encoder: Encoder, units: list[np.ndarray]) -> Callable[[], object]:
@@ -176,10 +175,7 @@ def made_up_buffer_set(root: Path, options: argparse.Namespace) -> Path:
     """Write a buffer set of tables and embeddings alone: queries and 900 units."""
     write_dataset(root / DEMONSTRATIONS, DEMONSTRATIONS, options.queries)
     write_dataset(root / DISTRACTORS, DISTRACTORS, 900)
-    for _ in write_manifests(
-        plan_manifests(in_folder(root), CONDITIONS, position_limit=None), root
-    ):
-        pass
+    written(root, CONDITIONS)
     roots = [root / DEMONSTRATIONS, root / DISTRACTORS]
     with patch.object(Dataset, "read_frames", lambda *_: None):
         build_index(roots, MadeUp(options.size), QUIET)
@@ -188,7 +184,7 @@ def made_up_buffer_set(root: Path, options: argparse.Namespace) -> Path:
 
 def lookup_table(
     made: Path, buffer_set: Path, encoders: list[Encoder], options: argparse.Namespace
-) -> str:
+) -> None:
     """Time one retrieval against one live frame's embedding, and grading against reading."""
     buffers = list(load_buffer_set(made).buffers())
     longest = sorted((one for one in buffers if one.condition == CONDITIONS[-1]), key=len)
@@ -215,7 +211,7 @@ def lookup_table(
         f"Embeddings of {options.size} values, {options.queries} queries and 900 units under "
         f"{', '.join(CONDITIONS)}; medians."
     )
-    return table(title, COLUMNS, rows)
+    print_table(title, COLUMNS, rows)
 
 
 def row(work: str, way: str, against: str, other: str, times: Times) -> list[str]:
@@ -225,4 +221,4 @@ def row(work: str, way: str, against: str, other: str, times: Times) -> list[str
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -12,7 +12,7 @@ import statistics
 import time
 
 import numpy as np
-from common import machine, positive, table
+from common import positive, print_machine, print_table
 
 from robomme_interference_data.simulators.base import Status
 from robomme_interference_data.simulators.robomme.simulator import RoboMMESimulator
@@ -52,7 +52,7 @@ def main() -> None:
     parser.add_argument("--steps", type=positive, default=64, help="steps of a rollout, at most")
     parser.add_argument("--rounds", type=positive, default=3)
     given = parser.parse_args()
-    print(machine())
+    print_machine()
     rows = []
     for family in given.families:
         taken: dict[str, list[tuple[float, float]]] = {kind: [] for kind in KINDS}
@@ -69,7 +69,7 @@ def main() -> None:
             numbers = [f"{reset:.1f}", f"{1 / step:.1f}", f"{whole[kind]:.1f}", f"{ratio:.1f}"]
             rows.append([family, kind, *numbers])
     columns = ["<family", "<drawn", ">reset, s", ">steps/s", ">s a rollout", ">times as fast"]
-    print(f"\n{table(f'A reset and {given.steps} steps', columns, rows)}")
+    print_table(f"A reset and {given.steps} steps", columns, rows)
 
 
 if __name__ == "__main__":

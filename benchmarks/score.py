@@ -1,8 +1,5 @@
 """How fast rows are scored, against pandas computing the same tables.
 
-    python benchmarks/score.py            # the full grid; minutes
-    python benchmarks/score.py --command  # the command alone, figures and report included
-
 Each way reads the rows, checks them, and writes the same rates, intervals, exact tests and
 bootstrap intervals. With pandas the bootstrap is done twice: as one would write it down, a call of
 scipy.stats.bootstrap for each statistic, and by hand, all statistics of a system from one set of
@@ -11,35 +8,28 @@ draws. pandas is no dependency of the package: install it for this.
 
 import argparse
 import math
-import resource
-import subprocess
 import sys
 import tempfile
-import time
+import warnings
 from collections.abc import Callable
 from functools import partial
 from importlib.util import find_spec
 from operator import mul
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
-from common import interleave, machine, positive, table
+from common import interleave, positive, print_machine, print_table
+from support import scoring as made
+from support.full_grid import full_grid
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.config import Settings
 from robomme_interference_data.evaluate.score.scoring import score
-from robomme_interference_data.schema.codec import arrow_schema
-from robomme_interference_data.schema.rollouts import Rollout
 from robomme_interference_data.stats.bootstrap import drawn_counts
 
 CONDITIONS = ("no-history", "k0", "k1", "k3", "k7")
 KS = (0, 1, 3, 7)
-SYSTEMS = 11
-EPISODES = len(FAMILIES) * 50
 
 
 def main() -> None:
@@ -47,108 +37,28 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--rounds", type=positive, default=3, help="repetitions of the full grid")
     parser.add_argument("--draws", type=positive, default=10_000, help="of each bootstrap")
-    parser.add_argument("--command", action="store_true", help="time the command alone")
     options = parser.parse_args()
-    if options.command:
-        return time_command(options.rounds)
     if not find_spec("pandas"):
         sys.exit("pandas is needed to compare with: pip install pandas")
-    print(machine("pyarrow", "pandas", "numpy", "scipy"), end="\n\n")
+    print_machine("pyarrow", "pandas", "numpy", "scipy")
+    np.seterr(all="ignore")  # with pandas, some draws divide by a lift of 0
+    warnings.simplefilter("ignore")
     with tempfile.TemporaryDirectory(prefix="interference-score-") as name:
         folder = Path(name)
-        rows = write_rows(folder / "grid.parquet")
+        grid = made.changed(full_grid(), evidence_kept=None)  # pandas computes nothing of that
+        rows = made.write_parquet(folder / "grid.parquet", grid)
         calls = {w: partial(c, rows, folder / "out", options.draws) for w, c in WAYS.items()}
         times = interleave(calls, options.rounds)
         lines = [
-            [f"{grid():,}", way, f"{times.median(way):.2f}", f"{times.ratio(way, 'score'):.1f}"]
+            [f"{len(grid):,}", way, f"{times.median(way):.2f}", f"{times.ratio(way, 'score'):.1f}"]
             for way in WAYS
         ]
-        print(
-            table(
-                f"The full grid, all tables, {options.draws:,} bootstrap draws; medians of "
-                f"{options.rounds} rounds.",
-                [">rows", "<way", ">s", ">× score"],
-                lines,
-            )
+        print_table(
+            f"The full grid, all tables, {options.draws:,} bootstrap draws; medians of "
+            f"{options.rounds} rounds.",
+            [">rows", "<way", ">s", ">× score"],
+            lines,
         )
-
-
-def time_command(rounds: int) -> None:
-    """Time `score` as a command on the full grid, tables, figures and report, and print."""
-    print(machine("pyarrow", "numpy", "matplotlib"), end="\n\n")
-    seconds, busy = [], []
-    with tempfile.TemporaryDirectory(prefix="interference-score-") as name:
-        rows = write_rows(Path(name) / "grid.parquet")
-        program = Path(sys.executable).with_name("robomme-interference")
-        for _ in range(rounds):
-            before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-            subprocess.run(
-                [program, "score", rows, "--out", Path(name) / "out"],
-                check=True,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-            )
-            seconds.append(time.perf_counter() - began)
-            after = resource.getrusage(resource.RUSAGE_CHILDREN)
-            busy.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
-    line = [f"{grid():,}", f"{median(seconds):.1f}", f"{median(busy):.1f}"]
-    title = f"The command, tables, figures and report; medians of {rounds} rounds."
-    print(table(title, [">rows", ">s", ">processor s"], [line]))
-
-
-def grid() -> int:
-    """Return the rows of the full grid: each system under five conditions, π0.5 under one."""
-    return (SYSTEMS * len(CONDITIONS) + 1) * EPISODES
-
-
-def write_rows(path: Path) -> Path:
-    """Write made-up rows of the grid, in the columns of a run."""
-    numbers = np.random.default_rng(0)
-    skill = numbers.random((SYSTEMS, len(CONDITIONS))) * 0.4 + 0.1
-    skill[:, 0] = 0  # without history
-    cells = [*np.ndindex(SYSTEMS, len(CONDITIONS)), (SYSTEMS, 0)]
-    system, condition = (part.repeat(EPISODES) for part in np.array(cells).T)
-    family, episode = np.divmod(np.tile(np.arange(EPISODES), len(cells)), 50)
-    chance = np.append(skill, 0).repeat(EPISODES) + np.tile(
-        numbers.random(EPISODES) * 0.5, len(cells)
-    )
-    same = np.zeros(grid(), int)
-    texts = {
-        "system": ([*(f"memory-{n}" for n in range(SYSTEMS)), "pi05_baseline"], system),
-        "simulator": (["tabletop"], same),
-        "buffer_set": (["made-up"], same),
-        "revision": (["ab" * 32], same),
-        "family": (list(FAMILIES), family),
-        "condition": (list(CONDITIONS), condition),
-        "split": (["test"], same),
-        "shift": (["none"], same),
-        "difficulty": (["easy", "medium", "hard"], episode % 3),
-        "goal": (["do it"], same),
-    }
-    fixed = {"protocol_version": 1, "steps": 200, "history_frames": 300, "lesson_frames": 100}
-    fixed |= {"lesson_share": 0.5, "attempt": 1}
-    schema = arrow_schema(Rollout)
-    won = numbers.random(grid()) < chance
-    columns: dict[str, Any] = {
-        name: pa.DictionaryArray.from_arrays(
-            pa.array(codes.astype(np.int32)), pa.array(values)
-        ).cast(pa.string())
-        for name, (values, codes) in texts.items()
-    }
-    columns |= {name: np.full(grid(), value) for name, value in fixed.items()}
-    columns |= {
-        "episode": episode,
-        "model_seed": same,
-        "seed": family * 50 + episode,
-        "status": pa.array(np.where(won, "success", "fail")),
-        "success": won,
-    }
-    arrays = [
-        pa.array(columns[f.name]).cast(f.type) if f.name in columns else pa.nulls(grid(), f.type)
-        for f in schema
-    ]
-    pq.write_table(pa.table(arrays, schema=schema), path, compression="zstd")
-    return path
 
 
 def ours(rows: Path, out: Path, draws: int) -> None:

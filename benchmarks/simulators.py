@@ -1,4 +1,4 @@
-"""Measure the embedded simulator: speed, start of episodes, workers, leaks.
+"""Measure the embedded simulator: speed, start of episodes, leaks.
 
     python benchmarks/simulators.py            # some minutes
     python benchmarks/simulators.py --episodes 500 --only leaks
@@ -16,12 +16,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from common import in_fresh_process, machine, positive, table
+from common import in_fresh_process, positive, print_machine, print_table
 
 from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.runtime.executor import Processes, Worker
-from robomme_interference_data.simulators import Simulator, Status, make_simulator
+from robomme_interference_data.simulators import make_simulator
 
 EPISODE = "MoveCube/test/0"
 
@@ -78,7 +76,7 @@ def speed(rounds: int) -> None:
     ratio = statistics.median(a / b for a, b in pairs)
     rows = [["tabletop", f"{mine:.1f}"], ["PickCube-v1, same cameras", f"{stock:.1f}"]]
     rows.append([f"ratio (median of {rounds} rounds)", f"{ratio:.1f}"])
-    print(table(_title(speed), ["<scene", ">steps/s"], rows))
+    print_table(_title(speed), ["<scene", ">steps/s"], rows)
 
 
 def resets() -> None:
@@ -99,38 +97,7 @@ def resets() -> None:
             frames.append(str(len(lesson)))
         rows.append([family, *seconds, ", ".join(frames)])
     columns = ["<family", ">easy", ">medium", ">hard", ">frames"]
-    print(table(_title(resets), columns, rows))
-
-
-class _Play:
-    """Plays 100 steps of episodes, each worker on a simulator of its own."""
-
-    simulator: Simulator | None = None
-
-    def __call__(self, episode: EpisodeId | None, worker: Worker) -> None:
-        self.simulator = self.simulator or make_simulator("tabletop")
-        if episode is None:  # only start up
-            return
-        self.simulator.reset(str(episode))
-        for _ in range(100):
-            if self.simulator.step(self.simulator.act("oracle"))[1] is not Status.ONGOING:
-                break
-
-
-def workers(episodes: int = 24) -> None:
-    """Wall seconds of the same episodes with one worker and with two, their start-up left out."""
-    todo = [EpisodeId("MoveCube", "train", index) for index in range(episodes)]
-    taken = {1: 0.0, 2: 0.0}
-    for count in (1, 2, 2, 1):  # so that neither has the better half of the time
-        started = 0.0
-        outcomes = Processes(count).run(_Play(), [*[None] * count, *todo])
-        for number, _ in enumerate(outcomes):
-            if number == 0:  # the others are up at about the same time; if later, it counts
-                started = time.perf_counter()
-        taken[count] += (time.perf_counter() - started) / (2 * episodes)
-    rows = [[str(count), f"{seconds:.2f}"] for count, seconds in taken.items()]
-    rows.append(["ratio", f"{taken[1] / taken[2]:.2f}"])
-    print(table(_title(workers), ["<workers", ">seconds per episode"], rows))
+    print_table(_title(resets), columns, rows)
 
 
 def leaks(episodes: int) -> None:
@@ -153,34 +120,23 @@ def leaks(episodes: int) -> None:
             opened = len(list(Path("/proc/self/fd").iterdir()))
             rows.append([str(number), f"{resident:.0f}", str(opened)])
     columns = [">episodes", ">resident MiB", ">open files"]
-    print(table(_title(leaks), columns, rows))
+    print_table(_title(leaks), columns, rows)
 
 
 def _title(part: Callable[..., None]) -> str:
     return (part.__doc__ or "").splitlines()[0]
 
 
-PARTS: dict[str, Callable[..., None]] = {
-    part.__name__: part for part in (speed, resets, workers, leaks)
-}
-
-
 def main() -> None:
     """Run the parts."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--only", choices=PARTS, help="run one part")
+    parser.add_argument("--only", choices=("speed", "resets", "leaks"), help="run one part")
     parser.add_argument("--rounds", type=positive, default=5, help="rounds of the speed")
     parser.add_argument("--episodes", type=positive, default=100, help="episodes of the leak check")
     given = parser.parse_args()
-    print(machine("mani-skill", "torch"))
-    for name, part in PARTS.items():
-        if given.only not in (None, name):
-            continue
-        print(flush=True)
-        if part is workers:  # starts processes of its own
-            part()
-        else:
-            options = {speed: [given.rounds], leaks: [given.episodes]}.get(part, [])
+    print_machine("mani-skill", "torch")
+    for part, *options in ((speed, given.rounds), (resets,), (leaks, given.episodes)):
+        if given.only in (None, part.__name__):
             in_fresh_process(part, *options)
 
 

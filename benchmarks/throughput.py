@@ -36,7 +36,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
-from common import machine, positive, table
+from common import positive, print_machine, print_table
 
 from robomme_interference_data.evaluate import BatchPolicy, Observation, RolloutInfo, RunConfig
 from robomme_interference_data.evaluate.policies.policy import Policy
@@ -247,7 +247,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=positive, default=3)
     options = parser.parse_args()
     os.environ["OMP_NUM_THREADS"] = "1"  # of each process: workers share the cores
-    print(machine("torch", "lerobot"), end="\n\n", flush=True)
+    print_machine("torch", "lerobot")
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         os.environ[DEVICE] = str(Path(folder, "device"))
@@ -269,17 +269,14 @@ def main() -> None:
             ratio = median(one[2] / one[0] for one in rounds)
             aim = "≥ 3" if (model, chunk_ms, workers) == ("fake", 16, 8) else ""
             rows.append([model, str(chunk_ms), str(workers), *rates, f"{ratio:.2f}", aim])
-    print(
-        table(
-            "Observations/s; medians of "
-            f"{options.rounds} rounds of {options.seconds} s; the ratio is that of one policy "
-            "for all, with waits of 30 ms, to one for each.",
-            (
-                *("<model", ">simulator ms", ">rollouts", ">one each"),
-                *(">one for all, 10 ms", ">30 ms", ">vla-eval", ">lockstep", ">ratio", ">aim"),
-            ),
-            rows,
-        )
+    print_table(
+        f"Observations/s; medians of {options.rounds} rounds of {options.seconds} s; the ratio is "
+        "that of one policy for all, with waits of 30 ms, to one for each.",
+        (
+            *("<model", ">simulator ms", ">rollouts", ">one each"),
+            *(">one for all, 10 ms", ">30 ms", ">vla-eval", ">lockstep", ">ratio", ">aim"),
+        ),
+        rows,
     )
 
 

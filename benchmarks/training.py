@@ -6,40 +6,31 @@ with LeRobotDataset, whose delta_timestamps take 32 frames from one episode, the
 """
 
 import argparse
-import gc
-import statistics
-import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from common import add_buffer_set, demo_buffers, machine, megabytes, peak_memory, positive, table
+from common import (
+    add_buffer_set,
+    demo_buffers,
+    interleave,
+    megabytes,
+    peak_memory,
+    positive,
+    print_machine,
+    print_table,
+    run,
+)
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.constants import DEMONSTRATIONS, FPS, FRONT
-from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.training import HistoryDataset
 
 MEMORY = Memory("framesamp", 32)
-
-
-def items_per_second(
-    ways: dict[str, tuple[int, Callable[[int], object]]], rounds: int
-) -> dict[str, float]:
-    """Return each way's items per processor second: the median of rounds, taken in turn."""
-    rates: dict[str, list[float]] = {name: [] for name in ways}
-    for number in range(rounds + 1):
-        for name, (count, make) in ways.items():
-            gc.collect()
-            began = time.process_time()
-            for item in range(count):
-                make(item)
-            if number:
-                rates[name].append(count / (time.process_time() - began))
-    return {name: statistics.median(values) for name, values in rates.items()}
 
 
 def main() -> None:
@@ -68,6 +59,10 @@ def main() -> None:
         def stream(number: int) -> object:
             return list(buffers[number].stream(64, ["front"], kept[number]))
 
+        def each(items: int, make: Callable[[int], object]) -> None:
+            for number in range(items):
+                make(number)
+
         side = buffer_set.datasets[DEMONSTRATIONS].shape("front")[0]
         ways: dict[str, tuple[int, Callable[[int], object]]] = {
             f"HistoryDataset, {args.image_size} px": (500, lambda n: data[n % count]),
@@ -77,17 +72,18 @@ def main() -> None:
             f"Buffer.stream(indices=…), {side} px": (min(4, count), stream),
             f"LeRobotDataset, delta_timestamps, {side} px": (4, lerobot(Path(root))),
         }
-        rates = items_per_second(ways, args.rounds)
+        calls = {name: partial(each, *way) for name, way in ways.items()}
+        times = interleave(calls, args.rounds, time.process_time)
+        rates = {name: items / times.median(name) for name, (items, _) in ways.items()}
         before = peak_memory()
         for number in range(4 * count):
             data[number % count]
         grown = peak_memory() - before
     base = rates[f"HistoryDataset, {args.image_size} px"]
     rows = [[name, f"{rate:,.1f}", f"{base / rate:,.1f}"] for name, rate in rates.items()]
-    title = f"Items of 32 frames, one process, {machine('numpy', 'torch', 'lerobot')}:"
-    print(
-        table(title, ("<way", ">items per processor second", ">HistoryDataset is faster by"), rows)
-    )
+    print_machine("numpy", "torch", "lerobot")
+    columns = ("<way", ">items per processor second", ">HistoryDataset is faster by")
+    print_table("Items of 32 frames, one process:", columns, rows)
     print(f"\nFour more epochs add {megabytes(grown)} MB to the peak memory.")
 
 
@@ -107,7 +103,4 @@ def lerobot(root: Path) -> Callable[[int], object]:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InterferenceError as error:
-        sys.exit(f"error: {error}")
+    run(main)

@@ -5,7 +5,6 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
-from hashlib import sha256
 from pathlib import Path, PurePosixPath
 
 from robomme_interference_data.build_dataset.audit import audit_buffer_set
@@ -25,18 +24,23 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.data.questions import read_questions
+from robomme_interference_data.data.questions import digest_questions, read_questions
 from robomme_interference_data.errors import MissingFileError, PublishError, counted
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.manifest import BufferManifest
-from robomme_interference_data.storage.files import LocalFiles, indented_json, with_filename
+from robomme_interference_data.storage.files import (
+    LocalFiles,
+    digest_json,
+    indented_json,
+    with_filename,
+)
 from robomme_interference_data.storage.hub import HubFiles
 
 from .dataset_facts import buffer_set_facts, demonstrations_facts
 from .facts import Facts
 from .publication import Publication, PublishConfig, Version
-from .publisher import Publisher, RepoContent, RepoPlan, digest
+from .publisher import Publisher, RepoContent, RepoPlan
 from .render import card_files
 from .repo import LocalFile, RepoFiles
 
@@ -198,7 +202,7 @@ def parts_of_dataset(dataset: Dataset) -> dict[str, str]:
     """Return a digest of each episode of a dataset, whatever its position."""
     records = ((record, to_dict(record)) for record in dataset.records())
     return {
-        f"{dataset.kind} {record.episode_id}": digest(row | {"episode_index": None})
+        f"{dataset.kind} {record.episode_id}": digest_json([row | {"episode_index": None}])
         for record, row in records
     }
 
@@ -211,16 +215,14 @@ def parts_of_buffers(manifests: Iterable[BufferManifest]) -> dict[str, str]:
         sessions = row.pop("sessions")
         del row["query"]
         held = [[one[name] for name in ("role", "source", "repeat", "sha256")] for one in sessions]
-        parts[str(manifest)] = digest([row, held])
+        parts[str(manifest)] = digest_json([[row, held]])
     return parts
 
 
 def parts_of_questions(buffer_set: BufferSet) -> dict[str, str]:
     """Return a digest of each question, its picture included."""
     return {
-        f"question {question.episode_id}": digest(
-            to_dict(question) | {"picture": sha256(question.picture).hexdigest()}
-        )
+        f"question {question.episode_id}": digest_questions([question])
         for question in read_questions(buffer_set).values()
     }
 

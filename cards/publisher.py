@@ -11,7 +11,7 @@ from typing import Any
 
 from robomme_interference_data.constants import PARTS_PATH
 from robomme_interference_data.errors import FormatError, MissingFileError, PublishError, counted
-from robomme_interference_data.storage.files import digest_json, indented_json, read_json
+from robomme_interference_data.storage.files import indented_json, read_json
 from robomme_interference_data.storage.hub import HubFiles
 from robomme_interference_data.viz.tables import Table
 
@@ -93,11 +93,6 @@ class RepoPlan:
         if self.difference.removed and not self.content.pending:
             status += f", removes {counted(len(self.difference.removed), 'file')}"
         return status + ", without files that name the demonstrations" * self.content.pending
-
-
-def digest(value: Any) -> str:
-    """Return the digest of a part: SHA-256 of its plain values as JSON."""
-    return digest_json([value])
 
 
 def plan_table(plans: Iterable[RepoPlan]) -> Table:

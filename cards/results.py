@@ -20,14 +20,14 @@ from robomme_interference_data.evaluate.score.writing import write_score
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.rollouts import TIMING_COLUMNS, Rollout
-from robomme_interference_data.storage.files import sha256_file
+from robomme_interference_data.storage.files import digest_json, sha256_file
 from robomme_interference_data.viz.figure import open_figure, save_figure
 from robomme_interference_data.viz.tables import Table
 
 from .facts import CardTable, Facts, Rows, origin_limit
 from .markdown import Raw, code, escape
 from .publication import Publication, Version
-from .publisher import RepoContent, digest
+from .publisher import RepoContent
 from .render import card_files
 from .repo import LocalFile, RepoFiles
 
@@ -231,4 +231,4 @@ def results_content(found: Score, run: Path, config: Publication) -> RepoContent
 def _rollout_digest(row: dict[str, Any]) -> str:
     """Return a digest of the outcome of a rollout, without its timing."""
     left_out: Iterable[str] = {*TIMING_COLUMNS, "attempt", "video"}
-    return digest({name: value for name, value in row.items() if name not in left_out})
+    return digest_json([{name: value for name, value in row.items() if name not in left_out}])

@@ -7,8 +7,7 @@ wrong; the same seed gives the same inputs. Findings so far:
 
     python scripts/fuzz.py buffers --inputs 1000000
     python scripts/fuzz.py all --seconds 60
-    python scripts/fuzz.py video --engine atheris    # guided by coverage of the package's Python
-    python scripts/fuzz.py video --read FILE         # reads one file again
+    python scripts/fuzz.py video --read FILE    # reads one file again
 """
 
 import argparse
@@ -19,7 +18,6 @@ import random
 import resource
 import select
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -46,9 +44,6 @@ MOST_BYTES = 4 << 30
 def main() -> None:
     """Fuzz one target, or all in turn."""
     options = _options()
-    if options.engine == "atheris" and options.child:
-        _atheris_child(options)
-        return
     from support.hostile import TARGETS
 
     for name in TARGETS if options.target == "all" else [options.target]:
@@ -56,14 +51,12 @@ def main() -> None:
             with tempfile.TemporaryDirectory() as folder:
                 print(repr(_place(TARGETS[name], folder)[1](options.read.read_bytes())))
             continue
-        run = _atheris if options.engine == "atheris" else _mutate
         started = time.monotonic()
-        count, refused, found = run(name, options)
+        count, refused, found = _mutate(name, options)
         print(
             json.dumps(
                 {
                     "target": name,
-                    "engine": options.engine,
                     "inputs": count,
                     "refused": refused,
                     "seconds": round(time.monotonic() - started, 1),
@@ -80,10 +73,8 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--inputs", type=int, default=1_000_000, help="Inputs of each target.")
     parser.add_argument("--seconds", type=float, help="Stop each target after so long.")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--engine", choices=("mutate", "atheris"), default="mutate")
     parser.add_argument("--out", type=Path, default=Path("build/fuzz"), help="What is kept.")
     parser.add_argument("--read", type=Path, help="Read this file alone, in this process.")
-    parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
     return parser.parse_args()
 
 
@@ -184,60 +175,6 @@ def _wait(child: int, pipe: int, progress: mmap.mmap) -> tuple[dict[str, Any] | 
         None,
         f"over {LONGEST_S} s" if hung else f"ended with {os.waitstatus_to_exitcode(status)}",
     )
-
-
-def _atheris(name: str, options: argparse.Namespace) -> tuple[int, int, Counter[str]]:
-    """Let atheris look for inputs that reach new lines; after one that ends it, go on."""
-    found, count, refused, started = Counter[str](), 0, 0, time.monotonic()
-    artifacts = options.out.absolute() / name
-    artifacts.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir="/dev/shm") as folder:
-        corpus, state = Path(folder) / "corpus", Path(folder) / "state"
-        corpus.mkdir()
-        while count < options.inputs:
-            left = (options.seconds or 10**9) - (time.monotonic() - started)
-            if left < 1:
-                break
-            arguments = [sys.executable, __file__, name, "--engine", "atheris"]
-            arguments += ["--inputs", str(options.inputs - count), "--seconds", str(int(left))]
-            arguments += ["--child", folder, "--out", str(artifacts)]
-            done = subprocess.run(arguments, capture_output=True, text=True, check=False)
-            if not state.is_file():
-                raise SystemExit(done.stderr)
-            read = [int(number) for number in state.read_text().split()]
-            state.unlink()
-            count, refused = count + read[0], refused + read[1]
-            if done.returncode:
-                lines = [line for line in done.stderr.splitlines() if "ERROR" in line]
-                found[(lines or ["ended"])[0].split("==")[-1].strip()[:120]] += 1
-                (artifacts / f"log-{count}.txt").write_text(done.stderr)
-    return count, refused, found
-
-
-def _atheris_child(options: argparse.Namespace) -> None:
-    import atheris
-
-    with atheris.instrument_imports(include=["robomme_interference_data"]):
-        from support.hostile import TARGETS
-    folder = options.child
-    with tempfile.TemporaryDirectory(dir="/dev/shm") as work:
-        sound, read = _place(TARGETS[options.target], work)
-        for number, data in enumerate(sound):
-            (folder / "corpus" / f"sound-{number}").write_bytes(data)
-        state, count, refused = (folder / "state").open("w"), 0, 0
-
-        def one(data: bytes) -> None:
-            nonlocal count, refused
-            count += 1
-            if count % 100 == 1:
-                os.pwrite(state.fileno(), b"%d %d" % (count, refused), 0)
-            refused += read(data) is not None
-
-        limits = [f"-runs={options.inputs}", f"-max_total_time={int(options.seconds)}"]
-        limits += [f"-timeout={LONGEST_S}", f"-rss_limit_mb={MOST_BYTES >> 20}"]
-        limits += [f"-artifact_prefix={options.out}/"]
-        atheris.Setup([sys.argv[0], *limits, str(folder / "corpus")], one)
-        atheris.Fuzz()
 
 
 if __name__ == "__main__":

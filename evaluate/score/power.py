@@ -6,7 +6,7 @@ other way round.
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from statistics import median
@@ -168,26 +168,25 @@ def _powers(base: float, exponents: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 @lru_cache(maxsize=64)
-def smallest(episodes: int, flips: float, alpha: float = ALPHA) -> float | None:
-    """Return the smallest difference that is found with 80% power, to 0.01 points, or None."""
-    return _smallest(1 - flips, lambda margin: power(margin, episodes, flips, alpha))
+def smallest(
+    episodes: int, flips: float, alpha: float = ALPHA, *, among: bool = False
+) -> float | None:
+    """Return the smallest difference that is found with 80% power, to 0.01 points, or None.
 
+    With `among`, `flips` is the share of the episodes that differs: those of the difference are
+    among them.
+    """
 
-@lru_cache(maxsize=64)
-def _smallest_among(episodes: int, differing: float, alpha: float) -> float | None:
-    """Return the same if a share of the episodes differs, those of the difference among them."""
-    return _smallest(
-        differing, lambda margin: power(margin, episodes, max(0.0, differing - margin), alpha)
-    )
+    def is_found(margin: float) -> bool:
+        by_chance = max(0.0, flips - margin) if among else flips
+        return power(margin, episodes, by_chance, alpha) >= POWER
 
-
-def _smallest(high: float, power_of: Callable[[float], float]) -> float | None:
-    low = 0.0
-    if high <= 0 or power_of(high) < POWER:
+    low, high = 0.0, flips if among else 1 - flips
+    if high <= 0 or not is_found(high):
         return None
     while high - low > 1e-4:
         middle = (low + high) / 2
-        low, high = (low, middle) if power_of(middle) >= POWER else (middle, high)
+        low, high = (low, middle) if is_found(middle) else (middle, high)
     return high
 
 
@@ -202,7 +201,7 @@ def note(counts: Iterable[tuple[int, int, int]], tests: int) -> str:
         return ""
     n = min(MOST, max(pairs for pairs, _, _ in found))
     differing = round(median((gained + lost) / pairs for pairs, gained, lost in found), 3)
-    least = _smallest_among(n, differing, ALPHA / tests)
+    least = smallest(n, differing, ALPHA / tests, among=True)
     shown = "no difference" if least is None else f"a difference of {100 * least:.1f} points"
     corrected = f" after correction for {tests} tests" * (tests > 1)
     return (

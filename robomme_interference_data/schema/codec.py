@@ -55,19 +55,17 @@ def descriptions(record: type) -> dict[str, str]:
 def to_dict(record: Any) -> dict[str, Any]:
     """Return a record as plain values, for JSON and Arrow, columns in order."""
     write = _codec(type(record)).write
-    plain: dict[str, Any] = write(record, {}) if write else record
+    plain: dict[str, Any] = write(record) if write else record
     return plain
 
 
 def to_table(records: Iterable[Any], schema: pa.Schema) -> pa.Table:
-    """Return records as a table; parts that records share are converted once."""
-    rows = list(records)  # kept alive, because `shared` has the ids of their parts
-    shared: dict[int, Any] = {}
-    return pa.table([_column(field, rows, shared) for field in schema], schema=schema)
+    """Return records as a table; records that several lists share are converted once."""
+    rows = list(records)
+    return pa.table([_column(field, rows) for field in schema], schema=schema)
 
 
-def _column(field: pa.Field, records: Sequence[Any], shared: dict[int, Any]) -> pa.Array:
-    """Return a column; records that several lists share are converted once."""
+def _column(field: pa.Field, records: Sequence[Any]) -> pa.Array:
     if not records:
         return pa.array([], field.type)
     if field.name not in _names(records[0]):  # a part of the id
@@ -77,11 +75,11 @@ def _column(field: pa.Field, records: Sequence[Any], shared: dict[int, Any]) -> 
     if codec.write is None:
         return pa.array(values, field.type)
     if codec.item is None:
-        return pa.array([codec.write(one, shared) for one in values], field.type)
+        return pa.array([codec.write(one) for one in values], field.type)
     listed = [one for value in values for one in value]
     distinct = {id(one): one for one in listed}
     position = {key: number for number, key in enumerate(distinct)}
-    converted = [codec.item(one, shared) for one in distinct.values()]
+    converted = [codec.item(one) for one in distinct.values()]
     order = pa.array([position[id(one)] for one in listed], pa.int64())
     items = pa.array(converted, field.type.value_type).take(order)
     offsets = pa.array([0, *accumulate(map(len, values))], pa.int32())
@@ -118,22 +116,19 @@ def _names(record: Any) -> list[str]:
 
 # --- conversion by type ------------------------------------------------------------------------
 
-_Writer = Callable[[Any, dict[int, Any]], Any]
-"""Converts a value to a plain one; the dict has the results for shared values by their id."""
-
 
 @dataclass(frozen=True)
 class _Codec:
     """Conversions of a type; `arrow` takes the keys of dicts.
 
-    Without `write`, values are plain already. `item` converts one value of a list.
+    Without `write`, values are plain already. `item` is the `write` of a list's values.
     """
 
     arrow: Callable[[Sequence[str]], pa.DataType]
     read: Callable[[Any], Any]
-    write: _Writer | None = None
+    write: Callable[[Any], Any] | None = None
     optional: bool = False
-    item: _Writer | None = None
+    item: Callable[[Any], Any] | None = None
 
 
 def _codec_of(hint: Any) -> _Codec:
@@ -152,8 +147,7 @@ def _codec_of(hint: Any) -> _Codec:
 
         return _Codec(lambda keys: kind, scalar)
     if hint is EpisodeId:
-        write = _remembered(lambda value, shared: str(value))
-        return _Codec(lambda keys: pa.string(), EpisodeId.parse, write)
+        return _Codec(lambda keys: pa.string(), EpisodeId.parse, str)
     if is_dataclass(hint):
         return _record(hint)
     if origin in (tuple, dict):
@@ -169,7 +163,7 @@ def _or_none(plain: _Codec) -> _Codec:
     return _Codec(
         plain.arrow,
         lambda value: None if value is None else read(value),
-        write and (lambda value, shared: None if value is None else write(value, shared)),
+        write and (lambda value: None if value is None else write(value)),
         optional=True,
     )
 
@@ -179,7 +173,7 @@ def _list(item: _Codec) -> _Codec:
     return _Codec(
         lambda keys: pa.list_(pa.field("item", item.arrow(keys), nullable=False)),
         lambda value: tuple(map(read, _of((list, tuple), value, "a list"))),
-        lambda value, shared: [write(one, shared) for one in value] if write else list(value),
+        lambda value: list(map(write, value) if write else value),
         item=write,
     )
 
@@ -194,7 +188,7 @@ def _map(item: _Codec) -> _Codec:
     return _Codec(
         lambda keys: pa.struct([pa.field(key, item.arrow(keys), nullable=False) for key in keys]),
         checked,
-        write and (lambda value, shared: {key: write(one, shared) for key, one in value.items()}),
+        write and (lambda value: {key: write(one) for key, one in value.items()}),
     )
 
 
@@ -223,26 +217,16 @@ def _record(record: Any) -> _Codec:
                 raise ValueError(f"{name}: {first_line(error)}") from None
         return record(**values)
 
-    def write(value: Any, shared: dict[int, Any]) -> Any:
+    def write(value: Any) -> Any:
         plain = {}
         for name, codec in codecs.items():
             one = getattr(value, name)
-            plain[name] = one if codec.write is None else codec.write(one, shared)
+            plain[name] = one if codec.write is None else codec.write(one)
         if identified:
             plain |= {part: getattr(value.episode_id, part) for part in _PARTS}
         return plain
 
-    return _Codec(arrow, read, _remembered(write))
-
-
-def _remembered(write: _Writer) -> _Writer:
-    def write_once(value: Any, shared: dict[int, Any]) -> Any:
-        plain = shared.get(id(value))
-        if plain is None:
-            plain = shared[id(value)] = write(value, shared)
-        return plain
-
-    return write_once
+    return _Codec(arrow, read, write)
 
 
 def _of(types: tuple[type, ...], value: Any, expected: str) -> Any:

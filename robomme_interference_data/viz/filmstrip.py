@@ -1,7 +1,7 @@
 """Draw a history buffer as a labeled film strip: `robomme-interference show … --out strip.png`."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -75,29 +75,6 @@ def session_colors(sessions: Sequence[Session]) -> list[str]:
     families = dict.fromkeys(s.family for s in sessions if s.role != "lesson")
     by_family = {family: COLORS[n % len(COLORS)] for n, family in enumerate(families)}
     return [LESSON_COLOR if s.role == "lesson" else by_family[s.family] for s in sessions]
-
-
-def draw_bar(
-    page: Page,
-    buffer: "Buffer",
-    place: tuple[float, float, float, float],
-    names: Callable[[int, Session], Sequence[str]],
-) -> None:
-    """Draw the sessions to scale, with the first of their names that fits, and the evidence.
-
-    `place` is the bar's left edge, top, inches per frame and height.
-    """
-    left, top, scale, height = place
-    for number, color in enumerate(session_colors(buffer.sessions)):
-        session = buffer.sessions[number]
-        x, width = left + session.start * scale, len(session) * scale
-        page.box(x, top, width, height, fill=color, edge="white", line=0.5)
-        for name in names(number, session):
-            if page.text_width(name, 6, bold=True) < width:
-                y = top + height / 2 - 0.05
-                page.text(x + width / 2, y, name, 6, bold=True, color=ink_on(color))
-                break
-    mark_evidence(page, buffer, left, scale, top + height)
 
 
 def mark_evidence(page: Page, buffer: "Buffer", left: float, scale: float, bottom: float) -> None:
@@ -232,7 +209,16 @@ def _draw_timeline(page: Page, buffer: "Buffer", top: float) -> None:
         caption += "; dark line: shows the answer"
     page.text(_MARGIN, top, caption, 6.5, align="left", color=_GRAY)
     bar, sample = top + 0.44, even_sample(len(buffer))
-    draw_bar(page, buffer, (_MARGIN, bar, scale, _BAR), lambda n, s: (f"{n} {s.role}", str(n)))
+    for number, color in enumerate(session_colors(buffer.sessions)):
+        session = buffer.sessions[number]
+        x, wide = _MARGIN + session.start * scale, len(session) * scale
+        page.box(x, bar, wide, _BAR, fill=color, edge="white", line=0.5)
+        for name in (f"{number} {session.role}", str(number)):  # the first that fits
+            if page.text_width(name, 6, bold=True) < wide:
+                y = bar + _BAR / 2 - 0.05
+                page.text(x + wide / 2, y, name, 6, bold=True, color=ink_on(color))
+                break
+    mark_evidence(page, buffer, _MARGIN, scale, bar + _BAR)
     for index in sample:
         page.tick(_MARGIN + (index + 0.5) * scale, bar - 0.1, bar - 0.02)
     for session in buffer.sessions:

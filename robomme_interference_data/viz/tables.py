@@ -19,10 +19,6 @@ from robomme_interference_data.schema.codec import arrow_schema, to_dict
 Kind = Literal["text", "count", "rate", "points", "ratio", "number", "p", "flag"]
 
 
-class Provisional(float):
-    """A p-value of incomplete data, shown with †."""
-
-
 @dataclass(frozen=True)
 class Column:
     """A column.
@@ -94,8 +90,10 @@ class Table:
         return sides, heads, [self.cells(row) for row in self.rows]
 
     def cells(self, row: Sequence[Any]) -> list[str]:
-        """Return a row as text."""
-        return [_shown(v, c.kind) for v, c in zip(row, self.columns, strict=True)]
+        """Return a row as text; p-values of a row that is not complete are marked with †."""
+        early = any(c.name == "complete" and not v for v, c in zip(row, self.columns, strict=True))
+        cells = [(_shown(v, c.kind), c.kind) for v, c in zip(row, self.columns, strict=True)]
+        return [f"{cell}†" if early and cell and kind == "p" else cell for cell, kind in cells]
 
     def markdown(self) -> str:
         """Return the table as Markdown, under its title."""
@@ -218,9 +216,8 @@ def points(value: float) -> str:
 
 
 def p_text(value: float) -> str:
-    """Return a p-value as `0.031` or `< 0.001`, with † if provisional."""
-    text = "< 0.001" if value < 0.001 else f"{value:.3f}"
-    return f"{text}†" if isinstance(value, Provisional) else text
+    """Return a p-value as `0.031` or `< 0.001`."""
+    return "< 0.001" if value < 0.001 else f"{value:.3f}"
 
 
 def _known(value: Any) -> Any:

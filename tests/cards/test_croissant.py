@@ -1,8 +1,6 @@
 """`croissant.json`: what the reference library reads of it, and what dataset tracks ask for."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -77,21 +75,6 @@ def test_every_column_is_described(record: type) -> None:
     assert {one.name for one in columns} == {*arrow_schema(record).names} - {"feature_sha256"}
     for column in (part for one in columns for part in (one, *one.parts)):
         assert column.meaning.endswith((".", "…")) and "`" not in column.meaning, column.name
-
-
-OPTIMIZED = """
-from robomme_interference_data.cards.tables import columns_of
-from robomme_interference_data.schema.manifest import BufferManifest
-
-print(all(part.meaning for one in columns_of(BufferManifest) for part in (one, *one.parts)))
-"""
-
-
-def test_columns_are_described_without_docstrings() -> None:
-    done = subprocess.run(
-        [sys.executable, "-OO", "-c", OPTIMIZED], capture_output=True, text=True, check=True
-    )
-    assert done.stdout == "True\n"
 
 
 @pytest.mark.parametrize(("buffer_set", "has_questions"), [(TABLETOP, True), (GOLDEN, False)])

@@ -218,16 +218,3 @@ def test_versions_are_tags() -> None:
 )
 def test_the_next_version(before: dict[str, str], now: dict[str, str], following: str) -> None:
     assert str(Version(1, 2, 3).following(before, now)) == following
-
-
-PARTS = st.dictionaries(st.sampled_from("abc"), st.sampled_from("12"))
-
-
-@given(st.builds(Version, *[st.integers(0, 50)] * 3), PARTS, PARTS)
-def test_the_next_version_is_later(
-    version: Version, before: dict[str, str], now: dict[str, str]
-) -> None:
-    following = version.following(before, now)
-    assert version < following <= Version(version.major + 1, 0, 0)
-    assert Version.parse(str(version)) == version
-    assert versions_of({version.tag: "a"}) == {version: "a"}

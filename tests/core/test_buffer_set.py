@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from support.buffer_sets import CONDITIONS, GOLDEN, QUERIES
+from support.damage import HEADER, ROWS, edit, renew_header
 from support.lerobot_layouts import edit_columns, edit_info
 
 from robomme_interference_data import (
@@ -34,10 +34,6 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.storage.encode import CODECS, VideoEncoder
-from robomme_interference_data.storage.files import sha256_file
-
-HEADER = "manifests/manifest.json"
-ROWS = "manifests/buffers.parquet"
 
 
 def test_what_a_buffer_set_lists() -> None:
@@ -257,10 +253,6 @@ def test_damaged_headers(own_buffers: Path, before: str, after: str) -> None:
         load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
 
 
-def rewritten(path: Path, change: Any) -> None:
-    pq.write_table(change(pq.read_table(path)), path)
-
-
 @pytest.mark.parametrize(
     "columns",
     [
@@ -277,7 +269,7 @@ def test_damaged_rows(own_buffers: Path, columns: dict[str, Any]) -> None:
 
 
 def test_a_key_that_occurs_twice(own_buffers: Path) -> None:
-    rewritten(own_buffers / ROWS, lambda table: pa.concat_tables([table, table.slice(8, 1)]))
+    edit(own_buffers / ROWS, lambda table: pa.concat_tables([table, table.slice(8, 1)]))
     with pytest.raises(FormatError, match="2 rows of MoveCube/test/0 under k3"):
         load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
 
@@ -288,8 +280,7 @@ def other_goals(root: Path) -> None:
 
 def other_goals_with_their_sum(root: Path) -> None:
     other_goals(root)
-    header = json.loads((root / HEADER).read_text())
-    (root / HEADER).write_text(json.dumps(header | {"rows": sha256_file(root / ROWS)}))
+    renew_header(root)
 
 
 def shorter_lesson(root: Path) -> None:
@@ -360,7 +351,7 @@ def test_features_that_are_not_as_they_must_be(
 
 
 def test_a_row_that_is_missing(own_buffers: Path) -> None:
-    rewritten(own_buffers / ROWS, lambda table: table.slice(0, 3))
+    edit(own_buffers / ROWS, lambda table: table.slice(0, 3))
     with pytest.raises(UnknownNameError):
         load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
     with pytest.raises(FormatError, match="no row of VideoRepick/test/0 under k7"):

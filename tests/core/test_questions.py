@@ -8,7 +8,9 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from support import damage
 from support.buffer_sets import copy_buffer_set
+from support.lerobot_layouts import edit_columns
 from support.tabletop import QUERIES, TABLETOP, copy_tabletop
 
 from robomme_interference_data import load_buffer_set
@@ -88,21 +90,9 @@ def test_the_golden_questions() -> None:
 # --- invalid questions -------------------------------------------------------------------------
 
 
-def rewrite(root: Path, change: Callable[[pa.Table], pa.Table]) -> None:
-    path = root / QUESTIONS_PATH
-    pq.write_table(change(pq.read_table(path)), path)
-
-
 def put(name: str, value: Any) -> Callable[[pa.Table], pa.Table]:
     """Another value in the first row of a column."""
-
-    def change(table: pa.Table) -> pa.Table:
-        values = table.column(name).to_pylist()
-        place, field = table.column_names.index(name), table.schema.field(name)
-        loose = pa.field(name, field.type)
-        return table.set_column(place, loose, pa.array([value, *values[1:]], field.type))
-
-    return change
+    return lambda table: damage.put(table, name, [value, *table[name].to_pylist()[1:]])
 
 
 DAMAGED: dict[str, tuple[Callable[[pa.Table], pa.Table], str]] = {
@@ -121,7 +111,7 @@ DAMAGED: dict[str, tuple[Callable[[pa.Table], pa.Table], str]] = {
 def test_damage_is_one_error(tmp_path: Path, name: str) -> None:
     change, words = DAMAGED[name]
     root = copy_tabletop(tmp_path / "buffer_set")
-    rewrite(root, change)
+    damage.edit(root / QUESTIONS_PATH, change)
     with pytest.raises(FormatError) as raised:
         read_questions(load_buffer_set(root))
     assert words in raised.value.message and str(root / QUESTIONS_PATH) in raised.value.message
@@ -138,7 +128,7 @@ def test_questions_of_other_demonstrations_are_stale(
     tmp_path: Path, change: Any, words: str
 ) -> None:
     root = copy_tabletop(tmp_path / "buffer_set")
-    rewrite(root, change)
+    damage.edit(root / QUESTIONS_PATH, change)
     with pytest.raises(FormatError, match=words) as raised:
         read_questions(load_buffer_set(root))
     assert raised.value.command == f"build questions {root}"
@@ -146,7 +136,7 @@ def test_questions_of_other_demonstrations_are_stale(
 
 def test_further_columns_are_left_aside(tmp_path: Path) -> None:
     root = copy_tabletop(tmp_path / "buffer_set")
-    rewrite(root, lambda table: table.append_column("colour", pa.array(["red"] * len(table))))
+    edit_columns(root / QUESTIONS_PATH, colour=pa.array(["red"] * len(QUERIES)))
     assert len(read_questions(load_buffer_set(root))) == len(QUERIES)
 
 

@@ -23,7 +23,7 @@ def test_a_terminal_gets_aligned_columns() -> None:
         "system      n   rate  change  kept        p  complete",
         "------  -----  -----  ------  ----  -------  --------",
         "a|b     1,234  44.9%    −3.0  0.67  < 0.001  yes",
-        "c                        0.0  0.00    1.000  no",
+        "c                        0.0  0.00   1.000†  no",
         "",
         "How to read it.",
     ]

@@ -3,12 +3,12 @@
 import json
 from collections import Counter
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from support.pages import RESULTS, table
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.tables.paper import by_family
@@ -18,17 +18,14 @@ from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.simulators.robomme.scenes import OfficialScene, read_scene
 from robomme_interference_data.stats.intervals import wilson
 
-RESULTS = Path(__file__).parents[2] / "docs" / "results"
 PAGE = (RESULTS / "robomme-ceilings.md").read_text(encoding="utf-8")
 LESSONS: list[dict[str, Any]] = pq.read_table(RESULTS / "robomme/lessons.parquet").to_pylist()
 ROLLOUTS: list[dict[str, Any]] = pq.read_table(RESULTS / "robomme/rollouts.parquet").to_pylist()
 
 
-def table(head: str) -> list[list[str]]:
-    """The cells of the page's table whose head contains a text."""
-    blocks = (part.splitlines() for part in PAGE.split("\n\n"))
-    [lines] = (block for block in blocks if block[0].startswith("|") and head in block[0])
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+def rows(head: str) -> list[list[str]]:
+    """The rows of the page's table with a column."""
+    return [[*row.values()] for row in table(PAGE, head)]
 
 
 def family_of(lesson: dict[str, Any]) -> str:
@@ -77,7 +74,7 @@ def test_ceilings_follow_from_the_lessons() -> None:
         assert scene.agreeing(parts) == [scene.own_answer(0)]
         assert {chance(lesson, "framesamp", k) for k in (0, 1, 3, 7, 15)} == {1.0}
         assert {chance(lesson, "full", k) for k in (0, 31)} == {1.0}
-    for family, frames, by_chance, most, two, k31, *windows in table("lesson frames"):
+    for family, frames, by_chance, most, two, k31, *windows in rows("lesson frames"):
         lessons = [one for one in LESSONS if family_of(one) == family]
         lengths = [one["lesson_frames"] for one in lessons]
         assert frames == f"{min(lengths)} to {max(lengths)}"
@@ -121,7 +118,7 @@ def test_rollouts_are_counted() -> None:
     found = {(one["system"], one["condition"]) for one in ROLLOUTS}
     assert found == {column for columns in tables.values() for column in columns}
     for head, columns in tables.items():
-        for family, *cells in table(head):
+        for family, *cells in rows(head):
             for (system, condition), cell in zip(columns, cells, strict=True):
                 key = system, condition, family
                 assert cell == counted(*key), key
@@ -143,17 +140,19 @@ def test_played_and_computed_agree() -> None:
     """Of 18 cells of ten rollouts each, the 99.9% intervals contain the computed mean."""
     for system, condition in (("framesamp", 7), ("framesamp", 31), ("window", 0), ("window", 1)):
         for family in FAMILIES:
-            rows = [
+            played = [
                 one
                 for one in ROLLOUTS
                 if (one["system"], one["condition"], one["family"])
                 == (f"recall-{system}", f"k{condition}", family)
                 and one["status"] != "error"
             ]
-            names = {f"{family}/test/{one['episode']}" for one in rows}
+            names = {f"{family}/test/{one['episode']}" for one in played}
             lessons = [one for one in LESSONS if one["episode_id"] in names]
             expected = sum(chance(one, system, condition) for one in lessons) / len(lessons)
-            low, high = wilson(sum(one["status"] == "success" for one in rows), len(rows), 0.999)
+            low, high = wilson(
+                sum(one["status"] == "success" for one in played), len(played), 0.999
+            )
             assert low - 1e-9 <= expected <= high + 1e-9, (system, condition, family)
 
 
@@ -161,13 +160,13 @@ def test_published_rates() -> None:
     rates = {(one.system, one.condition, one.part): round(one.rate * 50) for one in by_family()}
     systems = [("perceptual-framesamp-modul", k) for k in ("k0", "k1", "k3", "k7")]
     systems.append(("retrieval-framesamp-modul", "k7"))
-    *rows, total = table("with retrieval, k7")
-    for family, *cells, ceiling in rows:
+    *families, total = rows("with retrieval, k7")
+    for family, *cells, ceiling in families:
         assert cells == [f"{2 * rates[(*one, family)]}%" for one in systems]
         assert ceiling == "100.0%"
     won = [sum(rates[(*one, family)] for family in FAMILIES) for one in systems]
     assert total[1:-1] == [f"{100 * one / 450:.1f}%" for one in won]
-    assert [row[0] for row in rows] == list(FAMILIES)
+    assert [row[0] for row in families] == list(FAMILIES)
 
 
 PARTS = {
@@ -202,9 +201,9 @@ def test_what_else_reveals_the_answer() -> None:
 
     everything = measured(LESSONS)
     viewed = measured([one for one in LESSONS if one["live_view"]])
-    rows = table("most frequent value")
-    assert {(family, what) for family, what, *_ in rows} == {*PARTS}
-    for family, what, *cells in rows:
+    parts = rows("most frequent value")
+    assert {(family, what) for family, what, *_ in parts} == {*PARTS}
+    for family, what, *cells in parts:
         key = family, PARTS[family, what]
         found, seen = everything[key], viewed[key]
         assert found.queries == 50

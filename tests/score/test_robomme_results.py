@@ -1,17 +1,16 @@
 """What docs/results/robomme.md tells is what its rows say."""
 
 import re
-from pathlib import Path
 
 import pytest
 from support import scoring as made
+from support.pages import RESULTS, table
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.scoring import Score
 
-ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "results" / "robomme.md").read_text(encoding="utf-8")
-FILES = sorted((ROOT / "docs" / "results").glob("*.csv"))
+PAGE = (RESULTS / "robomme.md").read_text(encoding="utf-8")
+FILES = sorted(RESULTS.glob("*.csv"))
 
 
 @pytest.fixture(scope="module")
@@ -19,19 +18,10 @@ def found() -> Score:
     return made.score(*FILES, paper=True)
 
 
-def table(first: str) -> list[dict[str, str]]:
-    """The rows of the page's table that begins with a column."""
-    block = next(part for part in PAGE.split("\n\n") if part.startswith(f"| {first} |"))
-    head, _, *lines = (
-        [cell.strip() for cell in line.strip("|").split("|")] for line in block.splitlines()
-    )
-    return [dict(zip(head, line, strict=True)) for line in lines]
-
-
 def test_successes_are_those_of_the_rows(found: Score) -> None:
     cells = {(cell.system, cell.condition, cell.part): cell for cell in found.cells if cell.n}
     told = set()
-    for row in table("system"):
+    for row in table(PAGE, "system"):
         system, condition = row.pop("system").strip("`"), row.pop("condition")
         for family, text in row.items():
             if text == "–":
@@ -49,7 +39,7 @@ def test_successes_are_those_of_the_rows(found: Score) -> None:
 
 
 def test_published_rates_are_of_the_same_kind_of_memory(found: Score) -> None:
-    for row in table("family"):
+    for row in table(PAGE, "family"):
         ours, theirs = (row[name].strip("`") for name in ("ours", "released"))
         kept = "retrieval-framesamp-modul" if "retrieval" in ours else "perceptual-framesamp-modul"
         assert theirs == kept and "framesamp" in ours
@@ -60,14 +50,14 @@ def test_published_rates_are_of_the_same_kind_of_memory(found: Score) -> None:
         change, low, high = (f"{100 * end:+.0f}" for end in ends)
         rates = (f"{100 * one['rate']:.0f}%", f"{100 * one['published_rate']:.0f}%")
         assert told == (str(one["n"]), *rates, f"{change} ({low} to {high})")
-    assert len(table("family")) == 12
+    assert len(table(PAGE, "family")) == 12
 
 
 def test_every_failure_is_told(found: Score) -> None:
     """Those of MoveCube, and without history, in a line each; of the others every episode."""
     told = {
         (row["system"].strip("`"), row["condition"], family, int(number))
-        for row in table("system | condition | episodes")
+        for row in table(PAGE, "system | condition | episodes")
         for family, numbers in re.findall(r"([A-Z]\w+) ([\d, ]+)", row["episodes"])
         for number in re.findall(r"\d+", numbers)
         if family != "MoveCube"

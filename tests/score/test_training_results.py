@@ -1,12 +1,10 @@
 """The tables of docs/results/training.md are those of its rows."""
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import pyarrow.parquet as pq
 import pytest
+from support.pages import RESULTS, table
 
-RESULTS = Path(__file__).parents[2] / "docs" / "results"
+PAGE = (RESULTS / "training.md").read_text(encoding="utf-8")
 Rows = dict[tuple[str, str, str], list[bool]]
 
 
@@ -32,18 +30,8 @@ def percent(rows: Rows, system: str, condition: str, family: str | None = None) 
     return f"{100 * sum(chosen) / len(chosen):.1f}" if chosen else ""
 
 
-def table(first: str) -> Iterator[dict[str, str]]:
-    """Yield the rows of the table whose first column has this title."""
-    blocks = (RESULTS / "training.md").read_text().split("\n\n")
-    head, _, *lines = next(one for one in blocks if one.startswith(f"| {first} |")).splitlines()
-    names = [cell.strip() for cell in head.strip("| ").split(" | ")]
-    for line in lines:
-        cells = [cell.strip() for cell in line.removeprefix("|").removesuffix("|").split("|")]
-        yield dict(zip(names, cells, strict=True))
-
-
 def test_rates_by_condition(rows: Rows) -> None:
-    listed = list(table("system"))
+    listed = table(PAGE, "system")
     assert len(listed) >= 10
     for line in listed:
         system = line.pop("system").strip("`")
@@ -53,7 +41,7 @@ def test_rates_by_condition(rows: Rows) -> None:
 
 
 def test_rates_by_family(rows: Rows) -> None:
-    for line in table("family"):
+    for line in table(PAGE, "family"):
         family = line.pop("family")
         for title, rate in line.items():
             system, condition = title.split()
@@ -61,7 +49,7 @@ def test_rates_by_family(rows: Rows) -> None:
 
 
 def test_what_training_with_interference_changes(rows: Rows) -> None:
-    for line in table("condition"):
+    for line in table(PAGE, "condition"):
         with_, without = (
             float(percent(rows, system, line["condition"]))
             for system in ("learned-mixture", "learned-k0")

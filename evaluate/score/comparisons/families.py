@@ -15,11 +15,12 @@ from robomme_interference_data.stats.bootstrap import (
     generator_of,
     varies_enough,
 )
+from robomme_interference_data.stats.significance import holm
 from robomme_interference_data.viz.tables import Table
 
 from .contrast import Contrast
 from .pairs import pair
-from .tables import CELLS, TableSpec, comparison_table, corrected, provisional
+from .tables import CELLS, TableSpec, comparison_table
 
 DRAWS = 2000
 """Random signs, and draws of families and episodes."""
@@ -81,10 +82,9 @@ def families_table(every: Iterable[Outcomes], contrasts: Sequence[Contrast]) -> 
             continue
         values = np.stack([differences for _, differences, _ in found], axis=1)
         numbers = over_families(values, labels, outcomes.simulator)
-        holms = corrected([float(p) for *_, p in numbers], [0] * len(found))
+        holms = holm([p for *_, p in numbers])
         for (one, _, count), estimates, p_holm in zip(found, numbers, holms, strict=True):
             ps = {"p_families": estimates[-1], "p_families_holm": p_holm}
-            ps = {name: provisional(p, one.complete) for name, p in ps.items()}
             more = {"families": count, **dict(zip(_COLUMNS, estimates, strict=True)), **ps}
             rows.append(replace(one, table="families", more=more))
     return comparison_table("families", rows, _SPEC)

@@ -14,6 +14,8 @@ from robomme_interference_data.viz.tables import Table
 from .contrast import Contrast
 from .pairs import Pairs, compare_unpaired, pair
 
+_Compared = dict[tuple[str, str], Pairs]
+
 
 def against(outcomes: Outcomes, condition: str, one: str, other: str, here: Flags) -> Pairs:
     """Compare `one` with the `other`, unpaired where histories differ, over some episodes."""
@@ -23,9 +25,7 @@ def against(outcomes: Outcomes, condition: str, one: str, other: str, here: Flag
     return compare_unpaired(*map(rate_of, sides))
 
 
-def all_pairs(
-    outcomes: Outcomes, condition: str, systems: Sequence[str], here: Flags
-) -> dict[tuple[str, str], Pairs]:
+def all_pairs(outcomes: Outcomes, condition: str, systems: Sequence[str], here: Flags) -> _Compared:
     """Compare each pair of systems, the first with the second, over some episodes."""
     two = combinations(systems, 2)
     return {both: against(outcomes, condition, *both, here) for both in two}
@@ -57,11 +57,20 @@ def tied_with_best(systems: Sequence[str], compared: Mapping[tuple[str, str], Pa
     return {name for name, (first, _) in bounds.items() if first == 1}
 
 
-def ranked(outcomes: Outcomes) -> Iterator[tuple[str, list[str]]]:
-    """Yield each condition and the systems ranked in it: complete cells, no references."""
+def ranked(outcomes: Outcomes) -> Iterator[tuple[str, dict[str, float], _Compared]]:
+    """Yield each condition with several ranked systems, their rates, and each pair compared.
+
+    Ranked are complete cells, of systems that are no references.
+    """
+    every: Flags = np.ones(len(outcomes.episodes), bool)
     for place, condition in enumerate(outcomes.conditions):
-        whole = zip(outcomes.systems, outcomes.complete[:, place], strict=True)
-        yield condition, [system for system, has in whole if has and not is_reference(system)]
+        rates = {
+            system: rate_of(outcomes.status[at, place]).value
+            for at, system in enumerate(outcomes.systems)
+            if outcomes.complete[at, place] and not is_reference(system)
+        }
+        if len(rates) > 1:
+            yield condition, rates, all_pairs(outcomes, condition, list(rates), every)
 
 
 def systems_of(outcomes: Outcomes) -> list[Contrast]:
@@ -71,16 +80,12 @@ def systems_of(outcomes: Outcomes) -> list[Contrast]:
     """
     every: Flags = np.ones(len(outcomes.episodes), bool)
     found = {"systems": list[Contrast](), "matrix": list[Contrast]()}
-    for condition, systems in ranked(outcomes):
-        if len(systems) < 2:
-            continue
-        compared = all_pairs(outcomes, condition, systems, every)
+    for condition, rates, compared in ranked(outcomes):
         ps = zip(compared, holm([pairs.p for pairs in compared.values()]), strict=True)
         corrected = {frozenset(both): p for both, p in ps}
-        rates = [rate_of(outcomes.status[outcomes.cell(one, condition)]).value for one in systems]
-        best = systems[rates.index(max(rates))]
+        best = max(rates, key=lambda one: rates[one])
         rows = [("matrix", *both, pairs) for both, pairs in compared.items()]
-        for one in systems:
+        for one in rates:
             if one != best:
                 rows.append(("systems", one, best, against(outcomes, condition, one, best, every)))
         for table, one, other, pairs in rows:
@@ -97,18 +102,11 @@ def rank_table(every: Iterable[Outcomes]) -> Table:
     """Return the rank of each ranked system, and the ranks that it can have."""
     rows = []
     for outcomes in every:
-        here: Flags = np.ones(len(outcomes.episodes), bool)
-        for condition, systems in ranked(outcomes):
-            if len(systems) < 2:
-                continue
-            bounds = rank_bounds(systems, all_pairs(outcomes, condition, systems, here))
-            cells = [outcomes.status[outcomes.cell(one, condition)] for one in systems]
-            rates = {name: rate_of(cell).value for name, cell in zip(systems, cells, strict=True)}
-            rows += [
-                (outcomes.simulator, condition, name, rate, rank, *bounds[name])
-                for name, rate in rates.items()
-                for rank in [1 + sum(other > rate for other in rates.values())]
-            ]
+        for condition, rates, compared in ranked(outcomes):
+            bounds = rank_bounds(list(rates), compared)
+            for name, rate in rates.items():
+                rank = 1 + sum(other > rate for other in rates.values())
+                rows.append((outcomes.simulator, condition, name, rate, rank, *bounds[name]))
     return Table.make(
         "ranks",
         "Ranks of systems",

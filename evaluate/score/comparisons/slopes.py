@@ -18,12 +18,13 @@ from robomme_interference_data.stats.bootstrap import (
     known_interval,
     slope_weights,
 )
+from robomme_interference_data.stats.significance import holm
 from robomme_interference_data.stats.signs import sign_flips, vector_sign_flips
 from robomme_interference_data.viz.tables import Table
 
 from .contrast import Contrast
 from .pairs import Pairs
-from .tables import corrected, provisional, provisional_note
+from .tables import tested
 
 
 def _falling(outcomes: Outcomes, *systems: str) -> list[str]:
@@ -46,7 +47,7 @@ def _numbers(conditions: Iterable[str]) -> list[int]:
 def decay_table(every: Iterable[Outcomes], draws: int = DRAWS) -> Table:
     """Return each system's log-linear decay over the sessions in the buffer."""
     rows = [row for outcomes in every for row in _decays(outcomes, draws)]
-    return Table.make(
+    return tested(
         "decay",
         "Decay over sessions",
         "simulator system conditions n:count slope:points low:points high:points p:p p_holm:p "
@@ -57,8 +58,7 @@ def decay_table(every: Iterable[Outcomes], draws: int = DRAWS) -> Table:
         f"if at least {MIN_EPISODES} episodes contribute to the slope. p: sign-flip test of no "
         "trend. p fit: whether the rates depart from the line, by sign flips of the episodes' "
         "departures; if they do, the slope describes the fall only on average. p holm and "
-        "p fit holm: after Holm's correction among the systems of a simulator."
-        + provisional_note(row[-1] for row in rows),
+        "p fit holm: after Holm's correction among the systems of a simulator.",
     )
 
 
@@ -68,25 +68,21 @@ def _decays(outcomes: Outcomes, draws: int) -> list[tuple[object, ...]]:
     if not found:
         return []
     values = [_values(outcomes, system, conditions) for system, conditions in found.items()]
-    slopes = np.stack([v @ _weights(c) for v, c in zip(values, found.values(), strict=True)], 1)
+    slopes = np.stack(
+        [v @ slope_weights(_numbers(c)) for v, c in zip(values, found.values(), strict=True)], 1
+    )
     ps = [one.p for one in sign_flips(slopes.round(12), key, draws)]
     fits = _fits(values, list(found.values()), key, draws)
-    alike = [0] * len(found)
-    tests = zip(ps, corrected(ps, alike), fits, corrected(fits, alike), strict=True)
     rows = list[tuple[object, ...]]()
-    for (system, conditions), each, four in zip(found.items(), slopes.T, tests, strict=True):
+    for (system, conditions), each, *both in zip(found.items(), slopes.T, ps, fits, strict=True):
         here = outcomes.has_episode[outcomes.systems.index(system)]
         [fall] = bootstrap(each[here, None], key, draws)
         changing = each[~np.isnan(each)]
         known = known_interval(fall, changing)
         whole = all(bool(outcomes.complete[outcomes.cell(system, c)]) for c in conditions)
         names = (key, system, " ".join(conditions), len(changing))
-        rows.append((*names, *known, *(provisional(p, whole) for p in four), whole))
+        rows.append((*names, *known, *both, whole))
     return rows
-
-
-def _weights(conditions: Sequence[str]) -> Floats:
-    return slope_weights(_numbers(conditions))
 
 
 def _fits(
@@ -112,14 +108,14 @@ def interactions_of(outcomes: Outcomes, draws: int = DRAWS) -> list[Contrast]:
             continue
         both = [_values(outcomes, name, conditions) for name in (other, one)]
         pairs.append((one, other, conditions))
-        slopes.append([values @ _weights(conditions) for values in both])
+        slopes.append([values @ slope_weights(_numbers(conditions)) for values in both])
         apart.append(both[1] - both[0])
     if not pairs:
         return []
     changes = np.stack([(after - before).round(12) for before, after in slopes], axis=1)
     tests = sign_flips(changes, outcomes.simulator, draws)
     fits = _fits(apart, [conditions for *_, conditions in pairs], outcomes.simulator, draws)
-    both_fits = list(zip(fits, corrected(fits, [0] * len(fits)), strict=True))
+    both_fits = list(zip(fits, holm(fits), strict=True))
     found = []
     for (one, other, conditions), sides, step, test, fit in zip(
         pairs, slopes, changes.T, tests, both_fits, strict=True
@@ -134,9 +130,6 @@ def interactions_of(outcomes: Outcomes, draws: int = DRAWS) -> list[Contrast]:
         names = (outcomes.simulator, one, conditions[-1], (other, conditions[-1]), "interaction")
         complete = all(bool(outcomes.complete[cell]) for cell in every)
         more: dict[str, object] = {"conditions": " ".join(conditions)}
-        more |= {
-            name: provisional(p, complete)
-            for name, p in zip(("p_fit", "p_fit_holm"), fit, strict=True)
-        }
+        more |= dict(zip(("p_fit", "p_fit_holm"), fit, strict=True))
         found.append(Contrast(*names, compared, complete, more=more))
     return found

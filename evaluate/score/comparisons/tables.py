@@ -12,7 +12,7 @@ from robomme_interference_data.evaluate.score import power
 from robomme_interference_data.stats.intervals import cohens_h
 from robomme_interference_data.stats.significance import ALPHA, holm
 from robomme_interference_data.stats.signs import simultaneous
-from robomme_interference_data.viz.tables import Provisional, Table
+from robomme_interference_data.viz.tables import Table
 
 from .contrast import Contrast
 
@@ -37,8 +37,8 @@ _VALUES: dict[str, tuple[str, Callable[[Contrast], Any]]] = {
     "interval": ("text", lambda c: c.pairs.interval),
     **{name: ("count", partial(_count, name)) for name in ("pairs", "gained", "lost")},
     "flips": ("rate", lambda c: c.pairs.flips),
-    "p": ("p", lambda c: provisional(c.pairs.p, c.complete)),
-    "p_mid": ("p", lambda c: provisional(c.pairs.p_mid, c.complete)),
+    "p": ("p", lambda c: c.pairs.p),
+    "p_mid": ("p", lambda c: c.pairs.p_mid),
     "cohens_h": ("ratio", lambda c: cohens_h(c.pairs.second, c.pairs.first)),
     "retention": ("ratio", lambda c: c.retention.value),
     "retention_low": ("ratio", lambda c: c.retention.low),
@@ -156,7 +156,7 @@ def comparison_table(
     for one, p_holm in zip(found, holms, strict=True):
         tests = one.more.get("tests", groups[spec.group(one)])
         joint = one.pairs.at(simultaneous(tests, spec.alpha))
-        more = {"p_holm": provisional(p_holm, one.complete), **one.more}
+        more = {"p_holm": p_holm, **one.more}
         more |= {"joint_low": joint.low, "joint_high": joint.high}
         rows.append(tuple(more[key] if key in more else _VALUES[key][1](one) for _, key in columns))
     correct = _CORRECT.format(among=spec.among)
@@ -176,14 +176,21 @@ def _column(text: str) -> tuple[str, str]:
     return f"{name}:{kind or _VALUES[value][0]}", value
 
 
-def provisional(p: float, complete: bool) -> float:
-    """Return a p-value, marked as provisional if a cell is incomplete."""
-    return p if complete else Provisional(p)
+def tested(name: str, title: str, columns: str, rows: Iterable[Sequence[Any]], note: str) -> Table:
+    """Return a table of tests of one simulator each, the first column; the last is `complete`.
 
-
-def provisional_note(complete: Iterable[object]) -> str:
-    """Return the end of a note if some rows are not complete, else nothing."""
-    return "" if all(complete) else " p†: provisional, because a cell is incomplete."
+    Rows lack the columns `…_holm`: p of the column before, after Holm's correction within the
+    simulator. The note explains marks of rows that are not complete.
+    """
+    found = [list(row) for row in rows]
+    for place, column in enumerate(columns.split()):
+        if column.endswith("_holm:p"):
+            ps = corrected([row[place - 1] for row in found], [row[0] for row in found])
+            for row, p in zip(found, ps, strict=True):
+                row.insert(place, p)
+    if not all(row[-1] for row in found):
+        note += " p†: provisional, because a cell is incomplete."
+    return Table.make(name, title, columns, map(tuple, found), note)
 
 
 def corrected(p_values: Sequence[float], groups: Sequence[Hashable]) -> list[float]:

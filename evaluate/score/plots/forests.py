@@ -34,10 +34,6 @@ _Groups = dict[str, dict[str, Contrast]]
 """Label of a comparison to each system's contrast."""
 
 
-def _change(one: Contrast) -> Interval:
-    return one.pairs.change
-
-
 def _forest(
     figure: Any,
     data: Data,
@@ -45,7 +41,7 @@ def _forest(
     rows: Mapping[str, str],
     title: str,
     *notes: str,
-    value: Callable[[Contrast], Interval] = _change,
+    value: Callable[[Contrast], Interval] = lambda one: one.pairs.change,
     scale: float = 100,
     guides: Sequence[float] = (0,),
     band: float = 0.0,

@@ -3,11 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping
 
-from robomme_interference_data.evaluate.score.comparisons.tables import (
-    corrected,
-    provisional,
-    provisional_note,
-)
+from robomme_interference_data.evaluate.score.comparisons.tables import tested
 from robomme_interference_data.evaluate.score.outcomes import Outcomes
 from robomme_interference_data.stats.intervals import above_chance
 from robomme_interference_data.stats.significance import ALPHA, poisson_binomial
@@ -35,25 +31,22 @@ _REPEATS = (
 def chance_table(outcomes: Mapping[str, Outcomes], cells: Iterable[Cell]) -> Table:
     """Return how far above chance each cell is whose episodes are all questions."""
     found = [one for one in cells if not (one.part or math.isnan(one.chance))]
-    ps = [_p(outcomes[one.simulator], one) for one in found]
-    tests = zip(found, ps, corrected(ps, [one.simulator for one in found]), strict=True)
     rows = [
         (
             *(cell.simulator, cell.system, cell.condition, cell.n, cell.rate, cell.chance),
             *(above_chance(one, cell.chance) for one in (cell.rate, *cell.interval)),
-            *(provisional(one, cell.complete) for one in p),
-            cell.complete,
+            *(_p(outcomes[cell.simulator], cell), cell.complete),
         )
-        for cell, *p in tests
+        for cell in found
     ]
     repeated = any(sum(cell.counts) - cell.errors > cell.n for cell in found)
-    return Table.make(
+    return tested(
         "chance",
         "Against chance",
         "simulator system condition n:count rate:rate chance:rate above:ratio low:ratio high:ratio "
         "p:p p_holm:p complete:flag",
         rows,
-        _NOTE + _REPEATS * repeated + provisional_note(cell.complete for cell in found),
+        _NOTE + _REPEATS * repeated,
     )
 
 

@@ -7,11 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.evaluate.score.comparisons.pairs import pair
-from robomme_interference_data.evaluate.score.comparisons.tables import (
-    corrected,
-    provisional,
-    provisional_note,
-)
+from robomme_interference_data.evaluate.score.comparisons.tables import tested
 from robomme_interference_data.evaluate.score.outcomes import Outcomes, Statuses, counting, rate_of
 from robomme_interference_data.evaluate.systems import is_reference, known_system
 from robomme_interference_data.stats.strata import mantel_haenszel
@@ -85,7 +81,7 @@ def _rates(cells: _Cells) -> Table:
 
 def _effects(cells: _Cells) -> Table:
     """Return the differences between the levels, within families."""
-    found = []
+    rows = []
     for outcomes, cell, levels in cells:
         families = outcomes.family
         parts = {name: _by_family(status, families) for name, status in levels.items()}
@@ -98,17 +94,10 @@ def _effects(cells: _Cells) -> Table:
                     sum(rate_of(levels[name][families == f]).n for f in np.flatnonzero(of.all(0)))
                     for name in (one, other)
                 ]
-                found.append((cell, one, other, n, compared, complete))
-    ps = corrected([row[4].p for row in found], [row[0][0] for row in found])
-    rows = [
-        (
-            *(*cell, one, other, compared.strata, *n, compared.second, compared.first),
-            *(*compared.change, provisional(compared.p, complete), provisional(p, complete)),
-            complete,
-        )
-        for (cell, one, other, n, compared, complete), p in zip(found, ps, strict=True)
-    ]
-    return Table.make(
+                both = (compared.second, compared.first, *compared.change)
+                levels_of = (*cell, one, other, compared.strata, *n)
+                rows.append((*levels_of, *both, compared.p, complete))
+    return tested(
         "evidence_effects",
         "Effect of the evidence kept, within families",
         "simulator system condition kept against_kept families:count n:count against_n:count "
@@ -121,8 +110,7 @@ def _effects(cells: _Cells) -> Table:
         "weighs n1 n2 / (n1 + n2) (Mantel and Haenszel), in rates and difference alike. low to "
         "high: 95% interval, from Wilson's stratified intervals of both rates. p: Cochran-Mantel-"
         "Haenszel test; p holm: after Holm's correction among the tests of this table in one "
-        "simulator. Within a family, episodes that keep less may still be harder."
-        + provisional_note(row[-1] for row in rows),
+        "simulator. Within a family, episodes that keep less may still be harder.",
     )
 
 

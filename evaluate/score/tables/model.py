@@ -11,11 +11,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.errors import MissingExtraError
-from robomme_interference_data.evaluate.score.comparisons.tables import (
-    corrected,
-    provisional,
-    provisional_note,
-)
+from robomme_interference_data.evaluate.score.comparisons.tables import tested
 from robomme_interference_data.evaluate.score.outcomes import Outcomes, counting
 from robomme_interference_data.evaluate.systems import is_reference
 from robomme_interference_data.schema.conditions import NO_HISTORY, parse_condition
@@ -142,7 +138,7 @@ def model_table(every: Iterable[Outcomes]) -> Table:
     """Return the effects of history, sessions and difficulty on each system's odds of success."""
     load_conditional_logit()
     rows = [row for outcomes in every for row in _rows(outcomes)]
-    return Table.make(
+    return tested(
         "model",
         "Odds of success within episodes",
         "simulator system term episodes:count families:count odds_ratio:ratio low:ratio high:ratio "
@@ -158,7 +154,7 @@ def model_table(every: Iterable[Outcomes]) -> Table:
         "table in one simulator. sample low to sample high: 95%, for tasks of which these families "
         "are a sample (jackknife over families, Student's t). spread: standard deviation of the "
         "families' log odds ratios. Empty: no finite estimate, because no outcome contradicts the "
-        "effect." + provisional_note(row[-1] for row in rows),
+        "effect.",
     )
 
 
@@ -175,14 +171,13 @@ def _rows(outcomes: Outcomes) -> Iterator[tuple[object, ...]]:
         terms, fit = _fit(outcomes, system, conditions)
         whole = all(bool(outcomes.complete[outcomes.cell(system, c)]) for c in conditions)
         found += [(system, term, fit, place, whole) for place, term in enumerate(terms)]
-    ps = [math.erfc(abs(f.effects[at] / f.errors[at]) / 2**0.5) for _, _, f, at, _ in found]
-    tests = zip(found, ps, corrected(ps, [0] * len(ps)), strict=True)
-    for (system, term, fit, at, whole), p, p_holm in tests:
+    for system, term, fit, at, whole in found:
+        p = math.erfc(abs(fit.effects[at] / fit.errors[at]) / 2**0.5)
         low, high = _bounds(fit.effects[at], fit.errors[at], z_of(LEVEL))
         sample = _bounds(fit.effects[at], fit.sample_errors[at], _student(fit.families - 1))
         names = (outcomes.simulator, system, term, fit.episodes, fit.families)
-        both = (provisional(one, whole) for one in (p, p_holm))
-        yield (*names, math.exp(fit.effects[at]), low, high, *both, fit.spread[at], *sample, whole)
+        ratio, spread = math.exp(fit.effects[at]), fit.spread[at]
+        yield (*names, ratio, low, high, p, spread, *sample, whole)
 
 
 def _student(degrees: int) -> float:

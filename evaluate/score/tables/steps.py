@@ -6,11 +6,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from robomme_interference_data.evaluate.score.comparisons.contrast import START
-from robomme_interference_data.evaluate.score.comparisons.tables import (
-    corrected,
-    provisional,
-    provisional_note,
-)
+from robomme_interference_data.evaluate.score.comparisons.tables import tested
 from robomme_interference_data.evaluate.score.outcomes import Outcomes, steps_to_success
 from robomme_interference_data.stats.bootstrap import DRAWS, Interval
 from robomme_interference_data.stats.signs import SignFlips, sign_flips
@@ -20,7 +16,7 @@ from robomme_interference_data.viz.tables import Table
 def steps_table(every: Iterable[Outcomes], draws: int = DRAWS) -> Table:
     """Return the steps to success of each cell, compared with the same system's k0."""
     rows = [row for outcomes in every for row in _rows(outcomes, draws)]
-    return Table.make(
+    return tested(
         "steps",
         "Steps to success",
         "simulator system condition n:count median:ratio mean:ratio pairs:count "
@@ -30,8 +26,7 @@ def steps_table(every: Iterable[Outcomes], draws: int = DRAWS) -> Table:
         "the pairs: episodes that succeed under both conditions. Episodes that only one of them "
         "solves are not compared, so an effect on them shows in the rates alone. low to high and "
         "p: sign flips of the episodes' differences, if at least ten differ; p holm: after Holm's "
-        "correction among the tests of this table in one simulator."
-        + provisional_note(row[-1] for row in rows),
+        "correction among the tests of this table in one simulator.",
     )
 
 
@@ -47,8 +42,6 @@ def _rows(outcomes: Outcomes, draws: int) -> list[tuple[object, ...]]:
     if changes:
         flips = sign_flips(np.stack(changes, axis=1), outcomes.simulator, draws)
         tests = dict(zip(compared, flips, strict=True))
-    ps = [one.p for one in tests.values()]
-    holms = dict(zip(tests, corrected(ps, [0] * len(ps)), strict=True))
     rows = list[tuple[object, ...]]()
     for s, c in cells:
         known = steps[s, c][~np.isnan(steps[s, c])]
@@ -56,10 +49,9 @@ def _rows(outcomes: Outcomes, draws: int) -> list[tuple[object, ...]]:
         own = (len(known), float(np.median(known)), float(known.mean()))
         test, whole = tests.get((s, c)), bool(outcomes.complete[s, c])
         if test is None:
-            rows.append((*names, *own, None, *Interval(math.nan), math.nan, math.nan, whole))
+            rows.append((*names, *own, None, *Interval(math.nan), math.nan, whole))
             continue
         whole = whole and bool(outcomes.complete[s, start])
         pairs = int((~np.isnan(steps[s, c] - steps[s, start])).sum())
-        p = (provisional(one, whole) for one in (test.p, holms[s, c]))
-        rows.append((*names, *own, pairs, *test.at(), *p, whole))
+        rows.append((*names, *own, pairs, *test.at(), test.p, whole))
     return rows
