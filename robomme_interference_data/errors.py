@@ -172,6 +172,13 @@ class BuildError(InterferenceError, RuntimeError):
     """
 
 
+class BusyError(BuildError):
+    """Another process is building the same folder.
+
+    Fix: wait for it to end, or stop it.
+    """
+
+
 class PublishError(InterferenceError, RuntimeError):
     """Data or results that cannot be published, or not under the requested version.
 

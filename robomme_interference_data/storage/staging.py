@@ -3,10 +3,10 @@
 import fcntl
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from robomme_interference_data.errors import BuildError, InterferenceError
+from robomme_interference_data.errors import BusyError, InterferenceError
 
 from .files import with_filename
 
@@ -21,10 +21,11 @@ def file_lock(lock: Path, busy: InterferenceError) -> Iterator[None]:
     The file remains. A folder cannot be locked: network file systems lock only files that are open
     for writing.
     """
-    with lock.open("a") as file:
+    with ExitStack() as stack:
         try:
+            file = stack.enter_context(lock.open("a"))
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except (FileNotFoundError, BlockingIOError):  # its owner ends, and removes the folder
             raise busy from None
         yield
 
@@ -43,7 +44,7 @@ def staging_dir(out: Path) -> Iterator[Path]:
     """
     work = staging_path(out)
     work.mkdir(parents=True, exist_ok=True)
-    busy = BuildError(f"another process is building {out}", "Wait for it to end, or stop it.")
+    busy = BusyError(f"another process is building {out}", "Wait for it to end, or stop it.")
     with file_lock(work / "lock", busy):
         before, finished = work / _BEFORE, False
         if before.exists() and not out.exists():  # killed during `replace_folder`

@@ -7,6 +7,7 @@ decoded once, compared with their SHA-256, resized, and stored in
 
 import math
 import os
+import time
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import CAMERA_PREFIX
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.errors import FormatError, HashMismatchError
+from robomme_interference_data.errors import BusyError, FormatError, HashMismatchError
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.storage.arrays import FeatureDigests, allocate_array, map_array
 from robomme_interference_data.storage.staging import replace_folder, staging_dir
@@ -24,6 +25,9 @@ from robomme_interference_data.storage.staging import replace_folder, staging_di
 from .images import resize
 
 _VALUES = "values.npy"
+
+_PAUSE_S = 0.5
+"""Seconds between looks at the work of another process."""
 
 
 def first_rows(dataset: Dataset) -> NDArray[np.int64]:
@@ -36,7 +40,8 @@ def stored_values(
 ) -> NDArray[Any]:
     """Return all values of a feature, episode after episode, as a read-only memory map.
 
-    They are stored at the first call, which resumes after an interruption.
+    They are stored at the first call, which resumes after an interruption. If another process is
+    storing them, such as another rank of the same training, this one waits for it.
 
     Args:
         dataset: The dataset.
@@ -50,16 +55,19 @@ def stored_values(
 
     Raises:
         HashMismatchError: Frames or vectors differ from the recorded ones.
-        BuildError: Another process is storing the same values.
         OSError: The disk is full.
     """
     shape, dtype = _layout(dataset, feature, size)
     name = feature if size is None else f"{feature}-{size}px"
     out = folder / f"{dataset.kind}-{dataset.revision[:16]}" / name
-    if not (out / _VALUES).is_file():
-        with staging_dir(out) as work:
-            _store(dataset, feature, size, work, progress)
-            replace_folder(work / "values", out)
+    while not (out / _VALUES).is_file():
+        try:
+            with staging_dir(out) as work:
+                _store(dataset, feature, size, work, progress)
+                replace_folder(work / "values", out)
+        except BusyError:
+            with progress.status(f"Waiting for another process that stores {feature}"):
+                time.sleep(_PAUSE_S)
     try:
         return map_array(out / _VALUES, dtype, shape)
     except FormatError as error:

@@ -1,7 +1,10 @@
 """The store of decoded frames: resized, complete, resumed, compared with the digests."""
 
 import errno
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -89,3 +92,26 @@ def test_a_full_disk_is_an_error_before_anything_is_decoded(
         stored_values(dataset(tiny_buffers, "distractors"), FRONT, tmp_path, 16, QUIET)
     monkeypatch.undo()
     assert len(stored_values(dataset(tiny_buffers, "distractors"), FRONT, tmp_path, 16, QUIET))
+
+
+def test_of_two_processes_one_waits_for_the_other(
+    tiny_buffers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the ranks of a training; threads have locks of their own, as processes do."""
+    units = dataset(tiny_buffers, "distractors")
+    read, decoded, begun = frame_store._read, list[Any](), Event()
+
+    def slow(*given: Any) -> None:
+        begun.set()
+        decoded.append(given[2])
+        time.sleep(0.02)
+        read(*given)
+
+    monkeypatch.setattr(frame_store, "_read", slow)
+    monkeypatch.setattr(frame_store, "_PAUSE_S", 0.01)
+    with ThreadPoolExecutor(2) as pool:
+        first = pool.submit(stored_values, units, FRONT, tmp_path, 16, QUIET)
+        assert begun.wait(30)
+        second = pool.submit(stored_values, units, FRONT, tmp_path, 16, QUIET)
+        np.testing.assert_array_equal(first.result(60), second.result(60))
+    assert sorted(decoded) == list(range(17))
