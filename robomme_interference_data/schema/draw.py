@@ -7,9 +7,10 @@ generator.
 Rule version 1, for a query of family F and index i:
 
 1. *Units of a family* are ordered by SHA-256. The query takes the unit at position q, modulo their
-   number; q numbers all queries that may draw from this family: i times the number of such
-   benchmark families, plus the rank of F among them, plus an offset from SHA-256. So consecutive
-   queries take consecutive units, and all units are used equally often.
+   number; q numbers all queries that may draw from this family: i times the number of families
+   that do, plus the rank of F among them, plus an offset from SHA-256. So consecutive queries take
+   consecutive units, and all units are used equally often. Families that draw are the benchmark's
+   nine; if F or a family with units is none of them, those with units and F.
 2. *Families* are ordered by SHA-256 for every block of m consecutive queries of F, where m is the
    number of eligible families; the order rotates by one from query to query. So within a block
    every family comes once at each position.
@@ -79,7 +80,9 @@ class UnitPool:
         """Yield all units of other families for a query, in buffer order."""
         largest = max(map(len, others.values()), default=0)
         order = self._order(query, list(others))
-        numbers = {name: self._number(query, name, largest) for name in order}
+        named = {query.family, *others}
+        drawing = FAMILIES if named <= {*FAMILIES} else tuple(sorted(named))
+        numbers = {name: self._number(query, name, largest, drawing) for name in order}
         taken = dict.fromkeys(order, 0)
 
         def joined(name: str, turn: int) -> int:
@@ -109,16 +112,12 @@ class UnitPool:
         order = sorted(names, key=lambda name: self._hash(*parts, name))
         return order[rotation:] + order[:rotation]
 
-    def _number(self, query: EpisodeId, family: str, largest: int) -> int:
+    def _number(self, query: EpisodeId, family: str, largest: int, drawing: tuple[str, ...]) -> int:
         """Return the query's number among all that may draw from a family, plus an offset."""
-        drawing = [name for name in FAMILIES if name != family]
-        if query.family in drawing:
-            rank = drawing.index(query.family)
-        else:
-            rank = self._offset("rank", query.family) % len(drawing)
+        others = [name for name in drawing if name != family]
         # Families start at different positions, so that small ones join different queries.
         offset = self._offset("offset", query.split, family) % largest
-        return query.index * len(drawing) + rank + offset
+        return query.index * len(others) + others.index(query.family) + offset
 
     def _offset(self, *parts: str) -> int:
         return int.from_bytes(self._hash(*parts)[:8])

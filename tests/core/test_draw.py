@@ -190,6 +190,16 @@ def test_usage_of_the_nominal_pool(seed: int) -> None:
         assert Counter(seven.values()) == {1: 8, 2: 64, 3: 298, 4: 530}
 
 
+@pytest.mark.parametrize("units", [12, 50])
+def test_families_of_another_benchmark_use_their_units_alike(units: int) -> None:
+    """Four families, also where their number of units divides that of the benchmark's families."""
+    names = ("press", "open", "pour", "stack")
+    pool = UnitPool(units_of(dict.fromkeys(names, units)))
+    drawn = [EpisodeId(name, "test", index) for name in names for index in range(units)]
+    counts = Counter(unit for query in drawn for unit in pool.draw(query, 3))
+    assert set(counts.values()) == {3} and len(counts) == 4 * units  # a round of three families
+
+
 def test_consecutive_queries_draw_different_units() -> None:
     pool = UnitPool(units_of(NOMINAL))
     for family in FAMILIES:
