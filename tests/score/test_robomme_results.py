@@ -53,18 +53,33 @@ def test_published_rates_are_of_the_same_kind_of_memory(found: Score) -> None:
     assert len(table(PAGE, "family")) == 12
 
 
-def test_every_failure_is_told(found: Score) -> None:
-    """Those of MoveCube, and without history, in a line each; of the others every episode."""
-    told = {
-        (row["system"].strip("`"), row["condition"], family, int(number))
-        for row in table(PAGE, "system | condition | episodes")
-        for family, numbers in re.findall(r"([A-Z]\w+) ([\d, ]+)", row["episodes"])
-        for number in re.findall(r"\d+", numbers)
-        if family != "MoveCube"
-    }
-    failed = {
-        (row.system, row.condition, row.family, row.episode)
+def test_changes_by_family_are_those_of_the_score(found: Score) -> None:
+    for row in table(PAGE, "lesson's family"):
+        key = {"system": "replay-framesamp", "condition": "k7", "family": row["lesson's family"]}
+        one = made.record(found, "family_effects", **key)
+        ends = (one["difference"], one["low"], one["high"])
+        change, low, high = (f"{100 * end:+.0f}" for end in ends)
+        assert [*row.values()][1:] == [
+            *(str(one[name]) for name in ("pairs", "gained", "lost")),
+            f"{change} ({low} to {high})",
+            f"{one['p_holm']:.2g}",
+        ]
+    assert len(table(PAGE, "lesson's family")) == 3
+
+
+def test_every_failure_is_told_and_who_solves_it(found: Score) -> None:
+    """Those of MoveCube in a sentence; of the others every episode."""
+    solved = {
+        (row.system, row.condition, row.family, row.episode): row.status == "success"
         for row in found.rows
-        if row.status != "success" and row.family != "MoveCube" and row.condition != "no-history"
+        if row.family != "MoveCube"
     }
-    assert told == failed
+    told = []
+    for row in table(PAGE, "system | condition | solved by"):
+        by, *here = (row[name].strip("`") for name in ("solved by", "system", "condition"))
+        for family, numbers in re.findall(r"([A-Z]\w+) ([\d, ]+)", row["episodes"]):
+            for number in map(int, numbers.strip(", ").split(",")):
+                told.append((*here, family, number))
+                system = "replay-full" if by == "none" else by
+                assert solved[system, here[1], family, number] == (by != "none"), (by, *told[-1])
+    assert sorted(told) == sorted(key for key, well in solved.items() if not well)
