@@ -201,7 +201,7 @@ def policy_processes(config: RunConfig) -> Iterator[tuple[Address, ...]]:
             try:
                 for outcome in session.run(addresses, attempts=sys.maxsize):
                     if outcome.error is not None:
-                        failures.append(WorkerError(f"the policy's process: {outcome.error}"))
+                        failures.append(WorkerError(f"the policy's process ended: {outcome.error}"))
                         break
             except WorkerError as error:  # a process cannot start
                 failures.append(error)
