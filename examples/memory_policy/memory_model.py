@@ -37,11 +37,7 @@ class Config:
     width: int = 96
     layers: int = 2
     trunk: str = "transformer"
-    pictures: bool = True  # False: the control that sees positions and lengths only
-
-    def __post_init__(self) -> None:
-        if self.image_size % 4:
-            raise ValueError(f"image_size {self.image_size}; expected a multiple of 4, the patch")
+    pictures: bool = True  # False: the control, with memory's positions and lengths only
 
 
 class FrameEncoder(nn.Module):
@@ -71,7 +67,7 @@ class MemoryModel(nn.Module):
         super().__init__()
         self.config, width = config, config.width
         self.encoders = nn.ModuleList(FrameEncoder(width) for _ in config.cameras)
-        self.state = nn.Linear(config.state, width)
+        self.state: nn.Module = nn.Linear(config.state, width)
         # At each point of an option: what the first camera shows there, and where it is.
         self.at_points = nn.Linear((CHANNELS + 2) * config.points, width)
         self.mix = nn.Sequential(nn.GELU(), nn.Linear(width, width), nn.GELU())
@@ -81,12 +77,32 @@ class MemoryModel(nn.Module):
         if config.trunk == "gru":
             self.trunk: nn.Module = nn.GRU(width, width, config.layers, batch_first=True)
         else:
+            dropout = 0.1 if config.task == "answer" else 0.0  # actions need precision
             layer = nn.TransformerEncoderLayer(
-                width, 4, 2 * width, 0.1, "gelu", batch_first=True, norm_first=True
+                width, 4, 2 * width, dropout, "gelu", batch_first=True, norm_first=True
             )
             self.trunk = nn.TransformerEncoder(layer, config.layers, enable_nested_tensor=False)
         outputs = 1 if config.task == "answer" else config.chunk * config.action
         self.head = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, outputs))
+        if config.task == "act":
+            self.state = nn.Sequential(
+                nn.Linear(9 * config.state, width), nn.GELU(), nn.Linear(width, width)
+            )
+            # `fit_scales` sets these.
+            self.register_buffer("state_mean", torch.zeros(config.state))
+            self.register_buffer("state_std", torch.ones(config.state))
+            self.register_buffer("action_std", torch.ones(config.action))
+
+    def fit_scales(self, batch: dict[str, Any]) -> None:
+        """Set the scales of states and of changes of the joints, from a batch of the data."""
+        state, valid = batch["observation.state"], ~batch["action_is_pad"]
+        self.state_mean, self.state_std = state.mean(0), state.std(0).clamp(1e-3)
+        change = (batch["action"] - self._still(batch))[valid]
+        self.action_std = change.std(0).clamp(1e-3)
+
+    def _still(self, batch: dict[str, Any]) -> Tensor:
+        """Return the action that keeps the joints where they are, `(B, 1, D)`."""
+        return functional.pad(batch["observation.state"][:, None, :-1], (0, 1))
 
     def forward(self, batch: dict[str, Any]) -> Tensor:
         """Return scores of the options, `(B, O)`, or actions, `(B, chunk, D)`."""
@@ -95,9 +111,8 @@ class MemoryModel(nn.Module):
         time = self._time(batch) + self._text(batch["task"])[:, None]
         if self.config.task == "act":
             read = self._read(self.mixed(self.mix(tokens)) + time, is_pad)
-            change = self.head(read).unflatten(1, (self.config.chunk, -1))
-            # Joint targets near the current joints, and the gripper's command.
-            return functional.pad(batch["observation.state"][:, None, :-1], (0, 1)) + change
+            change = self.head(read).unflatten(1, (self.config.chunk, -1)) * self.action_std
+            return self._still(batch) + change
         batch_size, options = batch["question.option_is_pad"].shape
         # The loader turns B lists of O texts into O lists of B.
         words = [text for texts in zip(*batch["question.options"], strict=True) for text in texts]
@@ -112,11 +127,12 @@ class MemoryModel(nn.Module):
 
     def _frames(self, batch: dict[str, Any]) -> tuple[Tensor, Tensor]:
         """Return a token per frame, `(B, M + 1, width)`, and maps of the first camera."""
-        tokens: Tensor = self.state(_with_current(batch, "state"))
+        states, acts = _with_current(batch, "state"), self.config.task == "act"
+        if acts:
+            states = _with_waves((states - self.state_mean) / self.state_std)
+        tokens: Tensor = self.state(states)
         size = self.config.image_size // 4
         maps = tokens.new_zeros(len(tokens), tokens.shape[1], CHANNELS, size, size)
-        if not self.config.pictures:
-            return torch.zeros_like(tokens), maps
         for number, (encoder, camera) in enumerate(
             zip(self.encoders, self.config.cameras, strict=True)
         ):
@@ -125,7 +141,12 @@ class MemoryModel(nn.Module):
             tokens = tokens + whole.view_as(tokens)
             if number == 0:
                 maps = seen.unflatten(0, images.shape[:2])
-        return tokens, maps
+        if self.config.pictures:
+            return tokens, maps
+        hidden = torch.zeros_like(tokens)
+        if acts:  # it must still see where the arm is now
+            hidden[:, -1] = tokens[:, -1]
+        return hidden, torch.zeros_like(maps)
 
     def _at_points(self, batch: dict[str, Any], maps: Tensor) -> Tensor:
         """Return what each frame shows at the points of each option, `(B, O, M + 1, width)`."""
@@ -145,8 +166,7 @@ class MemoryModel(nn.Module):
         live = batch["position"][:, None]
         positions = torch.cat([batch["memory.position"], live], 1)
         far = torch.log1p(torch.stack([live - positions, positions], -1).float())
-        waves = [wave(far * 2.0**power) for wave in (torch.sin, torch.cos) for power in range(4)]
-        time: Tensor = self.time(torch.cat([far, *waves], -1))
+        time: Tensor = self.time(_with_waves(far))
         return time
 
     def _text(self, texts: list[str]) -> Tensor:
@@ -166,6 +186,12 @@ class MemoryModel(nn.Module):
         order[:, -1] = tokens.shape[1] - 1
         moved = tokens.gather(1, order.clamp(0)[..., None].expand_as(tokens))
         return self.trunk(moved * (order >= 0)[..., None])[0][:, -1]  # type: ignore[no-any-return]
+
+
+def _with_waves(values: Tensor) -> Tensor:
+    """Return values, then their sines and cosines at four frequencies, `(…, 9 * D)`."""
+    waves = [wave(values * 2.0**power) for wave in (torch.sin, torch.cos) for power in range(4)]
+    return torch.cat([values, *waves], -1)
 
 
 def _with_current(batch: dict[str, Any], name: str) -> Tensor:

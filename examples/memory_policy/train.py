@@ -1,7 +1,7 @@
 """Train the small memory policy on a buffer set: `train.py BUFFER_SET --out RUN`.
 
     python examples/memory_policy/train.py my-buffers --out runs/k0 --conditions k0
-    python examples/memory_policy/train.py my-buffers --out runs/acts --task act
+    python examples/memory_policy/train.py my-buffers --out runs/acts --task act --steps 5000
 
 The same command resumes an interrupted run. `RUN/log.csv` has the losses.
 """
@@ -31,10 +31,10 @@ def positive(text: str) -> int:
     return int(text)
 
 
-def patches(text: str) -> int:
-    """Read an image size, which patches of 4 pixels must fill."""
+def by_four(text: str) -> int:
+    """Read a multiple of 4: patches have 4 pixels, and attention has 4 heads."""
     if positive(text) % 4:
-        raise argparse.ArgumentTypeError(f"{text}; expected a multiple of 4 pixels, the patch")
+        raise argparse.ArgumentTypeError(f"{text}; expected a multiple of 4")
     return int(text)
 
 
@@ -61,14 +61,17 @@ def arguments() -> argparse.Namespace:
     add("--memory", default="framesamp:32", help="framesamp:N, window:N or full")
     add("--retrieval", help="encoder of a retrieval step before the memory, such as thumbnail")
     add("--cameras", nargs="+", default=["front"])
-    add("--image-size", type=patches, default=64, help="side of the images in pixels")
+    add("--image-size", type=by_four, default=64, help="side of the images in pixels")
     add("--families", nargs="+", default=[], help="default: all")
     add("--episodes", help="indices of the train episodes to use, such as 0-79; default: all")
     add("--redraw", action="store_true", help="draw the sessions anew in every epoch")
     add("--unit-episodes", help="with --redraw, train episodes whose units may be drawn")
     add("--trunk", choices=("transformer", "gru"), default="transformer")
     add("--no-pictures", action="store_true", help="the control: positions and lengths only")
+    add("--width", type=by_four, default=96, help="values of a token")
+    add("--layers", type=positive, default=2)
     add("--chunk", type=positive, default=16, help="actions per chunk (--task act)")
+    add("--noise", type=float, default=0.02, help="std on current joints in rad (--task act)")
     add("--steps", type=positive, default=1000)
     add("--batch", type=positive, default=32)
     add("--save-every", type=positive, default=100, help="steps between checkpoints")
@@ -120,10 +123,16 @@ def main() -> None:
         state=len(item["observation.state"]),
         action=item["action"].shape[1] if args.task == "act" else 8,
         chunk=args.chunk,
+        width=args.width,
+        layers=args.layers,
         trunk=args.trunk,
         pictures=not args.no_pictures,
     )
-    model = MemoryModel(config).to(args.device)
+    model = MemoryModel(config)
+    if args.task == "act":
+        sample = range(0, len(data), max(1, len(data) // 256))
+        model.fit_scales(next(iter(DataLoader(Subset(data, sample), len(sample)))))
+    model.to(args.device)
     optimizer = torch.optim.AdamW(model.parameters(), args.learning_rate, weight_decay=0.05)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, args.learning_rate, args.steps)
     parts = {"model": model, "optimizer": optimizer, "schedule": schedule}
@@ -136,6 +145,9 @@ def main() -> None:
     began = time.perf_counter()
     model.train()
     for batch in batches(data, args, step):
+        if args.task == "act":  # it learns to come back from where it did not mean to go
+            joints = batch["observation.state"][:, :-1]
+            joints += args.noise * torch.randn_like(joints)
         loss, accuracy = train_step(model, batch, optimizer)
         schedule.step()
         step += 1
@@ -183,7 +195,7 @@ def train_step(
         right = (predicted.argmax(1) == batch["question.answer"]).float().mean()
     else:
         valid = ~batch["action_is_pad"]
-        loss = (predicted - batch["action"]).abs()[valid].mean()
+        loss = ((predicted - batch["action"]) / model.action_std).abs()[valid].mean()
         same = predicted[..., -1].sign() == batch["action"][..., -1].sign()
         right = same[valid].float().mean()
     optimizer.zero_grad()
