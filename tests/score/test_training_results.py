@@ -40,9 +40,20 @@ def test_rates_by_condition(rows: Rows) -> None:
             assert rate == percent(rows, system, condition), (system, condition)
 
 
-def test_rates_by_family(rows: Rows) -> None:
-    for line in table(PAGE, "family"):
-        family = line.pop("family")
+def test_rates_of_the_policy_that_acts(rows: Rows) -> None:
+    listed = table(PAGE, "policy")
+    assert len(listed) >= 4
+    for line in listed:
+        system = line.pop("policy").strip("`")
+        line.pop("seeds")
+        for condition, rate in line.items():
+            assert rate == percent(rows, system, condition), (system, condition)
+
+
+@pytest.mark.parametrize("first", ["family", "acting in"])
+def test_rates_by_family(rows: Rows, first: str) -> None:
+    for line in table(PAGE, first):
+        family = line.pop(first)
         for title, rate in line.items():
             system, condition = title.split()
             assert rate == percent(rows, system.strip("`"), condition, family), (title, family)
