@@ -95,10 +95,10 @@ class MemoryModel(nn.Module):
 
     def fit_scales(self, batch: dict[str, Any]) -> None:
         """Set the scales of states and of changes of the joints, from a batch of the data."""
-        state, valid = batch["observation.state"], ~batch["action_is_pad"]
-        self.state_mean, self.state_std = state.mean(0), state.std(0).clamp(1e-3)
-        change = (batch["action"] - self._still(batch))[valid]
-        self.action_std = change.std(0).clamp(1e-3)
+        state = batch["observation.state"]
+        change = (batch["action"] - self._still(batch))[~batch["action_is_pad"]]
+        self.state_mean = state.mean(0)
+        self.state_std, self.action_std = _std(state), _std(change)
 
     def _still(self, batch: dict[str, Any]) -> Tensor:
         """Return the action that keeps the joints where they are, `(B, 1, D)`."""
@@ -186,6 +186,12 @@ class MemoryModel(nn.Module):
         order[:, -1] = tokens.shape[1] - 1
         moved = tokens.gather(1, order.clamp(0)[..., None].expand_as(tokens))
         return self.trunk(moved * (order >= 0)[..., None])[0][:, -1]  # type: ignore[no-any-return]
+
+
+def _std(values: Tensor) -> Tensor:
+    """Return the standard deviations of `(N, D)` values, 1 for those that are always the same."""
+    std = values.std(0)
+    return torch.where(std > 1e-3, std, 1.0)
 
 
 def _with_waves(values: Tensor) -> Tensor:
