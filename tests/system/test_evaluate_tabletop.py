@@ -14,6 +14,7 @@ pytest.importorskip("mani_skill", reason="needs the extra sim")
 pytestmark = pytest.mark.slow
 
 COMMAND = Path(sys.executable).parent / "robomme-interference"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "memory_policy"
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +30,7 @@ def buffer_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
     played = "--source tabletop --episodes 0 --cameras front --workers 2"
     for words in (
         f"demonstrations {out} {played} --split test --families MoveCube,RouteStick",
+        f"executions {out} {played} --split test --families RouteStick",
         f"distractors {out} {played} --families PatternLock",
         f"manifests {out} --conditions no-history,k0,k1",
     ):
@@ -77,3 +79,25 @@ def test_follow_subgoals_matches_oracle_with_subgoals_and_guess_without(
     assert {status for status, _ in obeyed.values()} == {"success"}
     assert ended("follow-subgoals") == guessed  # the floor, to the very step
     assert {status for status, _ in guessed.values()} != {"success"}
+
+
+def test_the_example_policy_learns_to_act(
+    buffer_set: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is trained on one execution, and carries it out from the lesson."""
+    monkeypatch.syspath_prepend(str(EXAMPLE))
+    run = tmp_path / "run"
+    options = "--task act --conditions k0 --noise 0.005 --learning-rate 2e-3 --device cpu"
+    small = "--steps 400 --batch 16 --image-size 16"
+    program = [sys.executable, EXAMPLE / "train.py", buffer_set, "--out", run]
+    program += [*options.split(), *small.split()]
+    done = subprocess.run(program, capture_output=True, text=True, timeout=400, check=False)
+    assert done.returncode == 0, done.stderr
+    config = RunConfig(
+        *("python:memory_policy:MemoryPolicy", buffer_set, tmp_path / "results"),
+        policy_options=(f"checkpoint={run}", "device=cpu"),
+        system="acts",
+        conditions=("k0",),
+        families=("RouteStick",),
+    )
+    assert [row.status for row in run_evaluation(config).rows] == ["success"]
