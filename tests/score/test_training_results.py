@@ -30,21 +30,12 @@ def percent(rows: Rows, system: str, condition: str, family: str | None = None) 
     return f"{100 * sum(chosen) / len(chosen):.1f}" if chosen else ""
 
 
-def test_rates_by_condition(rows: Rows) -> None:
-    listed = table(PAGE, "system")
+@pytest.mark.parametrize("first", ["system", "policy"])
+def test_rates_by_condition(rows: Rows, first: str) -> None:
+    listed = table(PAGE, first)
     assert len(listed) >= 10
     for line in listed:
-        system = line.pop("system").strip("`")
-        line.pop("seeds")
-        for condition, rate in line.items():
-            assert rate == percent(rows, system, condition), (system, condition)
-
-
-def test_rates_of_the_policy_that_acts(rows: Rows) -> None:
-    listed = table(PAGE, "policy")
-    assert len(listed) >= 4
-    for line in listed:
-        system = line.pop("policy").strip("`")
+        system = line.pop(first).strip("`")
         line.pop("seeds")
         for condition, rate in line.items():
             assert rate == percent(rows, system, condition), (system, condition)
@@ -59,11 +50,12 @@ def test_rates_by_family(rows: Rows, first: str) -> None:
             assert rate == percent(rows, system.strip("`"), condition, family), (title, family)
 
 
-def test_what_training_with_interference_changes(rows: Rows) -> None:
-    for line in table(PAGE, "condition"):
+@pytest.mark.parametrize(("first", "learner"), [("condition", "learned"), ("under", "acts")])
+def test_what_training_with_interference_changes(rows: Rows, first: str, learner: str) -> None:
+    for line in table(PAGE, first):
         with_, without = (
-            float(percent(rows, system, line["condition"]))
-            for system in ("learned-mixture", "learned-k0")
+            float(percent(rows, f"{learner}-{trained}", line[first]))
+            for trained in ("mixture", "k0")
         )
         assert float(line["mixture − k0"].split()[0].replace("−", "-")) == pytest.approx(
             with_ - without, abs=0.11
