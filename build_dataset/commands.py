@@ -22,7 +22,7 @@ from robomme_interference_data.errors import MissingFileError, counted
 from robomme_interference_data.runtime.executor import WorkersConfig, make_executor
 
 from .config import AllConfig, BuildConfig, NewConfig, PlanConfig, position_limit
-from .plan import BuildPlan, plan_all, plan_build, plan_new
+from .plan import BuildPlan, plan_all, plan_alone, plan_new
 
 if TYPE_CHECKING:
     from robomme_interference_data.storage.files import Files
@@ -84,30 +84,32 @@ _DATASETS = {
     """,
     CONTRADICTIONS: """Build contradicting lessons: the same scene with another answer (tabletop).
 
-    For stale-k<n> and misled-k<n>. Use the query episodes.
+    For stale-k<n> and misled-k<n>. Default: the query episodes of the buffer set.
 
     Example:
     ```
-    robomme-interference build contradictions my-buffers --source tabletop --split test
+    robomme-interference build contradictions my-buffers --source tabletop
     ```
     """,
     SHIFTED: """Build the query episodes' views under each shift, for retrieval-score (tabletop).
 
     Nine frames per episode: the first live view under light, camera and clutter shifts of strengths
-    1, 2 and 3. Use the query episodes; build the manifests and the index afterwards.
+    1, 2 and 3. Default: the query episodes of the buffer set. Build the manifests and the index
+    afterwards.
 
     Example:
     ```
-    robomme-interference build shifted my-buffers --source tabletop --split test --episodes 0-4
+    robomme-interference build shifted my-buffers --source tabletop
     ```
     """,
     EXECUTIONS: """Build what follows each lesson: live frames and states, with the next actions.
 
-    To train and test policies. Use the query episodes; build the manifests afterwards.
+    To train and test policies. Default: the query episodes of the buffer set. Build the manifests
+    afterwards.
 
     Example:
     ```
-    robomme-interference build executions my-buffers --source tabletop --split test --episodes 0-4
+    robomme-interference build executions my-buffers --source tabletop
     ```
     """,
 }
@@ -118,7 +120,7 @@ def _add_command(kind: str, text: str) -> None:
     @with_settings
     def build(config: BuildConfig, as_json: AsJson = False) -> None:
         with graceful_interrupt(_KEPT):
-            _build(plan_build(kind, config), config.buffer_set / kind, config, as_json=as_json)
+            _build(plan_alone(kind, config), config.buffer_set / kind, config, as_json=as_json)
 
     app.command(name=kind, help=text)(build)
 

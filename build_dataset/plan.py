@@ -1,7 +1,7 @@
 """The plan that follows from the settings of a build."""
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -138,8 +138,25 @@ class _UnreadSessions:
         return self.pool.draw_own(self.query, k)
 
 
-def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
-    """Open the sources and plan one dataset."""
+def plan_alone(kind: str, config: BuildConfig) -> BuildPlan:
+    """Plan one dataset; one of query episodes has those and the cameras of the demonstrations."""
+    from robomme_interference_data.data.dataset import Dataset
+    from robomme_interference_data.storage.files import LocalFiles
+
+    folder = config.buffer_set / DEMONSTRATIONS
+    if kind not in (CONTRADICTIONS, SHIFTED, EXECUTIONS) or not folder.is_dir():
+        return plan_build(kind, config)
+    base = Dataset(LocalFiles(folder))
+    config = dataclasses.replace(config, cameras=config.cameras or base.cameras or NO_CAMERAS)
+    if config.families or config.split or config.episodes:
+        return plan_build(kind, config)
+    return plan_build(kind, config, {record.episode_id for record in base.records()})
+
+
+def plan_build(
+    kind: str, config: BuildConfig, queries: Container[EpisodeId] | None = None
+) -> BuildPlan:
+    """Open the sources and plan one dataset, of `queries` or of what `config` chooses."""
     from robomme_interference_data.storage.encode import get_codec
 
     from .frame_selection import unmarked_error
@@ -167,7 +184,9 @@ def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
         for text in config.source
     )
     split = config.split or ("train" if kind in UNITS else None)
-    tasks = list_episodes(sources, families=config.families, split=split, numbers=numbers)
+    tasks = list_episodes(
+        sources, families=config.families, split=split, numbers=numbers, queries=queries
+    )
     unmarked = next((one for _, one in tasks if not one.marked), None)
     if kind in (*LESSONS, EXECUTIONS) and unmarked is not None:
         raise unmarked_error().about(unmarked.id)
@@ -209,6 +228,7 @@ def list_episodes(
     families: Iterable[str] = (),
     split: str | None = None,
     numbers: Iterable[int] | None = None,
+    queries: Container[EpisodeId] | None = None,
 ) -> "tuple[tuple[int, SourceEpisode], ...]":
     """List the episodes of sources that pass all filters, in canonical order."""
     listed = [(number, one) for number, source in enumerate(sources) for one in source.episodes()]
@@ -219,14 +239,16 @@ def list_episodes(
     if split is not None and split not in SPLITS:
         raise InvalidOptionError.one_of("split", split, SPLITS)
     chosen_indices = None if numbers is None else set(numbers)
+
+    def passes(one: "SourceEpisode") -> bool:
+        if queries is not None:
+            return one.id in queries
+        if one.id.family not in chosen_families or split not in (None, one.id.split):
+            return False
+        return not one.further if chosen_indices is None else one.id.index in chosen_indices
+
     chosen = sorted(
-        (
-            (number, one)
-            for number, one in listed
-            if one.id.family in chosen_families
-            and split in (None, one.id.split)
-            and (not one.further if chosen_indices is None else one.id.index in chosen_indices)
-        ),
+        ((number, one) for number, one in listed if passes(one)),
         key=lambda item: item[1].id.sort_key,
     )
     for (first, one), (second, other) in pairwise(chosen):

@@ -11,16 +11,18 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import torch
+from command_line import default_device, device, names, run
 from memory_model import MemoryModel, load_checkpoint
 from torch.utils.data import DataLoader
 
 from robomme_interference_data import EpisodeId, Rollout, load_buffer_set
 from robomme_interference_data.constants import PROTOCOL_VERSION
 from robomme_interference_data.data.questions import LETTERS
-from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.run.kind import history_columns
 from robomme_interference_data.retrieval.selector import Selector
 from robomme_interference_data.schema.codec import to_dict
+from robomme_interference_data.storage.files import atomic_path
 from robomme_interference_data.training import HistoryDataset
 
 
@@ -34,22 +36,23 @@ def arguments() -> argparse.Namespace:
     add("buffer_set", help="folder, or namespace/name on the Hub, with questions")
     add("--out", type=Path, required=True, help="CSV file to write")
     add("--system", required=True, help="label of the rows, such as learned-k0")
-    add("--conditions", nargs="+", help="default: all that are planned")
+    add(
+        "--conditions", type=names, metavar="NAMES", help="NAME,…; all that are planned if left out"
+    )
     add("--retrieval", help="encoder of a retrieval step before the memory, such as thumbnail")
-    add("--seed", type=int, default=0, help="seed of the training, for the column model_seed")
-    add("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    add("--device", type=device, default=default_device(), help="cpu or cuda (%(default)s)")
     return parser.parse_args()
 
 
-def main() -> None:
+def main(args: argparse.Namespace) -> None:
     """Answer, and write the rows."""
-    args = arguments()
-    args.out.parent.mkdir(parents=True, exist_ok=True)
+    if args.out.exists():
+        raise InvalidOptionError(f"{args.out} exists.", "Use another `out`, or delete it.")
     model = load_checkpoint(args.checkpoint, args.device)
     if model.config.task != "answer":
-        raise SystemExit(f"{args.checkpoint} was trained to act; expected --task answer")
+        raise InvalidOptionError(f"{args.checkpoint} was trained to act; expected --task answer.")
     answered = [to_dict(row) for row in rows(model, args)]
-    with args.out.open("w", newline="") as file:
+    with atomic_path(args.out) as partial, partial.open("w", newline="") as file:
         writer = csv.DictWriter(file, answered[0])
         writer.writeheader()
         writer.writerows(answered)
@@ -97,7 +100,7 @@ def rows(model: MemoryModel, args: argparse.Namespace) -> Iterator[Rollout]:
                     split=episode.split,
                     episode=episode.index,
                     shift="none",
-                    model_seed=args.seed,
+                    model_seed=config.seed,
                     protocol_version=PROTOCOL_VERSION,
                     seed=record.seed,
                     difficulty=record.difficulty,
@@ -113,7 +116,4 @@ def rows(model: MemoryModel, args: argparse.Namespace) -> Iterator[Rollout]:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (InterferenceError, OSError) as error:
-        raise SystemExit(f"error: {error}") from None
+    run(main, arguments())

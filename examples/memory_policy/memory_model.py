@@ -5,7 +5,6 @@ option, the robot's state, and how long ago it was. A transformer (or a recurren
 the tokens and ends in a score for each option, or in a chunk of actions.
 """
 
-import json
 import zlib
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,6 +15,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 from torch.nn import functional
+
+from robomme_interference_data.errors import FormatError, MissingFileError
+from robomme_interference_data.storage.files import atomic_path, read_json, write_json
 
 WORDS = 1024  # buckets for hashed words
 CHANNELS = 16  # of a frame's feature map
@@ -38,6 +40,7 @@ class Config:
     layers: int = 2
     trunk: str = "transformer"
     pictures: bool = True  # False: the control, with memory's positions and lengths only
+    seed: int = 0
 
 
 class FrameEncoder(nn.Module):
@@ -151,6 +154,10 @@ class MemoryModel(nn.Module):
     def _at_points(self, batch: dict[str, Any], maps: Tensor) -> Tensor:
         """Return what each frame shows at the points of each option, `(B, O, M + 1, width)`."""
         points, is_pad = batch["question.points"], batch["question.point_is_pad"]
+        # Another buffer set may pad to more or fewer points; those beyond the model's are cut.
+        lacking = self.config.points - points.shape[2]
+        points = functional.pad(points, (0, 0, 0, lacking))
+        is_pad = functional.pad(is_pad, (0, lacking), value=True)
         (count, frames), (options, places) = maps.shape[:2], points.shape[1:3]
         grid = (2 * points.flip(-1) - 1).view(count, 1, 1, options * places, 2)
         grid = grid.expand(-1, frames, -1, -1, -1).flatten(0, 1)
@@ -206,21 +213,27 @@ def _with_current(batch: dict[str, Any], name: str) -> Tensor:
 
 
 def save_checkpoint(model: MemoryModel, folder: Path) -> None:
-    """Write `config.json` and, whole or not at all, `model.safetensors`."""
-    (folder / "config.json").write_text(json.dumps(asdict(model.config), indent=2) + "\n")
-    partial = folder / "model.partial"
-    partial.write_bytes(save(model.state_dict()))
-    partial.replace(folder / "model.safetensors")
+    """Write `config.json` and `model.safetensors`, each whole or not at all."""
+    write_json(folder / "config.json", asdict(model.config))
+    with atomic_path(folder / "model.safetensors") as partial:
+        partial.write_bytes(save(model.state_dict()))
 
 
 def load_checkpoint(folder: Path, device: str = "cpu") -> MemoryModel:
     """Read what `save_checkpoint` wrote."""
     try:
-        values = json.loads((folder / "config.json").read_text())
+        values = read_json(folder / "config.json")
         model = MemoryModel(Config(**values | {"cameras": tuple(values["cameras"])}))
         model.load_state_dict(load_file(folder / "model.safetensors"))
     except FileNotFoundError as error:
-        raise SystemExit(f"{folder} is not a checkpoint: {error.filename} is missing") from None
+        raise MissingFileError(
+            f"{folder} is not a checkpoint: {error.filename} is missing.",
+            "Give the folder of a run of train.py that has saved its weights.",
+        ) from None
     except (ValueError, KeyError, TypeError, RuntimeError, SafetensorError) as error:
-        raise SystemExit(f"{folder} is not a checkpoint, or is damaged: {error}") from None
+        reason = str(error).splitlines()[0]
+        raise FormatError(
+            f"{folder}: config.json or model.safetensors is damaged ({reason}).",
+            "Run train.py once more as before: it restores both from state.pt.",
+        ) from None
     return model.to(device).eval()

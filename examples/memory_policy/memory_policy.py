@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from command_line import default_device
 from memory_model import load_checkpoint
 from numpy.typing import NDArray
 
+from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate import Observation, Policy, RolloutInfo
 from robomme_interference_data.storage.files import sha256_file
 from robomme_interference_data.training import Memory, resize
@@ -31,11 +33,11 @@ class MemoryPolicy(Policy):
 
     def __init__(self, checkpoint: str, device: str | None = None):
         self._folder = Path(checkpoint)
-        self._device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+        self._device = device or default_device()
         self._model = load_checkpoint(self._folder, self._device)
         self.config = self._model.config
         if self.config.task != "act":
-            raise SystemExit(f"{checkpoint} was trained to answer; expected --task act")
+            raise InvalidOptionError(f"{checkpoint} was trained to answer; expected --task act.")
         self.cameras = self.history_cameras = self.config.cameras
         self._memory = Memory.parse(self.config.memory)
 

@@ -1,50 +1,30 @@
 """Train the small memory policy on a buffer set: `train.py BUFFER_SET --out RUN`.
 
-    python examples/memory_policy/train.py my-buffers --out runs/k0 --conditions k0
-    python examples/memory_policy/train.py my-buffers --out runs/acts --task act --steps 5000
+    python examples/memory_policy/train.py my-training --out runs/k0 --conditions k0
+    python examples/memory_policy/train.py my-training --out runs/acts --task act --steps 6000
 
-The same command resumes an interrupted run. `RUN/log.csv` has the losses.
+The same command resumes an interrupted run from its last checkpoint. `RUN/log.csv` has the losses.
 """
 
 import argparse
 import csv
-import json
-import time
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from pickle import UnpicklingError
+from time import perf_counter
 from typing import Any
 
 import torch
+from command_line import default_device, device, names, number, run, weights, whole
 from memory_model import Config, MemoryModel, save_checkpoint
 from torch.nn import functional
 from torch.utils.data import DataLoader, Subset
 
-from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data import load_buffer_set
+from robomme_interference_data.errors import FormatError, InvalidOptionError
+from robomme_interference_data.storage.files import atomic_path
 from robomme_interference_data.training import HistoryDataset
-
-
-def positive(text: str) -> int:
-    """Read a whole number from 1."""
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r}; expected a whole number from 1")
-    return int(text)
-
-
-def by_four(text: str) -> int:
-    """Read a multiple of 4: patches have 4 pixels, and attention has 4 heads."""
-    if positive(text) % 4:
-        raise argparse.ArgumentTypeError(f"{text}; expected a multiple of 4")
-    return int(text)
-
-
-def weighted(text: str) -> tuple[str, float]:
-    """Read `NAME` or `NAME=WEIGHT`."""
-    name, _, weight = text.partition("=")
-    try:
-        return name, float(weight or 1)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r}; expected NAME or NAME=WEIGHT") from None
 
 
 def arguments() -> argparse.Namespace:
@@ -52,44 +32,50 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    add = parser.add_argument
-    add("buffer_set", help="folder, or namespace/name on the Hub, with train episodes")
-    add("--out", type=Path, required=True, help="folder of the run")
-    add("--task", choices=("answer", "act"), default="answer", help="answer questions, or act")
-    every = [(name, 1.0) for name in ("k0", "k1", "k3", "k7")]
-    add("--conditions", nargs="+", type=weighted, default=every, help="NAME or NAME=WEIGHT")
-    add("--memory", default="framesamp:32", help="framesamp:N, window:N or full")
-    add("--retrieval", help="encoder of a retrieval step before the memory, such as thumbnail")
-    add("--cameras", nargs="+", default=["front"])
-    add("--image-size", type=by_four, default=64, help="side of the images in pixels")
-    add("--families", nargs="+", default=[], help="default: all")
-    add("--episodes", help="indices of the train episodes to use, such as 0-79; default: all")
-    add("--redraw", action="store_true", help="draw the sessions anew in every epoch")
-    add("--unit-episodes", help="with --redraw, train episodes whose units may be drawn")
-    add("--trunk", choices=("transformer", "gru"), default="transformer")
-    add("--no-pictures", action="store_true", help="the control: positions and lengths only")
-    add("--width", type=by_four, default=96, help="values of a token")
-    add("--layers", type=positive, default=2)
-    add("--chunk", type=positive, default=16, help="actions per chunk (--task act)")
-    add("--noise", type=float, default=0.02, help="std on current joints in rad (--task act)")
-    add("--steps", type=positive, default=1000)
-    add("--batch", type=positive, default=32)
-    add("--save-every", type=positive, default=100, help="steps between checkpoints")
-    add("--learning-rate", type=float, default=1e-3)
-    add("--workers", type=int, default=0, help="processes that load items")
-    add("--seed", type=int, default=0)
-    add("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+
+    def add(name: str, text: str, **how: Any) -> None:
+        shown = name[0] != "-" or how.get("default") is None
+        parser.add_argument(name, help=text if shown else f"{text} (%(default)s)", **how)
+
+    add("buffer_set", "folder, or namespace/name on the Hub, of a buffer set of train episodes")
+    add("--out", "folder of the run", type=Path, required=True)
+    add("--task", "answer questions, or act", choices=("answer", "act"), default="answer")
+    conditions = "NAME,… or NAME=WEIGHT,…"
+    add("--conditions", conditions, type=weights, default="k0,k1,k3,k7", metavar="NAMES")
+    add("--memory", "framesamp:N, window:N or full", default="framesamp:32")
+    add("--retrieval", "encoder of a retrieval step before the memory, such as thumbnail")
+    add("--cameras", "NAME,…", type=names, default="front", metavar="NAMES")
+    add("--image-size", "side of the images in pixels", type=whole(4, 4), default=64)
+    add("--families", "NAME,…; all if left out", type=names, default=(), metavar="NAMES")
+    add("--episodes", "indices of the episodes to use, such as 0-79; all if left out")
+    add("--redraw", "draw the sessions anew in every epoch", action="store_true")
+    add("--unit-episodes", "with --redraw, indices of episodes whose units may be drawn")
+    add("--trunk", "reader of the memory", choices=("transformer", "gru"), default="transformer")
+    add("--no-pictures", "the control: positions and lengths only", action="store_true")
+    add("--width", "values of a token", type=whole(4, 4), default=96)
+    add("--layers", "layers of the trunk", type=whole(1), default=2)
+    add("--chunk", "with --task act, actions per chunk", type=whole(1), default=16)
+    add("--noise", "with --task act, noise on the current joints in rad", type=number, default=0.02)
+    add("--steps", "batches to train on, a setting of the run", type=whole(1), default=1000)
+    add("--batch", "items per batch", type=whole(1), default=32)
+    add("--save-every", "steps between checkpoints", type=whole(1), default=100)
+    add("--learning-rate", "highest learning rate", type=number, default=1e-3)
+    add("--workers", "processes that load items", type=whole(0), default=0)
+    add("--seed", "seed of weights, noise and draws", type=whole(0), default=0)
+    add("--device", "cpu, or cuda for a GPU", type=device, default=default_device())
     return parser.parse_args()
 
 
-def main() -> None:
+def main(args: argparse.Namespace) -> None:
     """Train, from the beginning or from the last checkpoint."""
-    args = arguments()
-    if args.device.startswith("cuda") and not torch.cuda.is_available():
-        raise SystemExit("error: no GPU is available here; leave --device out, or use cpu")
+    buffer_set = load_buffer_set(args.buffer_set)
+    other = ("out", "device", "workers", "save_every")
+    settings = {name: value for name, value in vars(args).items() if name not in other}
+    settings |= {"data": buffer_set.revision}
+    state = resume(args.out, settings)
     data = HistoryDataset(
-        args.buffer_set,
-        dict(args.conditions),
+        buffer_set,
+        args.conditions,
         memory=args.memory,
         cameras=args.cameras,
         image_size=args.image_size,
@@ -103,21 +89,16 @@ def main() -> None:
         seed=args.seed,
     )
     print(data)
-    if other := [str(one) for one in data.episode_ids if one.split != "train"]:
-        print(f"warning: {other[0]} and others are not train episodes: do not test on them")
-    settings = {
-        k: v for k, v in vars(args).items() if k not in ("out", "device", "workers", "save_every")
-    }
-    settings |= {"data": data.buffer_set.revision}
+    if tests := [str(one) for one in data.episode_ids if one.split != "train"]:
+        print(f"warning: {tests[0]} and others are not train episodes: do not test on them")
     args.out.mkdir(parents=True, exist_ok=True)
-    state = resume(args.out, settings)
     torch.manual_seed(args.seed)
     item = data[0]
     config = Config(
         task=args.task,
-        data=data.buffer_set.revision,
+        data=buffer_set.revision,
         memory=args.memory,
-        cameras=tuple(args.cameras),
+        cameras=args.cameras,
         image_size=args.image_size,
         points=item["question.points"].shape[1] if args.task == "answer" else 1,
         state=len(item["observation.state"]),
@@ -127,6 +108,7 @@ def main() -> None:
         layers=args.layers,
         trunk=args.trunk,
         pictures=not args.no_pictures,
+        seed=args.seed,
     )
     model = MemoryModel(config)
     if args.task == "act":
@@ -141,25 +123,31 @@ def main() -> None:
     step, log = (state["step"], state["log"]) if state else (0, [])
     if state:
         torch.set_rng_state(state["random"])
+        save(args.out, model, state)  # in case that files other than the state are lost
     print(f"{sum(p.numel() for p in model.parameters()):,} parameters; step {step} of {args.steps}")
-    began = time.perf_counter()
+    began = perf_counter()
     model.train()
     for batch in batches(data, args, step):
         if args.task == "act":  # it learns to come back from where it did not mean to go
             joints = batch["observation.state"][:, :-1]
             joints += args.noise * torch.randn_like(joints)
         loss, accuracy = train_step(model, batch, optimizer)
+        if not math.isfinite(loss):
+            raise InvalidOptionError(
+                f"The loss is {loss} at step {step + 1} with --learning-rate {args.learning_rate} "
+                f"and --noise {args.noise}; expected a finite one.",
+                "Use lower ones, and another --out.",
+            )
         schedule.step()
         step += 1
         if step % 20 == 0 or step == args.steps:
-            seconds = time.perf_counter() - began
+            seconds = perf_counter() - began
             log.append([step, round(loss, 5), round(accuracy, 4), round(seconds, 2)])
             print(f"step {step}: loss {loss:.4f}, accuracy {accuracy:.2f}, {seconds:.0f} s")
         if step % args.save_every == 0 or step == args.steps:
             kept = {name: part.state_dict() for name, part in parts.items()}
             kept |= {"step": step, "log": log, "random": torch.get_rng_state()}
-            save_checkpoint(model, args.out)  # first: a finished state means a finished model
-            save_state(args.out, kept | {"settings": settings})
+            save(args.out, model, kept | {"settings": settings})
 
 
 def batches(data: HistoryDataset, args: argparse.Namespace, step: int) -> Iterator[dict[str, Any]]:
@@ -209,30 +197,36 @@ def resume(out: Path, settings: dict[str, Any]) -> dict[str, Any] | None:
     """Return the state of an interrupted run with the same settings; None without one."""
     path = out / "state.pt"
     if not path.is_file():
+        found = out.iterdir() if out.exists() else ()
+        written = [one.name for one in found if one.suffix != ".partial"]
+        if others := {*written} - {"config.json", "model.safetensors"}:
+            raise InvalidOptionError(
+                f"{out} holds other files, such as {min(others)}; expected a folder of a run.",
+                "Use another `out`.",
+            )
         return None
     try:
         state: dict[str, Any] = torch.load(path, weights_only=True, map_location="cpu")
-    except (RuntimeError, EOFError, UnpicklingError) as error:
-        raise SystemExit(f"error: {path} is damaged ({error}): delete it to begin again") from None
-    different = [name for name, value in settings.items() if state["settings"].get(name) != value]
-    if different:
-        raise SystemExit(
-            f"{out} holds a run with another {', '.join(different)}: "
-            f"{json.dumps(state['settings'])}. Use the same settings, or another --out."
+    except (RuntimeError, EOFError, UnpicklingError):
+        raise FormatError(f"{path} is damaged.", "Delete it to begin again.") from None
+    before = state["settings"]
+    if changed := [name for name in settings if before.get(name) != settings[name]]:
+        what = "; ".join(f"{name}: {before.get(name)}, now {settings[name]}" for name in changed)
+        raise InvalidOptionError(
+            f"{out} holds a run with other settings ({what}).",
+            "Use the same settings to resume it, or another `out`.",
         )
     return state
 
 
-def save_state(out: Path, state: dict[str, Any]) -> None:
-    """Write what `resume` reads, whole or not at all, and the log."""
-    torch.save(state, out / "state.partial")
-    (out / "state.partial").replace(out / "state.pt")
+def save(out: Path, model: MemoryModel, state: dict[str, Any]) -> None:
+    """Write the weights, then what `resume` reads, each whole or not at all, and the log."""
+    save_checkpoint(model, out)
+    with atomic_path(out / "state.pt") as partial:
+        torch.save(state, partial)
     with (out / "log.csv").open("w", newline="") as file:
         csv.writer(file).writerows([["step", "loss", "accuracy", "seconds"], *state["log"]])
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (InterferenceError, OSError) as error:
-        raise SystemExit(f"error: {error}") from None
+    run(main, arguments())

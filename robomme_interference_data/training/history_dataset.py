@@ -114,6 +114,9 @@ class HistoryDataset:
         store: str | os.PathLike[str] | None = None,
         quiet: bool = False,
     ):
+        for option, given in (("cameras", cameras), ("families", families)):
+            if isinstance(given, str):
+                raise InvalidOptionError.expected(option, given, f"a list of names: [{given!r}]")
         opened = isinstance(buffer_set, BufferSet)
         self.buffer_set: BufferSet = buffer_set if opened else load_buffer_set(buffer_set)  # type: ignore[assignment,arg-type]
         self._arguments = dict(

@@ -6,14 +6,15 @@ from typing import Any
 
 import pytest
 from support.buffer_sets import GOLDEN, contents
-from support.made_up import MadeUpSource
+from support.made_up import MadeUpSource, record, write_metadata
 
 from robomme_interference_data.build_dataset.build import BuildResult, build_dataset
-from robomme_interference_data.build_dataset.config import AllConfig, PlanConfig
+from robomme_interference_data.build_dataset.config import AllConfig, BuildConfig, PlanConfig
 from robomme_interference_data.build_dataset.plan import (
     BuildPlan,
     list_episodes,
     plan_all,
+    plan_alone,
     plan_build,
 )
 from robomme_interference_data.build_dataset.sources import Robot, Source
@@ -257,6 +258,25 @@ def test_views_under_shifts_and_executions_are_of_the_queries(tmp_path: Path) ->
     assert [*plans] == ["demonstrations", "distractors", *further]
     for name in further:
         assert plans[name].tasks == plans["demonstrations"].tasks
+
+
+@pytest.mark.parametrize("kind", ["contradictions", "shifted", "executions"])
+def test_what_goes_with_demonstrations_has_their_episodes_and_cameras(
+    kind: str, tmp_path: Path
+) -> None:
+    config = BuildConfig(source=("tabletop",), buffer_set=tmp_path)
+    assert len(plan_alone(kind, config).tasks) > 1000  # all: there are no demonstrations yet
+    episodes = {"MoveCube/train/120", "PatternLock/test/1"}
+    records = [record("demonstrations", episode, n) for n, episode in enumerate(sorted(episodes))]
+    write_metadata(tmp_path / "demonstrations", "demonstrations", records)
+    planned = plan_alone(kind, config)
+    asked = {f"{one.id.family}/{one.id.split}/{one.id.index}" for _, one in planned.tasks}
+    assert asked == episodes
+    assert planned.cameras == ("front",)
+    chosen = plan_alone(kind, replace(config, split="test", episodes="0-1", cameras=("wrist",)))
+    assert len(chosen.tasks) == 18 and chosen.cameras == ("wrist",)
+    units = plan_alone("distractors", config)
+    assert len(units.tasks) > 18 and units.cameras is None
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ def example(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Make the example's modules importable, as if one stood in its folder."""
     monkeypatch.syspath_prepend(str(EXAMPLE))
     yield
-    for name in ("train", "answer", "memory_model", "memory_policy"):
+    for name in ("train", "answer", "command_line", "memory_model", "memory_policy"):
         sys.modules.pop(name, None)
 
 
@@ -37,7 +37,8 @@ def program(monkeypatch: pytest.MonkeyPatch) -> Any:
     def call(name: str, *arguments: object) -> None:
         monkeypatch.setattr(sys, "argv", [f"{name}.py", *map(str, arguments)])
         __import__(name)
-        sys.modules[name].main()
+        module = sys.modules[name]
+        module.run(module.main, module.arguments())
 
     return call
 
@@ -52,15 +53,15 @@ def weights(run: Path) -> dict[str, torch.Tensor]:
 def test_it_learns_to_answer_and_writes_rows(program: Any, tmp_path: Path) -> None:
     """Of six golden lessons: their frames are of one color each, so not all can be told apart."""
     run, families = tmp_path / "run", ("VideoRepick", "MoveCube", "InsertPeg")
-    options = ("--conditions", "k0", "--steps", 140, "--families", *families)
-    program("train", TABLETOP, "--out", run, *options, *SMALL, "--batch", 6)
+    options = ("--conditions", "k0", "--steps", 140, "--families", ",".join(families))
+    program("train", TABLETOP, "--out", run, *options, *SMALL, "--batch", 6, "--seed", 3)
     with (run / "log.csv").open() as file:
         log = [*csv.DictReader(file)]
     assert [line["step"] for line in log] == ["20", "40", "60", "80", "100", "120", "140"]
     first, last = float(log[0]["loss"]), float(log[-1]["loss"])
     assert last < 0.75 * first < 1.2  # guessing: about 1.3
     out = tmp_path / "rows.csv"
-    program("answer", run, TABLETOP, "--system", "learned-k0", "--out", out, "--seed", 3)
+    program("answer", run, TABLETOP, "--system", "learned-k0", "--out", out)
     rows = read_rows([out]).rows
     assert len(rows) == 3 * 18 and {row.model_seed for row in rows} == {3}
     assert {row.condition for row in rows} == {"no-history", "k0", "k1"}
@@ -72,7 +73,7 @@ def test_it_learns_to_answer_and_writes_rows(program: Any, tmp_path: Path) -> No
 def test_an_interrupted_run_ends_like_another(
     program: Any, executed_buffers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = ("--task", "act", "--conditions", "k0=2", "k3", "--steps", 6, "--save-every", 2)
+    settings = ("--task", "act", "--conditions", "k0=2,k3", "--steps", 6, "--save-every", 2)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     program("train", executed_buffers, "--out", whole, *settings, *SMALL)
     step, taken = sys.modules["train"].train_step, []
@@ -84,14 +85,20 @@ def test_an_interrupted_run_ends_like_another(
         return step(*given)
 
     monkeypatch.setattr(sys.modules["train"], "train_step", interrupted)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(SystemExit, match="interrupted"):
         program("train", executed_buffers, "--out", parts, *settings, *SMALL)
     monkeypatch.setattr(sys.modules["train"], "train_step", step)
-    with pytest.raises(SystemExit, match="another seed"):
+    with pytest.raises(SystemExit, match="seed: 0, now 1"):
         program("train", executed_buffers, "--out", parts, *settings, *SMALL, "--seed", 1)
     program("train", executed_buffers, "--out", parts, *settings, *SMALL)
     expected, found = weights(whole), weights(parts)
     assert all(torch.equal(expected[name], found[name]) for name in expected)
+    for name in ("model.safetensors", "config.json", "log.csv"):  # the state restores them
+        (parts / name).unlink()
+    program("train", executed_buffers, "--out", parts, *settings, *SMALL)
+    for name in ("model.safetensors", "config.json"):
+        assert (parts / name).read_bytes() == (whole / name).read_bytes()
+    assert (parts / "log.csv").is_file()
 
 
 @pytest.mark.parametrize("trunk, memory", [("transformer", "framesamp:8"), ("gru", "full")])
@@ -163,6 +170,12 @@ def test_the_pages_commands_and_its_example(
         ("--chunk", "0"),
         ("--save-every", "x"),
         ("--conditions", "k1=x"),
+        ("--conditions", "k0,k0=3"),
+        ("--noise", "-1"),
+        ("--learning-rate", "nan"),
+        ("--workers", "-1"),
+        ("--seed", "99999999999"),
+        ("--device", "nowhere"),
     ],
 )
 def test_wrong_options_are_one_line(
@@ -172,6 +185,45 @@ def test_wrong_options_are_one_line(
         program("train", TABLETOP, "--out", tmp_path / "run", *options)
     assert f"argument {options[0]}" in capsys.readouterr().err.splitlines()[-1]
     assert not (tmp_path / "run").exists()
+
+
+def test_what_a_run_must_not_do(program: Any, tmp_path: Path) -> None:
+    options = ("--conditions", "k0", "--families", "MoveCube", "--steps", 9, *SMALL)
+    with pytest.raises(SystemExit, match="loss is nan"):
+        program("train", TABLETOP, "--out", tmp_path / "run", *options, "--learning-rate", 1e10)
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(SystemExit, match=r"notes\.txt(.|\n)*another --out"):
+        program("train", TABLETOP, "--out", tmp_path, *options)
+    rows = tmp_path / "rows.csv"
+    rows.touch()
+    with pytest.raises(SystemExit, match="exists"):
+        program("answer", tmp_path, TABLETOP, "--system", "x", "--out", rows)
+
+
+@pytest.mark.parametrize("places", [1, 3])
+def test_questions_with_other_points(places: int, program: Any, tmp_path: Path) -> None:
+    """Padding of another buffer set changes no score; points beyond the model's are cut."""
+    run = tmp_path / "run"
+    options = ("--conditions", "k0", "--families", "MoveCube", "--steps", 1, *SMALL)
+    program("train", TABLETOP, "--out", run, *options)
+    model = sys.modules["memory_model"].load_checkpoint(run)
+    data = sys.modules["train"].HistoryDataset(
+        TABLETOP, ["k0"], image_size=16, chunk=0, questions=True, quiet=True
+    )
+    batch = next(iter(torch.utils.data.DataLoader(data, len(data))))
+    trained = batch["question.points"].shape[2]
+    assert trained == model.config.points
+    whole = model(batch)
+    batch["question.points"] = torch.nn.functional.pad(
+        batch["question.points"], (0, 0, 0, places), value=0.5
+    )
+    batch["question.point_is_pad"] = torch.nn.functional.pad(
+        batch["question.point_is_pad"], (0, places), value=True
+    )
+    assert torch.equal(model(batch), whole)
+    fewer = {**batch, "question.points": batch["question.points"][:, :, :1]}
+    fewer["question.point_is_pad"] = batch["question.point_is_pad"][:, :, :1]
+    assert model(fewer).shape == whole.shape
 
 
 def test_damaged_checkpoints(program: Any, tmp_path: Path) -> None:

@@ -235,6 +235,8 @@ def test_sessions_drawn_anew_keep_the_rules(make: Make, buffers: Path) -> None:
         ({"memory": "full:9"}, InvalidOptionError, "full:9"),
         ({"memory": "sometimes"}, UnknownNameError, "sometimes"),
         ({"cameras": ["side"]}, UnknownNameError, "side"),
+        ({"cameras": "front"}, InvalidOptionError, "'front'"),
+        ({"families": "MoveCube"}, InvalidOptionError, "'MoveCube'"),
         ({"image_size": 33}, InvalidOptionError, "32"),
         ({"image_size": 0}, InvalidOptionError, "0"),
         ({"chunk": -1}, InvalidOptionError, "chunk"),
