@@ -30,13 +30,13 @@ def percent(rows: Rows, system: str, condition: str, family: str | None = None) 
     return f"{100 * sum(chosen) / len(chosen):.1f}" if chosen else ""
 
 
-@pytest.mark.parametrize("first", ["system", "policy"])
+@pytest.mark.parametrize("first", ["system", "policy", "further conditions"])
 def test_rates_by_condition(rows: Rows, first: str) -> None:
     listed = table(PAGE, first)
-    assert len(listed) >= 10
+    assert len(listed) >= 2
     for line in listed:
         system = line.pop(first).strip("`")
-        line.pop("seeds")
+        line.pop("seeds", None)
         for condition, rate in line.items():
             assert rate == percent(rows, system, condition), (system, condition)
 
