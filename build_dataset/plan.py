@@ -93,8 +93,7 @@ def plan_new(config: NewConfig, plan: PlanConfig) -> "tuple[Dataset, BuildPlan]"
             "Choose another `buffer_set`, or remove the folder first.",
         )
     check_needs(in_order(plan.conditions), in_folder(config.buffer_set))
-    cameras = config.cameras or base.cameras or NO_CAMERAS
-    units = plan_build(DISTRACTORS, dataclasses.replace(config, cameras=cameras))
+    units = plan_build(DISTRACTORS, _with_cameras_of(base, config))
     queries = (record.episode_id for record in base.records())
     _check_plans(queries, {DISTRACTORS: units}, config.buffer_set, plan)
     return base, units
@@ -147,10 +146,15 @@ def plan_alone(kind: str, config: BuildConfig) -> BuildPlan:
     if kind not in (CONTRADICTIONS, SHIFTED, EXECUTIONS) or not folder.is_dir():
         return plan_build(kind, config)
     base = Dataset(LocalFiles(folder))
-    config = dataclasses.replace(config, cameras=config.cameras or base.cameras or NO_CAMERAS)
+    config = _with_cameras_of(base, config)
     if config.families or config.split or config.episodes:
         return plan_build(kind, config)
     return plan_build(kind, config, {record.episode_id for record in base.records()})
+
+
+def _with_cameras_of(base: "Dataset", config: BuildConfig) -> BuildConfig:
+    cameras = config.cameras or base.cameras or NO_CAMERAS
+    return dataclasses.replace(config, cameras=cameras)
 
 
 def plan_build(
