@@ -136,7 +136,7 @@ def test_the_commands_of_the_pages_run(
     buffer_set = copy_tabletop(tmp_path / "tabletop") if asked else own_buffers
     (tmp_path / "docs").symlink_to(ROOT / "docs")  # rows that a page scores
     (tmp_path / "demo").mkdir()
-    for name in ("my-buffers", "my-training", "demo/buffers"):
+    for name in ("my-buffers", "my-training", "acting-buffers", "demo/buffers"):
         (tmp_path / name).symlink_to(buffer_set)
     monkeypatch.chdir(tmp_path)
     world = buffer_set if asked else tiny_buffers
