@@ -77,4 +77,4 @@ def run(main: Callable[[argparse.Namespace], None], args: argparse.Namespace) ->
     except OSError as error:
         raise SystemExit(f"error: {error}") from None
     except KeyboardInterrupt:
-        raise SystemExit("interrupted: the same command goes on from what is saved") from None
+        raise SystemExit("interrupted: run the same command again") from None

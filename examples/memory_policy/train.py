@@ -34,7 +34,7 @@ def arguments() -> argparse.Namespace:
     )
 
     def add(name: str, text: str, **how: Any) -> None:
-        shown = name[0] != "-" or how.get("default") is None
+        shown = name[0] != "-" or how.get("default") in (None, ())
         parser.add_argument(name, help=text if shown else f"{text} (%(default)s)", **how)
 
     add("buffer_set", "folder, or namespace/name on the Hub, of a buffer set of train episodes")
