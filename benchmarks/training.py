@@ -1,8 +1,9 @@
 """How many items a processor second gives for training, and how flat memory stays.
 
 An item has 32 frames of the front camera, sampled evenly from a k7 buffer and the first live view.
-HistoryDataset is compared with a copy of as many bytes, with Buffer.stream of the same frames, and
-with LeRobotDataset, whose delta_timestamps take 32 frames from one episode, the lesson.
+Batches of 64 from HistoryDataset are compared with its single items, collated; with a copy of the
+images in a batch's memory; with Buffer.stream of the same frames; and with LeRobotDataset, whose
+delta_timestamps take 32 frames from one episode, the lesson.
 """
 
 import argparse
@@ -24,6 +25,7 @@ from common import (
     print_table,
     run,
 )
+from torch.utils.data import default_collate
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.constants import DEMONSTRATIONS, FPS, FRONT
@@ -31,6 +33,7 @@ from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.training import HistoryDataset
 
 MEMORY = Memory("framesamp", 32)
+BATCH = 64
 
 
 def main() -> None:
@@ -50,41 +53,51 @@ def main() -> None:
         buffers = [buffer_set.load(episode, "k7") for episode in data.episode_ids]
         kept = [list(MEMORY.earlier(len(buffer))) for buffer in buffers]
 
-        def copying(size: int) -> Callable[[int], object]:
-            # Larger than any cache, as the store is.
-            pool = np.ones((1000, 3, size, size), np.uint8)
-            rows = np.random.default_rng(0).integers(0, len(pool), (500, 32))
-            return lambda number: pool.take(rows[number], axis=0)
+        indices = np.resize(np.arange(count), (8, BATCH)).tolist()
+
+        def batches(of: HistoryDataset) -> Callable[[int], object]:
+            return lambda number: of[indices[number]]
+
+        def collated(number: int) -> object:
+            return default_collate([data[index] for index in indices[number]])
+
+        def copying(of: HistoryDataset) -> Callable[[int], object]:
+            images = of[indices[0]]["memory.images.front"]
+            return lambda number: images.clone()
 
         def stream(number: int) -> object:
             return list(buffers[number].stream(64, ["front"], kept[number]))
 
-        def each(items: int, make: Callable[[int], object]) -> None:
-            for number in range(items):
+        def each(calls: int, make: Callable[[int], object]) -> None:
+            for number in range(calls):
                 make(number)
 
         side = buffer_set.datasets[DEMONSTRATIONS].shape("front")[0]
-        ways: dict[str, tuple[int, Callable[[int], object]]] = {
-            f"HistoryDataset, {args.image_size} px": (500, lambda n: data[n % count]),
-            f"copy of as many bytes, {args.image_size} px": (500, copying(args.image_size)),
-            f"HistoryDataset, {side} px": (100, lambda n: large[n % count]),
-            f"copy of as many bytes, {side} px": (100, copying(side)),
-            f"Buffer.stream(indices=…), {side} px": (min(4, count), stream),
-            f"LeRobotDataset, delta_timestamps, {side} px": (4, lerobot(Path(root))),
+        # Calls a round, items a call, and what is called.
+        ways: dict[str, tuple[int, int, Callable[[int], object]]] = {
+            f"HistoryDataset, {args.image_size} px": (8, BATCH, batches(data)),
+            f"items and default_collate, {args.image_size} px": (8, BATCH, collated),
+            f"copy of the same bytes, {args.image_size} px": (8, BATCH, copying(data)),
+            f"HistoryDataset, {side} px": (2, BATCH, batches(large)),
+            f"copy of the same bytes, {side} px": (2, BATCH, copying(large)),
+            f"Buffer.stream(indices=…), {side} px": (min(4, count), 1, stream),
+            f"LeRobotDataset, delta_timestamps, {side} px": (4, 1, lerobot(Path(root))),
         }
-        calls = {name: partial(each, *way) for name, way in ways.items()}
+        calls = {name: partial(each, number, call) for name, (number, _, call) in ways.items()}
         times = interleave(calls, args.rounds, time.process_time)
-        rates = {name: items / times.median(name) for name, (items, _) in ways.items()}
+        rates = {
+            name: calls * items / times.median(name) for name, (calls, items, _) in ways.items()
+        }
         before = peak_memory()
-        for number in range(4 * count):
-            data[number % count]
+        for number in range(count):
+            data[indices[number % 8]]
         grown = peak_memory() - before
     base = rates[f"HistoryDataset, {args.image_size} px"]
     rows = [[name, f"{rate:,.1f}", f"{base / rate:,.1f}"] for name, rate in rates.items()]
     print_machine("numpy", "torch", "lerobot")
     columns = ("<way", ">items per processor second", ">HistoryDataset is faster by")
     print_table("Items of 32 frames, one process:", columns, rows)
-    print(f"\nFour more epochs add {megabytes(grown)} MB to the peak memory.")
+    print(f"\n{count} more batches add {megabytes(grown)} MB to the peak memory.")
 
 
 def lerobot(root: Path) -> Callable[[int], object]:

@@ -117,7 +117,7 @@ class MemoryModel(nn.Module):
             change = self.head(read).unflatten(1, (self.config.chunk, -1)) * self.action_std
             return self._still(batch) + change
         batch_size, options = batch["question.option_is_pad"].shape
-        # The loader turns B lists of O texts into O lists of B.
+        # A batch has O lists of B texts.
         words = [text for texts in zip(*batch["question.options"], strict=True) for text in texts]
         text = self._text(words).unflatten(0, (batch_size, options))[:, :, None]
         seen = tokens[:, None] + self._at_points(batch, maps) + text

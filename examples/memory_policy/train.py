@@ -19,7 +19,7 @@ import torch
 from command_line import default_device, device, names, number, run, weights, whole
 from memory_model import Config, MemoryModel, save_checkpoint
 from torch.nn import functional
-from torch.utils.data import DataLoader, Subset
+from torch.utils.data import BatchSampler, DataLoader
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.errors import FormatError, InvalidOptionError
@@ -112,8 +112,7 @@ def main(args: argparse.Namespace) -> None:
     )
     model = MemoryModel(config)
     if args.task == "act":
-        sample = range(0, len(data), max(1, len(data) // 256))
-        model.fit_scales(next(iter(DataLoader(Subset(data, sample), len(sample)))))
+        model.fit_scales(data[[*range(0, len(data), max(1, len(data) // 256))]])
     model.to(args.device)
     optimizer = torch.optim.AdamW(model.parameters(), args.learning_rate, weight_decay=0.05)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, args.learning_rate, args.steps)
@@ -161,7 +160,11 @@ def batches(data: HistoryDataset, args: argparse.Namespace, step: int) -> Iterat
         rest = order[done * args.batch : per_epoch * args.batch].tolist()
         # With its own generator, the loader does not change what dropout draws.
         loader = DataLoader(
-            Subset(data, rest), args.batch, num_workers=args.workers, generator=generator
+            data,
+            batch_size=None,  # the sampler makes the batches, and the dataset takes them whole
+            sampler=BatchSampler(rest, args.batch, drop_last=False),
+            num_workers=args.workers,
+            generator=generator,
         )
         for batch in loader:
             if step == args.steps:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.constants import DEMONSTRATIONS
 from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
@@ -23,7 +24,6 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.retrieval.selector import select_stored
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.conditions import parse_condition
-from robomme_interference_data.schema.evidence import among
 from robomme_interference_data.schema.shifts import Shift
 
 from .frame_store import first_rows, stored_values
@@ -44,16 +44,15 @@ class History:
 
     Attributes:
         rows: The rows of its frames in order, `(T,) int64`.
-        evidence: Spans of `rows` that show a part of the answer: start, stop (excluded) and number
-            of the part; None if unknown.
+        evidence: Which parts of the answer each frame shows, `(T, P) bool`; None if unknown.
     """
 
     rows: NDArray[np.int64]
-    evidence: tuple[tuple[int, int, int], ...] | None
+    evidence: NDArray[np.bool_] | None
 
 
-_Piece = tuple[int, NDArray[np.int64], int, int]
-"""Number of a dataset, rows in it, and their start and stop (excluded) among all rows."""
+PADDING = -1
+"""The row of a place without a frame."""
 
 
 class Rows:
@@ -90,28 +89,24 @@ class Rows:
             for name, dataset in self._datasets.items()
         ]
 
-    def pieces(self, rows: NDArray[np.int64]) -> "list[_Piece]":
-        """Return where rows are stored: the runs of rows of the same dataset."""
-        owner = self._starts.searchsorted(rows, "right") - 1
-        bounds = [0, *((owner[1:] != owner[:-1]).nonzero()[0] + 1).tolist(), len(rows)]
-        return [
-            (number := int(owner[start]), rows[start:stop] - self._starts[number], start, stop)
-            for start, stop in pairwise(bounds)
-            if start < stop
-        ]
-
-    def take(self, feature: str, pieces: "list[_Piece]", out: NDArray[Any]) -> None:
-        """Copy the values of rows, in pieces, into `out`, `(len(rows), …)`."""
-        arrays = self._values[feature]
-        for number, local, start, stop in pieces:
+    def take(self, feature: str, rows: NDArray[np.int64]) -> NDArray[Any]:
+        """Return the values of rows, `(*rows.shape, …)`; 0 for `PADDING`."""
+        arrays, flat = self._values[feature], rows.ravel()
+        some = next(one for one in arrays if one is not None)
+        out = np.empty((len(flat), *some.shape[1:]), some.dtype)
+        # Run by run of rows of the same dataset; PADDING belongs to none, number -1.
+        owner = self._starts.searchsorted(flat, "right") - 1
+        local = flat - self._starts[owner]
+        bounds = [*np.diff(owner, prepend=len(arrays)).nonzero()[0].tolist(), len(flat)]
+        for start, stop in pairwise(bounds):
+            if (number := owner[start]) < 0:
+                out[start:stop] = 0
+                continue
             values = arrays[number]
             assert values is not None
             # The mode lets numpy write into `out` without a copy in between.
-            values.take(local, axis=0, out=out[start:stop], mode="clip")
-
-    def shape(self, feature: str) -> tuple[int, ...]:
-        """Return the shape of a value."""
-        return next(one.shape[1:] for one in self._values[feature] if one is not None)
+            values.take(local[start:stop], axis=0, out=out[start:stop], mode="clip")
+        return out.reshape(*rows.shape, *out.shape[1:])
 
 
 class Histories:
@@ -121,10 +116,19 @@ class Histories:
         buffer_set: The buffer set.
         rows: The rows of its datasets.
         retrieval: A retrieval step, or None.
+
+    Attributes:
+        parts: Most parts P of an answer, at least 1.
     """
 
     def __init__(self, buffer_set: BufferSet, rows: Rows, retrieval: Retrieval | None):
         self._set, self._rows, self._retrieval = buffer_set, rows, retrieval
+        spans = (
+            span
+            for record in buffer_set.datasets[DEMONSTRATIONS].records()
+            for span in record.evidence or ()
+        )
+        self.parts = max((span.part + 1 for span in spans), default=1)
 
     def draw(
         self, source: SessionSource, episode: EpisodeId, condition: str, shift: Shift | None
@@ -142,18 +146,20 @@ class Histories:
             parts.append(
                 np.repeat(np.arange(first + entry.start, first + entry.stop), entry.repeat)
             )
-        rows, evidence = np.concatenate(parts), buffer.evidence
+        rows = np.concatenate(parts)
+        evidence: NDArray[np.bool_] | None = None
+        if buffer.evidence is not None:
+            evidence = np.zeros((len(rows), self.parts), bool)
+            for one in buffer.evidence:
+                if one.session.role != "contradiction":
+                    evidence[one.start : one.stop, one.span.part] = True
         if self._retrieval is not None and len(rows):
             step = self._retrieval
             chosen = select_stored(
                 self._set, buffer, step.encoder, rule=step.rule, camera=step.camera, shift=shift
             )
-            rows = rows[chosen]
-            evidence = evidence if evidence is None else among(evidence, chosen.tolist())
-        if evidence is None:
-            return History(rows, None)
-        shown = (one for one in evidence if one.session.role != "contradiction")
-        return History(rows, tuple((one.start, one.stop, one.span.part) for one in shown))
+            rows, evidence = rows[chosen], evidence if evidence is None else evidence[chosen]
+        return History(rows, evidence)
 
 
 @dataclass(frozen=True)
@@ -180,6 +186,8 @@ class Weights:
 
     def draw(self, *key: int | str) -> str:
         """Return the name that a key draws, the same on every machine."""
+        if len(self.names) == 1:
+            return self.names[0]
         lot = (number_from(*key) >> 11) / 2**53
         numbers = (n for n, stop in enumerate(self.cumulative) if lot < stop)
         return self.names[next(numbers, len(self.names) - 1)]

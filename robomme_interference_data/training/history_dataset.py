@@ -3,12 +3,11 @@
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, EXECUTIONS, SHIFTED, STATE
+from robomme_interference_data.constants import ACTION, EXECUTIONS, SHIFTED, STATE
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import camera_feature
 from robomme_interference_data.data.loading import load_buffer_set
@@ -17,10 +16,10 @@ from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.ids import EpisodeId, parse_numbers, whole_number
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.sampling import Memory
-from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFTS, Shift, parse_shift
+from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFTS, parse_shift
 from robomme_interference_data.storage.cache import default_cache_folder
 
-from .histories import Histories, History, Retrieval, Rows, Weights, number_from
+from .histories import PADDING, Histories, History, Retrieval, Rows, Weights, number_from
 from .moments import check_size, choose_moments, needed_datasets
 from .question_tensors import QuestionTensors
 
@@ -29,6 +28,17 @@ if TYPE_CHECKING:
 
 _Key = tuple[EpisodeId, str, str]
 """Query episode, condition and shift."""
+
+
+class _Drawn(NamedTuple):
+    """What the draws make of an index: a moment of an episode, given by number, and its history."""
+
+    item: int
+    number: int
+    moment: int
+    condition: str
+    shift: str
+    history: History
 
 
 class HistoryDataset:
@@ -60,6 +70,9 @@ class HistoryDataset:
       `question.answer`: `() int64`, the index of the right option;
     - `task`: the goal; `condition`, `shift`, `episode_id`: text;
     - `frame_index`: `() int64`, t; `index`: `() int64`, the item's index.
+
+    A list of indices gives a batch, with all entries as `default_collate` makes them of the items,
+    but faster; for `DataLoader(data, batch_size=None, sampler=BatchSampler(…))`.
 
     Args:
         buffer_set: Folder, `namespace/name` on the Hub, or a `BufferSet`.
@@ -149,7 +162,7 @@ class HistoryDataset:
         )
         step = Retrieval(retrieval, retrieval_rule, retrieval_camera) if retrieval else None
         self._histories = Histories(self.buffer_set, self._rows, step)
-        self._questions = QuestionTensors(self.buffer_set) if questions else None
+        self._questions = QuestionTensors(self.buffer_set, self.episode_ids) if questions else None
         folder = default_cache_folder().parent / "frames" if store is None else Path(store)
         with WorkProgress(unit="episodes", quiet=quiet) as progress:
             for camera in self.cameras:
@@ -161,12 +174,6 @@ class HistoryDataset:
                 self._planned = {} if redraw else self._plan()
         self._redrawn: tuple[int, SessionSource, dict[_Key, History]] | None = None
         self._size = self.memory_frames
-        spans = (
-            span
-            for one in self.buffer_set.datasets[DEMONSTRATIONS].records()
-            for span in one.evidence or ()
-        )
-        self._parts = max((span.part + 1 for span in spans), default=1)
         import torch
 
         # Shared with the processes of a loader, which have copies of the dataset.
@@ -215,67 +222,79 @@ class HistoryDataset:
         """
         return self._moments.index_of(EpisodeId.parse(episode_id), frame_index)
 
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        """Return an item; see the class."""
-        import torch
+    def __getitem__(self, index: int | list[int]) -> dict[str, Any]:
+        """Return an item, or for a list of indices a batch; see the class."""
+        if isinstance(index, list):
+            return self._batch([self._drawn(one) for one in index])
+        batch = self._batch([self._drawn(index)])
+        options = batch.pop("question.options", None)
+        item = {name: values[0] for name, values in batch.items()}
+        return item if options is None else item | {"question.options": [one for (one,) in options]}
 
+    def _drawn(self, index: int) -> _Drawn:
         if not -len(self) <= index < len(self):
             raise IndexError(f"index {index} of {len(self)} items")
         index %= len(self)
         epoch, (number, moment) = self.epoch, self._moments.locate(index)
-        episode = self.episode_ids[number]
-        first, actions = self._moments.first[number], self._moments.actions[number]
         condition = self._conditions.draw("condition", self.seed, epoch, index)
         shift = self._shifts.draw("shift", self.seed, epoch, index)
-        history = self._history(epoch, episode, condition, shift)
-        live = len(history.rows) + moment
-        kept = np.asarray(self.memory.earlier(live), np.int64)
-        changed = self._shift_of[shift]
-        current = first + moment if changed is None else self._shifted_row(episode, changed)
-        earlier = kept < len(history.rows)
-        rows = np.concatenate(
-            [history.rows[kept[earlier]], first + kept[~earlier] - len(history.rows)]
-        )
-        item: dict[str, Any] = {}
-        earlier_pieces, now = self._rows.pieces(rows), self._rows.pieces(np.array([current]))
-        for name in (*self.cameras, STATE):
-            values = self._empty(name, self._size + 1)
-            self._rows.take(name, earlier_pieces, values[: len(rows)])
-            values[len(rows) : self._size] = 0
-            self._rows.take(name, now, values[self._size :])
-            both = torch.from_numpy(values)
-            item[name] = both[self._size]
-            item[f"memory.{name.removeprefix('observation.')}"] = both[: self._size]
-        padded = np.pad(kept, (0, self._size - len(kept)))
-        item["memory.position"] = torch.from_numpy(padded)
-        item["memory.is_pad"] = torch.arange(self._size) >= len(kept)
-        evidence = np.zeros((self._size, self._parts), bool)
-        for start, stop, part in history.evidence or ():
-            evidence[: len(kept), part] |= (kept >= start) & (kept < stop)
-        item["memory.evidence"] = torch.from_numpy(evidence)
-        item["evidence_known"] = torch.tensor(history.evidence is not None)
-        item["position"] = torch.tensor(live)
-        if self.chunk:
-            steps = np.arange(moment, moment + self.chunk)
-            executed = self._empty(ACTION, self.chunk)
-            pieces = self._rows.pieces(first + np.minimum(steps, actions - 1))
-            self._rows.take(ACTION, pieces, executed)
-            item[ACTION] = torch.from_numpy(executed)
-            item["action_is_pad"] = torch.from_numpy(steps >= actions)
-        if self._questions is not None:
-            item |= self._questions.of(episode)
-        return item | {
-            "task": self.buffer_set.query(episode).goal,
-            "condition": condition,
-            "shift": shift,
-            "episode_id": str(episode),
-            "frame_index": torch.tensor(moment),
-            "index": torch.tensor(index),
-        }
+        history = self._history(epoch, self.episode_ids[number], condition, shift)
+        return _Drawn(index, number, moment, condition, shift, history)
 
-    def _empty(self, feature: str, count: int) -> NDArray[Any]:
-        dtype = np.float32 if feature in (STATE, ACTION) else np.uint8
-        return np.empty((count, *self._rows.shape(feature)), dtype)
+    def _batch(self, items: Sequence[_Drawn]) -> dict[str, Any]:
+        import torch
+
+        places = len(items), self._size
+        rows, position = np.full(places, PADDING), np.zeros(places, np.int64)
+        is_pad = np.ones(places, bool)
+        evidence = np.zeros((*places, self._histories.parts), bool)
+        for place, one in enumerate(items):
+            past, shown = one.history.rows, one.history.evidence
+            kept = np.asarray(self.memory.earlier(len(past) + one.moment), np.int64)
+            count, ended = len(kept), int(kept.searchsorted(len(past)))
+            rows[place, :ended] = past[kept[:ended]]
+            rows[place, ended:count] = kept[ended:] + (self._moments.first[one.number] - len(past))
+            position[place, :count], is_pad[place, :count] = kept, False
+            if shown is not None:
+                evidence[place, :ended] = shown[kept[:ended]]
+        moment = np.array([one.moment for one in items])
+        numbers = [one.number for one in items]
+        first = self._moments.first[numbers]
+        now = np.array([self._current_row(one) for one in items])
+        batch: dict[str, Any] = {}
+        for name in (*self.cameras, STATE):
+            batch[name] = self._rows.take(name, now)
+            batch[f"memory.{name.removeprefix('observation.')}"] = self._rows.take(name, rows)
+        batch["memory.position"], batch["memory.is_pad"] = position, is_pad
+        batch["memory.evidence"] = evidence
+        batch["evidence_known"] = np.array([one.history.evidence is not None for one in items])
+        batch["position"] = moment + [len(one.history.rows) for one in items]
+        if self.chunk:
+            steps = moment[:, None] + np.arange(self.chunk)
+            last = self._moments.actions[numbers][:, None] - 1
+            batch[ACTION] = self._rows.take(ACTION, first[:, None] + np.minimum(steps, last))
+            batch["action_is_pad"] = steps > last
+        batch["frame_index"] = moment
+        batch["index"] = np.array([one.item for one in items])
+        episodes = [self.episode_ids[number] for number in numbers]
+        texts = {
+            "task": [self.buffer_set.query(one).goal for one in episodes],
+            "condition": [one.condition for one in items],
+            "shift": [one.shift for one in items],
+            "episode_id": [str(one) for one in episodes],
+        }
+        if self._questions is not None:
+            batch |= self._questions.arrays(numbers)
+            texts |= self._questions.texts(numbers)
+        return {name: torch.from_numpy(values) for name, values in batch.items()} | texts
+
+    def _current_row(self, one: _Drawn) -> int:
+        shift = self._shift_of[one.shift]
+        if shift is None:
+            return int(self._moments.first[one.number]) + one.moment
+        views = self.buffer_set.datasets[SHIFTED]
+        episode = views.index_of(self.episode_ids[one.number])
+        return self._rows.first(SHIFTED, episode) + SHIFTS.index(shift)
 
     def _history(self, epoch: int, episode: EpisodeId, condition: str, shift: str) -> History:
         if not self._redraw:
@@ -315,10 +334,6 @@ class HistoryDataset:
             for buffer in self.buffer_set.buffers(condition=self._conditions.names)
             if buffer.episode_id in used
         }
-
-    def _shifted_row(self, episode: EpisodeId, shift: Shift) -> int:
-        views = self.buffer_set.datasets[SHIFTED]
-        return self._rows.first(SHIFTED, views.index_of(episode)) + SHIFTS.index(shift)
 
 
 def _from_zero(option: str, given: int) -> int:

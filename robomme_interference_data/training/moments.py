@@ -54,14 +54,15 @@ class Moments:
 
     Attributes:
         episodes: The episodes.
-        first: Row of each episode's first live frame.
-        actions: Actions of each episode from there on; 0 where only the first moment is used.
+        first: Row of each episode's first live frame, `(E,) int64`.
+        actions: Actions of each episode from there on, `(E,) int64`; 0 where only the first moment
+            is used.
         stops: Index after the last item of each episode, `(E,) int64`.
     """
 
     episodes: tuple[EpisodeId, ...]
-    first: tuple[int, ...]
-    actions: tuple[int, ...]
+    first: NDArray[np.int64]
+    actions: NDArray[np.int64]
     stops: NDArray[np.int64]
 
     def __len__(self) -> int:
@@ -118,8 +119,8 @@ def choose_moments(
         hint = f"They lack {format_numbers(sorted(missing))}." if missing else None
         raise InvalidOptionError.expected("episodes", episodes, expected, hint)
     records = [recorded[one] for one in chosen]
-    counts = tuple(one.length if actions else 0 for one in records)
-    first = (
+    counts = np.array([one.length if actions else 0 for one in records])
+    first = [
         rows.first(live.kind, one.episode_index) + (one.exec_start_idx or 0) for one in records
-    )
-    return Moments(chosen, tuple(first), counts, np.cumsum([count or 1 for count in counts]))
+    ]
+    return Moments(chosen, np.array(first), counts, np.cumsum(np.maximum(counts, 1)))

@@ -1,8 +1,10 @@
-"""The questions about the past as tensors, for models that choose an option."""
+"""The questions about the past as arrays, for models that choose an option."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.questions import read_questions
@@ -10,33 +12,45 @@ from robomme_interference_data.ids import EpisodeId
 
 
 class QuestionTensors:
-    """The questions of a buffer set, padded to the most options (O) and points (P) of any."""
+    """The questions of episodes, padded to the most options (O) and points (P) of the buffer set.
 
-    def __init__(self, buffer_set: BufferSet):
-        self._questions = read_questions(buffer_set)
-        every = self._questions.values()
-        self._options = max(len(one.options) for one in every)
-        self._points = max(1, *(len(points) for one in every for points in one.pixels))
-        shape = buffer_set.query(next(iter(self._questions))).dataset.shape("front")
-        self._size = np.array(shape[:2], np.float32)
+    Entries of several episodes, given by their numbers, are those of a batch; see `HistoryDataset`.
+    """
 
-    def of(self, episode: EpisodeId) -> dict[str, Any]:
-        """Return the entries of an item for an episode's question; see `HistoryDataset`."""
-        import torch
+    def __init__(self, buffer_set: BufferSet, episodes: Sequence[EpisodeId]):
+        questions = read_questions(buffer_set)
+        options = max(len(one.options) for one in questions.values())
+        most = max(1, *(len(points) for one in questions.values() for points in one.pixels))
+        shape = buffer_set.query(episodes[0]).dataset.shape("front")
+        self._questions = [questions[one] for one in episodes]
+        points = np.zeros((len(episodes), options, most, 2), np.float32)
+        point_is_pad = np.ones(points.shape[:3], bool)
+        for number, question in enumerate(self._questions):
+            for option, values in enumerate(question.pixels):
+                pixels = np.reshape(np.array(values, np.float32), (-1, 2))
+                points[number, option, : len(pixels)] = (pixels + 0.5) / np.array(
+                    shape[:2], np.float32
+                )
+                point_is_pad[number, option, : len(pixels)] = False
+        counts = np.array([len(one.options) for one in self._questions])
+        self._arrays = {
+            "question.option_is_pad": np.arange(options) >= counts[:, None],
+            "question.points": points,
+            "question.point_is_pad": point_is_pad,
+            "question.answer": np.array([one.right for one in self._questions]),
+        }
+        self._texts = [
+            [*one.options, *[""] * (options - len(one.options))] for one in self._questions
+        ]
 
-        question = self._questions[episode]
-        points = np.zeros((self._options, self._points, 2), np.float32)
-        point_is_pad = np.ones((self._options, self._points), bool)
-        for option, values in enumerate(question.pixels):
-            pixels = np.reshape(np.array(values, np.float32), (-1, 2))
-            points[option, : len(pixels)] = (pixels + 0.5) / self._size
-            point_is_pad[option, : len(pixels)] = False
-        padding = self._options - len(question.options)
+    def arrays(self, numbers: list[int]) -> dict[str, NDArray[Any]]:
+        """Return the entries of a batch that are arrays."""
+        return {name: values[numbers] for name, values in self._arrays.items()}
+
+    def texts(self, numbers: list[int]) -> dict[str, Any]:
+        """Return the others: B questions, and O lists of the texts of B options."""
+        options = zip(*(self._texts[number] for number in numbers), strict=True)
         return {
-            "question": question.text,
-            "question.options": [*question.options, *[""] * padding],
-            "question.option_is_pad": torch.arange(self._options) >= len(question.options),
-            "question.points": torch.from_numpy(points),
-            "question.point_is_pad": torch.from_numpy(point_is_pad),
-            "question.answer": torch.tensor(question.right),
+            "question": [self._questions[number].text for number in numbers],
+            "question.options": [list(one) for one in options],
         }

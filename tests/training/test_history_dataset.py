@@ -16,6 +16,7 @@ from support.buffer_sets import GOLDEN, QUERIES, copy_buffer_set, plan_again
 from support.retrieval import make_index
 from support.shifted import add_shifted
 from support.tabletop import TABLETOP
+from torch.utils.data import default_collate
 
 from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.constants import EXECUTIONS, MANIFESTS, STATE
@@ -157,6 +158,43 @@ def test_questions_as_tensors(tmp_path: Path) -> None:
             y, x = question.pixels[0][0]
             expected = [(y + 0.5) / 256, (x + 0.5) / 256]
             np.testing.assert_allclose(item["question.points"][0, 0], expected, rtol=1e-6)
+
+
+def same(batch: dict[str, Any], collated: dict[str, Any]) -> None:
+    """Check that two batches have the same entries; texts may be in tuples or lists."""
+    assert batch.keys() == collated.keys()
+    for name, values in batch.items():
+        if isinstance(values, torch.Tensor):
+            torch.testing.assert_close(values, collated[name], rtol=0, atol=0)
+        elif name == "question.options":
+            assert [*map(list, values)] == [*map(list, collated[name])]
+        else:
+            assert values == list(collated[name])
+
+
+@pytest.mark.parametrize("memory", ["framesamp:8", "window:5", "full"])
+def test_a_batch_is_the_collated_items(memory: str, make: Make) -> None:
+    data = make({"no-history": 1, "k0": 1, "k3": 1}, memory=memory)
+    indices = [5, 0, 5, 2 * LIVE, LIVE - 1, *range(90, 99), -1]
+    collated = default_collate([data[index] for index in indices])
+    assert {*collated["condition"]} == {"no-history", "k0", "k3"}
+    same(data[indices], collated)
+    sampler = torch.utils.data.BatchSampler(indices, 6, drop_last=False)
+    loader = torch.utils.data.DataLoader(data, None, sampler=sampler, num_workers=2)
+    for batch, chosen in zip(loader, sampler, strict=True):
+        same(batch, data[chosen])
+    with pytest.raises(IndexError, match="636"):
+        data[[0, 3 * LIVE]]
+
+
+def test_a_batch_of_questions_and_shifts(make: Make, tmp_path: Path) -> None:
+    options: dict[str, Any] = {"chunk": 0, "questions": True, "store": tmp_path, "quiet": True}
+    asked = HistoryDataset(TABLETOP, ["k0"], image_size=8, **options)
+    shifted = make(["k0"], chunk=0, shifts={"none": 1, str(SHIFTS[2]): 1}, seed=3)
+    assert len({shifted[index]["shift"] for index in range(3)}) == 2
+    for data in (asked, shifted):
+        every = [*range(len(data))]
+        same(data[every], default_collate([data[index] for index in every]))
 
 
 # --- draws -------------------------------------------------------------------------------------
