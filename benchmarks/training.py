@@ -33,7 +33,8 @@ from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.training import HistoryDataset
 
 MEMORY = Memory("framesamp", 32)
-BATCH = 64
+BATCH, FEW = 64, 8
+"""Items of a batch of resized images, and of one of full images: about as many bytes."""
 
 
 def main() -> None:
@@ -53,15 +54,15 @@ def main() -> None:
         buffers = [buffer_set.load(episode, "k7") for episode in data.episode_ids]
         kept = [list(MEMORY.earlier(len(buffer))) for buffer in buffers]
 
-        indices = np.resize(np.arange(count), (8, BATCH)).tolist()
+        many, few = (np.resize(np.arange(count), (8, size)).tolist() for size in (BATCH, FEW))
 
-        def batches(of: HistoryDataset) -> Callable[[int], object]:
+        def batches(of: HistoryDataset, indices: list[list[int]]) -> Callable[[int], object]:
             return lambda number: of[indices[number]]
 
         def collated(number: int) -> object:
-            return default_collate([data[index] for index in indices[number]])
+            return default_collate([data[index] for index in many[number]])
 
-        def copying(of: HistoryDataset) -> Callable[[int], object]:
+        def copying(of: HistoryDataset, indices: list[list[int]]) -> Callable[[int], object]:
             images = of[indices[0]]["memory.images.front"]
             return lambda number: images.clone()
 
@@ -73,31 +74,36 @@ def main() -> None:
                 make(number)
 
         side = buffer_set.datasets[DEMONSTRATIONS].shape("front")[0]
-        # Calls a round, items a call, and what is called.
-        ways: dict[str, tuple[int, int, Callable[[int], object]]] = {
-            f"HistoryDataset, {args.image_size} px": (8, BATCH, batches(data)),
-            f"items and default_collate, {args.image_size} px": (8, BATCH, collated),
-            f"copy of the same bytes, {args.image_size} px": (8, BATCH, copying(data)),
-            f"HistoryDataset, {side} px": (2, BATCH, batches(large)),
-            f"copy of the same bytes, {side} px": (2, BATCH, copying(large)),
-            f"Buffer.stream(indices=…), {side} px": (min(4, count), 1, stream),
-            f"LeRobotDataset, delta_timestamps, {side} px": (4, 1, lerobot(Path(root))),
+        small, full = f"HistoryDataset, {args.image_size} px", f"HistoryDataset, {side} px"
+        # Calls a round, items a call, what is called, and what it is compared with.
+        ways: dict[str, tuple[int, int, Callable[[int], object], str]] = {
+            small: (8, BATCH, batches(data, many), small),
+            f"items and default_collate, {args.image_size} px": (8, BATCH, collated, small),
+            f"copy of the same bytes, {args.image_size} px": (8, BATCH, copying(data, many), small),
+            full: (8, FEW, batches(large, few), full),
+            f"copy of the same bytes, {side} px": (8, FEW, copying(large, few), full),
+            f"Buffer.stream(indices=…), {side} px": (min(4, count), 1, stream, full),
+            f"LeRobotDataset, delta_timestamps, {side} px": (4, 1, lerobot(Path(root)), full),
         }
-        calls = {name: partial(each, number, call) for name, (number, _, call) in ways.items()}
+
+        def epochs(number: int) -> int:
+            for _ in range(number):
+                for indices in many:
+                    data[indices]
+            return peak_memory()
+
+        grown = -epochs(1) + epochs(4)
+        calls = {name: partial(each, number, way) for name, (number, _, way, _) in ways.items()}
         times = interleave(calls, args.rounds, time.process_time)
-        rates = {
-            name: calls * items / times.median(name) for name, (calls, items, _) in ways.items()
-        }
-        before = peak_memory()
-        for number in range(count):
-            data[indices[number % 8]]
-        grown = peak_memory() - before
-    base = rates[f"HistoryDataset, {args.image_size} px"]
-    rows = [[name, f"{rate:,.1f}", f"{base / rate:,.1f}"] for name, rate in rates.items()]
+    items = {name: number * size for name, (number, size, _, _) in ways.items()}
+    rows = []
+    for name, (*_, base) in ways.items():
+        ratio = times.ratio(name, base) * items[base] / items[name]
+        rows.append([name, f"{items[name] / times.median(name):,.1f}", f"{ratio:,.1f}"])
     print_machine("numpy", "torch", "lerobot")
     columns = ("<way", ">items per processor second", ">HistoryDataset is faster by")
     print_table("Items of 32 frames, one process:", columns, rows)
-    print(f"\n{count} more batches add {megabytes(grown)} MB to the peak memory.")
+    print(f"\nFour more epochs add {megabytes(grown)} MB to the peak memory.")
 
 
 def lerobot(root: Path) -> Callable[[int], object]:

@@ -106,11 +106,16 @@ class EpisodeId:
         return self.sort_key < other.sort_key
 
 
-def whole_number(option: str, given: Any, expected: str) -> int:
-    """Return an integer argument, Python's or numpy's, but not a boolean; else raise an error."""
+def whole_number(option: str, given: Any, expected: str, least: int | None = None) -> int:
+    """Return an integer argument, Python's or numpy's, but not a boolean; else raise an error.
+
+    The error also has those below `least`.
+    """
     try:
         if not isinstance(given, bool):
-            return operator.index(given)
+            number = operator.index(given)
+            if least is None or number >= least:
+                return number
     except TypeError:
         pass
     raise InvalidOptionError.expected(option, given, expected)

@@ -39,7 +39,7 @@ class Config:
     width: int = 96
     layers: int = 2
     trunk: str = "transformer"
-    pictures: bool = True  # False: the control, with memory's positions and lengths only
+    pictures: bool = True  # False: the control, with its memory's positions and lengths only
     seed: int = 0
 
 
@@ -210,6 +210,14 @@ def _with_waves(values: Tensor) -> Tensor:
 def _with_current(batch: dict[str, Any], name: str) -> Tensor:
     """Return a feature of the frames in memory and of the current one, `(B, M + 1, …)`."""
     return torch.cat([batch[f"memory.{name}"], batch[f"observation.{name}"][:, None]], 1)
+
+
+def on_device(batch: dict[str, Any], device: str) -> dict[str, Any]:
+    """Return a batch with its tensors on a device."""
+    return {
+        name: value.to(device) if isinstance(value, Tensor) else value
+        for name, value in batch.items()
+    }
 
 
 def save_checkpoint(model: MemoryModel, folder: Path) -> None:

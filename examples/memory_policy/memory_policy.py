@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from command_line import default_device
-from memory_model import load_checkpoint
+from memory_model import load_checkpoint, on_device
 from numpy.typing import NDArray
 
 from robomme_interference_data.errors import InvalidOptionError
@@ -86,10 +86,7 @@ class MemoryPolicy(Policy):
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the next chunk of actions, `(chunk, 8) float32`."""
-        batch = {
-            name: value.to(self._device) if isinstance(value, torch.Tensor) else value
-            for name, value in self.batch(goal).items()
-        }
+        batch = on_device(self.batch(goal), self._device)
         with torch.inference_mode():
             actions: NDArray[np.float32] = self._model(batch)[0].cpu().numpy()
         actions[:, -1] = np.sign(actions[:, -1])

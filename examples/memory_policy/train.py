@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 from command_line import default_device, device, names, number, run, weights, whole
-from memory_model import Config, MemoryModel, save_checkpoint
+from memory_model import Config, MemoryModel, on_device, save_checkpoint
 from torch.nn import functional
 from torch.utils.data import BatchSampler, DataLoader
 
@@ -51,7 +51,7 @@ def arguments() -> argparse.Namespace:
     add("--redraw", "draw the sessions anew in every epoch", action="store_true")
     add("--unit-episodes", "with --redraw, indices of episodes whose units may be drawn")
     add("--trunk", "reader of the memory", choices=("transformer", "gru"), default="transformer")
-    add("--no-pictures", "the control: positions and lengths only", action="store_true")
+    add("--no-pictures", "the control: memory without pictures and states", action="store_true")
     add("--width", "values of a token", type=whole(4, 4), default=96)
     add("--layers", "layers of the trunk", type=whole(1), default=2)
     add("--chunk", "with --task act, actions per chunk", type=whole(1), default=16)
@@ -122,6 +122,7 @@ def main(args: argparse.Namespace) -> None:
     step, log = (state["step"], state["log"]) if state else (0, [])
     if state:
         torch.set_rng_state(state["random"])
+        torch.cuda.set_rng_state_all(state["random_on_gpus"])
         save(args.out, model, state)  # in case that files other than the state are lost
     print(f"{sum(p.numel() for p in model.parameters()):,} parameters; step {step} of {args.steps}")
     began = perf_counter()
@@ -146,6 +147,7 @@ def main(args: argparse.Namespace) -> None:
         if step % args.save_every == 0 or step == args.steps:
             kept = {name: part.state_dict() for name, part in parts.items()}
             kept |= {"step": step, "log": log, "random": torch.get_rng_state()}
+            kept |= {"random_on_gpus": torch.cuda.get_rng_state_all()}
             save(args.out, model, kept | {"settings": settings})
 
 
@@ -170,16 +172,13 @@ def batches(data: HistoryDataset, args: argparse.Namespace, step: int) -> Iterat
             if step == args.steps:
                 return
             step += 1
-            yield {
-                name: value.to(args.device) if isinstance(value, torch.Tensor) else value
-                for name, value in batch.items()
-            }
+            yield on_device(batch, args.device)
 
 
 def train_step(
     model: MemoryModel, batch: dict[str, Any], optimizer: torch.optim.Optimizer
 ) -> tuple[float, float]:
-    """Take one step; return the loss, and the share of right answers or exact gripper commands."""
+    """Take one step; return the loss, and the share of right answers or signs of the gripper."""
     predicted = model(batch)
     if model.config.task == "answer":
         loss = functional.cross_entropy(predicted, batch["question.answer"])

@@ -234,10 +234,7 @@ class Buffer:
             UnknownNameError: The buffer has no such frame or camera.
             MissingFileError, FormatError: As for `frames`.
         """
-        expected = "an integer from 1"
-        chunk = whole_number("chunk", chunk, expected)
-        if chunk < 1:
-            raise InvalidOptionError.expected("chunk", chunk, expected)
+        chunk = whole_number("chunk", chunk, "an integer from 1", 1)
         chosen = self._chosen(indices)
         if isinstance(cameras, str) or not isinstance(cameras, Iterable | None):
             raise InvalidOptionError.expected("cameras", cameras, "their names: ['front', 'wrist']")

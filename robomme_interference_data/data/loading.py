@@ -46,10 +46,7 @@ def load_buffer_set(
     _check_location("buffer_set", buffer_set, "a folder, or namespace/name")
     files = locate(buffer_set, revision=revision)
     if threads is not None:
-        expected = "an integer from 1, or None"
-        threads = whole_number("threads", threads, expected)
-        if threads < 1:
-            raise InvalidOptionError.expected("threads", threads, expected)
+        threads = whole_number("threads", threads, "an integer from 1, or None", 1)
     try:
         return BufferSet(files, _cache(cache), threads)
     except MissingFileError as error:

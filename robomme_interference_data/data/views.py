@@ -3,15 +3,15 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, SHIFTED
-from robomme_interference_data.errors import MissingFileError
+from robomme_interference_data.constants import DISTRACTORS, SHIFTED
+from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.shifts import SHIFTS, Shift
-from robomme_interference_data.storage.files import LocalFiles
 
 from .buffer import Buffer
 from .buffer_set import BufferSet
 from .dataset import Dataset
 from .embeddings import BufferSetIndex
+from .loading import open_dataset
 
 
 def live_frame(
@@ -20,8 +20,8 @@ def live_frame(
     """Decode the stored first live view of a buffer's query, `(H, W, 3) uint8` RGB."""
     if shift is None:
         return buffer.query.frame(camera)
-    views, number = _views(buffer_set), SHIFTS.index(shift)
-    [frame] = views.iter_frames(views.index_of(buffer.episode_id), camera, number, number + 1)
+    views, stored, number = shifted_view(buffer_set, buffer.episode_id, shift)
+    [frame] = views.iter_frames(stored, camera, number, number + 1)
     return frame
 
 
@@ -31,22 +31,19 @@ def live_embedding(
     """Read the embedding of the stored first live view of a buffer's query, `(D,) float32`."""
     if shift is None:
         return buffer.query_embedding(encoder, camera)
-    views, number = _views(buffer_set), SHIFTS.index(shift)
+    views, stored, number = shifted_view(buffer_set, buffer.episode_id, shift)
     datasets = {DISTRACTORS: buffer_set.datasets[DISTRACTORS], SHIFTED: views}
     index = BufferSetIndex(datasets, encoder, camera)
-    return index.span(SHIFTED, views.index_of(buffer.episode_id), number, number + 1)[0]
+    return index.span(SHIFTED, stored, number, number + 1)[0]
 
 
-def _views(buffer_set: BufferSet) -> Dataset:
-    if SHIFTED in buffer_set.datasets:
-        return buffer_set.datasets[SHIFTED]
-    what = f"{buffer_set.location} has no first live views under shifts"
-    if not isinstance(buffer_set.files, LocalFiles):
-        raise MissingFileError(what, "Ask its publisher to add them.")
-    source = next(iter(buffer_set.datasets[DEMONSTRATIONS].identity.simulators), "SIMULATOR")
-    raise MissingFileError(
-        what,
-        "If the simulator of its demonstrations supports shifts, build them, then run build "
-        "manifests and index again.",
-        f"build {SHIFTED} --source {source} --split test --out {buffer_set.location}/{SHIFTED}",
-    )
+def shifted_view(
+    buffer_set: BufferSet, episode: EpisodeId, shift: Shift
+) -> tuple[Dataset, int, int]:
+    """Return the dataset, episode index and frame of a query's first live view under a shift.
+
+    Raises:
+        MissingFileError: The buffer set has no views under shifts.
+    """
+    views = open_dataset(buffer_set, SHIFTED, "For retrieval, run index again, too.")
+    return views, views.index_of(episode), SHIFTS.index(shift)

@@ -8,6 +8,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -175,7 +176,7 @@ class Weights:
         if isinstance(given, str):
             given = (given,)
         weights = dict(given) if isinstance(given, Mapping) else dict.fromkeys(given, 1.0)
-        numbers = [one for one in weights.values() if isinstance(one, int | float)]
+        numbers = [one for one in weights.values() if isinstance(one, Real)]
         if len(numbers) < len(weights) or not all(0 < one < math.inf for one in numbers):
             expected = "a positive weight for each name, such as {'k0': 1, 'k7': 2}"
             raise InvalidOptionError.expected(option, given, expected)

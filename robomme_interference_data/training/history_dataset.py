@@ -1,5 +1,6 @@
 """A map-style PyTorch dataset of moments in executions, each with the memory of its history."""
 
+import operator
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,11 +13,12 @@ from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import camera_feature
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.data.query_sessions import SessionSource
+from robomme_interference_data.data.views import shifted_view
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.ids import EpisodeId, parse_numbers, whole_number
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.sampling import Memory
-from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFTS, parse_shift
+from robomme_interference_data.schema.shifts import NO_SHIFT, parse_shift
 from robomme_interference_data.storage.cache import default_cache_folder
 
 from .histories import PADDING, Histories, History, Retrieval, Rows, Weights, number_from
@@ -139,7 +141,7 @@ class HistoryDataset:
             questions=questions, redraw=redraw, unit_episodes=unit_episodes, seed=seed, store=store,
         )  # fmt: skip
         self.memory, self.seed = Memory.parse(memory), seed
-        self.chunk = _from_zero("chunk", chunk)
+        self.chunk = whole_number("chunk", chunk, "an integer from 0", 0)
         self.cameras = tuple(camera_feature(one) for one in cameras)
         self._conditions = Weights.parse("conditions", conditions)
         self._shifts = Weights.parse("shifts", shifts or {NO_SHIFT: 1})
@@ -155,6 +157,8 @@ class HistoryDataset:
             planned=not redraw,
         )
         self.buffer_set.check_tables(self._conditions.names)
+        for dataset in datasets.values():
+            dataset.check_records()
         size = check_size(self.buffer_set, self.cameras, image_size)
         self._rows, actions = Rows(datasets), self.chunk > 0
         self._moments = choose_moments(
@@ -212,7 +216,7 @@ class HistoryDataset:
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch, on which all draws depend, in this process and in those of its loaders."""
-        self._epoch.fill_(_from_zero("epoch", epoch))
+        self._epoch.fill_(whole_number("epoch", epoch, "an integer from 0", 0))
 
     def index_of(self, episode_id: EpisodeId | str, frame_index: int = 0) -> int:
         """Return the index of the item of an episode's moment.
@@ -232,6 +236,7 @@ class HistoryDataset:
         return item if options is None else item | {"question.options": [one for (one,) in options]}
 
     def _drawn(self, index: int) -> _Drawn:
+        index = operator.index(index)  # draws depend on its text: a tensor has another
         if not -len(self) <= index < len(self):
             raise IndexError(f"index {index} of {len(self)} items")
         index %= len(self)
@@ -292,9 +297,8 @@ class HistoryDataset:
         shift = self._shift_of[one.shift]
         if shift is None:
             return int(self._moments.first[one.number]) + one.moment
-        views = self.buffer_set.datasets[SHIFTED]
-        episode = views.index_of(self.episode_ids[one.number])
-        return self._rows.first(SHIFTED, episode) + SHIFTS.index(shift)
+        _, stored, frame = shifted_view(self.buffer_set, self.episode_ids[one.number], shift)
+        return self._rows.first(SHIFTED, stored) + frame
 
     def _history(self, epoch: int, episode: EpisodeId, condition: str, shift: str) -> History:
         if not self._redraw:
@@ -334,14 +338,6 @@ class HistoryDataset:
             for buffer in self.buffer_set.buffers(condition=self._conditions.names)
             if buffer.episode_id in used
         }
-
-
-def _from_zero(option: str, given: int) -> int:
-    expected = "an integer from 0"
-    number = whole_number(option, given, expected)
-    if number < 0:
-        raise InvalidOptionError.expected(option, given, expected)
-    return number
 
 
 def _open_again(location: str, arguments: dict[str, Any], epoch: "torch.Tensor") -> HistoryDataset:

@@ -40,9 +40,9 @@ def check_size(buffer_set: BufferSet, cameras: Sequence[str], size: int | None) 
     shapes = {camera: demonstrations.shape(camera) for camera in cameras}
     if size is None:
         return None
-    size = whole_number("image_size", size, "an integer from 1, or None")
+    size = whole_number("image_size", size, "an integer from 1, or None", 1)
     for camera, (height, width, _) in shapes.items():
-        if not 0 < size <= min(height, width):
+        if size > min(height, width):
             expected = f"1 to {min(height, width)}: {camera} has {width}×{height} pixels"
             raise InvalidOptionError.expected("image_size", size, expected)
     return size

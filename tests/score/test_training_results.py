@@ -4,17 +4,20 @@ import pyarrow.parquet as pq
 import pytest
 from support.pages import RESULTS, table
 
+from robomme_interference_data.schema.shifts import NO_SHIFT
+
 PAGE = (RESULTS / "training.md").read_text(encoding="utf-8")
 Rows = dict[tuple[str, str, str], list[bool]]
 
 
 @pytest.fixture(scope="module")
 def rows() -> Rows:
-    """Outcomes by system, condition and family."""
+    """Outcomes by system, condition (with the shift, if there is one) and family."""
     outcomes: Rows = {}
     for path in sorted((RESULTS / "training").glob("*.parquet")):
         for row in pq.read_table(path).to_pylist():
-            key = row["system"], row["condition"], row["family"]
+            shift = "" if row["shift"] == NO_SHIFT else f" {row['shift']}"
+            key = row["system"], row["condition"] + shift, row["family"]
             outcomes.setdefault(key, []).append(row["success"])
     return outcomes
 
