@@ -33,10 +33,12 @@ def percent(rows: Rows, system: str, condition: str, family: str | None = None) 
     return f"{100 * sum(chosen) / len(chosen):.1f}" if chosen else ""
 
 
-@pytest.mark.parametrize("first", ["system", "policy", "further conditions"])
+@pytest.mark.parametrize(
+    "first", ["system", "policy", "further conditions", "under shifts", "carried out"]
+)
 def test_rates_by_condition(rows: Rows, first: str) -> None:
     listed = table(PAGE, first)
-    assert len(listed) >= 2
+    assert listed
     for line in listed:
         system = line.pop(first).strip("`")
         line.pop("seeds", None)
