@@ -210,6 +210,8 @@ def test_items_are_a_function_of_seed_epoch_and_index(make: Make) -> None:
     assert {*first} == {"k0", "k3"} and first == drawn(data, 2) == drawn(make({"k0": 1, "k3": 1}))
     assert [data[index]["condition"] for index in (5, 0, 5)] == [first[5], first[0], first[5]]
     assert drawn(make({"k0": 1, "k3": 1}, seed=1)) != first
+    shuffled = torch.randperm(20)
+    assert data[[*shuffled]]["condition"] == [first[index] for index in shuffled]
     data.set_epoch(1)
     second = drawn(data)
     assert second != first and second == drawn(data, 2)
