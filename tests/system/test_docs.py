@@ -95,7 +95,7 @@ ELSEWHERE = (
     "python:memory_policy",  # has a test of its own
     "lamp",  # has a test of its own
     "k0.csv",  # rows of that policy
-    "answers:mixture.csv",  # answers of that policy
+    "answers:mixture",  # answers of that policy
     "results/acted-k0",  # their rollouts
 )
 """What marks command lines of the pages that need what is not available: they are parsed only."""
