@@ -63,8 +63,8 @@ def main() -> None:
             return default_collate([data[index] for index in many[number]])
 
         def copying(of: HistoryDataset, indices: list[list[int]]) -> Callable[[int], object]:
-            images = of[indices[0]]["memory.images.front"]
-            return lambda number: images.clone()
+            images = of[indices[0]]["memory.images.front"].numpy()
+            return lambda number: images.copy()  # several times as fast as torch's clone
 
         def stream(number: int) -> object:
             return list(buffers[number].stream(64, ["front"], kept[number]))
