@@ -13,7 +13,7 @@ from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.retrieval.grade import ALL
-from robomme_interference_data.retrieval.selector import select_stored
+from robomme_interference_data.retrieval.selector import StoredSelector
 from robomme_interference_data.schema.conditions import NO_HISTORY, in_order
 from robomme_interference_data.schema.evidence import known_parts
 from robomme_interference_data.schema.sampling import Memory, check_memory, evidence_kept
@@ -123,15 +123,10 @@ def _given(buffer_set: BufferSet, buffer: Buffer, config: CeilingConfig) -> Sequ
         return range(len(buffer))
     if not len(buffer):
         return None
-    chosen = select_stored(
-        buffer_set,
-        buffer,
-        config.retrieval,
-        rule=config.retrieval_rule,
-        camera=config.retrieval_camera,
-        shift=parse_shift(config.shift),
+    step = StoredSelector(
+        config.retrieval, rule=config.retrieval_rule, camera=config.retrieval_camera
     )
-    return chosen.tolist()
+    return step.select(buffer_set, buffer, parse_shift(config.shift)).tolist()
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

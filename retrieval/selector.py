@@ -18,30 +18,65 @@ from .encoders import check_encoder, encoder_name, make_encoder, published_thres
 from .select import Rule, choose, measure
 
 
-class Selector:
+class RetrievalStep:
+    """What the retrieval steps share: encoder, rule and camera.
+
+    Args:
+        encoder: Name of the encoder of the index, see `make_encoder`.
+        rule: Rule of the choice, see `Rule.parse`.
+        camera: Camera whose frames are compared.
+    """
+
+    def __init__(self, encoder: str, *, rule: str = "max", camera: str = "front"):
+        self.encoder = encoder_name(encoder)
+        self.rule = Rule.parse(rule, published_threshold(self.encoder))
+        self.camera = camera.removeprefix(CAMERA_PREFIX)
+
+    @property
+    def name(self) -> str:
+        """Encoder, camera unless it is the front one, and rule, such as `siglip/max/0.923`."""
+        return f"{PurePath(index_folder(self.encoder, self.camera)).name}/{self.rule}"
+
+    def _chosen(self, buffer: Buffer, query: NDArray[np.floating]) -> NDArray[np.int64]:
+        """Choose the frames of a buffer that match the embedding of a live image, `(D,)`."""
+        return choose(measure(buffer, self.encoder, self.camera, query), self.rule).frames
+
+
+class StoredSelector(RetrievalStep):
+    """Chooses the frames of a history that match its stored first live view.
+
+    No image is embedded: that view has an embedding in the index, too.
+    """
+
+    def select(
+        self, buffer_set: BufferSet, buffer: Buffer, shift: Shift | None = None
+    ) -> NDArray[np.int64]:
+        """Choose the frames of a buffer that match its stored first live view.
+
+        Args:
+            buffer_set: The buffer set of the buffer.
+            buffer: The history, with at least one frame.
+            shift: Shift of the first live view.
+
+        Returns:
+            Indices in the buffer, ascending, `(n,) int64`, n at least 1.
+        """
+        live = live_embedding(buffer_set, buffer, shift, self.encoder, self.camera)
+        return self._chosen(buffer, live)
+
+
+class Selector(RetrievalStep):
     """Chooses the frames of a history that match a live image.
 
     The embeddings of the history come from the index beside the data; only the live image is
-    embedded.
-
-    Args:
-        encoder: Name of the encoder, see `make_encoder`.
-        rule: Rule of the choice, see `Rule.parse`.
-        camera: Camera whose frames are compared.
-        device: Device to compute on; None for a GPU if there is one.
+    embedded, on `device`; None for a GPU if there is one.
     """
 
     def __init__(
         self, encoder: str, *, rule: str = "max", camera: str = "front", device: str | None = None
     ):
-        self.rule = Rule.parse(rule, published_threshold(encoder))
-        self.camera = camera.removeprefix(CAMERA_PREFIX)
+        super().__init__(encoder, rule=rule, camera=camera)
         self._encoder = make_encoder(encoder, device=device)
-
-    @property
-    def name(self) -> str:
-        """Encoder, camera unless it is the front one, and rule, such as `siglip/max/0.923`."""
-        return f"{PurePath(index_folder(self._encoder.name, self.camera)).name}/{self.rule}"
 
     def identity(self, buffer: Buffer) -> dict[str, Any]:
         """Return everything that its choices depend on besides the buffers, as plain values.
@@ -79,38 +114,10 @@ class Selector:
             raise InvalidOptionError.expected("image", actual, "(H, W, 3) uint8")
         features = self._encoder.features(self._encoder.prepare(image[None]))
         query = index.embed(features)[0]
-        return choose(measure(buffer, self._encoder.name, self.camera, query), self.rule).frames
+        return self._chosen(buffer, query)
 
     def _index(self, buffer: Buffer) -> BufferSetIndex:
         """Return the index of the buffer set, which this encoder has to have made."""
-        index = buffer.index(self._encoder.name, self.camera)
+        index = buffer.index(self.encoder, self.camera)
         check_encoder(index.units.header.encoder, self._encoder, index.units.remedy)
         return index
-
-
-def select_stored(
-    buffer_set: BufferSet,
-    buffer: Buffer,
-    encoder: str,
-    *,
-    rule: str = "max",
-    camera: str = "front",
-    shift: Shift | None = None,
-) -> NDArray[np.int64]:
-    """Choose the frames of a buffer that match its stored first live view; no image is embedded.
-
-    Args:
-        buffer_set: The buffer set of the buffer.
-        buffer: The history, with at least one frame.
-        encoder: Name of the encoder of the index, as for `Selector`.
-        rule: Rule of the choice, see `Rule.parse`.
-        camera: Camera whose frames are compared.
-        shift: Shift of the first live view.
-
-    Returns:
-        Indices in the buffer, ascending, `(n,) int64`, n at least 1.
-    """
-    name = encoder_name(encoder)
-    live = live_embedding(buffer_set, buffer, shift, name, camera)
-    parsed = Rule.parse(rule, published_threshold(name))
-    return choose(measure(buffer, name, camera, live), parsed).frames

@@ -20,7 +20,7 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.evidence import known_parts
 from robomme_interference_data.schema.rollouts import Rollout, Status
-from robomme_interference_data.schema.sampling import Memory, evidence_kept
+from robomme_interference_data.schema.sampling import Memory
 
 from .responders import OWN, ModelResponder, Prompted
 
@@ -59,9 +59,9 @@ class AskTask(RunTask[AskConfig]):
         given: Sequence[int] = range(len(buffer))
         if self.selector is not None and len(buffer):
             given = self.selector.select(buffer, query.frame(self.selector.camera)).tolist()
-        kept = Memory(config.sampling, config.frames).kept(given)
-        evidence = buffer.evidence
-        known = None if evidence is None else known_parts(evidence, kept)
+        memory = Memory(config.sampling, config.frames)
+        kept = memory.kept(given)
+        known = None if buffer.evidence is None else known_parts(buffer.evidence, kept)
         history = History(buffer, kept, self.history)
         prompted = Prompted(question, query, config.model_seed, known, history)
         right = question.letters[question.right]
@@ -84,8 +84,7 @@ class AskTask(RunTask[AskConfig]):
             difficulty=query.difficulty,
             goal=query.goal,
             steps=0,
-            **history_columns(buffer, given, self.selector),
-            evidence_kept=None if evidence is None else evidence_kept(evidence, kept),
+            **history_columns(buffer, given, self.selector, memory),
             answer=letter,
             chance=question.chance,
             **columns,

@@ -25,7 +25,7 @@ from robomme_interference_data.evaluate.systems import check_history, name_syste
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.evidence import among
 from robomme_interference_data.schema.rollouts import Rollout, Status
-from robomme_interference_data.schema.sampling import Memory, evidence_kept
+from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.schema.shifts import NO_SHIFT
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import (
@@ -126,6 +126,8 @@ def run_rollout(
     except Exception as error:
         vars(error)["progress"] = {"steps": live.steps, **_model_columns(writer)}
         raise
+    sampling = name_system(run.system).sampling
+    memory = Memory(sampling) if sampling else None
     times: dict[str, Any] = {name: round(value, 4) for name, value in clock.items()}
     return run.row(
         item,
@@ -134,8 +136,7 @@ def run_rollout(
         difficulty=info.difficulty,
         goal=info.goal,
         steps=live.steps,
-        **history_columns(buffer, given, selector),
-        evidence_kept=_evidence_kept(run.system, buffer, given),
+        **history_columns(buffer, given, selector, memory),
         **_model_columns(writer),
         **(simulator.columns() if isinstance(simulator, Simulator) else {}),
         **times,
@@ -221,14 +222,6 @@ def _model_columns(writer: SubgoalWriter | None) -> dict[str, Any]:
         [turn.tokens for turn in turns],
         sum(turn.fault is not None for turn in turns),
     )
-
-
-def _evidence_kept(system: str, buffer: Buffer, given: Sequence[int]) -> float | None:
-    """Return the share of the evidence that a system's memory holds at the first step, if known."""
-    memory = name_system(system).sampling
-    if memory is None or buffer.evidence is None:
-        return None
-    return evidence_kept(buffer.evidence, Memory(memory).kept(given))
 
 
 def _decode(

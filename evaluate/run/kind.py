@@ -17,7 +17,13 @@ from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.runtime.executor import Session, Worker
 from robomme_interference_data.schema.rollouts import Rollout, Status, success_of
-from robomme_interference_data.schema.sampling import even_sample, lesson_frames, lesson_share
+from robomme_interference_data.schema.sampling import (
+    Memory,
+    even_sample,
+    evidence_kept,
+    lesson_frames,
+    lesson_share,
+)
 from robomme_interference_data.simulators.registry import simulator_class
 
 from .config import AskConfig, RetrievalConfig, RunConfig
@@ -25,7 +31,7 @@ from .history import HistoryReader
 from .plan import Plan, WorkItem
 
 if TYPE_CHECKING:
-    from robomme_interference_data.retrieval.selector import Selector
+    from robomme_interference_data.retrieval.selector import RetrievalStep, Selector
 
 
 @dataclass(frozen=True)
@@ -102,22 +108,31 @@ def package_versions(config: RunConfig | AskConfig) -> dict[str, str]:
 
 
 def history_columns(
-    buffer: Buffer, given: Sequence[int], selector: "Selector | None"
+    buffer: Buffer, given: Sequence[int], step: "RetrievalStep | None", memory: Memory | None
 ) -> dict[str, Any]:
-    """Return the columns about the frames of a buffer that a policy or model was given."""
+    """Return the columns about the frames of a buffer that a policy or model was given.
+
+    Args:
+        buffer: The history.
+        given: The frames, as ascending indices.
+        step: The retrieval step that chose them; None if all frames were given.
+        memory: What of them the memory keeps; None if unknown.
+    """
     share = lesson_share(buffer.sessions, given) if given else None
     columns: dict[str, Any] = {
         "history_frames": len(given),
         "lesson_frames": lesson_frames(buffer.sessions, given),
         "lesson_share": share,
-        "retrieval_model": selector.name if selector else None,
+        "retrieval_model": step.name if step else None,
     }
-    if selector is not None and share is not None:
+    if step is not None and share is not None:
         columns |= {"retrieval_start": given[0], "retrieval_stop": given[-1] + 1}
         frames = len(even_sample(len(given)))
         filler = (frames - 1 - round(share * frames)) / frames
         for part, fraction in {"lesson": share, "filler": filler, "query": 1 / frames}.items():
             columns[f"retrieval_selected_{part}_fraction"] = fraction
+    if memory is not None and buffer.evidence is not None:
+        columns["evidence_kept"] = evidence_kept(buffer.evidence, memory.kept(given))
     return columns
 
 

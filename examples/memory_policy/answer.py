@@ -12,18 +12,19 @@ from pathlib import Path
 
 import torch
 from command_line import default_device, device, names, run
-from memory_model import MemoryModel, load_checkpoint
-from torch.utils.data import DataLoader
+from memory_model import MemoryModel, load_checkpoint, on_device
+from torch.utils.data import BatchSampler, DataLoader
 
 from robomme_interference_data import EpisodeId, Rollout, load_buffer_set
 from robomme_interference_data.constants import PROTOCOL_VERSION
 from robomme_interference_data.data.questions import LETTERS
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.run.kind import history_columns
-from robomme_interference_data.retrieval.selector import Selector
+from robomme_interference_data.retrieval.selector import StoredSelector
 from robomme_interference_data.schema.codec import to_dict
+from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.storage.files import atomic_path
-from robomme_interference_data.training import HistoryDataset
+from robomme_interference_data.training import HistoryDataset, Memory
 
 
 def arguments() -> argparse.Namespace:
@@ -36,9 +37,7 @@ def arguments() -> argparse.Namespace:
     add("buffer_set", help="folder, or namespace/name on the Hub, with questions")
     add("--out", type=Path, required=True, help="CSV file to write")
     add("--system", required=True, help="label of the rows, such as learned-k0")
-    add(
-        "--conditions", type=names, metavar="NAMES", help="NAME,…; all that are planned if left out"
-    )
+    add("--conditions", type=names, metavar="NAMES", help="NAME,…; all that apply if left out")
     add("--retrieval", help="encoder of a retrieval step before the memory, such as thumbnail")
     add("--device", type=device, default=default_device(), help="cpu or cuda (%(default)s)")
     return parser.parse_args()
@@ -61,8 +60,10 @@ def main(args: argparse.Namespace) -> None:
 def rows(model: MemoryModel, args: argparse.Namespace) -> Iterator[Rollout]:
     """Yield a row for each query episode under each condition."""
     config, buffer_set = model.config, load_buffer_set(args.buffer_set)
-    selector = Selector(args.retrieval) if args.retrieval else None
-    for condition in args.conditions or buffer_set.conditions:
+    memory = Memory.parse(config.memory)
+    step = StoredSelector(args.retrieval) if args.retrieval else None
+    applying = [one for one in buffer_set.conditions if step is None or one != NO_HISTORY]
+    for condition in args.conditions or applying:
         data = HistoryDataset(
             buffer_set,
             [condition],
@@ -71,23 +72,20 @@ def rows(model: MemoryModel, args: argparse.Namespace) -> Iterator[Rollout]:
             image_size=config.image_size,
             chunk=0,
             questions=True,
-            retrieval=args.retrieval if condition != "no-history" else None,
+            retrieval=args.retrieval,
             quiet=True,
         )
         right = 0
-        for batch in DataLoader(data, 32):
-            on_device = {
-                name: value.to(args.device) if isinstance(value, torch.Tensor) else value
-                for name, value in batch.items()
-            }
+        batches = BatchSampler(range(len(data)), 16, drop_last=False)
+        for batch in DataLoader(data, batch_size=None, sampler=batches):
             with torch.inference_mode():
-                chosen = model(on_device).argmax(1).tolist()
+                chosen = model(on_device(batch, args.device)).argmax(1).tolist()
             for number, option in enumerate(chosen):
                 episode = EpisodeId.parse(batch["episode_id"][number])
                 buffer = buffer_set.load(episode, condition)
                 record, given = buffer.query.record, [*range(len(buffer))]
-                if selector is not None and given:
-                    given = selector.select(buffer, buffer.query.frame(selector.camera)).tolist()
+                if step is not None:
+                    given = step.select(buffer_set, buffer).tolist()
                 success = option == int(batch["question.answer"][number])
                 right += success
                 yield Rollout(
@@ -108,7 +106,7 @@ def rows(model: MemoryModel, args: argparse.Namespace) -> Iterator[Rollout]:
                     status="success" if success else "fail",
                     success=success,
                     steps=0,
-                    **history_columns(buffer, given, selector),
+                    **history_columns(buffer, given, step, memory),
                     answer=LETTERS[option],
                     chance=1 / int((~batch["question.option_is_pad"][number]).sum()),
                 )

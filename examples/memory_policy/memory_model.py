@@ -39,6 +39,7 @@ class Config:
     width: int = 96
     layers: int = 2
     trunk: str = "transformer"
+    attention_dropout: bool = True  # False: attention over a long memory is several times as fast
     pictures: bool = True  # False: the control, with its memory's positions and lengths only
     seed: int = 0
 
@@ -59,7 +60,7 @@ class FrameEncoder(nn.Module):
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Return maps `(N, CHANNELS, h, w)` and vectors `(N, width)` of `(N, 3, S, S) uint8`."""
-        maps = self.patches(images.float() / 127.5 - 1)
+        maps = self.patches(images.float().div_(127.5).sub_(1))
         return maps, self.whole(maps)
 
 
@@ -84,6 +85,7 @@ class MemoryModel(nn.Module):
             layer = nn.TransformerEncoderLayer(
                 width, 4, 2 * width, dropout, "gelu", batch_first=True, norm_first=True
             )
+            layer.self_attn.dropout *= config.attention_dropout
             self.trunk = nn.TransformerEncoder(layer, config.layers, enable_nested_tensor=False)
         outputs = 1 if config.task == "answer" else config.chunk * config.action
         self.head = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, outputs))
@@ -109,6 +111,7 @@ class MemoryModel(nn.Module):
 
     def forward(self, batch: dict[str, Any]) -> Tensor:
         """Return scores of the options, `(B, O)`, or actions, `(B, chunk, D)`."""
+        batch = _trimmed(batch)
         tokens, maps = self._frames(batch)
         is_pad = functional.pad(batch["memory.is_pad"], (0, 1))  # the current frame is the last
         time = self._time(batch) + self._text(batch["task"])[:, None]
@@ -116,17 +119,18 @@ class MemoryModel(nn.Module):
             read = self._read(self.mixed(self.mix(tokens)) + time, is_pad)
             change = self.head(read).unflatten(1, (self.config.chunk, -1)) * self.action_std
             return self._still(batch) + change
-        batch_size, options = batch["question.option_is_pad"].shape
+        is_option = ~batch["question.option_is_pad"]
         # A batch has O lists of B texts.
         words = [text for texts in zip(*batch["question.options"], strict=True) for text in texts]
-        text = self._text(words).unflatten(0, (batch_size, options))[:, :, None]
+        text = self._text(words).unflatten(0, is_option.shape)[:, :, None]
         seen = tokens[:, None] + self._at_points(batch, maps) + text
         read = self._read(
-            (self.mixed(self.mix(seen)) + time[:, None] + text).flatten(0, 1),
-            is_pad.repeat_interleave(options, 0),
+            (self.mixed(self.mix(seen)) + time[:, None] + text)[is_option],
+            is_pad.repeat_interleave(is_option.sum(1), 0),
         )
-        scores = self.head(read).view(batch_size, options)
-        return scores.masked_fill(batch["question.option_is_pad"], -torch.inf)
+        scores = read.new_full(is_option.shape, -torch.inf)
+        scores[is_option] = self.head(read)[:, 0]
+        return scores
 
     def _frames(self, batch: dict[str, Any]) -> tuple[Tensor, Tensor]:
         """Return a token per frame, `(B, M + 1, width)`, and maps of the first camera."""
@@ -205,6 +209,15 @@ def _with_waves(values: Tensor) -> Tensor:
     """Return values, then their sines and cosines at four frequencies, `(…, 9 * D)`."""
     waves = [wave(values * 2.0**power) for wave in (torch.sin, torch.cos) for power in range(4)]
     return torch.cat([values, *waves], -1)
+
+
+def _trimmed(batch: dict[str, Any]) -> dict[str, Any]:
+    """Return a batch without the places in memory that none of its items uses."""
+    used = int((~batch["memory.is_pad"]).sum(1).max())
+    return {
+        name: value[:, :used] if name.startswith("memory.") else value
+        for name, value in batch.items()
+    }
 
 
 def _with_current(batch: dict[str, Any], name: str) -> Tensor:

@@ -54,6 +54,7 @@ def arguments() -> argparse.Namespace:
     add("--no-pictures", "the control: memory without pictures and states", action="store_true")
     add("--width", "values of a token", type=whole(4, 4), default=96)
     add("--layers", "layers of the trunk", type=whole(1), default=2)
+    add("--no-attention-dropout", "faster with --memory full", action="store_true")
     add("--chunk", "with --task act, actions per chunk", type=whole(1), default=16)
     add("--noise", "with --task act, noise on the current joints in rad", type=number, default=0.02)
     add("--steps", "batches to train on, a setting of the run", type=whole(1), default=1000)
@@ -106,6 +107,7 @@ def main(args: argparse.Namespace) -> None:
         chunk=args.chunk,
         width=args.width,
         layers=args.layers,
+        attention_dropout=not args.no_attention_dropout,
         trunk=args.trunk,
         pictures=not args.no_pictures,
         seed=args.seed,

@@ -22,21 +22,12 @@ from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.query_sessions import QuerySessions, SessionSource
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.retrieval.selector import select_stored
+from robomme_interference_data.retrieval.selector import StoredSelector
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.schema.shifts import Shift
 
 from .frame_store import first_rows, stored_values
-
-
-@dataclass(frozen=True)
-class Retrieval:
-    """A retrieval step in front of the memory; see `retrieval.selector.select_stored`."""
-
-    encoder: str
-    rule: str = "max"
-    camera: str = "front"
 
 
 @dataclass(frozen=True)
@@ -122,7 +113,7 @@ class Histories:
         parts: Most parts P of an answer, at least 1.
     """
 
-    def __init__(self, buffer_set: BufferSet, rows: Rows, retrieval: Retrieval | None):
+    def __init__(self, buffer_set: BufferSet, rows: Rows, retrieval: StoredSelector | None):
         self._set, self._rows, self._retrieval = buffer_set, rows, retrieval
         spans = (
             span
@@ -155,10 +146,7 @@ class Histories:
                 if one.session.role != "contradiction":
                     evidence[one.start : one.stop, one.span.part] = True
         if self._retrieval is not None and len(rows):
-            step = self._retrieval
-            chosen = select_stored(
-                self._set, buffer, step.encoder, rule=step.rule, camera=step.camera, shift=shift
-            )
+            chosen = self._retrieval.select(self._set, buffer, shift)
             rows, evidence = rows[chosen], evidence if evidence is None else evidence[chosen]
         return History(rows, evidence)
 

@@ -16,20 +16,21 @@ from robomme_interference_data.data.query_sessions import SessionSource
 from robomme_interference_data.data.views import shifted_view
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.ids import EpisodeId, parse_numbers, whole_number
+from robomme_interference_data.retrieval.selector import StoredSelector
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.sampling import Memory
-from robomme_interference_data.schema.shifts import NO_SHIFT, parse_shift
+from robomme_interference_data.schema.shifts import NO_SHIFT, Shift, parse_shift
 from robomme_interference_data.storage.cache import default_cache_folder
 
-from .histories import PADDING, Histories, History, Retrieval, Rows, Weights, number_from
+from .histories import PADDING, Histories, History, Rows, Weights, number_from
 from .moments import check_size, choose_moments, needed_datasets
 from .question_tensors import QuestionTensors
 
 if TYPE_CHECKING:
     import torch
 
-_Key = tuple[EpisodeId, str, str]
-"""Query episode, condition and shift."""
+_Key = tuple[EpisodeId, str, Shift | None]
+"""Query episode, condition, and the shift of the first live view that a retrieval step matches."""
 
 
 class _Drawn(NamedTuple):
@@ -148,6 +149,14 @@ class HistoryDataset:
         self._shift_of = {name: parse_shift(name) for name in self._shifts.names}
         self._redraw, shifted = redraw, self._shifts.names != (NO_SHIFT,)
         self._units = None if unit_episodes is None else frozenset(parse_numbers(unit_episodes))
+        step = {"rule": retrieval_rule, "camera": retrieval_camera}
+        self._retrieval = None if retrieval is None else StoredSelector(retrieval, **step)
+        if self._retrieval is None and step != {"rule": "max", "camera": "front"}:
+            raise InvalidOptionError(
+                f"retrieval_rule {retrieval_rule!r} and retrieval_camera {retrieval_camera!r} have "
+                "no effect without a retrieval step",
+                'Set retrieval, such as retrieval="thumbnail", or leave them out.',
+            )
         self._check(unit_episodes, shifted=shifted)
         datasets = needed_datasets(
             self.buffer_set,
@@ -164,8 +173,7 @@ class HistoryDataset:
         self._moments = choose_moments(
             self.buffer_set, self._rows, families, episodes, actions=actions
         )
-        step = Retrieval(retrieval, retrieval_rule, retrieval_camera) if retrieval else None
-        self._histories = Histories(self.buffer_set, self._rows, step)
+        self._histories = Histories(self.buffer_set, self._rows, self._retrieval)
         self._questions = QuestionTensors(self.buffer_set, self.episode_ids) if questions else None
         folder = default_cache_folder().parent / "frames" if store is None else Path(store)
         with WorkProgress(unit="episodes", quiet=quiet) as progress:
@@ -243,7 +251,8 @@ class HistoryDataset:
         epoch, (number, moment) = self.epoch, self._moments.locate(index)
         condition = self._conditions.draw("condition", self.seed, epoch, index)
         shift = self._shifts.draw("shift", self.seed, epoch, index)
-        history = self._history(epoch, self.episode_ids[number], condition, shift)
+        matched = self._shift_of[shift] if self._retrieval else None
+        history = self._history(epoch, (self.episode_ids[number], condition, matched))
         return _Drawn(index, number, moment, condition, shift, history)
 
     def _batch(self, items: Sequence[_Drawn]) -> dict[str, Any]:
@@ -300,17 +309,16 @@ class HistoryDataset:
         _, stored, frame = shifted_view(self.buffer_set, self.episode_ids[one.number], shift)
         return self._rows.first(SHIFTED, stored) + frame
 
-    def _history(self, epoch: int, episode: EpisodeId, condition: str, shift: str) -> History:
+    def _history(self, epoch: int, key: _Key) -> History:
         if not self._redraw:
-            return self._planned[episode, condition, shift]
+            return self._planned[key]
         if self._redrawn is None or self._redrawn[0] != epoch:
             seed = number_from("draw", self.seed, epoch)
             source = SessionSource(self.buffer_set.datasets, seed, self._units)
             self._redrawn = epoch, source, {}
         _, source, drawn = self._redrawn
-        key = episode, condition, shift
         if key not in drawn:
-            drawn[key] = self._histories.draw(source, episode, condition, self._shift_of[shift])
+            drawn[key] = self._histories.draw(source, *key)
         return drawn[key]
 
     def _check(self, unit_episodes: str | None, *, shifted: bool) -> None:
@@ -333,8 +341,8 @@ class HistoryDataset:
         """Return the planned histories."""
         used = frozenset(self.episode_ids)
         return {
-            (buffer.episode_id, buffer.condition, shift): self._histories.of(buffer, changed)
-            for shift, changed in self._shift_of.items()
+            (buffer.episode_id, buffer.condition, shift): self._histories.of(buffer, shift)
+            for shift in (self._shift_of.values() if self._retrieval else [None])
             for buffer in self.buffer_set.buffers(condition=self._conditions.names)
             if buffer.episode_id in used
         }

@@ -9,16 +9,19 @@ from support.buffer_sets import QUERIES
 from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.retrieval.select import choose, measure
-from robomme_interference_data.retrieval.selector import Selector
+from robomme_interference_data.retrieval.selector import Selector, StoredSelector
 
 
 def test_it_chooses_what_stored_embeddings_choose(indexed: Path) -> None:
     selector = Selector("thumbnail")
     assert (selector.name, selector.camera) == ("thumbnail/max/adaptive", "front")
-    assert Selector("thumbnail", rule="mean/0.9").name == "thumbnail/mean/0.9"
+    for step in (Selector, StoredSelector):
+        assert step("thumbnail", rule="mean/0.9").name == "thumbnail/mean/0.9"
     for buffer in load_buffer_set(indexed).buffers(condition="k3"):
         stored = choose(measure(buffer, "thumbnail"), selector.rule)
         assert selector.select(buffer, buffer.query.frame()).tolist() == stored.frames.tolist()
+        chosen = StoredSelector("thumbnail").select(load_buffer_set(indexed), buffer)
+        assert chosen.tolist() == stored.frames.tolist()
 
 
 def test_what_identifies_a_selector(indexed: Path) -> None:

@@ -2,6 +2,7 @@
 
 import csv
 import re
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from support.retrieval import make_index
 from support.tabletop import TABLETOP
 from support.worlds import BUFFER_SET
 
@@ -68,6 +70,17 @@ def test_it_learns_to_answer_and_writes_rows(program: Any, tmp_path: Path) -> No
     assert {row.revision for row in rows} == {load_buffer_set(TABLETOP).revision}
     seen = [row.success for row in rows if row.condition == "k0" and row.family in families]
     assert sum(map(bool, seen)) >= 4  # by chance about 2 of 6
+    assert {row.evidence_kept for row in rows if row.condition == "k0"} == {1.0}
+    assert {row.evidence_kept for row in rows if row.condition == "no-history"} == {None}
+    retrieved = tmp_path / "retrieved.csv"
+    indexed = tmp_path / "indexed"
+    shutil.copytree(TABLETOP, indexed)
+    make_index(indexed)
+    options = ("--retrieval", "thumbnail", "--system", "learned-k0-retrieval")
+    program("answer", run, indexed, *options, "--out", retrieved)
+    rows = read_rows([retrieved]).rows
+    assert {row.condition for row in rows} == {"k0", "k1"}  # no-history does not apply
+    assert {row.retrieval_model for row in rows} == {"thumbnail/max/adaptive"}
 
 
 def test_an_interrupted_run_ends_like_another(
@@ -210,7 +223,7 @@ def test_questions_with_other_points(places: int, program: Any, tmp_path: Path) 
     data = sys.modules["train"].HistoryDataset(
         TABLETOP, ["k0"], image_size=16, chunk=0, questions=True, quiet=True
     )
-    batch = next(iter(torch.utils.data.DataLoader(data, len(data))))
+    batch = data[[*range(len(data))]]
     trained = batch["question.points"].shape[2]
     assert trained == model.config.points
     whole = model(batch)

@@ -283,6 +283,8 @@ def test_sessions_drawn_anew_keep_the_rules(make: Make, buffers: Path) -> None:
         ({"families": ["RouteStick"]}, UnknownNameError, "RouteStick"),
         ({"episodes": "7"}, InvalidOptionError, "episodes"),
         ({"unit_episodes": "0"}, InvalidOptionError, "redraw"),
+        ({"retrieval_rule": "mean"}, InvalidOptionError, "retrieval="),
+        ({"retrieval_camera": "wrist"}, InvalidOptionError, "retrieval="),
         ({"shifts": {"light:1": 1}}, InvalidOptionError, "shifts"),
         ({"questions": True}, MissingFileError, "questions"),
         ({"conditions": ["raw-k1"], "redraw": True}, MissingFileError, "distractors-raw"),
