@@ -62,26 +62,17 @@ class MemoryPolicy(Policy):
         self._states.extend(np.array(states))
 
     def batch(self, goal: str) -> dict[str, Any]:
-        """Return a batch of one: what `HistoryDataset` gives at this moment of an execution."""
+        """Return a batch of one: what `HistoryDataset` gives here, without places for padding."""
         live = len(self._states) - 1
-        kept = list(self._memory.earlier(live))
-        places = len(kept) if self._memory.rule == "full" else self._memory.frames - 1
-
-        def earlier(values: list[NDArray[Any]]) -> torch.Tensor:
-            padded = np.zeros((1, places, *values[0].shape), values[0].dtype)
-            for place, frame in enumerate(kept):
-                padded[0, place] = values[frame]
-            return torch.from_numpy(padded)
-
+        kept = [*self._memory.earlier(live)]
         batch: dict[str, Any] = {"task": [goal], "position": torch.tensor([live])}
-        for name, values in (
-            ("state", self._states),
-            *((f"images.{camera}", self._frames[camera]) for camera in self.cameras),
-        ):
-            batch[f"observation.{name}"] = torch.from_numpy(values[live][None])
-            batch[f"memory.{name}"] = earlier(values)
-        batch["memory.position"] = torch.tensor([[*kept, *[0] * (places - len(kept))]])
-        batch["memory.is_pad"] = torch.arange(places)[None] >= len(kept)
+        batch["memory.position"] = torch.tensor([kept], dtype=torch.int64)
+        batch["memory.is_pad"] = torch.zeros(1, len(kept), dtype=torch.bool)
+        images = {f"images.{camera}": frames for camera, frames in self._frames.items()}
+        for name, values in {"state": self._states, **images}.items():
+            frames = torch.from_numpy(np.stack([values[at] for at in (*kept, live)]))
+            batch[f"memory.{name}"] = frames[None, :-1]
+            batch[f"observation.{name}"] = frames[-1:]
         return batch
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:

@@ -2,7 +2,7 @@
 
 import logging
 from bisect import bisect_right
-from collections.abc import Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -19,7 +19,7 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.ids import EpisodeId, whole_number
 from robomme_interference_data.schema.conditions import parse_condition
-from robomme_interference_data.schema.manifest import BufferManifest, layout_sessions
+from robomme_interference_data.schema.manifest import BufferManifest, SessionEntry, layout_sessions
 from robomme_interference_data.storage.arrays import combine
 
 from .dataset import Dataset
@@ -126,15 +126,29 @@ class Buffer:
     @cached_property
     def states(self) -> NDArray[np.float32]:
         """Robot states, `(T, 8) float32`: 7 joint positions in rad, gripper opening; read-only."""
-        parts = [np.empty((0, *self.query.dataset.features[STATE]), np.float32)]
-        for entry in self.manifest.sessions:
-            values = self._datasets[entry.dataset].read_vectors(
+        states = self.gather(
+            lambda entry: self._datasets[entry.dataset].read_vectors(
                 entry.episode_index, STATE, entry.start, entry.stop
-            )
-            parts.append(np.repeat(values, entry.repeat, axis=0))
-        states = np.concatenate(parts)
+            ),
+            np.empty((0, *self.query.dataset.features[STATE]), np.float32),
+        )
         states.setflags(write=False)
         return states
+
+    def gather[Value: np.generic](
+        self, read: Callable[[SessionEntry], NDArray[Value]], empty: NDArray[Value]
+    ) -> NDArray[Value]:
+        """Return values of all frames, read session by session; held frames repeat.
+
+        Args:
+            read: Returns the values of a session's stored frames.
+            empty: Values of no frames, `(0, …)`.
+
+        Returns:
+            `(T, …)`, in the buffer's order; a new array.
+        """
+        sessions = self.manifest.sessions
+        return np.concatenate([empty, *(np.repeat(read(one), one.repeat, 0) for one in sessions)])
 
     @cached_property
     def evidence(self) -> "tuple[Evidence, ...] | None":
@@ -288,11 +302,10 @@ class Buffer:
             `(T, D) float32`, each of length 1, in the buffer's order; a new array.
         """
         index = self.index(encoder, camera)
-        parts: list[NDArray[np.float32]] = [np.empty((0, index.size), np.float32)]
-        for entry in self.manifest.sessions:
-            values = index.span(entry.dataset, entry.episode_index, entry.start, entry.stop)
-            parts.append(np.repeat(values, entry.repeat, axis=0))
-        return np.concatenate(parts)
+        return self.gather(
+            lambda one: index.span(one.dataset, one.episode_index, one.start, one.stop),
+            np.empty((0, index.size), np.float32),
+        )
 
     def query_embedding(self, encoder: str, camera: str = "front") -> NDArray[np.float32]:
         """Read the stored embedding of the first live observation, `(D,) float32`.

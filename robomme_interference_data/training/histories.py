@@ -132,13 +132,11 @@ class Histories:
 
     def of(self, buffer: Buffer, shift: Shift | None) -> History:
         """Return the history of a buffer's query, as the retrieval step leaves it."""
-        parts: list[NDArray[np.int64]] = [np.empty(0, np.int64)]
-        for entry in buffer.manifest.sessions:
-            first = self._rows.first(entry.dataset, entry.episode_index)
-            parts.append(
-                np.repeat(np.arange(first + entry.start, first + entry.stop), entry.repeat)
-            )
-        rows = np.concatenate(parts)
+        rows = buffer.gather(
+            lambda one: self._rows.first(one.dataset, one.episode_index)
+            + np.arange(one.start, one.stop),
+            np.empty(0, np.int64),
+        )
         evidence: NDArray[np.bool_] | None = None
         if buffer.evidence is not None:
             evidence = np.zeros((len(rows), self.parts), bool)
