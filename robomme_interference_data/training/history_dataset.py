@@ -12,25 +12,23 @@ from robomme_interference_data.constants import ACTION, EXECUTIONS, SHIFTED, STA
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import camera_feature
 from robomme_interference_data.data.loading import load_buffer_set
-from robomme_interference_data.data.query_sessions import SessionSource
 from robomme_interference_data.data.views import shifted_view
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.ids import EpisodeId, parse_numbers, whole_number
 from robomme_interference_data.retrieval.selector import StoredSelector
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.sampling import Memory
-from robomme_interference_data.schema.shifts import NO_SHIFT, Shift, parse_shift
+from robomme_interference_data.schema.shifts import NO_SHIFT, parse_shift
 from robomme_interference_data.storage.cache import default_cache_folder
 
-from .histories import PADDING, Histories, History, Rows, Weights, number_from
-from .moments import check_size, choose_moments, needed_datasets
+from .draws import Weights
+from .histories import Histories, History
+from .moments import check_arguments, check_size, choose_moments, needed_datasets
 from .question_tensors import QuestionTensors
+from .rows import PADDING, Rows
 
 if TYPE_CHECKING:
     import torch
-
-_Key = tuple[EpisodeId, str, Shift | None]
-"""Query episode, condition, and the shift of the first live view that a retrieval step matches."""
 
 
 class _Drawn(NamedTuple):
@@ -147,21 +145,18 @@ class HistoryDataset:
         self._conditions = Weights.parse("conditions", conditions)
         self._shifts = Weights.parse("shifts", shifts or {NO_SHIFT: 1})
         self._shift_of = {name: parse_shift(name) for name in self._shifts.names}
-        self._redraw, shifted = redraw, self._shifts.names != (NO_SHIFT,)
-        self._units = None if unit_episodes is None else frozenset(parse_numbers(unit_episodes))
-        step = {"rule": retrieval_rule, "camera": retrieval_camera}
-        self._retrieval = None if retrieval is None else StoredSelector(retrieval, **step)
-        if self._retrieval is None and step != {"rule": "max", "camera": "front"}:
-            raise InvalidOptionError(
-                f"retrieval_rule {retrieval_rule!r} and retrieval_camera {retrieval_camera!r} have "
-                "no effect without a retrieval step",
-                'Set retrieval, such as retrieval="thumbnail", or leave them out.',
-            )
-        self._check(unit_episodes, shifted=shifted)
+        shifted, actions = self._shifts.names != (NO_SHIFT,), self.chunk > 0
+        units = None if unit_episodes is None else frozenset(parse_numbers(unit_episodes))
+        check_arguments(self._arguments, self._shifts.names)
+        step = (
+            StoredSelector(retrieval, rule=retrieval_rule, camera=retrieval_camera)
+            if retrieval
+            else None
+        )
         datasets = needed_datasets(
             self.buffer_set,
             self._conditions.names,
-            actions=self.chunk > 0,
+            actions=actions,
             shifts=shifted,
             planned=not redraw,
         )
@@ -169,11 +164,12 @@ class HistoryDataset:
         for dataset in datasets.values():
             dataset.check_records()
         size = check_size(self.buffer_set, self.cameras, image_size)
-        self._rows, actions = Rows(datasets), self.chunk > 0
+        self._rows = Rows(datasets)
         self._moments = choose_moments(
             self.buffer_set, self._rows, families, episodes, actions=actions
         )
-        self._histories = Histories(self.buffer_set, self._rows, self._retrieval)
+        draws = (seed, units) if redraw else None
+        self._histories = Histories(self.buffer_set, self._rows, step, draws)
         self._questions = QuestionTensors(self.buffer_set, self.episode_ids) if questions else None
         folder = default_cache_folder().parent / "frames" if store is None else Path(store)
         with WorkProgress(unit="episodes", quiet=quiet) as progress:
@@ -182,9 +178,11 @@ class HistoryDataset:
             self._rows.load(STATE, folder, None, progress)
             if actions:
                 self._rows.load(ACTION, folder, None, progress, (EXECUTIONS,))
-            with progress.status("Laying out histories"):
-                self._planned = {} if redraw else self._plan()
-        self._redrawn: tuple[int, SessionSource, dict[_Key, History]] | None = None
+            if not redraw:
+                with progress.status("Laying out histories"):
+                    self._histories.plan(
+                        self._conditions.names, self.episode_ids, self._shift_of.values()
+                    )
         self._size = self.memory_frames
         import torch
 
@@ -214,8 +212,7 @@ class HistoryDataset:
         """Number M of places in memory, without the current frame."""
         if self.memory.rule != "full":
             return self.memory.frames - 1
-        longest = max(len(history.rows) for history in self._planned.values())
-        return longest + self._moments.most - 1
+        return self._histories.longest + self._moments.most - 1
 
     @property
     def epoch(self) -> int:
@@ -251,8 +248,8 @@ class HistoryDataset:
         epoch, (number, moment) = self.epoch, self._moments.locate(index)
         condition = self._conditions.draw("condition", self.seed, epoch, index)
         shift = self._shifts.draw("shift", self.seed, epoch, index)
-        matched = self._shift_of[shift] if self._retrieval else None
-        history = self._history(epoch, (self.episode_ids[number], condition, matched))
+        episode = self.episode_ids[number]
+        history = self._histories.get(epoch, episode, condition, self._shift_of[shift])
         return _Drawn(index, number, moment, condition, shift, history)
 
     def _batch(self, items: Sequence[_Drawn]) -> dict[str, Any]:
@@ -308,44 +305,6 @@ class HistoryDataset:
             return int(self._moments.first[one.number]) + one.moment
         _, stored, frame = shifted_view(self.buffer_set, self.episode_ids[one.number], shift)
         return self._rows.first(SHIFTED, stored) + frame
-
-    def _history(self, epoch: int, key: _Key) -> History:
-        if not self._redraw:
-            return self._planned[key]
-        if self._redrawn is None or self._redrawn[0] != epoch:
-            seed = number_from("draw", self.seed, epoch)
-            source = SessionSource(self.buffer_set.datasets, seed, self._units)
-            self._redrawn = epoch, source, {}
-        _, source, drawn = self._redrawn
-        if key not in drawn:
-            drawn[key] = self._histories.draw(source, *key)
-        return drawn[key]
-
-    def _check(self, unit_episodes: str | None, *, shifted: bool) -> None:
-        """Check arguments against each other."""
-        if unit_episodes is not None and not self._redraw:
-            raise InvalidOptionError(
-                f"unit_episodes {unit_episodes!r} has no effect on planned buffers",
-                "Set redraw=True, or leave it out.",
-            )
-        if self._redraw and self.memory.rule == "full":
-            raise InvalidOptionError(
-                "memory 'full' has no fixed size if sessions are drawn anew",
-                "Set a size, such as memory='window:512', or redraw=False.",
-            )
-        if shifted and self.chunk:
-            expected = "none with actions: only first live views are stored under shifts"
-            raise InvalidOptionError.expected("shifts", list(self._shifts.names), expected)
-
-    def _plan(self) -> "dict[_Key, History]":
-        """Return the planned histories."""
-        used = frozenset(self.episode_ids)
-        return {
-            (buffer.episode_id, buffer.condition, shift): self._histories.of(buffer, shift)
-            for shift in (self._shift_of.values() if self._retrieval else [None])
-            for buffer in self.buffer_set.buffers(condition=self._conditions.names)
-            if buffer.episode_id in used
-        }
 
 
 def _open_again(location: str, arguments: dict[str, Any], epoch: "torch.Tensor") -> HistoryDataset:

@@ -1,7 +1,8 @@
 """Which datasets and moments a `HistoryDataset` has, and the checks of its arguments."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +14,9 @@ from robomme_interference_data.data.loading import open_dataset
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId, format_numbers, parse_numbers, whole_number
 from robomme_interference_data.schema.conditions import datasets_of, parse_condition
+from robomme_interference_data.schema.shifts import NO_SHIFT
 
-from .histories import Rows
+from .rows import Rows
 
 _NO_ACTIONS = "Items without actions (chunk=0) need no executions."
 
@@ -46,6 +48,27 @@ def check_size(buffer_set: BufferSet, cameras: Sequence[str], size: int | None) 
             expected = f"1 to {min(height, width)}: {camera} has {width}×{height} pixels"
             raise InvalidOptionError.expected("image_size", size, expected)
     return size
+
+
+def check_arguments(given: Mapping[str, Any], shifts: Sequence[str]) -> None:
+    """Check the arguments of a `HistoryDataset` against each other."""
+    for name, default, needed in (
+        ("unit_episodes", None, "redraw"),
+        ("retrieval_rule", "max", "retrieval"),
+        ("retrieval_camera", "front", "retrieval"),
+    ):
+        if given[name] != default and not given[needed]:
+            raise InvalidOptionError(
+                f"{name} has no effect without {needed}", f"Set {needed}, or leave {name} out."
+            )
+    if given["redraw"] and given["memory"] == "full":
+        raise InvalidOptionError(
+            "memory 'full' has no fixed size if sessions are drawn anew",
+            "Set a size, such as memory='window:512', or redraw=False.",
+        )
+    if shifts != (NO_SHIFT,) and given["chunk"]:
+        expected = "none with actions: only first live views are stored under shifts"
+        raise InvalidOptionError.expected("shifts", list(shifts), expected)
 
 
 @dataclass(frozen=True)

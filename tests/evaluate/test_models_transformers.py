@@ -8,23 +8,22 @@ from typing import Any
 import numpy as np
 import pytest
 from support.asking import ask
-from support.vision_language import save_tiny_adapter, save_tiny_model
+from support.lazy import lazy
 
 from robomme_interference_data.errors import InvalidOptionError, ModelError
 from robomme_interference_data.evaluate.models.model import Message, Video
 from robomme_interference_data.evaluate.models.registry import MODELS, model_identity
-
-pytest.importorskip("transformers", reason="needs the extra vlm")
-
-from robomme_interference_data.evaluate.models.transformers import TransformersModel
 from robomme_interference_data.storage import weights
+
+_, tiny_models = lazy("transformers"), lazy("support.vision_language")
+loaded = lazy("robomme_interference_data.evaluate.models.transformers")
 
 NOISE = np.random.default_rng(0).integers(0, 256, (6, 32, 24, 3), dtype=np.uint8)
 
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return save_tiny_model(tmp_path_factory.mktemp("models") / "tiny")
+    return tiny_models.save_tiny_model(tmp_path_factory.mktemp("models") / "tiny")
 
 
 def asked(number: int) -> list[Message]:
@@ -49,7 +48,7 @@ def test_a_video_is_thinned_out(tiny: Path) -> None:
 
 
 def test_an_adapter_is_another_model(tiny: Path, tmp_path: Path) -> None:
-    adapter = save_tiny_adapter(tiny, tmp_path / "adapter")
+    adapter = tiny_models.save_tiny_adapter(tiny, tmp_path / "adapter")
     plain = MODELS.make(f"transformers:{tiny}", ["max_tokens=12"])
     adapted = MODELS.make(f"transformers:{tiny}", ["max_tokens=12", f"adapter={adapter}"])
     assert plain.reply(asked(0)).text != adapted.reply(asked(0)).text
@@ -59,7 +58,7 @@ def test_an_adapter_is_another_model(tiny: Path, tmp_path: Path) -> None:
 
 def test_the_folder_is_not_part_of_the_identity(tiny: Path, tmp_path: Path) -> None:
     (tmp_path / "moved").symlink_to(tiny)
-    other = save_tiny_model(tmp_path / "other", seed=1)
+    other = tiny_models.save_tiny_model(tmp_path / "other", seed=1)
     said = [
         MODELS.make(f"transformers:{path}").metadata() for path in (tiny, tmp_path / "moved", other)
     ]
@@ -75,7 +74,7 @@ def test_the_identity_needs_no_loaded_weights_and_is_cached(
 ) -> None:
     metadata = MODELS.make(f"transformers:{tiny}").metadata()
     assert MODELS.pin(f"transformers:{tiny}") == f"transformers:{tiny}"
-    monkeypatch.setattr(TransformersModel, "_load", None)
+    monkeypatch.setattr(loaded.TransformersModel, "_load", None)
     monkeypatch.setattr(weights, "digest_folder", None)
     assert MODELS.make(f"transformers:{tiny}").metadata() == metadata
 

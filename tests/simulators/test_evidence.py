@@ -154,7 +154,7 @@ def test_every_part_is_shown_in_the_lesson(
 
 
 @pytest.mark.parametrize("index", [0, pytest.param(2, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("family", families("VideoRepick", "VideoPlaceButton", "MoveCube"))
+@pytest.mark.parametrize("family", families("VideoRepick"))
 def test_a_lesson_reveals_its_answer_in_its_evidence_only(
     blind: TabletopSimulator, family: str, index: int
 ) -> None:

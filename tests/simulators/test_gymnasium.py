@@ -6,18 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from robomme_interference_data.errors import InvalidOptionError, NoRendererError
-
-pytest.importorskip("mani_skill", reason="needs the extra sim")
-
-import gymnasium
-import torch
+from support.lazy import lazy
 
 import robomme_interference_data.simulators.tabletop  # noqa: F401, registers the ids
 from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.simulators.tabletop.env import TabletopEnv
-from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
+from robomme_interference_data.errors import InvalidOptionError, NoRendererError
+
+gymnasium, torch, _ = lazy("gymnasium"), lazy("torch"), lazy("mani_skill")
+tabletop_env = lazy("robomme_interference_data.simulators.tabletop.env")
 
 SEED = 19803  # of MoveCube/test/3
 
@@ -54,7 +50,7 @@ print(*sorted(name for name in gymnasium.registry if name.startswith("tabletop/"
     assert done.stdout.split() == sorted(f"tabletop/{family}-v1" for family in FAMILIES)
 
 
-def test_an_episode_is_the_simulators(tabletop: TabletopSimulator) -> None:
+def test_an_episode_is_the_simulators(tabletop: Any) -> None:
     env = make(render_mode="rgb_array")
     seen, info = env.reset(seed=SEED)
     lesson, first, about = tabletop.reset("MoveCube/test/3", demonstration=False)
@@ -85,7 +81,7 @@ def test_an_episode_is_the_simulators(tabletop: TabletopSimulator) -> None:
 def test_unsupported_options(options: dict[str, Any], possible: str) -> None:
     name, value = next(iter(options.items()))
     with pytest.raises(InvalidOptionError, match=f"^{name} {value!r}; .*{possible}"):
-        TabletopEnv(**options)
+        tabletop_env.TabletopEnv(**options)
 
 
 @pytest.mark.slow

@@ -19,11 +19,6 @@ from robomme_interference_data.storage.staging import staging_path
 pytestmark = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs /proc")
 
 HASH_SEED = "4711"
-SIGNALS = [
-    signal.SIGKILL,
-    pytest.param(signal.SIGINT, marks=pytest.mark.slow),
-    pytest.param(signal.SIGTERM, marks=pytest.mark.slow),
-]
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +59,9 @@ def staged(out: Path) -> dict[Path, int]:
     }
 
 
-@pytest.mark.parametrize("times", [1, pytest.param(12, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("sent", SIGNALS)
+@pytest.mark.slow
+@pytest.mark.parametrize("times", [1, 12])
+@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
 def test_stopped_at_random_moments(
     server: BuildServer,
     undisturbed: tuple[dict[str, bytes], float],

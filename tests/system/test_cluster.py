@@ -15,8 +15,8 @@ import psutil
 import pytest
 from support import runs, worlds
 from support.buffer_sets import GOLDEN, contents
+from support.lazy import lazy
 from support.made_up import MadeUpSource
-from support.ray_cluster import add_node, running_cluster
 from support.serve_policy import command
 from support.shared_policies import FAULT
 from support.worker_calls import Marked, behave, wait_until_gone
@@ -27,8 +27,9 @@ from robomme_interference_data.errors import WorkerError
 from robomme_interference_data.evaluate.run.log import read_record
 from robomme_interference_data.runtime.executor import Executor, Serial
 from robomme_interference_data.runtime.progress import WorkProgress
-from robomme_interference_data.runtime.ray_cluster import RayWorkers
 
+ray_cluster = lazy("support.ray_cluster")
+ray_workers = lazy("robomme_interference_data.runtime.ray_cluster")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 
 CONDITIONS = ("no-history", "k0", "k1", "k3", "k7")
@@ -46,7 +47,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     with pytest.MonkeyPatch.context() as patch:
         for name, value in variables.items():
             patch.setenv(name, value)
-        with running_cluster(3) as made:
+        with ray_cluster.running_cluster(3) as made:
             yield made
 
 
@@ -104,7 +105,7 @@ def test_a_node_and_the_driver_are_killed_and_no_row_is_lost(
     second = driver(out, cluster.address)
     runs.wait_for_rows(out, len(before) + 1, second)
     cluster.remove_node(cluster.list_all_nodes()[1], allow_graceful=False)
-    add_node(cluster)
+    ray_cluster.add_node(cluster)
     answer, err = second.communicate(timeout=300)
     assert second.returncode == 0, err
     assert len(json.loads(answer)) == ROLLOUTS
@@ -127,7 +128,7 @@ def test_ctrl_c_gives_all_workers_back(cluster: Any, tmp_path: Path) -> None:
 
 def test_each_worker_of_a_node_starts_its_server(cluster: Any, tmp_path: Path) -> None:
     served = {"policy": "websocket", "serve": command("--pids", tmp_path / "pids")}
-    there = RayWorkers(2, cluster.address)
+    there = ray_workers.RayWorkers(2, cluster.address)
     result = runs.run(tmp_path / "run", there, conditions=CONDITIONS, videos=True, **served)
     assert result.counts["fail"] == ROLLOUTS
     assert all((tmp_path / "run" / str(row.video)).stat().st_size for row in result.rows)
@@ -153,10 +154,10 @@ def test_a_policy_is_shared_on_a_cluster_and_started_again(cluster: Any, tmp_pat
 
 
 def test_a_node_that_differs_is_one_error_that_says_how(cluster: Any) -> None:
-    node = add_node(cluster, cpus=2, MARK="other")
+    node = ray_cluster.add_node(cluster, cpus=2, MARK="other")
     try:
         with pytest.raises(WorkerError, match=r"node .*: mark is other there, none here"):
-            list(RayWorkers(1, cluster.address, cpus=2).run(Marked(), [7]))
+            list(ray_workers.RayWorkers(1, cluster.address, cpus=2).run(Marked(), [7]))
     finally:
         cluster.remove_node(node, allow_graceful=False)
 
@@ -199,15 +200,15 @@ def test_a_build_has_the_bytes_of_one_process(cluster: Any, tmp_path: Path) -> N
             build_dataset(plan, tmp_path / name, executor, progress)
         return contents(tmp_path / name)
 
-    assert built("cluster", RayWorkers(3, cluster.address)) == built("one", Serial())
+    assert built("cluster", ray_workers.RayWorkers(3, cluster.address)) == built("one", Serial())
 
 
 def test_processors_that_no_node_has_are_waited_for(cluster: Any) -> None:
     """A worker begins when a node with room for it joins."""
-    work = RayWorkers(1, cluster.address, cpus=2).run(behave, [("value", 7)])
+    work = ray_workers.RayWorkers(1, cluster.address, cpus=2).run(behave, [("value", 7)])
     node = None
     try:
-        node = add_node(cluster, cpus=2)
+        node = ray_cluster.add_node(cluster, cpus=2)
         assert [outcome.value for outcome in work] == [7]
     finally:
         work.close()

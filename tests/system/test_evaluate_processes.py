@@ -56,6 +56,7 @@ def undisturbed(tmp_path: Path) -> list[dict[str, Any]]:
     return runs.finished_rows(tmp_path / "undisturbed")
 
 
+@pytest.mark.slow
 def test_the_command_may_be_killed_or_stopped_at_any_moment(
     tmp_path: Path, undisturbed: list[dict[str, Any]]
 ) -> None:

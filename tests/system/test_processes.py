@@ -11,14 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.ray_cluster import running_cluster
+from support.lazy import lazy
 from support.worker_calls import behave, is_alive, pids_in, wait_until_gone
 
 from robomme_interference_data.errors import SimulatorCrashError, WorkerError, WorkerRetiredError
 from robomme_interference_data.runtime import process
 from robomme_interference_data.runtime.executor import Outcome, Processes
-from robomme_interference_data.runtime.ray_cluster import RayWorkers
 
+ray_cluster = lazy("support.ray_cluster")
+ray_workers = lazy("robomme_interference_data.runtime.ray_cluster")
 pytestmark = pytest.mark.timeout(150)
 
 TESTS = Path(__file__).parent.parent
@@ -30,7 +31,7 @@ Run = Callable[..., list[Outcome]]
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    with running_cluster(3) as made:
+    with ray_cluster.running_cluster(3) as made:
         yield made
 
 
@@ -40,7 +41,11 @@ def run(request: pytest.FixtureRequest) -> Run:
     cluster = request.getfixturevalue("cluster") if request.param == "ray" else None
 
     def all_of(tasks: list[Any], workers: int = 1, **options: Any) -> list[Outcome]:
-        executor = Processes(workers) if cluster is None else RayWorkers(workers, cluster.address)
+        executor = (
+            Processes(workers)
+            if cluster is None
+            else ray_workers.RayWorkers(workers, cluster.address)
+        )
         return list(executor.run(behave, tasks, **options))
 
     return all_of

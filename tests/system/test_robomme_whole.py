@@ -37,6 +37,7 @@ def config_of(out: Path, python: Path, episodes: str) -> BuildConfig:
     )
 
 
+@pytest.mark.slow
 def test_an_evaluation_on_it(tmp_path: Path, robomme_python: Path) -> None:
     from robomme_interference_data.evaluate import run_evaluation
     from robomme_interference_data.evaluate.run.config import RunConfig

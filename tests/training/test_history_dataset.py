@@ -27,7 +27,7 @@ from robomme_interference_data.retrieval.selector import Selector
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.schema.shifts import SHIFTS
 from robomme_interference_data.training import HistoryDataset, resize
-from robomme_interference_data.training.histories import Weights
+from robomme_interference_data.training.draws import Weights
 
 LIVE = 260 - 48
 """Frames of a sample episode after its lesson."""
@@ -283,8 +283,8 @@ def test_sessions_drawn_anew_keep_the_rules(make: Make, buffers: Path) -> None:
         ({"families": ["RouteStick"]}, UnknownNameError, "RouteStick"),
         ({"episodes": "7"}, InvalidOptionError, "episodes"),
         ({"unit_episodes": "0"}, InvalidOptionError, "redraw"),
-        ({"retrieval_rule": "mean"}, InvalidOptionError, "retrieval="),
-        ({"retrieval_camera": "wrist"}, InvalidOptionError, "retrieval="),
+        ({"retrieval_rule": "mean"}, InvalidOptionError, "Set retrieval"),
+        ({"retrieval_camera": "wrist"}, InvalidOptionError, "Set retrieval"),
         ({"shifts": {"light:1": 1}}, InvalidOptionError, "shifts"),
         ({"questions": True}, MissingFileError, "questions"),
         ({"conditions": ["raw-k1"], "redraw": True}, MissingFileError, "distractors-raw"),
