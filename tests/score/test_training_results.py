@@ -7,27 +7,29 @@ from support.pages import RESULTS, table
 from robomme_interference_data.schema.shifts import NO_SHIFT
 
 PAGE = (RESULTS / "training.md").read_text(encoding="utf-8")
-Rows = dict[tuple[str, str, str], list[bool]]
+Rows = dict[tuple[str, str, str, int], list[bool]]
 
 
 @pytest.fixture(scope="module")
 def rows() -> Rows:
-    """Outcomes by system, condition (with the shift, if there is one) and family."""
+    """Outcomes by system, condition (with the shift, if there is one), family and model seed."""
     outcomes: Rows = {}
     for path in sorted((RESULTS / "training").glob("*.parquet")):
         for row in pq.read_table(path).to_pylist():
             shift = "" if row["shift"] == NO_SHIFT else f" {row['shift']}"
-            key = row["system"], row["condition"] + shift, row["family"]
+            key = row["system"], row["condition"] + shift, row["family"], row["model_seed"]
             outcomes.setdefault(key, []).append(row["success"])
     return outcomes
 
 
-def percent(rows: Rows, system: str, condition: str, family: str | None = None) -> str:
+def percent(
+    rows: Rows, system: str, condition: str, family: str | None = None, seed: int | None = None
+) -> str:
     """Return the rate of successes as the page prints it; empty without rows."""
     chosen = [
         one
-        for (name, under, of), outcomes in rows.items()
-        if (name, under) == (system, condition) and family in (None, of)
+        for (name, under, of, trained), outcomes in rows.items()
+        if (name, under) == (system, condition) and family in (None, of) and seed in (None, trained)
         for one in outcomes
     ]
     return f"{100 * sum(chosen) / len(chosen):.1f}" if chosen else ""
@@ -44,6 +46,14 @@ def test_rates_by_condition(rows: Rows, first: str) -> None:
         line.pop("seeds", None)
         for condition, rate in line.items():
             assert rate == percent(rows, system, condition), (system, condition)
+
+
+def test_rates_by_training_seed(rows: Rows) -> None:
+    for line in table(PAGE, "by seed"):
+        system, seed = line.pop("by seed").split()
+        for condition, rate in line.items():
+            found = percent(rows, system.strip("`"), condition, seed=int(seed))
+            assert rate == found, (system, seed, condition)
 
 
 @pytest.mark.parametrize("first", ["family", "acting in"])
