@@ -239,6 +239,25 @@ def test_questions_with_other_points(places: int, program: Any, tmp_path: Path) 
     assert model(fewer).shape == whole.shape
 
 
+def test_scores_do_not_depend_on_the_rest_of_the_batch(program: Any, tmp_path: Path) -> None:
+    """Histories of two lengths, questions with more and fewer options, all frames in memory."""
+    run = tmp_path / "run"
+    options = ("--conditions", "k0", "--memory", "full", "--no-attention-dropout", "--steps", 1)
+    program("train", TABLETOP, "--out", run, *options, *SMALL)
+    model = sys.modules["memory_model"].load_checkpoint(run)
+    assert {layer.self_attn.dropout for layer in model.trunk.layers} == {0}
+    data = sys.modules["train"].HistoryDataset(
+        TABLETOP, ["k0", "k1"], memory="full", image_size=16, chunk=0, questions=True, quiet=True
+    )
+    batch = data[[*range(len(data))]]
+    frames, choices = (~batch["memory.is_pad"]).sum(1), (~batch["question.option_is_pad"]).sum(1)
+    assert len({*frames.tolist()}) > 1 and len({*choices.tolist()}) > 1
+    whole = model(batch)
+    for index, choice in enumerate(choices.tolist()):
+        torch.testing.assert_close(model(data[[index]])[0], whole[index], rtol=1e-3, atol=1e-4)
+        assert whole[index].isneginf().sum() == whole.shape[1] - choice
+
+
 def test_damaged_checkpoints(program: Any, tmp_path: Path) -> None:
     run, out = tmp_path / "run", ("--system", "x", "--out", tmp_path / "rows.csv")
     options = ("--conditions", "k0", "--families", "MoveCube", "--steps", 1, *SMALL)
