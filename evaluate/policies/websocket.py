@@ -26,6 +26,7 @@ from robomme_interference_data.errors import (
     printed_last,
 )
 from robomme_interference_data.runtime import guard
+from robomme_interference_data.runtime.safe_path import user_environment
 from robomme_interference_data.simulators.base import ACTION_SIZE, Observation
 
 from .connection import OpenpiConnection, check_server_options
@@ -263,7 +264,8 @@ class ServedPolicy(WebsocketPolicy):
             )
         self.started = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
         self._process = subprocess.Popen(
-            [sys.executable, guard.__file__, *words],
+            [sys.executable, "-I", guard.__file__, *words],
+            env=user_environment(),
             process_group=0,
             stdin=subprocess.PIPE,
             stdout=self._log,

@@ -1,9 +1,12 @@
 import os
 import signal
 
+from robomme_interference_data.runtime.safe_path import set_safe_path
+
 
 def run_program() -> None:
     """Run the command line as a program: Ctrl-C never prints a traceback."""
+    set_safe_path()
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # during the imports
     from .main import main
 

@@ -16,6 +16,7 @@ from typing import Any
 
 from robomme_interference_data.errors import WorkerError
 
+from .safe_path import safe_path
 from .scheduler import Scheduler
 from .worker import (
     Outcome,
@@ -63,7 +64,8 @@ class WorkerProcess:
         self._home = Path(tempfile.mkdtemp(prefix="robomme-interference-"))
         arguments = (function, theirs, number, self._home)
         self._process = context.Process(target=_serve, args=arguments, daemon=True)
-        self._process.start()
+        with safe_path():
+            self._process.start()
         theirs.close()
 
     def send(self, task: Any, time_limit: float | None) -> None:

@@ -14,7 +14,7 @@ import socket
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager, redirect_stdout, suppress
+from contextlib import chdir, closing, contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,12 +30,13 @@ from robomme_interference_data.errors import InvalidOptionError, WorkerError, fi
 
 from .executor import Executor, Session, describe, is_share
 from .process import CLOSE_S, START_S, end_if_starting
+from .safe_path import SAFE_PATH, safe_path
 from .scheduler import Scheduler
 from .worker import Outcome, ProcessWorker, Task, read_remains, unpickle_outcome
 
 logger = logging.getLogger(__name__)
 
-_PASSED = ("PYTHONPATH", "HF_ENDPOINT", "HF_HUB_OFFLINE")
+_PASSED = (SAFE_PATH, "HF_ENDPOINT", "HF_HUB_OFFLINE")
 """Environment variables that workers inherit."""
 
 _CONNECT_S = 10.0
@@ -255,19 +256,22 @@ def _connected(address: str) -> Iterator[None]:
     if ray.is_initialized():
         yield
         return
+    environment = _worker_environment()
     # Ray prints messages about lost nodes to stdout, which is reserved for the rows.
     with redirect_stdout(sys.stderr):
         try:
             host, colon, port = address.rpartition(":")
             if colon:  # Ray itself would wait for minutes
                 socket.create_connection((host, int(port)), timeout=_CONNECT_S).close()
-            ray.init(
-                address=address,
-                include_dashboard=False if address == "local" else None,
-                log_to_driver=False,
-                logging_level=logging.ERROR,
-                runtime_env={"env_vars": {k: v for k, v in os.environ.items() if k in _PASSED}},
-            )
+            # Ray puts the folder that is current now on the import path of all workers.
+            with safe_path(), chdir(sys.prefix):
+                ray.init(
+                    address=address,
+                    include_dashboard=False if address == "local" else None,
+                    log_to_driver=False,
+                    logging_level=logging.ERROR,
+                    runtime_env={"env_vars": environment},
+                )
         except (OSError, OverflowError, ValueError, RuntimeError, RayError) as error:
             raise WorkerError(
                 f"cannot connect to the Ray cluster at {address!r}: {first_line(error)}",
@@ -279,6 +283,15 @@ def _connected(address: str) -> Iterator[None]:
             yield
         finally:
             ray.shutdown()
+
+
+def _worker_environment() -> dict[str, str]:
+    """Return the environment variables that workers inherit, with absolute import paths."""
+    with safe_path():
+        environment = {name: os.environ[name] for name in _PASSED if name in os.environ}
+    if paths := list(filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))):
+        environment["PYTHONPATH"] = os.pathsep.join(str(Path(path).absolute()) for path in paths)
+    return environment
 
 
 def _name(node_id: str) -> str:

@@ -21,6 +21,7 @@ from robomme_interference_data.errors import (
     UnknownNameError,
     printed_last,
 )
+from robomme_interference_data.runtime.safe_path import SAFE_PATH
 from robomme_interference_data.storage.cache import default_cache_folder
 
 from . import versions as robomme_versions
@@ -31,7 +32,7 @@ PYTHON_VARIABLE = "ROBOMME_PYTHON"
 
 _ENVIRONMENT = {
     "PYTHONFAULTHANDLER": "1",  # a crash in a library prints a traceback
-    "PYTHONSAFEPATH": "1",  # the files beside the worker must not hide modules of the same names
+    SAFE_PATH: "1",  # nor may files beside the worker hide modules of the same names
     "PYTHONUNBUFFERED": "1",  # the last lines are not lost when it dies
 }
 
