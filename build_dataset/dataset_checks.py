@@ -28,6 +28,7 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.embeddings import IndexHeader, index_folder
+from robomme_interference_data.data.fetched_copy import FetchedCopy
 from robomme_interference_data.errors import InterferenceError, visible
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.manifest import ManifestHeader
@@ -73,14 +74,26 @@ def dataset_violations(
     header: ManifestHeader,
     units: Dataset | None,
     progress: WorkProgress | None,
+    copy: FetchedCopy | None,
 ) -> Iterator[Violation]:
-    """Check a dataset; decode it and show that only with `progress`. `units` are distractors."""
+    """Check a dataset.
+
+    Args:
+        name: Its name in the buffer set.
+        dataset: The dataset.
+        header: Header of the manifests.
+        units: The distractors, if they can be opened.
+        progress: Shows how many frames are decoded; None to decode none.
+        copy: What is there, if the dataset is in a copy of a published buffer set.
+    """
     unit = units.unit if units is not None and name in UNITS else PAPER_UNIT
-    yield from _files(name, dataset, header)
+    yield from _files(name, dataset, header, copy)
     records = list(dataset.records())
     yield from _identity(name, dataset, records, header, unit)
     yield from _report(name, dataset, records)
-    yield from (Violation(f"{name}/{where}", what) for where, what in lerobot_violations(dataset))
+    yield from (
+        Violation(f"{name}/{where}", what) for where, what in lerobot_violations(dataset, copy)
+    )
     for record in records:
         yield from _record(f"{name} {record.episode_id}", name, record, unit)
     if progress is None:
@@ -88,20 +101,23 @@ def dataset_violations(
     statistics = episode_statistics(LeRobotFiles(dataset.files, statistics=True).table)
     for record, stored in zip(records, statistics, strict=True):
         where = f"{name} {record.episode_id}"
+        if copy is not None and not copy.holds_all(dataset, record.episode_index):
+            continue  # hashes of what it holds of the episode need all of its cameras
         yield from caught(where, _episode(where, dataset, record, stored))
         progress.advance(record.length)
 
 
-def _files(name: str, dataset: Dataset, header: ManifestHeader) -> Iterator[Violation]:
+def _files(
+    name: str, dataset: Dataset, header: ManifestHeader, copy: FetchedCopy | None
+) -> Iterator[Violation]:
     """Check every byte of a dataset: identity, list of sums, and all files in it."""
     files, root = dataset.files, dataset.files.snapshot()
     if sha256_file(files.path(IDENTITY_PATH)) != header.datasets[name].identity:
         yield Violation(f"{name}/{IDENTITY_PATH}", f"does not have the SHA-256 of {HEADER}")
-    sums = dataset.sums()
-    # A fetched buffer set has one dataset at its root, and the others in folders there.
-    others = tuple(f"{other}/" for other in header.datasets if other != name)
-    existing = {path for path in listed_files(root) if not path.startswith(others)}
+    sums, existing = dataset.sums(), {*listed_files(root)}
     for path in sorted(sums.keys() | existing):
+        if path not in existing and copy is not None and not copy.lists(root, path):
+            continue  # not fetched
         if path not in sums:
             yield Violation(f"{name}/{path}", UNLISTED)
         elif problem := _file_problem(root, path):
@@ -198,7 +214,9 @@ def _episode(
             yield Violation(where, what)
 
 
-def index_violations(name: str, dataset: Dataset, units: Dataset | None) -> Iterator[Violation]:
+def index_violations(
+    name: str, dataset: Dataset, units: Dataset | None, copy: FetchedCopy | None
+) -> Iterator[Violation]:
     """Check the embeddings beside a dataset, of any encoders and cameras."""
     root = dataset.files.snapshot() / INDEX_DIR
     folders: set[str] = set()
@@ -211,10 +229,12 @@ def index_violations(name: str, dataset: Dataset, units: Dataset | None) -> Iter
             if not (root / path).is_file():
                 yield Violation(f"{name}/{INDEX_DIR}/{path}", "is a broken link, or no file")
     for folder in sorted(folders):
-        yield from caught(f"{name}/{folder}", _index(name, dataset, folder, units))
+        yield from caught(f"{name}/{folder}", _index(name, dataset, folder, units, copy))
 
 
-def _index(name: str, dataset: Dataset, folder: str, units: Dataset | None) -> Iterator[Violation]:
+def _index(
+    name: str, dataset: Dataset, folder: str, units: Dataset | None, copy: FetchedCopy | None
+) -> Iterator[Violation]:
     where = f"{name}/{folder}"
     header = read_header(dataset.files.path(f"{folder}/{INDEX_HEADER}"), IndexHeader)
     encoder, camera = header.encoder.name, header.camera
@@ -222,7 +242,8 @@ def _index(name: str, dataset: Dataset, folder: str, units: Dataset | None) -> I
         yield Violation(where, f"holds the embeddings of {encoder}, camera {camera}")
         return
     lengths = {record.episode_index: record.length for record in dataset.records()}
-    dataset.index(encoder, camera).check(lengths, units=name == DISTRACTORS)
+    held = [index for index in lengths if copy is None or copy.holds(dataset, index)]
+    dataset.index(encoder, camera).check(lengths, units=name == DISTRACTORS, held=held)
     with suppress(InterferenceError):  # reported where the units are checked
         made = dataset.index(encoder, camera).key
         if units is not None and units.index(encoder, camera).key != made:

@@ -8,7 +8,6 @@ copy of that table without LeRobot's statistics, which are most of its bytes.
 """
 
 import json
-import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -20,14 +19,11 @@ import pyarrow.parquet as pq
 
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
+    DATASET_FOLDERS,
     EPISODES_DIR,
     FORMAT_VERSION,
     IDENTITY_PATH,
-    INDEX_DIR,
-    MANIFESTS,
     PAPER_UNIT,
-    PARTS_PATH,
-    QUESTIONS_PATH,
     RECORDS_PATH,
     REPORT_PATH,
     STATS_PATH,
@@ -55,16 +51,14 @@ _LEROBOT_FIELDS = ("episode_index", "length")
 def listed_files(root: Path) -> list[str]:
     """Return the files of a dataset whose SHA-256 is recorded in it.
 
-    The identity holds that of the sums. An index has its own hashes. The manifests and questions of
-    a published buffer set, which lie beside its units, are checked by planning them again. Files
-    that people add have none: README, LICENSE, cards with `parts.json`, and hidden files.
+    The identity holds that of the sums, and an index has its own hashes.
     """
     unlisted = (IDENTITY_PATH, SUMS_PATH)
-    beside = re.compile(
-        rf"(README|LICENSE|croissant)[^/]*|{QUESTIONS_PATH}|{PARTS_PATH}|\..*"
-        rf"|({INDEX_DIR}|{MANIFESTS})/.*"
-    )
-    return [path for path in all_files(root) if path not in unlisted and not beside.fullmatch(path)]
+    return [
+        path
+        for path in all_files(root)
+        if path.split("/")[0] in DATASET_FOLDERS and path not in unlisted
+    ]
 
 
 def identity_of(

@@ -18,6 +18,7 @@ from robomme_interference_data.constants import (
     TASKS_PATH,
 )
 from robomme_interference_data.data.dataset import Dataset
+from robomme_interference_data.data.fetched_copy import FetchedCopy
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.schema.codec import arrow_schema
 from robomme_interference_data.schema.records import EpisodeRecord
@@ -33,8 +34,11 @@ _FRAME_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_in
 """Columns that LeRobot adds to every frame, in its order."""
 
 
-def lerobot_violations(dataset: Dataset) -> Iterator[tuple[str, str]]:
-    """Yield each violation: the file or episode, and what is wrong."""
+def lerobot_violations(dataset: Dataset, copy: FetchedCopy | None) -> Iterator[tuple[str, str]]:
+    """Yield each violation: the file or episode, and what is wrong.
+
+    In a partial copy only the files that are there are read.
+    """
     yield from _info(dataset)
     table = LeRobotFiles(dataset.files, statistics=True).table
     yield from _columns(dataset, table)
@@ -67,13 +71,14 @@ def lerobot_violations(dataset: Dataset) -> Iterator[tuple[str, str]]:
             other = users.setdefault(path, record.episode_index)
             if other != record.episode_index:
                 yield path, f"is shared by episodes {other} and {record.episode_index}"
-        try:
-            for path, _ in location.videos.values():
-                dataset.files.path(path)
-            stored = statistics[record.episode_index]
-            yield from _rows(dataset, record.episode_index, first, tasks.get(record.goal), stored)
-        except InterferenceError as error:
-            yield location.data, error.message
+        if copy is None or copy.holds_all(dataset, record.episode_index):
+            task, stored = tasks.get(record.goal), statistics[record.episode_index]
+            try:
+                for path, _ in location.videos.values():
+                    dataset.files.path(path)
+                yield from _rows(dataset, record.episode_index, first, task, stored)
+            except InterferenceError as error:
+                yield location.data, error.message
         first += record.length
 
 

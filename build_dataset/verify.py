@@ -10,6 +10,7 @@ from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,
     EXECUTIONS,
+    FETCH_RECORD,
     MANIFEST_HEADER,
     MANIFEST_ROWS,
     MANIFESTS,
@@ -39,6 +40,7 @@ from .dataset_checks import (
 )
 from .manifests import plan_manifests, planned_buffers
 from .questions import planned_questions
+from .set_files import further_files
 
 _ROWS = f"{MANIFESTS}/{MANIFEST_ROWS}"
 
@@ -61,39 +63,58 @@ def verify_buffer_set(
     """
     progress = progress or WorkProgress(quiet=True)
     header, root = buffer_set.header, buffer_set.files.snapshot("*")
-    for path in all_files(root / MANIFESTS):
-        # Hidden rows belong to manifests whose replacement was interrupted; the next build removes
-        # them.
-        hidden = path.startswith(".") and path.endswith(".parquet")
-        if path not in (MANIFEST_HEADER, MANIFEST_ROWS) and not hidden:
-            yield Violation(f"{MANIFESTS}/{path}", UNLISTED)
-    rows = pending if (root / (pending := pending_rows(header))).is_file() else _ROWS
-    if not (root / rows).is_file():
-        yield Violation(rows, "is missing")
-    elif sha256_file(root / rows) != header.rows:
-        yield Violation(rows, f"does not have the SHA-256 of {MANIFEST_HEADER}")
-    else:
-        yield from caught(MANIFESTS, _table(root, rows, BufferManifest))
+    yield from _files(buffer_set, root)
     datasets: dict[str, Dataset] = {}
-    for name in header.datasets:
+    for name in buffer_set.datasets:
         try:
-            datasets[name] = Dataset(LocalFiles(buffer_set.dataset_files(name).snapshot("*")))
+            folder = buffer_set.dataset_files(name).snapshot("*")
+            datasets[name] = Dataset(LocalFiles(folder))
         except InterferenceError as error:
             yield Violation(name, error.message)
+            continue
+        if not folder.is_relative_to(root):  # in a repository of its own
+            for path in further_files(folder, ()):
+                yield Violation(f"{name}/{path}", "is not part of the dataset")
     if decode:
         frames = sum(dataset.identity.counts.frames for dataset in datasets.values())
         progress.start("Verifying", frames)
     for name, dataset in datasets.items():
         units, shown = datasets.get(DISTRACTORS), progress if decode else None
-        yield from caught(name, dataset_violations(name, dataset, header, units, shown))
-        yield from index_violations(name, dataset, units)
-    if len(datasets) == len(header.datasets):
+        copy = buffer_set.copy if dataset.files.root.is_relative_to(root) else None
+        yield from caught(name, dataset_violations(name, dataset, header, units, shown, copy))
+        yield from index_violations(name, dataset, units, copy)
+    if len(datasets) == len(buffer_set.datasets):
         yield from caught(MANIFESTS, _buffers(buffer_set, datasets))
     if decode and {DEMONSTRATIONS, EXECUTIONS} <= datasets.keys():
         yield from caught(EXECUTIONS, _executions(datasets[EXECUTIONS], datasets[DEMONSTRATIONS]))
     if (root / QUESTIONS_PATH).is_file():
         yield from caught(QUESTIONS_PATH, _table(root, QUESTIONS_PATH, Question))
         yield from caught(QUESTIONS_PATH, _questions(buffer_set))
+
+
+def _files(buffer_set: BufferSet, root: Path) -> Iterator[Violation]:
+    """Check the manifests' files; name what a copy has lost, and what belongs to nothing."""
+    header = buffer_set.header
+    for path in all_files(root / MANIFESTS):
+        # Hidden rows belong to manifests whose replacement was interrupted; the next build removes
+        # them.
+        hidden = path.startswith(".") and path.endswith(".parquet")
+        if path not in (MANIFEST_HEADER, MANIFEST_ROWS, Path(FETCH_RECORD).name) and not hidden:
+            yield Violation(f"{MANIFESTS}/{path}", UNLISTED)
+    pending = pending_rows(header)
+    rows = pending if (root / pending).is_file() else _ROWS
+    if not (root / rows).is_file():
+        yield Violation(rows, "is missing")
+    elif sha256_file(root / rows) != header.rows:
+        yield Violation(rows, f"does not have the SHA-256 of {MANIFEST_HEADER}")
+    else:
+        yield from caught(MANIFESTS, _table(root, rows, BufferManifest))
+    for path in further_files(root, buffer_set.header.datasets):
+        yield Violation(path, "is not part of the buffer set")
+    recorded = buffer_set.copy.record.files if buffer_set.copy is not None else ()
+    for path in recorded:
+        if "/" not in path and not (root / path).is_file():
+            yield Violation(path, "is missing")
 
 
 def _table(root: Path, path: str, record: type) -> Iterator[Violation]:
@@ -112,7 +133,7 @@ def _buffers(buffer_set: BufferSet, datasets: Mapping[str, Dataset]) -> Iterator
         yield Violation(HEADER, what)
         return
     plan = plan_manifests(files, header.conditions, header.seed, header.position_limit)
-    stored = {str(manifest): to_dict(manifest) for manifest in buffer_set.manifests()}
+    stored = {str(manifest): to_dict(manifest) for manifest in buffer_set.planned_manifests()}
     order = list(stored)
     counts = {"queries": len(plan.demonstrations), "buffers": 0, "sessions": 0}
     for number, manifest in enumerate(planned_buffers(plan)):

@@ -77,6 +77,8 @@ REPORT_PATH = "meta/build_report.json"
 SUMS_PATH = "meta/SHA256SUMS"
 INDEX_DIR = "index"
 INDEX_HEADER = "index.json"
+DATASET_FOLDERS = ("data", "meta", "videos")
+"""Folders of a dataset's own files, which `SUMS_PATH` lists."""
 
 PAPER_ENCODER = "google/siglip-so400m-patch14-384"
 """Model that embeds frames in the paper; its index is `index/siglip`."""
@@ -143,6 +145,8 @@ MANIFESTS = "manifests"
 MANIFEST_HEADER = "manifest.json"
 MANIFEST_ROWS = "buffers.parquet"
 MANIFEST_PATH = f"{MANIFESTS}/{MANIFEST_HEADER}"
+FETCH_RECORD = f"{MANIFESTS}/fetched.json"
+"""What a copy of a published buffer set holds."""
 
 # --- files of a run -----------------------------------------------------------------------------
 

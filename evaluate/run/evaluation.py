@@ -128,10 +128,12 @@ def run_evaluation(
 def plan_run(kind: RunKind[Any]) -> tuple[Plan, tuple[WorkItem, ...]]:
     """Return the plan of a prepared run and its work items, and check them."""
     config, buffer_set = kind.config, kind.buffer_set
+    conditions = config.conditions or tuple(
+        name for name in buffer_set.conditions if kind.refusal(name) is None
+    )
     plan = plan_work(
-        buffer_set.episode_ids,
-        conditions=config.conditions
-        or tuple(one for one in buffer_set.conditions if kind.refusal(one) is None),
+        buffer_set.episodes_under(conditions),
+        conditions=conditions,
         families=config.families,
         episodes=config.episodes,
         split=config.split,
@@ -141,7 +143,6 @@ def plan_run(kind: RunKind[Any]) -> tuple[Plan, tuple[WorkItem, ...]]:
     for condition in plan.conditions:
         if (refusal := kind.refusal(condition)) is not None:
             raise refusal
-        buffer_set.manifest(buffer_set.episode_ids[0], condition)  # raises, with the available ones
     buffer_set.check_tables(plan.conditions)
     kind.check(plan, items)
     return plan, items

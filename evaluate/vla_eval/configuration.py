@@ -51,13 +51,11 @@ def configuration(
     check_label(system)
     opened = load_buffer_set(buffer_set)
     plan = plan_work(
-        opened.episode_ids,
+        opened.episodes_under(conditions or opened.conditions),
         conditions=conditions or opened.conditions,
         families=families,
         episodes=episodes,
     )
-    for condition in plan.conditions:
-        opened.manifest(opened.episode_ids[0], condition)  # raises, with the available ones
     groups = defaultdict[int, list[str]](list)
     for group, numbers in plan.episodes.items():
         groups[count_numbers(numbers)].append(group.partition("/")[0])

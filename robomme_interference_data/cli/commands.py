@@ -230,7 +230,7 @@ def fetch(
     from robomme_interference_data.data.fetch import plan_fetch
     from robomme_interference_data.data.loading import load_buffer_set
 
-    check_output(to)
+    check_output(None if to is None else to.resolve().parent)  # `to` may be an earlier copy
     with graceful_interrupt("What was fetched is kept"):
         opened = load_buffer_set(buffer_set)
         parts = plan_fetch(opened, config)

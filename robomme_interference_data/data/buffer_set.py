@@ -1,5 +1,6 @@
 """A buffer set: datasets, and the manifests that name buffers of them."""
 
+import logging
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -42,11 +43,13 @@ from robomme_interference_data.storage.parquet import RowSpan
 
 from .buffer import Buffer
 from .dataset import Dataset
+from .fetched_copy import FetchedCopy, read_fetch_record
 from .query import Query
 
 if TYPE_CHECKING:
     from robomme_interference_data.storage.cache import DecodedCache
 
+logger = logging.getLogger(__name__)
 _FOLDER = re.compile(r"\w[\w.-]*")
 _LOCATION = re.compile(r"\.|[\w.-]+(?:/[\w.-]+)+@[0-9a-f]{40}")
 _DIGEST = re.compile(r"[0-9a-f]{64}")
@@ -65,12 +68,18 @@ class BufferSet:
     Attributes:
         files: Access to the folder, or to the repository on the Hub, with its manifests.
         header: How its buffers were planned.
+        copy: What a folder holds that `fetch` copied; None for other folders and repositories.
+            Of a partial copy, this class shows the buffers that are there.
     """
 
     def __init__(
         self, files: LocalFiles | HubFiles, cache: "DecodedCache | None", threads: int | None
     ):
         self.files = files
+        self.copy: FetchedCopy | None = None
+        if isinstance(files, LocalFiles) and (record := read_fetch_record(files.root)) is not None:
+            self.copy = FetchedCopy(files.root, record)
+            self.files = files = replace(files, refetch=self.copy.refetch)
         self._cache = cache
         self._threads = threads
         path = files.path(MANIFEST_PATH)
@@ -92,7 +101,7 @@ class BufferSet:
         """Return the table of its buffers by family, for notebooks."""
         from robomme_interference_data.viz.tables import Table
 
-        counts = Counter(zip(self._keys["family"], self._keys["condition"], strict=True))
+        counts = Counter(zip(self._present["family"], self._present["condition"], strict=True))
         return Table.make(
             "buffers",
             f"{self.name}: {counted(len(self), 'buffer')} of "
@@ -104,6 +113,11 @@ class BufferSet:
 
     def __len__(self) -> int:
         """Return the number of buffers."""
+        return len(self._present["episode_id"])
+
+    @property
+    def planned_buffers(self) -> int:
+        """Number of buffers, including those that a partial copy lacks."""
         return len(self._keys["episode_id"])
 
     @property
@@ -129,7 +143,10 @@ class BufferSet:
     @property
     def conditions(self) -> tuple[str, ...]:
         """Names of the conditions for which buffers are planned, in order."""
-        return self.header.conditions
+        if self.copy is None:
+            return self.header.conditions
+        present = {*self._present["condition"]}
+        return tuple(name for name in self.header.conditions if name in present)
 
     @cached_property
     def datasets(self) -> Mapping[str, Dataset]:
@@ -148,7 +165,7 @@ class BufferSet:
         """
         location, files = self.header.datasets[name].location, self.files
         if isinstance(files, LocalFiles) and (location is None or (files.root / name).is_dir()):
-            return LocalFiles(files.root / name)
+            return LocalFiles(files.root / name, files.refetch)
         if location is None and isinstance(files, HubFiles) and name in OPTIONAL_DATASETS:
             return files.inside(name)
         if location is None:
@@ -162,7 +179,24 @@ class BufferSet:
     @cached_property
     def episode_ids(self) -> tuple[EpisodeId, ...]:
         """Ids of all query episodes, in canonical order."""
-        return tuple(sorted(EpisodeId.parse(text or "") for text in {*self._keys["episode_id"]}))
+        return tuple(sorted(EpisodeId.parse(text or "") for text in {*self._present["episode_id"]}))
+
+    def episodes_under(self, conditions: Iterable[Condition | str]) -> tuple[EpisodeId, ...]:
+        """Return the ids of the query episodes that have a buffer under all of some conditions.
+
+        Only a partial copy has fewer than `episode_ids`.
+
+        Raises:
+            UnknownNameError: No buffers are planned for one of the conditions.
+            MissingFileError: A partial copy has none of one of them.
+        """
+        names = [self.planned(condition).name for condition in conditions]
+        pairs = {*zip(self._present["episode_id"], self._present["condition"], strict=True)}
+        return tuple(
+            episode
+            for episode in self.episode_ids
+            if all((str(episode), name) in pairs for name in names)
+        )
 
     @cached_property
     def families(self) -> tuple[str, ...]:
@@ -172,7 +206,8 @@ class BufferSet:
     @property
     def cameras(self) -> tuple[str, ...]:
         """Names of the cameras, such as `front` and `wrist`."""
-        return self.datasets[DEMONSTRATIONS].cameras
+        demonstrations = self.datasets[DEMONSTRATIONS]
+        return demonstrations.cameras if self.copy is None else self.copy.cameras(demonstrations)
 
     def planned(self, condition: Condition | str | None, k: int | None = None) -> Condition:
         """Return a condition for which buffers are planned; for arguments see `load_buffer`.
@@ -180,8 +215,11 @@ class BufferSet:
         Raises:
             InvalidIdError: `condition` is not the name of a condition.
             UnknownNameError: No buffers are planned for it.
+            MissingFileError: A partial copy has none of them.
         """
         parsed = _condition(condition, k)
+        if self.copy is not None and parsed.name in {*self.header.conditions} - {*self.conditions}:
+            raise self._not_fetched(f"the buffers of {parsed.name}", f"--conditions {parsed.name}")
         if parsed.name not in self.conditions:
             raise UnknownNameError(
                 f"condition {parsed.name!r} is not in {self.location}",
@@ -211,6 +249,10 @@ class BufferSet:
             )
         return "Restore the original files, or build the manifests again."
 
+    def holds(self, dataset: Dataset, episode_index: int) -> bool:
+        """Whether an episode can be loaded; only a partial copy lacks some."""
+        return self.copy is None or self.copy.holds(dataset, episode_index)
+
     def query(self, episode_id: EpisodeId | str) -> Query:
         """Return a query episode: its goal, scene and first live observation, without a buffer.
 
@@ -236,6 +278,9 @@ class BufferSet:
         if row is None:
             self._check_episode(episode)
             raise FormatError.damaged(self._path, f"no row of {episode} under {name}")
+        if not self._is_present[row]:
+            options = f"--families {episode.family} --episodes {episode.index} --conditions {name}"
+            raise self._not_fetched(f"{episode} under {name}", options)
         return next(from_table(BufferManifest, self._rows.part(row, row + 1).table(), self._path))
 
     def manifests(
@@ -265,15 +310,19 @@ class BufferSet:
             "condition": [self.planned(one).name for one in given],
             "difficulty": () if difficulty is None else (difficulty,),
         }
-        keep = np.ones(len(self), bool)
+        keep = self._is_present.copy()
         for column, values in allowed.items():
-            known = {one for one in self._keys[column] if one is not None}
+            known = {one for one in self._present[column] if one is not None}
             for value in values:
                 if value not in known:
                     raise UnknownNameError.among(column, value, self.location, known)
             if values:
                 keep &= np.array([one in values for one in self._keys[column]])
         return self._read_rows(keep)
+
+    def planned_manifests(self) -> Iterator[BufferManifest]:
+        """Yield the manifests of all buffers, including those that a partial copy lacks."""
+        return self._read_rows(np.ones(self.planned_buffers, bool))
 
     def _read_rows(self, keep: NDArray[np.bool_]) -> Iterator[BufferManifest]:
         for first in range(0, len(keep), _BATCH_ROWS):
@@ -329,9 +378,20 @@ class BufferSet:
         query = self.query(manifest.episode_id)
         return Buffer(manifest, query, self.datasets, cache=self._cache, threads=self._threads)
 
+    def _not_fetched(self, what: str, options: str) -> MissingFileError:
+        assert self.copy is not None
+        return MissingFileError(
+            f"{what} are not in {self.location}, a copy of a part of {self.copy.record.location}",
+            "Fetch them too.",
+            f"{self.copy.refetch} {options}",
+        )
+
     def _check_episode(self, episode: EpisodeId) -> None:
         if episode in self._episodes:
             return
+        if self.copy is not None and str(episode) in {*self._keys["episode_id"]}:
+            options = f"--families {episode.family} --episodes {episode.index}"
+            raise self._not_fetched(f"the buffers of {episode}", options)
         if episode.family not in self.families:
             raise UnknownNameError.among("family", episode.family, self.location, self.families)
         raise UnknownNameError.among("episode", str(episode), self.location, self.episode_ids)
@@ -360,6 +420,33 @@ class BufferSet:
                     self._path, f"{count} rows of {episode} under {condition}"
                 )
         return keys
+
+    @cached_property
+    def _is_present(self) -> NDArray[np.bool_]:
+        """Whether the buffer of each row can be loaded; all but in a partial copy."""
+        if self.copy is None:
+            return np.ones(self.planned_buffers, bool)
+        present = [self.copy.holds_buffer(self, one) for one in self.planned_manifests()]
+        if not all(present):
+            logger.info(
+                "%s holds %d of the %s of %s; for more: robomme-interference %s",
+                self.location,
+                sum(present),
+                counted(len(present), "buffer"),
+                self.copy.record.location,
+                self.copy.refetch,
+            )
+        return np.array(present, bool)
+
+    @cached_property
+    def _present(self) -> dict[str, list[str | None]]:
+        """The columns `_keys` of the buffers that can be loaded."""
+        if self.copy is None:
+            return self._keys
+        return {
+            name: [value for value, here in zip(values, self._is_present, strict=True) if here]
+            for name, values in self._keys.items()
+        }
 
     @cached_property
     def _row_of(self) -> dict[tuple[str | None, str | None], int]:
@@ -394,13 +481,22 @@ class _Datasets(Mapping[str, Dataset]):
         return self._opened[name]
 
     def __contains__(self, name: object) -> bool:
-        return name in self._buffer_set.header.datasets
+        return name in self._names
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._buffer_set.header.datasets)
+        return iter(self._names)
 
     def __len__(self) -> int:
-        return len(self._buffer_set.header.datasets)
+        return len(self._names)
+
+    @cached_property
+    def _names(self) -> tuple[str, ...]:
+        """All that are planned; in a partial copy, those that are there."""
+        buffer_set, names = self._buffer_set, tuple(self._buffer_set.header.datasets)
+        copy = buffer_set.copy
+        if copy is None:
+            return names
+        return tuple(n for n in names if copy.has_dataset(n, buffer_set.dataset_files(n)))
 
 
 def _condition(condition: Condition | str | None, k: int | None) -> Condition:

@@ -230,10 +230,15 @@ class EmbeddingIndex:
             )
         return features[start:stop].copy()
 
-    def check(self, lengths: dict[int, int], *, units: bool) -> None:
+    def check(
+        self, lengths: dict[int, int], *, units: bool, held: Iterable[int] | None = None
+    ) -> None:
         """Check every file against its SHA-256, and the number of frames of every episode.
 
-        `lengths` has the stored frames by episode; `units` is true for distractor units.
+        Args:
+            lengths: The stored frames by episode.
+            units: Whether they are distractor units.
+            held: The episodes whose files are there, in a partial copy; None for all.
         """
         header, typical = self.header, self.header.typical_cosine
         finite = typical is None or np.isfinite(typical)
@@ -241,13 +246,17 @@ class EmbeddingIndex:
             raise self._damaged(f"{INDEX_HEADER} does not have the SHA-256 that it records")
         if (typical is not None) != units:
             raise self._damaged(f"the typical cosine is {typical}")
-        expected = {*map(episode_file, lengths), *([CENTER_FILE] if units else [])}
+        present = [*lengths] if held is None else [*held]
+        center_files = {CENTER_FILE} if units else set[str]()
+        expected = {*map(episode_file, lengths)} | center_files
         listed = {name.removeprefix(f"{self._folder}/") for name in self._files.list(self._folder)}
+        absent = {episode_file(episode) for episode in lengths.keys() - {*present}}
         known = {*self._sums, INDEX_HEADER, INDEX_SUMS}
-        if extra := sorted(listed ^ known | (self._sums.keys() - expected)):
+        if extra := sorted((listed ^ known) - absent | (self._sums.keys() - expected)):
             raise self._damaged(f"{extra[0]} is missing, or too many")
-        center = center_of(self.span(episode, 0, length) for episode, length in lengths.items())
-        if self.center is not None and not np.array_equal(self.center, center):
+        spans = [self.span(episode, 0, lengths[episode]) for episode in present]
+        whole = len(present) == len(lengths)
+        if whole and self.center is not None and not np.array_equal(self.center, center_of(spans)):
             raise self._damaged(f"{CENTER_FILE} is not the mean of the episodes")
         if header.frames != sum(lengths.values()):
             raise self._damaged(f"{header.frames} frames; the dataset has {sum(lengths.values())}")

@@ -1,7 +1,7 @@
 """Download a buffer set from the Hub, or the part of it that some buffers need."""
 
-import filecmp
 import logging
+import re
 import shutil
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -9,22 +9,40 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robomme_interference_data.constants import (
+    DATASET_FOLDERS,
     DEMONSTRATIONS,
     DISTRACTORS,
     EXECUTIONS,
+    FETCH_RECORD,
+    FORMAT_VERSION,
+    IDENTITY_PATH,
     INDEX_DIR,
     INDEX_HEADER,
     MANIFEST_PATH,
+    MANIFEST_ROWS,
     MANIFESTS,
     OPTIONAL_DATASETS,
+    PARTS_PATH,
     QUESTIONS_PATH,
     SHIFTED,
+    SUMS_PATH,
 )
-from robomme_interference_data.errors import HashMismatchError, InvalidOptionError, MissingFileError
+from robomme_interference_data.errors import (
+    FormatError,
+    HashMismatchError,
+    InvalidOptionError,
+    MissingFileError,
+    counted,
+)
 from robomme_interference_data.ids import parse_numbers
+from robomme_interference_data.schema.codec import to_dict
+from robomme_interference_data.schema.manifest import FetchRecord
 from robomme_interference_data.schema.settings import setting
-from robomme_interference_data.storage.files import atomic_path
+from robomme_interference_data.storage.files import atomic_path, sha256_file, write_json
 from robomme_interference_data.storage.hub import HubFiles
+from robomme_interference_data.storage.staging import staging_dir
+
+from .fetched_copy import read_fetch_record
 
 if TYPE_CHECKING:
     from .buffer_set import BufferSet
@@ -32,6 +50,15 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 _EPISODES, _CONTENT = "Episodes", "Content"
+
+_CARD = re.compile(r"(README|LICENSE)[^/]*")
+"""Files for readers, at the root of a repository."""
+
+_LEFT_OUT = re.compile(rf"\..*|{PARTS_PATH}|{INDEX_DIR}/.*|({'|'.join(OPTIONAL_DATASETS)})/.*")
+"""Files of a repository that a whole buffer set may have, and that are not copied with it."""
+
+_STAGED = "copy"
+_ANOTHER_FOLDER = "Give another folder: fetch NAMESPACE/NAME --to FOLDER."
 
 
 @dataclass(frozen=True)
@@ -69,17 +96,25 @@ class Part:
         files: The repository.
         folder: Folder for its files inside the local buffer set; empty for the root.
         sizes: Bytes of every file to download, by path.
+        sums: SHA-256 by path of the files whose digest the buffer set records.
         missing: Paths of those that are not in the cache yet.
+        unlisted: Paths of the repository's files that the buffer set does not list.
     """
 
     files: HubFiles
     folder: str
     sizes: dict[str, int]
+    sums: dict[str, str]
     missing: tuple[str, ...]
+    unlisted: tuple[str, ...]
 
 
 def plan_fetch(buffer_set: "BufferSet", config: FetchConfig) -> list[Part]:
-    """Return the files to download from each repository; only listings and metadata are read."""
+    """Return the files to download from each repository; only listings and metadata are read.
+
+    A repository may hold anything, but only files that the buffer set lists are fetched: those of
+    its datasets, by their lists of digests, its manifests, and its card.
+    """
     if not isinstance(buffer_set.files, HubFiles):
         raise InvalidOptionError(
             f"{buffer_set.location} is a folder on this machine; only a repository can be fetched",
@@ -93,47 +128,132 @@ def plan_fetch(buffer_set: "BufferSet", config: FetchConfig) -> list[Part]:
     for folder, files in {"": buffer_set.files, **others}.items():
         assert isinstance(files, HubFiles)  # all datasets of a published buffer set are on the Hub
         sizes = files.sizes()
-        # Small metadata is always downloaded: meta/, manifests/ and files at the root, except
-        # questions, which contain pictures.
-        paths = {
-            path
-            for path, (top, *below) in ((path, path.split("/")) for path in sizes)
-            if top in ("meta", MANIFESTS)
-            or (not below and (config.questions or top != QUESTIONS_PATH))
-            or (whole and top not in (INDEX_DIR, *OPTIONAL_DATASETS))
-        }
+        sums: dict[str, str] = {}
+        paths = {path for path in sizes if _CARD.fullmatch(path)}
+        if files is buffer_set.files:
+            paths |= {MANIFEST_PATH, f"{MANIFESTS}/{MANIFEST_ROWS}"}
+            if QUESTIONS_PATH in sizes and (whole or config.questions):
+                paths.add(QUESTIONS_PATH)
         for name, dataset in datasets.items():
             if dataset.files is files:
+                listed = _listed(dataset)
+                sums |= listed
+                paths |= {IDENTITY_PATH, SUMS_PATH}
+                paths |= {path for path in listed if whole or path.startswith("meta/")}
                 paths |= {*_paths(dataset, episodes[name], cameras, config.index, sizes)}
         if lacking := sorted(paths - sizes.keys()):
             more = f" and {len(lacking) - 1} more files" if len(lacking) > 1 else ""
             hint = "Without the index, the frames can be fetched." if config.index else None
             raise MissingFileError(f"{files.describe()} lacks {lacking[0]}{more}", hint)
         chosen = {path: sizes[path] for path in sorted(paths)}
-        parts.append(Part(files, folder, chosen, tuple(files.missing(chosen))))
+        unlisted = sizes.keys() - paths - sums.keys() if whole else ()
+        parts.append(
+            Part(
+                files,
+                folder,
+                chosen,
+                {path: sums[path] for path in chosen if path in sums},
+                tuple(files.missing(chosen)),
+                tuple(sorted(path for path in unlisted if not _LEFT_OUT.fullmatch(path))),
+            )
+        )
     return parts
 
 
 def fetch(parts: Sequence[Part], to: Path | None = None) -> None:
     """Download missing files and check each against its digest.
 
-    If `to` is given, all files are copied into that folder, which becomes a buffer set at the very
-    end; otherwise they stay in the Hub client's cache.
+    If `to` is given, all files are also copied into that folder, or added to an earlier copy of the
+    same buffer set there; otherwise they stay in the Hub client's cache. A copy can be interrupted
+    at any time: it is made beside the folder and moved there at the end, and the same call resumes.
+
+    Raises:
+        InvalidOptionError: `to` holds something else.
+        BusyError: Another process is copying there.
+        HashMismatchError: A file differs from its digest.
     """
-    header = parts[0].files.path(MANIFEST_PATH)
-    if to is not None:
-        existing = to / MANIFEST_PATH
-        if existing.is_file() and existing.read_bytes() != header.read_bytes():
-            raise InvalidOptionError(f"{to} holds another buffer set", "Give another folder.")
     for part in parts:
-        part.files.fetch(part.sizes)
+        if part.unlisted:
+            logger.warning(
+                "%s holds %s that the buffer set does not list, such as %s: not fetched",
+                part.files.describe(),
+                counted(len(part.unlisted), "file"),
+                part.unlisted[0],
+            )
     if to is None:
+        for part in parts:
+            part.files.fetch(part.sizes)
         return
-    for part in parts:
-        for path in part.sizes:
-            if part.folder or path != MANIFEST_PATH:
-                _copy(part.files.path(path), to / part.folder / path)
-    _copy(header, to / MANIFEST_PATH)
+    to = to.resolve()
+    earlier = _earlier_files(to, parts[0].files.path(MANIFEST_PATH))
+    record = FetchRecord(FORMAT_VERSION, parts[0].files.location, earlier)
+    with staging_dir(to) as staging:
+        for part in parts:
+            _copy(part, staging / _STAGED / part.folder, to / part.folder)
+        copied = {Path(part.folder, path).as_posix() for part in parts for path in part.sizes}
+        _move(staging / _STAGED, to, record, copied)
+
+
+def _earlier_files(to: Path, header: Path) -> tuple[str, ...]:
+    """Return the files of an earlier copy in a folder; check that it holds nothing else."""
+    if not to.exists() or (to.is_dir() and not any(to.iterdir())):
+        return ()
+    record = read_fetch_record(to) if to.is_dir() else None
+    if record is None:
+        raise InvalidOptionError(f"{to} exists, and is no copy of a buffer set", _ANOTHER_FOLDER)
+    existing = to / MANIFEST_PATH  # moved last: an interrupted copy has none
+    if existing.is_file() and existing.read_bytes() != header.read_bytes():
+        raise InvalidOptionError(f"{to} is a copy of {record.location}", _ANOTHER_FOLDER)
+    return record.files
+
+
+def _copy(part: Part, staged: Path, to: Path) -> None:
+    """Copy what a folder lacks into its staging folder, and check it."""
+
+    def is_there(path: str, sha256: str | None) -> bool:
+        places = (to / path, staged / path)
+        return any(place.is_file() and sha256_file(place) == sha256 for place in places)
+
+    lacking = [path for path in part.sizes if not is_there(path, part.sums.get(path))]
+    part.files.fetch(lacking)
+    for path in lacking:
+        source = part.files.path(path)
+        expected = part.sums.get(path) or sha256_file(source)
+        with atomic_path(staged / path) as partial:
+            shutil.copyfile(source, partial)
+            if sha256_file(partial) != expected:
+                raise HashMismatchError(
+                    f"{path} of {part.files.describe()} does not have the SHA-256 in {SUMS_PATH}",
+                    "Ask its publisher to publish it again.",
+                )
+
+
+def _move(staged: Path, to: Path, record: FetchRecord, copied: Collection[str]) -> None:
+    """Move files from the staging folder, and record all that the copy holds then.
+
+    The record is there first, so that the next call knows the folder if the process is killed in
+    between; the header of the manifests, without which the folder is no buffer set, comes last.
+    """
+    if not (to / FETCH_RECORD).is_file():
+        write_json(to / FETCH_RECORD, to_dict(record))
+    for path in sorted(copied, key=lambda path: (path == MANIFEST_PATH, path)):
+        if (staged / path).is_file():
+            (to / path).parent.mkdir(parents=True, exist_ok=True)
+            (staged / path).replace(to / path)
+    files = tuple(sorted({*record.files, *copied}))
+    write_json(to / FETCH_RECORD, to_dict(replace(record, files=files)))
+
+
+def _listed(dataset: "Dataset") -> dict[str, str]:
+    """Return the files that a dataset lists, with their SHA-256."""
+    sums = dataset.sums()
+    for path in sums:
+        if path.split("/")[0] not in DATASET_FOLDERS:
+            raise FormatError.damaged(
+                dataset.files.describe(),
+                f"{SUMS_PATH} lists {path}, which is outside {', '.join(DATASET_FOLDERS)}",
+            )
+    return sums
 
 
 def _needed(
@@ -201,9 +321,3 @@ def _paths(
             yield f"{folder}/{name}"
         if (center := f"{folder}/{CENTER_FILE}") in existing:
             yield center
-
-
-def _copy(source: Path, target: Path) -> None:
-    if not target.is_file() or not filecmp.cmp(source, target, shallow=False):
-        with atomic_path(target) as partial:
-            shutil.copyfile(source, partial)

@@ -15,6 +15,7 @@ from robomme_interference_data.storage.hub import locate
 from .buffer import Buffer
 from .buffer_set import BufferSet
 from .dataset import Dataset
+from .fetched_copy import fetch_command, read_fetch_record
 
 if TYPE_CHECKING:
     from robomme_interference_data.storage.cache import DecodedCache
@@ -50,6 +51,13 @@ def load_buffer_set(
     try:
         return BufferSet(files, _cache(cache), threads)
     except MissingFileError as error:
+        if isinstance(files, LocalFiles) and (record := read_fetch_record(files.root)) is not None:
+            raise MissingFileError(
+                f"{files.root} is an incomplete copy of {record.location}: the fetch was "
+                "interrupted",
+                "Resume it.",
+                fetch_command(files.root, record),
+            ) from error
         raise MissingFileError(
             f"{files.describe()} is not a buffer set: {MANIFEST_PATH} is missing",
             "Give a folder with demonstrations/, distractors/ and manifests/, or build one.",

@@ -160,6 +160,15 @@ class ManifestDataset:
 
 
 @dataclass(frozen=True)
+class FetchRecord:
+    """`manifests/fetched.json`: which files of a published buffer set a copy of it holds."""
+
+    format_version: Annotated[int, "Of the files."]
+    location: Annotated[str, "The repository with its commit, `namespace/name@…`."]
+    files: Annotated[tuple[str, ...], "Paths of the files, sorted."]
+
+
+@dataclass(frozen=True)
 class ManifestHeader:
     """Content of `manifests/manifest.json`: how the buffers of a buffer set were planned."""
 

@@ -35,9 +35,15 @@ class LocalFiles:
     This and `hub.HubFiles` are the only way in which this package accesses the files of a dataset
     or buffer set. A path is always relative, with `/`, such as `meta/info.json`. Paths come from
     data files that are not trusted: no path leaves the dataset, and no link does.
+
+    Attributes:
+        root: The folder.
+        refetch: Command that downloads files which this copy of a published buffer set lacks; None
+            for other folders.
     """
 
     root: Path
+    refetch: str | None = None
 
     def path(self, relative: str) -> Path:
         """Return where the file is on this machine."""
@@ -60,10 +66,10 @@ class LocalFiles:
                 raise
             raise FormatError.damaged(self.root, f"{relative[:80]!r}… is too long") from None
         if not exists:
-            raise MissingFileError(
-                f"{relative} is missing in {self.root}",
-                "The folder is not a complete dataset: build it again, or give the right folder.",
-            )
+            hint = "The folder is not a complete dataset: build it again, or give the right folder."
+            if self.refetch is not None:
+                hint = "This copy of a published buffer set lacks it; widen the copy."
+            raise MissingFileError(f"{relative} is missing in {self.root}", hint, self.refetch)
         return path
 
     def list(self, folder: str, suffix: str = "") -> list[str]:

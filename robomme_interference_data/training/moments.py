@@ -128,7 +128,11 @@ def choose_moments(
             raise UnknownNameError.among("family", family, buffer_set.location, known)
     numbers = None if episodes is None else frozenset(parse_numbers(episodes))
     live = buffer_set.datasets[EXECUTIONS if actions else DEMONSTRATIONS]
-    recorded = {record.episode_id: record for record in live.records()}
+    recorded = {
+        record.episode_id: record
+        for record in live.records()
+        if buffer_set.holds(live, record.episode_index)
+    }
     chosen = tuple(
         one
         for one in buffer_set.episode_ids

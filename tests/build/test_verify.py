@@ -104,7 +104,10 @@ def test_indexes_of_different_encoders(own_buffers: Path) -> None:
     ("path", "message"),
     [
         ("distractors/data/x.parquet", "is not listed"),
-        ("distractors/more/README.md", "is not listed"),
+        ("distractors/more/README.md", "is not part of the buffer set"),
+        ("multiprocessing.py", "is not part of the buffer set"),
+        (".hidden", "is not part of the buffer set"),
+        ("demonstrations/manifests/x.py", "is not part of the buffer set"),
         ("distractors/index/x.npy", "is not listed"),
         ("distractors/index/other", "index.json is missing"),
         ("manifests/x.parquet", "is not listed"),

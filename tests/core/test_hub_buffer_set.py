@@ -146,7 +146,7 @@ def test_fetch_the_whole_buffer_set(hub: HubServer, fetch: Fetched, tmp_path: Pa
     assert folders >= {"demonstrations", "manifests", "meta", "data", "videos"}
     answer = json.loads(output[output.index("{\n") :])
     assert [one["missing_files"] for one in answer["repositories"]] == [
-        one["files"] - known for one, known in zip(answer["repositories"], (5, 3), strict=True)
+        one["files"] - known for one, known in zip(answer["repositories"], (6, 4), strict=True)
     ]
 
 
@@ -200,7 +200,7 @@ def test_fetch_is_for_repositories_and_mixes_no_buffer_sets(
     (tmp_path / "other" / "manifests").mkdir(parents=True)
     (tmp_path / "other" / "manifests" / "manifest.json").write_text("{}", encoding="utf-8")
     code, output = fetch(BUFFER_SET, "--to", tmp_path / "other")
-    assert code == 1 and "another buffer set" in output
+    assert code == 1 and "no copy of a buffer set" in output
 
 
 def test_only_text_can_name_a_repository(hub: HubServer, run: Any) -> None:

@@ -2,14 +2,15 @@
 
 import json
 import re
+import signal
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from huggingface_hub import constants
-from support.buffer_sets import GOLDEN, QUERIES
-from support.hub import BUFFER_SET, kill_at, push_buffer_set
+from support.buffer_sets import GOLDEN, QUERIES, contents
+from support.hub import BUFFER_SET, elsewhere, kill_at, push_buffer_set
 from support.hub_http import Request
 from support.hub_server import HubServer
 
@@ -68,3 +69,63 @@ def test_fetch_after_a_kill(hub: HubServer, run: Run, tmp_path: Path) -> None:
             assert np.array_equal(found.frames(camera), expected.frames(camera))
         assert np.array_equal(found.states, expected.states)
     assert list(verify_buffer_set(buffer_set)) == []
+
+
+KILLED = """
+import os, shutil, signal, sys
+from pathlib import Path
+from robomme_interference_data.cli.main import main
+
+calls = 0
+
+def killing(call):
+    def wrapped(*arguments, **options):
+        global calls
+        result = call(*arguments, **options)
+        calls += 1
+        if calls == number:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return result
+    return wrapped
+
+step, number = sys.argv[1], int(sys.argv[2])
+if step == "copying":
+    shutil.copyfile = killing(shutil.copyfile)
+else:
+    Path.replace = killing(Path.replace)
+del sys.argv[1:3]
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("step", "number"),
+    [
+        ("copying", 1),
+        pytest.param("copying", 2, marks=pytest.mark.slow),
+        pytest.param("copying", 30, marks=pytest.mark.slow),
+        pytest.param("copying", 74, marks=pytest.mark.slow),
+        # Each copied file is renamed once in the staging folder, and again where it is moved.
+        pytest.param("renaming", 40, marks=pytest.mark.slow),
+        pytest.param("renaming", 75, marks=pytest.mark.slow),
+        pytest.param("renaming", 76, marks=pytest.mark.slow),
+        ("renaming", 100),
+        pytest.param("renaming", 149, marks=pytest.mark.slow),
+        pytest.param("renaming", 150, marks=pytest.mark.slow),
+    ],
+)
+def test_a_copy_after_a_kill(
+    hub: HubServer, run: Run, tmp_path: Path, step: str, number: int
+) -> None:
+    push_buffer_set(hub, GOLDEN, tmp_path / "work")
+    out, expected = tmp_path / "out", tmp_path / "expected"
+    assert run("fetch", SPLIT_AT, "--to", str(expected))[0] == 0
+    words = ["fetch", SPLIT_AT, "--to", str(out)]
+    with elsewhere(hub, KILLED, step, str(number), *words) as process:
+        process.wait(120)
+    assert process.returncode == -signal.SIGKILL
+    assert run("list", str(out))[0] == 1  # the manifests' header is moved last
+    assert run(*words)[0] == 0
+    assert contents(out) == contents(expected)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cache", "expected", "out", "work"]
+    assert list(verify_buffer_set(load_buffer_set(out))) == []

@@ -1,0 +1,43 @@
+"""Which files belong to a buffer set; `verify` names all others."""
+
+import re
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+from robomme_interference_data.constants import (
+    DATASET_FOLDERS,
+    INDEX_DIR,
+    INFO_PATH,
+    MANIFESTS,
+    PARTS_PATH,
+    QUESTIONS_PATH,
+)
+from robomme_interference_data.storage.files import all_files
+
+_BESIDE = r"(README|LICENSE)[^/]*|croissant\.json|\.gitattributes|\.git/.*|\.cache/huggingface/.*"
+"""Cards, and files of Git and of the Hub's client."""
+
+_IN_DATASET = re.compile(rf"({'|'.join((*DATASET_FOLDERS, INDEX_DIR))})/.*|{_BESIDE}")
+_IN_SET = re.compile(rf"{MANIFESTS}/.*|{QUESTIONS_PATH}|{PARTS_PATH}|{_BESIDE}")
+
+
+def further_files(root: Path, datasets: Collection[str]) -> Iterator[str]:
+    """Yield the paths of the files of a folder that belong to no dataset or buffer set.
+
+    Files in the folders of datasets and manifests count as theirs here, and are checked with them.
+
+    Args:
+        root: Folder of a buffer set, or of a single dataset.
+        datasets: Names of the buffer set's datasets; empty for a single dataset.
+    """
+    has_dataset = (root / INFO_PATH).is_file()  # a published buffer set has its units at the root
+    for path in all_files(root):
+        folder, _, inner = path.partition("/")
+        if folder in datasets:
+            belongs = _IN_DATASET.fullmatch(inner)
+        else:
+            belongs = (datasets and _IN_SET.fullmatch(path)) or (
+                has_dataset and _IN_DATASET.fullmatch(path)
+            )
+        if not belongs:
+            yield path

@@ -1,0 +1,105 @@
+"""What a copy of a published buffer set holds: `fetch --to` may have copied a part of it."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from robomme_interference_data.constants import DATASETS, FETCH_RECORD, INFO_PATH
+from robomme_interference_data.schema.manifest import BufferManifest, FetchRecord
+from robomme_interference_data.storage.files import LocalFiles, read_header
+
+from .dataset import Dataset
+
+if TYPE_CHECKING:
+    from .buffer_set import BufferSet
+
+
+def read_fetch_record(root: Path) -> FetchRecord | None:
+    """Return what a folder records of the fetch that made it; None if it is no copy.
+
+    Raises:
+        FormatError: The record is damaged, or of an unknown version.
+    """
+    path = root / FETCH_RECORD
+    return read_header(path, FetchRecord) if path.is_file() else None
+
+
+def fetch_command(root: Path, record: FetchRecord) -> str:
+    """Return the command that adds all that a copy lacks."""
+    return f"fetch {record.location} --to {root}"
+
+
+class FetchedCopy:
+    """The folder of a copy, and what its record lists.
+
+    Attributes:
+        root: The folder.
+        record: What `fetch` recorded.
+    """
+
+    def __init__(self, root: Path, record: FetchRecord):
+        self.root, self.record = root, record
+        self._files = frozenset(record.files)
+        self._cameras: dict[str, dict[int, frozenset[str]]] = {}
+
+    @property
+    def refetch(self) -> str:
+        """The command that adds all that it lacks."""
+        return fetch_command(self.root, self.record)
+
+    def has_dataset(self, name: str, files: object) -> bool:
+        """Whether the metadata of a dataset is here, or on the Hub, from which it is read."""
+        if not isinstance(files, LocalFiles):
+            return True
+        return name in DATASETS and self._path(files.root, INFO_PATH) in self._files
+
+    def lists(self, folder: Path, path: str) -> bool:
+        """Whether the record lists a file of a dataset in `folder`."""
+        return self._path(folder, path) in self._files
+
+    def holds(self, dataset: Dataset, episode_index: int) -> bool:
+        """Whether an episode's vectors and at least one of its videos are here."""
+        if not isinstance(dataset.files, LocalFiles):
+            return True
+        return episode_index in self._episodes(dataset, dataset.files.root)
+
+    def holds_all(self, dataset: Dataset, episode_index: int) -> bool:
+        """Whether an episode's vectors and all of its videos are here."""
+        if not isinstance(dataset.files, LocalFiles):
+            return True
+        held = self._episodes(dataset, dataset.files.root)
+        return held.get(episode_index) == frozenset(dataset.cameras)
+
+    def cameras(self, dataset: Dataset) -> tuple[str, ...]:
+        """Return the cameras whose videos are here for every episode that is."""
+        if not isinstance(dataset.files, LocalFiles):
+            return dataset.cameras
+        held = self._episodes(dataset, dataset.files.root).values()
+        return tuple(name for name in dataset.cameras if all(name in names for names in held))
+
+    def holds_buffer(self, buffer_set: "BufferSet", manifest: BufferManifest) -> bool:
+        """Whether the query and all sessions of a buffer are here."""
+        episodes = {(manifest.query.dataset, manifest.query.episode_index)}
+        episodes |= {(entry.dataset, entry.episode_index) for entry in manifest.sessions}
+        return all(
+            name in buffer_set.datasets and self.holds(buffer_set.datasets[name], index)
+            for name, index in episodes
+        )
+
+    def _episodes(self, dataset: Dataset, folder: Path) -> dict[int, frozenset[str]]:
+        """Return the cameras whose videos are here, by the index of each episode that is here."""
+        known = self._cameras.get(dataset.kind)
+        if known is None:
+            known = self._cameras[dataset.kind] = {}
+            for index in range(len(dataset)):
+                data, *videos = dataset.files_of(index, dataset.cameras)
+                cameras = frozenset(
+                    camera
+                    for camera, video in zip(dataset.cameras, videos, strict=True)
+                    if self.lists(folder, video)
+                )
+                if self.lists(folder, data) and (cameras or not dataset.cameras):
+                    known[index] = cameras
+        return known
+
+    def _path(self, folder: Path, path: str) -> str:
+        return (folder.relative_to(self.root) / path).as_posix()
