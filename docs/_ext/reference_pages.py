@@ -28,6 +28,7 @@ ROWS = {
     "Sessions of a buffer": "schema.manifest:SessionEntry",
     "Header of the manifests: `manifests/manifest.json`": "schema.manifest:ManifestHeader",
     "Datasets in that header": "schema.manifest:ManifestDataset",
+    "Files of a copy: `manifests/fetched.json`": "schema.manifest:FetchRecord",
     "Episodes: `meta/interference.parquet` of a dataset": "schema.records:EpisodeRecord",
     "Evidence spans of an episode": "schema.records:EvidenceSpan",
     "Identity of a dataset: `meta/interference.json`": "schema.records:DatasetIdentity",
