@@ -14,11 +14,14 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.storage.files import all_files
 
-_BESIDE = r"(README|LICENSE)[^/]*|croissant\.json|\.gitattributes|\.git/.*|\.cache/huggingface/.*"
+_BESIDE = (
+    rf"(README|LICENSE)[^/]*|croissant\.json|{PARTS_PATH}"
+    r"|\.gitattributes|\.git/.*|\.cache/huggingface/.*"
+)
 """Cards, and files of Git and of the Hub's client."""
 
 _IN_DATASET = re.compile(rf"({'|'.join((*DATASET_FOLDERS, INDEX_DIR))})/.*|{_BESIDE}")
-_IN_SET = re.compile(rf"{MANIFESTS}/.*|{QUESTIONS_PATH}|{PARTS_PATH}|{_BESIDE}")
+_IN_SET = re.compile(rf"{MANIFESTS}/.*|{QUESTIONS_PATH}|{_BESIDE}")
 
 
 def further_files(root: Path, datasets: Collection[str]) -> Iterator[str]:
@@ -34,10 +37,12 @@ def further_files(root: Path, datasets: Collection[str]) -> Iterator[str]:
     for path in all_files(root):
         folder, _, inner = path.partition("/")
         if folder in datasets:
-            belongs = _IN_DATASET.fullmatch(inner)
+            patterns, inside = [_IN_DATASET], inner
         else:
-            belongs = (datasets and _IN_SET.fullmatch(path)) or (
-                has_dataset and _IN_DATASET.fullmatch(path)
-            )
-        if not belongs:
+            patterns, inside = [], path
+            if has_dataset:
+                patterns.append(_IN_DATASET)
+            if datasets:
+                patterns.append(_IN_SET)
+        if not any(pattern.fullmatch(inside) for pattern in patterns):
             yield path

@@ -80,7 +80,7 @@ def verify_buffer_set(
         progress.start("Verifying", frames)
     for name, dataset in datasets.items():
         units, shown = datasets.get(DISTRACTORS), progress if decode else None
-        copy = buffer_set.copy if dataset.files.root.is_relative_to(root) else None
+        copy = buffer_set.copy if dataset.files.snapshot().is_relative_to(root) else None
         yield from caught(name, dataset_violations(name, dataset, header, units, shown, copy))
         yield from index_violations(name, dataset, units, copy)
     if len(datasets) == len(buffer_set.datasets):
