@@ -12,12 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import (
+    DATASETS,
     DEMONSTRATIONS,
+    DISTRACTORS,
     MANIFEST_HEADER,
     MANIFEST_PATH,
     MANIFEST_ROWS,
     MANIFESTS,
     OPTIONAL_DATASETS,
+    RULE_VERSION,
 )
 from robomme_interference_data.errors import (
     FormatError,
@@ -43,15 +46,15 @@ from robomme_interference_data.storage.parquet import RowSpan
 from .buffer import Buffer
 from .dataset import Dataset
 from .query import Query
+from .query_sessions import SessionSource
 
 if TYPE_CHECKING:
     from robomme_interference_data.storage.cache import DecodedCache
 
-_FOLDER = re.compile(r"\w[\w.-]*")
 _LOCATION = re.compile(r"\.|[\w.-]+(?:/[\w.-]+)+@[0-9a-f]{40}")
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _BATCH_ROWS = 1024
-_KEYS = ("episode_id", "condition", "family", "difficulty")
+_KEYS = ("episode_id", "condition", "difficulty")
 
 
 def pending_rows(header: ManifestHeader) -> str:
@@ -77,11 +80,11 @@ class BufferSet:
         self.header = read_header(path, ManifestHeader)
         if not _DIGEST.fullmatch(self.header.rows):
             raise FormatError.damaged(path, f"rows: {self.header.rows[:80]!r} is not a SHA-256")
-        if DEMONSTRATIONS not in self.header.datasets:
-            raise FormatError.damaged(path, "no demonstrations")
+        names = self.header.datasets.keys()
+        if not {DEMONSTRATIONS, DISTRACTORS} <= names <= {*DATASETS}:
+            what = f"datasets {', '.join(map(ascii, sorted(names)))}; expected demonstrations, "
+            raise FormatError.damaged(path, f"{what}distractors, and optional ones")
         for name, dataset in self.header.datasets.items():
-            if not _FOLDER.fullmatch(name):
-                raise FormatError.damaged(path, f"dataset {name!r} is not a folder name")
             if not _LOCATION.fullmatch(dataset.location or "."):
                 raise FormatError.damaged(path, f"{name} has the location {dataset.location!r}")
 
@@ -299,20 +302,40 @@ class BufferSet:
             buffer.verify()
         return buffer
 
-    def check_tables(self, conditions: Iterable[Condition | str]) -> None:
-        """Check the rows of all buffers, and the records of all episodes, against their hashes.
+    def check_tables(self, conditions: Iterable[Condition | str], *, planned: bool = True) -> None:
+        """Check the tables of some conditions; nothing is decoded.
+
+        Checked are the records of all episodes against the revisions of their datasets, and every
+        row against the one that the rules give.
 
         Args:
-            conditions: The conditions whose datasets' records are checked.
+            conditions: The conditions.
+            planned: Whether their rows are used; else the records alone are checked.
 
         Raises:
-            HashMismatchError: They differ.
+            HashMismatchError: A table differs.
+            FormatError: The rows follow rules of an unknown version.
         """
-        self._check_rows()
-        for name in datasets_of(map(parse_condition, conditions)):
+        parsed = [parse_condition(one) for one in conditions]
+        for name in datasets_of(parsed):
             self.datasets[name].check_records()
+        if planned:
+            self._check_rows()
+            for manifest in self.manifests(condition=parsed):
+                self._source.check(manifest)
+
+    @cached_property
+    def _source(self) -> SessionSource:
+        """What the rules depend on."""
+        return SessionSource(self.datasets, self.header.seed)
 
     def _check_rows(self) -> None:
+        if self.header.rule_version != RULE_VERSION:
+            raise FormatError(
+                f"{self.location} follows version {self.header.rule_version} of the rules; this "
+                f"package can check {RULE_VERSION}",
+                "Install the version of robomme-interference-data that made it.",
+            )
         if sha256_file(self._path) != self.header.rows:
             what = f"{self._path} does not have the SHA-256 in {MANIFEST_HEADER}"
             raise HashMismatchError(what, self.fix, "verify BUFFER_SET")
@@ -326,8 +349,14 @@ class BufferSet:
             if entry.dataset not in self.datasets:
                 what = f"{manifest} has a session of the unknown dataset {entry.dataset!r}"
                 raise FormatError.damaged(self._path, what)
-        query = self.query(manifest.episode_id)
-        return Buffer(manifest, query, self.datasets, cache=self._cache, threads=self._threads)
+        return Buffer(
+            manifest,
+            self.query(manifest.episode_id),
+            self.datasets,
+            cache=self._cache,
+            threads=self._threads,
+            source=self._source,
+        )
 
     def _check_episode(self, episode: EpisodeId) -> None:
         if episode in self._episodes:
@@ -359,6 +388,8 @@ class BufferSet:
                 raise FormatError.damaged(
                     self._path, f"{count} rows of {episode} under {condition}"
                 )
+        # Not the column of that name, which a reader of the table alone may filter by.
+        keys["family"] = [EpisodeId.parse(text or "").family for text in keys["episode_id"]]
         return keys
 
     @cached_property
