@@ -23,7 +23,7 @@ from robomme_interference_data.errors import FormatError, InterferenceError
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.codec import arrow_schema, to_dict
 from robomme_interference_data.schema.conditions import datasets_of
-from robomme_interference_data.schema.manifest import BufferManifest
+from robomme_interference_data.schema.manifest import BufferManifest, ManifestHeader
 from robomme_interference_data.storage.arrays import combine
 from robomme_interference_data.storage.encode import CODECS, decode_image
 from robomme_interference_data.storage.files import LocalFiles, all_files, sha256_file
@@ -61,19 +61,7 @@ def verify_buffer_set(
     """
     progress = progress or WorkProgress(quiet=True)
     header, root = buffer_set.header, buffer_set.files.snapshot("*")
-    for path in all_files(root / MANIFESTS):
-        # Hidden rows belong to manifests whose replacement was interrupted; the next build removes
-        # them.
-        hidden = path.startswith(".") and path.endswith(".parquet")
-        if path not in (MANIFEST_HEADER, MANIFEST_ROWS) and not hidden:
-            yield Violation(f"{MANIFESTS}/{path}", UNLISTED)
-    rows = pending if (root / (pending := pending_rows(header))).is_file() else _ROWS
-    if not (root / rows).is_file():
-        yield Violation(rows, "is missing")
-    elif sha256_file(root / rows) != header.rows:
-        yield Violation(rows, f"does not have the SHA-256 of {MANIFEST_HEADER}")
-    else:
-        yield from caught(MANIFESTS, _table(root, rows, BufferManifest))
+    yield from _manifests(root, header)
     datasets: dict[str, Dataset] = {}
     for name in header.datasets:
         try:
@@ -91,14 +79,33 @@ def verify_buffer_set(
         yield from caught(MANIFESTS, _buffers(buffer_set, datasets))
     if decode and {DEMONSTRATIONS, EXECUTIONS} <= datasets.keys():
         yield from caught(EXECUTIONS, _executions(datasets[EXECUTIONS], datasets[DEMONSTRATIONS]))
-    if (root / QUESTIONS_PATH).is_file():
+    if header.questions is not None:
         yield from caught(QUESTIONS_PATH, _table(root, QUESTIONS_PATH, Question))
         yield from caught(QUESTIONS_PATH, _questions(buffer_set))
+    elif (root / QUESTIONS_PATH).exists():
+        yield Violation(QUESTIONS_PATH, f"is not listed in {HEADER}")
+
+
+def _manifests(root: Path, header: ManifestHeader) -> Iterator[Violation]:
+    """Check the files of the manifests."""
+    for path in all_files(root / MANIFESTS):
+        # Hidden rows belong to manifests whose replacement was interrupted; the next build removes
+        # them.
+        hidden = path.startswith(".") and path.endswith(".parquet")
+        if path not in (MANIFEST_HEADER, MANIFEST_ROWS) and not hidden:
+            yield Violation(f"{MANIFESTS}/{path}", UNLISTED)
+    rows = pending if (root / (pending := pending_rows(header))).is_file() else _ROWS
+    if not (root / rows).is_file():
+        yield Violation(rows, "is missing")
+    elif sha256_file(root / rows) != header.rows:
+        yield Violation(rows, f"does not have the SHA-256 of {MANIFEST_HEADER}")
+    else:
+        yield from caught(MANIFESTS, _table(root, rows, BufferManifest))
 
 
 def _table(root: Path, path: str, record: type) -> Iterator[Violation]:
     """Check that a table has the columns of its records, and no others."""
-    schema, expected = open_parquet(root / path).schema_arrow, arrow_schema(record)
+    schema, expected = open_parquet(LocalFiles(root).path(path)).schema_arrow, arrow_schema(record)
     if not schema.remove_metadata().equals(expected):
         differing = {field.name for field in {*schema} ^ {*expected}}
         yield Violation(path, f"does not have the declared columns; differing: {sorted(differing)}")

@@ -124,10 +124,11 @@ class BufferSet:
     def revision(self) -> str:
         """Identity of the content: SHA-256 over its header, which lists all data by hash.
 
-        It does not depend on where the datasets are stored.
+        It depends neither on where the datasets are stored nor on the questions, which a run that
+        asks them records by itself.
         """
         bare = {name: replace(one, location=None) for name, one in self.header.datasets.items()}
-        return digest_json([to_dict(replace(self.header, datasets=bare))])
+        return digest_json([to_dict(replace(self.header, datasets=bare, questions=None))])
 
     @property
     def conditions(self) -> tuple[str, ...]:
@@ -151,7 +152,13 @@ class BufferSet:
         """
         location, files = self.header.datasets[name].location, self.files
         if isinstance(files, LocalFiles) and (location is None or (files.root / name).is_dir()):
-            return LocalFiles(files.root / name)
+            folder = files.root / name
+            if not folder.resolve().is_relative_to(files.root.resolve()):
+                raise FormatError(
+                    f"{folder} is a link that leads out of the buffer set",
+                    "Replace the link by the folder.",
+                )
+            return LocalFiles(folder)
         if location is None and isinstance(files, HubFiles) and name in OPTIONAL_DATASETS:
             return files.inside(name)
         if location is None:
