@@ -23,11 +23,13 @@ from robomme_interference_data.constants import (
     DISTRACTORS,
     FPS,
     FRONT,
+    INFO_PATH,
     STATE,
     WRIST,
 )
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.encode import CODECS, VideoEncoder
+from robomme_interference_data.storage.files import read_json
 
 SIDE, LESSON = 32, 8
 CAMERAS = (FRONT, WRIST)
@@ -62,7 +64,9 @@ def _write_dataset(root: Path, kind: str, count: int) -> None:
             episodes.append(StoredEpisode(record, FEATURES, videos, stats, vectors, ROBOT))
         for _ in write_lerobot(root, kind, episodes, FEATURES, CODEC):
             pass
-    complete_dataset(root, records, identity_of(records, kind, "1.0.0", CODEC.name, ()), {})
+    info = read_json(root / INFO_PATH)
+    identity = identity_of(records, info, kind, "1.0.0", CODEC.name, ())
+    complete_dataset(root, records, identity, {})
 
 
 def _record(kind: str, index: int) -> EpisodeRecord:

@@ -12,7 +12,7 @@ from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from robomme_interference_data.constants import ACTION, UNITS
+from robomme_interference_data.constants import ACTION, INFO_PATH, UNITS
 from robomme_interference_data.errors import (
     BuildError,
     InterferenceError,
@@ -26,7 +26,7 @@ from robomme_interference_data.runtime.executor import Executor, Outcome
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.encode import get_codec
-from robomme_interference_data.storage.files import canonical_json
+from robomme_interference_data.storage.files import canonical_json, read_json
 from robomme_interference_data.storage.staging import replace_folder, staging_dir
 
 from .existing import ExistingDataset, open_existing
@@ -190,7 +190,10 @@ def _write(
     provenances = [source.provenance for source in plan.sources]
     provenances += existing.dataset.identity.sources if existing else ()
     sources = [one for _, one in sorted({canonical_json(p): p for p in provenances}.items())]
-    identity = identity_of(records, plan.kind, plan.version, plan.codec, sources, unit=plan.unit)
+    info = read_json(made / INFO_PATH)
+    identity = identity_of(
+        records, info, plan.kind, plan.version, plan.codec, sources, unit=plan.unit
+    )
     with progress.status("Hashing"):
         complete_dataset(made, records, identity, skipped)
         os.sync()

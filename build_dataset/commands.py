@@ -223,15 +223,16 @@ def new_buffer_set(config: NewConfig, plan: PlanConfig, as_json: AsJson = False)
     ```
     """
     from robomme_interference_data.storage.files import LocalFiles
+    from robomme_interference_data.storage.staging import copy_folder
 
     with graceful_interrupt(_KEPT):
         base, units = plan_new(config, plan)
         print_status(f"Demonstrations: {base.files.describe()}; units from {len(units.tasks):,}")
         _build(units, config.buffer_set / DISTRACTORS, config, as_json=False)
         if isinstance(base.files, LocalFiles):
-            link = config.buffer_set / DEMONSTRATIONS
-            if not link.exists():
-                link.symlink_to(base.files.root.resolve(), target_is_directory=True)
+            own = config.buffer_set / DEMONSTRATIONS
+            if not own.exists():
+                copy_folder(base.files.root, own)
         _plan(config.buffer_set, plan, as_json=as_json, base=base.files)
         audit(str(config.buffer_set))
     print_status(f"Next: robomme-interference publish {config.buffer_set} --repo-id NAMESPACE/NAME")

@@ -27,17 +27,25 @@ from robomme_interference_data.constants import (
     Unit,
 )
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.data.embeddings import IndexHeader, index_folder
+from robomme_interference_data.data.embeddings import IndexHeader, index_folder, normalized
 from robomme_interference_data.data.fetched_copy import FetchedCopy
 from robomme_interference_data.errors import InterferenceError, visible
+from robomme_interference_data.retrieval.segment import typical_cosine
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.manifest import ManifestHeader
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.schema.shifts import SHIFTS
 from robomme_interference_data.storage.arrays import combine
 from robomme_interference_data.storage.encode import CODECS
-from robomme_interference_data.storage.files import all_files, read_header, read_json, sha256_file
+from robomme_interference_data.storage.files import (
+    all_files,
+    digest_json,
+    read_header,
+    read_json,
+    sha256_file,
+)
 from robomme_interference_data.storage.lerobot import LeRobotFiles
+from robomme_interference_data.storage.video import open_video
 
 from .identity import BuildReport, identity_of, listed_files, report_of
 from .image_stats import ImageStats, Statistics, episode_statistics
@@ -141,7 +149,7 @@ def _identity(
 ) -> Iterator[Violation]:
     stored, where = dataset.identity, f"{name}/{IDENTITY_PATH}"
     kept = stored.version, stored.codec, stored.sources, stored.sums
-    made = identity_of(records, name, *kept, unit)
+    made = identity_of(records, dataset.lerobot.info, name, *kept, unit)
     for field, value in (vars(made) | {"cameras": dataset.cameras}).items():
         if getattr(stored, field) != value:
             what = f"{field} is {getattr(stored, field)}; the episodes give {value}"
@@ -189,6 +197,13 @@ def _episode(
     where: str, dataset: Dataset, record: EpisodeRecord, statistics: Statistics
 ) -> Iterator[Violation]:
     recorded, spans = record.feature_sha256, record.spans
+    formats = _pixel_formats(dataset, record)
+    exact = formats <= {codec.pix_fmt for codec in CODECS.values() if codec.exact}
+    stated = CODECS.get(dataset.identity.codec)
+    if stated is not None and not formats <= {stated.pix_fmt}:
+        yield Violation(where, f"has videos in {', '.join(sorted(formats))}, not {stated.name}")
+    if record.exact and not exact:
+        yield Violation(where, "is exact, but its videos are lossy")
     images: defaultdict[str, ImageStats] = defaultdict(ImageStats)
 
     def count(feature: str, value: NDArray[Any]) -> None:
@@ -198,8 +213,8 @@ def _episode(
     session, *parts = dataset.digests(
         record.episode_index, [record.session, *spans.values()], count
     )
-    codec = CODECS.get(dataset.identity.codec)
-    for feature, counted in images.items() if codec and codec.exact else ():
+    # By the video itself: statistics of lossy ones are those of the frames before encoding.
+    for feature, counted in images.items() if exact else ():
         for name, value in counted.result().items():
             stored = statistics.get(feature, {}).get(name, np.empty(0))
             # Compared as LeRobot scales them: different means can become one number.
@@ -212,6 +227,15 @@ def _episode(
         if combine(part) != getattr(record.span_sha256, name, None):
             what = f"frames {start} to {stop - 1} ({name}) do not have the recorded SHA-256"
             yield Violation(where, what)
+
+
+def _pixel_formats(dataset: Dataset, record: EpisodeRecord) -> set[str]:
+    """Return the pixel formats of an episode's videos."""
+    formats = set()
+    for path, _ in dataset.lerobot.locate(record.episode_index).videos.values():
+        with open_video(dataset.files.path(path)) as (_, stream):
+            formats.add(str(stream.codec_context.pix_fmt))
+    return formats
 
 
 def index_violations(
@@ -243,7 +267,20 @@ def _index(
         return
     lengths = {record.episode_index: record.length for record in dataset.records()}
     held = [index for index in lengths if copy is None or copy.holds(dataset, index)]
-    dataset.index(encoder, camera).check(lengths, units=name == DISTRACTORS, held=held)
+    index = dataset.index(encoder, camera)
+    index.check(lengths, units=name == DISTRACTORS, held=held)
+    if header.encoder.sha256 != digest_json([header.encoder.fingerprint]):
+        yield Violation(where, "the encoder's fingerprint does not have its SHA-256")
+    if header.typical_cosine is not None and len(held) == len(lengths):
+
+        def embeddings(episode: int) -> NDArray[np.float32]:
+            return normalized(index.span(episode, 0, lengths[episode]), index.center)
+
+        typical = typical_cosine(len(lengths), embeddings)
+        # It has four digits, and the last one may differ between machines.
+        if not np.isclose(header.typical_cosine, typical, 0, 2e-4):
+            what = f"the typical cosine is {header.typical_cosine}; the embeddings give {typical}"
+            yield Violation(where, what)
     with suppress(InterferenceError):  # reported where the units are checked
         made = dataset.index(encoder, camera).key
         if units is not None and units.index(encoder, camera).key != made:

@@ -9,7 +9,7 @@ copy of that table without LeRobot's statistics, which are most of its bytes.
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -63,6 +63,7 @@ def listed_files(root: Path) -> list[str]:
 
 def identity_of(
     records: Sequence[EpisodeRecord],
+    info: Mapping[str, Any],
     kind: str,
     version: str,
     codec: str,
@@ -70,15 +71,18 @@ def identity_of(
     sums: str = "",
     unit: Unit = PAPER_UNIT,
 ) -> DatasetIdentity:
-    """Return the identity of a dataset with these episodes; `unit` is the distractors'."""
+    """Return the identity of a dataset with these episodes and this `info.json`.
+
+    `unit` is the distractors'.
+    """
     families = Counter(record.episode_id.family for record in records)
     features = {name for record in records for name in record.feature_sha256}
     cameras = sorted(name for name in features if name.startswith(CAMERA_PREFIX))
-    return DatasetIdentity(
+    identity = DatasetIdentity(
         format_version=FORMAT_VERSION,
         kind=kind,
         version=version,
-        revision=revision_of(records),
+        revision="",
         exact=all(record.exact for record in records),
         codec=codec,
         cameras=tuple(name.removeprefix(CAMERA_PREFIX) for name in cameras),
@@ -88,6 +92,7 @@ def identity_of(
         counts=Counts(len(records), sum(one.length for one in records), dict(families)),
         sums=sums,
     )
+    return replace(identity, revision=revision_of(identity, info, records))
 
 
 def complete_dataset(

@@ -49,6 +49,10 @@ def lerobot_violations(dataset: Dataset, copy: FetchedCopy | None) -> Iterator[t
         yield TASKS_PATH, f"task_index is {list(tasks.values())[:5]}; expected 0, 1, …"
     if set(tasks) != {record.goal for record in dataset.records()}:
         yield TASKS_PATH, "does not list the goals of the episodes, each once"
+    # LeRobot reads the frames of all files in the order of their paths.
+    data = [dataset.lerobot.locate(index).data for index in range(len(dataset))]
+    if data != sorted(data):
+        yield EPISODES_DIR, "does not have the data files in the order of the episodes"
     first = 0
     users: dict[str, int] = {}
     for record in dataset.records():

@@ -25,6 +25,7 @@ from robomme_interference_data.constants import (
     MAX_STEPS,
     OPTIONAL_DATASETS,
     POSITION_LIMIT,
+    QUESTIONS_PATH,
     RULE_VERSION,
     SHIFTED,
     UNITS,
@@ -221,7 +222,13 @@ def write_manifests(plan: ManifestPlan, root: Path) -> Iterator[int]:
             check_manifests_folder(root)
             written = work / rows.name
             counts = yield from _write_rows(plan, written)
-            made = _header(plan, counts, sha256_file(written))
+            questions = root / QUESTIONS_PATH
+            made = _header(
+                plan,
+                counts,
+                sha256_file(written),
+                sha256_file(questions) if questions.is_file() else None,
+            )
             write_json(work / header.name, to_dict(made))
             pending = out.parent / pending_rows(made)
             written.replace(pending)
@@ -246,7 +253,9 @@ def _write_rows(plan: ManifestPlan, path: Path) -> Generator[int, None, dict[str
     return {"queries": len(plan.demonstrations), "buffers": buffers, "sessions": sessions}
 
 
-def _header(plan: ManifestPlan, counts: dict[str, int], rows: str) -> ManifestHeader:
+def _header(
+    plan: ManifestPlan, counts: dict[str, int], rows: str, questions: str | None
+) -> ManifestHeader:
     return ManifestHeader(
         format_version=FORMAT_VERSION,
         rule_version=RULE_VERSION,
@@ -265,4 +274,5 @@ def _header(plan: ManifestPlan, counts: dict[str, int], rows: str) -> ManifestHe
         },
         counts=counts,
         rows=rows,
+        questions=questions,
     )

@@ -86,10 +86,10 @@ def plan_new(config: NewConfig, plan: PlanConfig) -> "tuple[Dataset, BuildPlan]"
             f"a repository or folder of demonstrations, not of {base.kind}",
             "The card of a published buffer set names the repository of its demonstrations.",
         )
-    link = config.buffer_set / DEMONSTRATIONS
-    if isinstance(base.files, LocalFiles) and link.exists() and not link.samefile(base.files.root):
+    own = config.buffer_set / DEMONSTRATIONS
+    if own.exists() and Dataset(LocalFiles(own)).identity != base.identity:
         raise BuildError(
-            f"{link} exists, and is not {base.files.root}",
+            f"{own} exists, and is not a copy of {base.files.describe()}",
             "Choose another `buffer_set`, or remove the folder first.",
         )
     check_needs(in_order(plan.conditions), in_folder(config.buffer_set))

@@ -1,23 +1,25 @@
 """Make the questions about the past of a buffer set."""
 
-import dataclasses
 import hashlib
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
 
-from robomme_interference_data.constants import DEMONSTRATIONS, QUESTIONS_PATH
+from robomme_interference_data.constants import DEMONSTRATIONS, MANIFEST_PATH, QUESTIONS_PATH
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.questions import Question
 from robomme_interference_data.errors import BuildError
 from robomme_interference_data.lazy import load_extra
-from robomme_interference_data.schema.codec import arrow_schema, to_table
+from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
+from robomme_interference_data.schema.manifest import ManifestHeader
 from robomme_interference_data.schema.subgoal import Pixel
 from robomme_interference_data.simulators.registry import recorded_scene
 from robomme_interference_data.storage.encode import png
+from robomme_interference_data.storage.files import read_header, sha256_file, write_json
 from robomme_interference_data.storage.parquet import writing
 
 _MOST, _DRAWN = 5, 4
@@ -42,7 +44,7 @@ def make_questions(buffer_set: BufferSet) -> Iterator[Question]:
                 f"pixels; expected {side}×{side}, in which the positions of objects are known",
                 "Build the demonstrations with the simulator itself.",
             )
-        yield dataclasses.replace(question, picture=png(picture(view, marks)))
+        yield replace(question, picture=png(picture(view, marks)))
 
 
 def planned_questions(buffer_set: BufferSet) -> Iterator[tuple[Question, Marks]]:
@@ -53,7 +55,11 @@ def planned_questions(buffer_set: BufferSet) -> Iterator[tuple[Question, Marks]]
 
 
 def write_questions(questions: Sequence[Question], folder: Path) -> Path:
-    """Write questions into a buffer set's folder, whole or not at all; return the file."""
+    """Write questions into a buffer set's folder, and their SHA-256 into its header.
+
+    Returns the file. After an interruption between the two, the questions are an error until they
+    are made again.
+    """
     out = folder / QUESTIONS_PATH
     schema = arrow_schema(Question)
     with (
@@ -62,6 +68,8 @@ def write_questions(questions: Sequence[Question], folder: Path) -> Path:
     ):
         for one in questions:  # one row group each: the pictures are already compressed
             writer.write_table(to_table([one], schema))
+    header = read_header(folder / MANIFEST_PATH, ManifestHeader)
+    write_json(folder / MANIFEST_PATH, to_dict(replace(header, questions=sha256_file(out))))
     return out
 
 

@@ -87,9 +87,12 @@ def verify_buffer_set(
         yield from caught(MANIFESTS, _buffers(buffer_set, datasets))
     if decode and {DEMONSTRATIONS, EXECUTIONS} <= datasets.keys():
         yield from caught(EXECUTIONS, _executions(datasets[EXECUTIONS], datasets[DEMONSTRATIONS]))
-    if (root / QUESTIONS_PATH).is_file():
+    copy = buffer_set.copy
+    if header.questions is not None and (copy is None or copy.lists(root, QUESTIONS_PATH)):
         yield from caught(QUESTIONS_PATH, _table(root, QUESTIONS_PATH, Question))
         yield from caught(QUESTIONS_PATH, _questions(buffer_set))
+    elif (root / QUESTIONS_PATH).exists():
+        yield Violation(QUESTIONS_PATH, f"is not listed in {HEADER}")
 
 
 def _files(buffer_set: BufferSet, root: Path) -> Iterator[Violation]:
@@ -119,7 +122,7 @@ def _files(buffer_set: BufferSet, root: Path) -> Iterator[Violation]:
 
 def _table(root: Path, path: str, record: type) -> Iterator[Violation]:
     """Check that a table has the columns of its records, and no others."""
-    schema, expected = open_parquet(root / path).schema_arrow, arrow_schema(record)
+    schema, expected = open_parquet(LocalFiles(root).path(path)).schema_arrow, arrow_schema(record)
     if not schema.remove_metadata().equals(expected):
         differing = {field.name for field in {*schema} ^ {*expected}}
         yield Violation(path, f"does not have the declared columns; differing: {sorted(differing)}")

@@ -65,6 +65,7 @@ def ceiling(buffer_set: BufferSet, config: CeilingConfig) -> list[Ceiling]:
         )
     queries_with_evidence(buffer_set)
     names = [one.name for one in in_order(config.conditions or buffer_set.conditions)]
+    buffer_set.check_tables(names)
     cells: dict[tuple[str, str], list[_Kept]] = {}
     for buffer in (one for name in names for one in buffer_set.buffers(condition=name)):
         if (given := _given(buffer_set, buffer, config)) is not None:

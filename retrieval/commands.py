@@ -308,6 +308,7 @@ def _measured(
     under, opened = parse_shift(shift), load_buffer_set(buffer_set)
     selected: dict[str, Any] = {"family": families, "condition": conditions}
     total = sum(1 for _ in opened.manifests(**selected))
+    opened.check_tables(conditions or opened.conditions)
     measured = []
     with WorkProgress(unit="buffers", quiet=quiet) as progress:
         progress.start(encoder, total)

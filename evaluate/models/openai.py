@@ -26,6 +26,9 @@ _LONGEST_PAUSE_S = 8.0
 
 _DAY_S = 86_400.0
 
+_UNREADABLE = (AttributeError, LookupError, RecursionError, TypeError, ValueError)
+"""What the client raises for an answer that is no JSON, too deep, or of another form."""
+
 
 class OpenAIModel(ChatModel):
     """A chat endpoint that takes images.
@@ -106,7 +109,7 @@ class OpenAIModel(ChatModel):
             calls += response.retries_taken + 1
             try:
                 return _read(response.parse(), calls, time.perf_counter() - began)
-            except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+            except _UNREADABLE as error:
                 fault = f"{type(error).__name__}: {first_line(error)}"
             if calls <= self._repeats:
                 time.sleep(min(_PAUSE_S * 2 ** (calls - 1), _LONGEST_PAUSE_S))
@@ -121,7 +124,7 @@ class OpenAIModel(ChatModel):
             known = [one.id for one in self._client.models.list()]
         except openai.APIError as error:
             raise self._error(error) from error
-        except (AttributeError, TypeError, ValueError) as error:
+        except _UNREADABLE as error:
             raise ModelError(
                 f"{self._url} does not list its models: {first_line(error)}",
                 "Is it the base of an OpenAI-compatible endpoint, mostly ending in /v1?",

@@ -10,7 +10,13 @@ from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from typing import Any
 
-from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidMessage, InvalidStatus
+from websockets.exceptions import (
+    ConnectionClosed,
+    InvalidHandshake,
+    InvalidMessage,
+    InvalidStatus,
+    InvalidURI,
+)
 from websockets.sync.client import ClientConnection, connect
 
 from robomme_interference_data.errors import (
@@ -28,8 +34,11 @@ logger = logging.getLogger(__name__)
 API_KEY_VARIABLE = "ROBOMME_POLICY_API_KEY"
 """Environment variable with the API key of servers that require one."""
 
-MAX_BYTES = 64 << 20
+MAX_BYTES = 16 << 20
 """Maximum bytes of an answer; a usual one has a few thousand."""
+
+_MAX_FRAGMENTS = 1 << 12
+"""Maximum fragments of an answer: an empty one has no bytes to count, but takes memory."""
 
 _QUIET_S = 2.0
 """Seconds of waiting before a log message; also the time limit of the first attempt."""
@@ -118,7 +127,8 @@ class ServerConnection(ABC):
                     reason = "it does not answer"
                 if isinstance(error, socket.gaierror):  # an unknown host name stays unknown
                     raise self._unreachable(reason) from error
-            except InvalidHandshake as error:
+            except (InvalidHandshake, InvalidURI, ValueError) as error:
+                # Of a redirect, its address may be none of a websocket, or none at all.
                 raise self._refusal(error) from error
             hint = self._check()
             waited = time.monotonic() - began
@@ -180,8 +190,13 @@ class ServerConnection(ABC):
         self.close()
         return PolicyServerError(f"policy server {self.name} {what}", hint)
 
-    def _exchange(self, messages: Iterable[bytes], seconds: float) -> str | bytes:
-        """Send messages, and receive one; close the connection if this fails."""
+    def _exchange[Answer](
+        self, messages: Iterable[bytes], seconds: float, read: Callable[[str | bytes], Answer]
+    ) -> Answer:
+        """Send messages, receive one and read it; close the connection if this fails.
+
+        Reading counts into the time limit.
+        """
         connection = self._connection
         if connection is None:
             raise PolicyServerError(
@@ -192,7 +207,12 @@ class ServerConnection(ABC):
             with shutdown_after(seconds, lambda: [connection.socket]) as expired:
                 for message in messages:
                     connection.send(message)
-                return connection.recv()
+                answer = read(self._receive(connection))
+            if expired.is_set():
+                raise TimeoutError
+            return answer
+        except PolicyServerError:  # of an answer that came: the connection is closed
+            raise
         except (ConnectionClosed, OSError) as error:
             self.close()
             self._check()
@@ -205,6 +225,15 @@ class ServerConnection(ABC):
             self.close()
             raise
 
+    def _receive(self, connection: ClientConnection) -> str | bytes:
+        fragments: list[Any] = []
+        for fragment in connection.recv_streaming():
+            fragments.append(fragment)
+            if len(fragments) > _MAX_FRAGMENTS:
+                raise self._failed(f"sends a message of over {_MAX_FRAGMENTS:,} fragments", None)
+        joined: str | bytes = type(fragments[0])().join(fragments)
+        return joined
+
 
 class OpenpiConnection(ServerConnection):
     """A connection to a server of openpi, as MME-VLA extends it: `wire.py` has its messages."""
@@ -213,14 +242,14 @@ class OpenpiConnection(ServerConnection):
     _sent = b""
 
     def _greet(self, seconds: float) -> dict[str, Any]:
-        return self._read(self._exchange([], seconds))  # the server speaks first
+        return self._exchange([], seconds, self._read)  # the server speaks first
 
     def request(self, message: dict[str, Any], expected: str) -> dict[str, Any]:
         """Send a message; return its answer, a map with a value of `expected` that is not false."""
         # Kept until the next one is packed: freeing messages of megabytes each time returns their
         # memory to the system, and allocating it again took as long as everything else together.
         self._sent = pack(message)
-        answer = self._read(self._exchange([self._sent], self._response_s))
+        answer = self._exchange([self._sent], self._response_s, self._read)
         value = answer.get(expected)
         if value is None or value is False:
             raise self._failed(

@@ -12,6 +12,7 @@ from robomme_interference_data.errors import InvalidOptionError, PolicyError, Po
 from robomme_interference_data.evaluate.run.identity import plain
 from robomme_interference_data.evaluate.systems import System
 from robomme_interference_data.schema.conditions import NO_HISTORY
+from robomme_interference_data.storage.files import indented_json
 
 from .policy import Policy
 from .registry import (
@@ -26,6 +27,9 @@ from .registry import (
 from .server_lock import lock_server
 
 logger = logging.getLogger(__name__)
+
+MOST_METADATA = 1 << 16
+"""Most letters of a policy's metadata in JSON: `run.json` holds it once for each start of a run."""
 
 
 @contextmanager
@@ -78,8 +82,13 @@ def policy_metadata(text: str, policy: Policy) -> dict[str, Any]:
     metadata = policy.metadata()
     try:
         if isinstance(metadata, Mapping):
-            return dict(plain(metadata))
-        fault = f"returned a {type(metadata).__name__}"
+            recorded = dict(plain(metadata))
+            length = len(indented_json(recorded))
+            if length <= MOST_METADATA:
+                return recorded
+            fault = f"holds {length:,} letters of JSON; expected at most {MOST_METADATA:,}"
+        else:
+            fault = f"returned a {type(metadata).__name__}"
     except ValueError as error:
         fault = f"holds {error}, a number that JSON, and so run.json, does not have"
     raise PolicyError(

@@ -5,6 +5,8 @@ An array is a map with four keys of bytes: `__ndarray__` true, `data` its bytes 
 number, and `dtype`. Everything else is plain msgpack.
 """
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import msgpack
@@ -19,6 +21,13 @@ _KINDS = "biufSU"
 _NOTHING_ELSE = (
     "Messages hold maps, lists, texts, bytes, numbers and arrays of these, nothing else."
 )
+
+MOST_ITEMS = 1 << 16
+"""Most maps and lists in a message together, and most entries in one of them. Actions are an array,
+which is one map; an empty map takes one byte of a message and a hundred in memory."""
+
+_DTYPE_LETTERS = 16
+"""Longest text of a dtype, such as `<f4`: NumPy parses a list of types from a longer one."""
 
 _NOT_READ = (KeyError, OverflowError, SyntaxError, TypeError, ValueError, msgpack.UnpackException)
 """What msgpack and NumPy raise for invalid bytes."""
@@ -38,13 +47,49 @@ def pack(message: Any) -> bytes:
         raise FormatError(f"a message cannot be sent: {error}", _NOTHING_ELSE) from error
 
 
+def check_items(data: bytes, refused: Callable[[Any], bool] = lambda items: False) -> None:
+    """Check that a message is small once it is read, without keeping what it holds.
+
+    The library bounds the length of each map and list; their number multiplies if they are nested.
+
+    Args:
+        data: The message.
+        refused: Whether a message may not hold this map or list.
+    """
+    count = 0
+
+    def drop(items: Any) -> None:
+        nonlocal count
+        count += 1
+        if count > MOST_ITEMS:
+            raise ValueError(f"over {MOST_ITEMS:,} maps and lists")
+        if isinstance(items, dict):
+            dtype = items.get("dtype", items.get(b"dtype"))
+            if dtype is not None and not (isinstance(dtype, str) and len(dtype) <= _DTYPE_LETTERS):
+                raise ValueError(f"a dtype {dtype!r:.80}")
+        if refused(items):
+            raise ValueError(f"it may not hold {items!r:.80}")
+
+    limits = {"max_map_len": MOST_ITEMS, "max_array_len": MOST_ITEMS}
+    with _reading(data):
+        msgpack.unpackb(data, object_hook=drop, list_hook=drop, ext_hook=_drop_extension, **limits)
+
+
 def unpack(data: bytes) -> Any:
     """Read a message; the inverse of `pack`, with lists for tuples.
 
     Arrays are read-only views of `data`.
     """
-    try:
+    check_items(data)
+    with _reading(data):
         return msgpack.unpackb(data, object_hook=_unpack_numpy, ext_hook=_refuse_extension)
+
+
+@contextmanager
+def _reading(data: bytes) -> Iterator[None]:
+    """Turn what invalid bytes raise into one error."""
+    try:
+        yield
     except FormatError:
         raise
     except _NOT_READ as error:
@@ -84,6 +129,10 @@ def _checked(dtype: np.dtype[Any]) -> np.dtype[Any]:
     if dtype.kind not in _KINDS or dtype.shape or (dtype.kind == "f" and dtype.itemsize > 8):
         raise FormatError(f"a message cannot hold NumPy data of dtype {dtype}", _NOTHING_ELSE)
     return dtype
+
+
+def _drop_extension(code: int, data: bytes) -> None:
+    """Return nothing for an extension: who reads the message decides about them."""
 
 
 def _refuse_extension(code: int, data: bytes) -> Any:

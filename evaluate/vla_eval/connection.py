@@ -6,6 +6,7 @@ again, to a server that has forgotten the episode.
 
 from typing import Any
 
+from vla_eval.protocol.image_codec import is_encoded_image
 from vla_eval.protocol.messages import (
     PROTOCOL_VERSION,
     Message,
@@ -15,8 +16,9 @@ from vla_eval.protocol.messages import (
     unpack_message,
 )
 
-from robomme_interference_data.errors import PolicyServerError
+from robomme_interference_data.errors import FormatError, PolicyServerError
 from robomme_interference_data.evaluate.policies.connection import ServerConnection
+from robomme_interference_data.evaluate.policies.wire import check_items
 
 
 class VlaEvalConnection(ServerConnection):
@@ -76,15 +78,7 @@ class VlaEvalConnection(ServerConnection):
         """Send a message, after those without answers; return the payload of its answer."""
         self._add(kind, payload)
         messages, self._unsent = self._unsent, []
-        data = self._exchange(messages, seconds or self._response_s)
-        try:
-            if isinstance(data, str):
-                raise ValueError(f"it sends the text {data!r:.200}")
-            answer = unpack_message(data)
-            if not isinstance(answer.payload, dict):
-                raise ValueError(f"it sends a {type(answer.payload).__name__}")
-        except ValueError as error:
-            raise self._other(error) from error
+        answer = self._exchange(messages, seconds or self._response_s, self._read)
         content: dict[str, Any] = answer.payload
         if answer.type is MessageType.ERROR:
             what = content.get("error", content)
@@ -95,6 +89,21 @@ class VlaEvalConnection(ServerConnection):
                 "A server must answer every observation, and each once.",
             )
         return content
+
+    def _read(self, data: str | bytes) -> Message:
+        try:
+            if isinstance(data, str):
+                raise ValueError(f"it sends the text {data!r:.200}")
+            # Answers are actions; an image of a few bytes can be huge once it is decoded.
+            check_items(data, refused=is_encoded_image)
+            answer = unpack_message(data)
+            if not isinstance(answer.payload, dict):
+                raise ValueError(f"it sends a {type(answer.payload).__name__}")
+        except FormatError as error:
+            raise self._other(error.message) from error
+        except ValueError as error:
+            raise self._other(error) from error
+        return answer
 
     def _other(self, reason: object) -> PolicyServerError:
         """Close the connection; return the error of what is no server of vla-eval."""

@@ -18,7 +18,6 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.ids import EpisodeId, whole_number
-from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.schema.manifest import BufferManifest, SessionEntry, layout_sessions
 from robomme_interference_data.storage.arrays import combine
 
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     from robomme_interference_data.storage.cache import DecodedCache
 
     from .embeddings import BufferSetIndex
+    from .query_sessions import SessionSource
 
 
 @dataclass(frozen=True)
@@ -70,11 +70,12 @@ class Buffer:
         *,
         cache: "DecodedCache | None" = None,
         threads: int | None = None,
+        source: "SessionSource | None" = None,
     ):
         self.manifest = manifest
         self.query = query
         self.sessions = layout_sessions(manifest.sessions)
-        self._datasets = datasets
+        self._datasets, self._source = datasets, source
         self._reader = FrameReader(self.sessions, datasets, cache, threads)
 
     def __repr__(self) -> str:
@@ -323,19 +324,15 @@ class Buffer:
         Later reads from a cache are compared as well.
 
         Raises:
-            HashMismatchError: The manifest contradicts the query's record, a dataset's records
-                do not have its revision, or frames or states differ from the recorded ones.
+            HashMismatchError: The manifest is not the one that the rules give, a dataset does not
+                have its revision, or frames or states differ from the recorded ones.
         """
         self._reader.verified = True
         query, manifest = self.query, self.manifest
         for dataset in {query.dataset, *(self._datasets[e.dataset] for e in manifest.sessions)}:
             dataset.check_records()
-        condition = parse_condition(manifest.condition)
-        planned = query.manifest(condition, manifest.sessions, exact=manifest.exact)
-        for name, value in vars(planned).items():
-            if getattr(manifest, name) != value:
-                what = f"{name} of {manifest} does not fit its query and sessions"
-                raise HashMismatchError.damaged(what)
+        if self._source is not None:  # else no rule made the buffer
+            self._source.check(manifest)
         for entry in manifest.sessions:
             span = entry.start, entry.stop
             what = f"{entry.role} {entry.source}"

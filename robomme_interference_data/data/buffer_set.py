@@ -13,12 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import (
+    DATASETS,
     DEMONSTRATIONS,
+    DISTRACTORS,
     MANIFEST_HEADER,
     MANIFEST_PATH,
     MANIFEST_ROWS,
     MANIFESTS,
     OPTIONAL_DATASETS,
+    RULE_VERSION,
 )
 from robomme_interference_data.errors import (
     FormatError,
@@ -45,16 +48,16 @@ from .buffer import Buffer
 from .dataset import Dataset
 from .fetched_copy import FetchedCopy, read_fetch_record
 from .query import Query
+from .query_sessions import SessionSource
 
 if TYPE_CHECKING:
     from robomme_interference_data.storage.cache import DecodedCache
 
 logger = logging.getLogger(__name__)
-_FOLDER = re.compile(r"\w[\w.-]*")
 _LOCATION = re.compile(r"\.|[\w.-]+(?:/[\w.-]+)+@[0-9a-f]{40}")
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _BATCH_ROWS = 1024
-_KEYS = ("episode_id", "condition", "family", "difficulty")
+_KEYS = ("episode_id", "condition", "difficulty")
 
 
 def pending_rows(header: ManifestHeader) -> str:
@@ -86,11 +89,11 @@ class BufferSet:
         self.header = read_header(path, ManifestHeader)
         if not _DIGEST.fullmatch(self.header.rows):
             raise FormatError.damaged(path, f"rows: {self.header.rows[:80]!r} is not a SHA-256")
-        if DEMONSTRATIONS not in self.header.datasets:
-            raise FormatError.damaged(path, "no demonstrations")
+        names = self.header.datasets.keys()
+        if not {DEMONSTRATIONS, DISTRACTORS} <= names <= {*DATASETS}:
+            what = f"datasets {', '.join(map(ascii, sorted(names)))}; expected demonstrations, "
+            raise FormatError.damaged(path, f"{what}distractors, and optional ones")
         for name, dataset in self.header.datasets.items():
-            if not _FOLDER.fullmatch(name):
-                raise FormatError.damaged(path, f"dataset {name!r} is not a folder name")
             if not _LOCATION.fullmatch(dataset.location or "."):
                 raise FormatError.damaged(path, f"{name} has the location {dataset.location!r}")
 
@@ -135,10 +138,11 @@ class BufferSet:
     def revision(self) -> str:
         """Identity of the content: SHA-256 over its header, which lists all data by hash.
 
-        It does not depend on where the datasets are stored.
+        It depends neither on where the datasets are stored nor on the questions, which a run that
+        asks them records by itself.
         """
         bare = {name: replace(one, location=None) for name, one in self.header.datasets.items()}
-        return digest_json([to_dict(replace(self.header, datasets=bare))])
+        return digest_json([to_dict(replace(self.header, datasets=bare, questions=None))])
 
     @property
     def conditions(self) -> tuple[str, ...]:
@@ -165,7 +169,13 @@ class BufferSet:
         """
         location, files = self.header.datasets[name].location, self.files
         if isinstance(files, LocalFiles) and (location is None or (files.root / name).is_dir()):
-            return LocalFiles(files.root / name, files.refetch)
+            folder = files.root / name
+            if not folder.resolve().is_relative_to(files.root.resolve()):
+                raise FormatError(
+                    f"{folder} is a link that leads out of the buffer set",
+                    "Replace the link by the folder.",
+                )
+            return LocalFiles(folder, files.refetch)
         if location is None and isinstance(files, HubFiles) and name in OPTIONAL_DATASETS:
             return files.inside(name)
         if location is None:
@@ -348,20 +358,40 @@ class BufferSet:
             buffer.verify()
         return buffer
 
-    def check_tables(self, conditions: Iterable[Condition | str]) -> None:
-        """Check the rows of all buffers, and the records of all episodes, against their hashes.
+    def check_tables(self, conditions: Iterable[Condition | str], *, planned: bool = True) -> None:
+        """Check the tables of some conditions; nothing is decoded.
+
+        Checked are the records of all episodes against the revisions of their datasets, and every
+        row against the one that the rules give.
 
         Args:
-            conditions: The conditions whose datasets' records are checked.
+            conditions: The conditions.
+            planned: Whether their rows are used; else the records alone are checked.
 
         Raises:
-            HashMismatchError: They differ.
+            HashMismatchError: A table differs.
+            FormatError: The rows follow rules of an unknown version.
         """
-        self._check_rows()
-        for name in datasets_of(map(parse_condition, conditions)):
+        parsed = [parse_condition(one) for one in conditions]
+        for name in datasets_of(parsed):
             self.datasets[name].check_records()
+        if planned:
+            self._check_rows()
+            for manifest in self.manifests(condition=parsed):
+                self._source.check(manifest)
+
+    @cached_property
+    def _source(self) -> SessionSource:
+        """What the rules depend on."""
+        return SessionSource(self.datasets, self.header.seed)
 
     def _check_rows(self) -> None:
+        if self.header.rule_version != RULE_VERSION:
+            raise FormatError(
+                f"{self.location} follows version {self.header.rule_version} of the rules; this "
+                f"package can check {RULE_VERSION}",
+                "Install the version of robomme-interference-data that made it.",
+            )
         if sha256_file(self._path) != self.header.rows:
             what = f"{self._path} does not have the SHA-256 in {MANIFEST_HEADER}"
             raise HashMismatchError(what, self.fix, "verify BUFFER_SET")
@@ -375,8 +405,14 @@ class BufferSet:
             if entry.dataset not in self.datasets:
                 what = f"{manifest} has a session of the unknown dataset {entry.dataset!r}"
                 raise FormatError.damaged(self._path, what)
-        query = self.query(manifest.episode_id)
-        return Buffer(manifest, query, self.datasets, cache=self._cache, threads=self._threads)
+        return Buffer(
+            manifest,
+            self.query(manifest.episode_id),
+            self.datasets,
+            cache=self._cache,
+            threads=self._threads,
+            source=self._source,
+        )
 
     def _not_fetched(self, what: str, options: str) -> MissingFileError:
         assert self.copy is not None
@@ -419,6 +455,8 @@ class BufferSet:
                 raise FormatError.damaged(
                     self._path, f"{count} rows of {episode} under {condition}"
                 )
+        # Not the column of that name, which a reader of the table alone may filter by.
+        keys["family"] = [EpisodeId.parse(text or "").family for text in keys["episode_id"]]
         return keys
 
     @cached_property

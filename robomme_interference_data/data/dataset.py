@@ -5,7 +5,7 @@ It is a LeRobot dataset in which every episode has its own files, with our colum
 `meta/interference.json`.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -55,9 +55,26 @@ def camera_feature(camera: str) -> str:
     return CAMERA_PREFIX + camera.removeprefix(CAMERA_PREFIX)
 
 
-def revision_of(records: Iterable[EpisodeRecord]) -> str:
-    """Return the revision of a dataset: the SHA-256 over its episode records."""
-    return digest_json(map(to_dict, records), end="\n")
+_COUNTED = ("total_episodes", "total_frames", "total_tasks", "splits")
+"""Fields of `info.json` that follow from the episodes."""
+
+
+def revision_of(
+    identity: DatasetIdentity, info: Mapping[str, Any], records: Iterable[EpisodeRecord]
+) -> str:
+    """Return the revision of a dataset: the SHA-256 over what describes its content.
+
+    That is all of its identity that does not follow from the rest, `info.json` without its counts,
+    and the episode records, which hold the digests of all frames and vectors.
+    """
+    described = {
+        "kind": identity.kind,
+        "codec": identity.codec,
+        "unit": identity.unit,
+        "sources": list(identity.sources),
+        "info": {name: value for name, value in info.items() if name not in _COUNTED},
+    }
+    return digest_json([described, *map(to_dict, records)], end="\n")
 
 
 class Dataset:
@@ -118,7 +135,7 @@ class Dataset:
 
     @property
     def revision(self) -> str:
-        """Identity of the content: a SHA-256 over all episode records."""
+        """Identity of the content, see `revision_of`."""
         return self.identity.revision
 
     @cached_property
@@ -179,14 +196,17 @@ class Dataset:
         return (self._records[index] for index in range(len(self)))
 
     def check_records(self) -> None:
-        """Check the records of all episodes against the revision; once.
+        """Check the records of all episodes, and what describes them, against the revision; once.
 
         Raises:
             HashMismatchError: They differ.
         """
-        if not self._checked and revision_of(self.records()) != self.revision:
+        if self._checked:
+            return
+        if revision_of(self.identity, self.lerobot.info, self.records()) != self.revision:
             raise HashMismatchError.damaged(
-                f"the episode records of {self._name} are not those of its revision"
+                f"the episode records of {self._name}, its identity and {INFO_PATH} are not those "
+                "of its revision"
             )
         self._checked = True
 

@@ -13,9 +13,9 @@ from robomme_interference_data.constants import (
     DISTRACTORS,
     RAW_DISTRACTORS,
 )
-from robomme_interference_data.errors import FormatError, SourceError
+from robomme_interference_data.errors import FormatError, HashMismatchError, SourceError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.schema.conditions import Condition
+from robomme_interference_data.schema.conditions import Condition, parse_condition
 from robomme_interference_data.schema.draw import UnitPool
 from robomme_interference_data.schema.manifest import BufferManifest, SessionEntry
 from robomme_interference_data.schema.records import EpisodeRecord
@@ -43,6 +43,29 @@ class SessionSource:
     seed: int = 0
     unit_episodes: Collection[int] | None = None
 
+    def planned(self, episode: EpisodeId, condition: Condition) -> BufferManifest:
+        """Return the manifest that the rules give for a query episode under a condition."""
+        if episode not in self._queries:
+            demonstrations = self.datasets[DEMONSTRATIONS]
+            record = demonstrations.record(demonstrations.index_of(episode))
+            self._queries[episode] = QuerySessions(self, record)
+        return self._queries[episode].buffer(condition)
+
+    def check(self, manifest: BufferManifest) -> None:
+        """Check that a manifest is the one that the rules give.
+
+        Raises:
+            HashMismatchError: It is not.
+            SourceError, BuildError: The datasets lack what its condition needs.
+        """
+        planned = self.planned(manifest.episode_id, parse_condition(manifest.condition))
+        for name, value in vars(planned).items():
+            if getattr(manifest, name) != value:
+                raise HashMismatchError.damaged(
+                    f"{name} of {manifest} is not what the rules give for its query, the units "
+                    "and the seed"
+                )
+
     @cached_property
     def pool(self) -> UnitPool:
         """The units to draw from."""
@@ -66,6 +89,10 @@ class SessionSource:
                 f"build {name}",
             )
         return session
+
+    @cached_property
+    def _queries(self) -> "dict[EpisodeId, QuerySessions]":
+        return {}
 
     @cached_property
     def _sessions(self) -> dict[str, dict[EpisodeId, SessionEntry]]:

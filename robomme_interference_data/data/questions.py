@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from hashlib import sha256
 from typing import Annotated
 
-from robomme_interference_data.constants import DEMONSTRATIONS, QUESTIONS_PATH
+from robomme_interference_data.constants import DEMONSTRATIONS, MANIFEST_PATH, QUESTIONS_PATH
 from robomme_interference_data.errors import FormatError, MissingFileError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import from_table, to_dict
 from robomme_interference_data.schema.subgoal import Pixel
-from robomme_interference_data.storage.files import LocalFiles, digest_json
+from robomme_interference_data.storage.files import LocalFiles, digest_json, sha256_file
 from robomme_interference_data.storage.parquet import open_parquet, read_table
 
 from .buffer_set import BufferSet
@@ -100,6 +100,8 @@ def read_questions(buffer_set: BufferSet) -> dict[EpisodeId, Question]:
     except MissingFileError:
         what = f"{buffer_set.location} has no questions ({QUESTIONS_PATH})"
         raise MissingFileError(what, hint, command) from None
+    if sha256_file(path) != buffer_set.header.questions:
+        raise FormatError(f"{path} does not have the SHA-256 in {MANIFEST_PATH}", hint, command)
     table = read_table(open_parquet(path), path)
     questions = {one.episode_id: one for one in from_table(Question, table, path)}
     revision = buffer_set.datasets[DEMONSTRATIONS].identity.revision

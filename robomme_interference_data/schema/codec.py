@@ -91,6 +91,7 @@ def from_table[T](record: type[T], table: pa.Table, path: object) -> Iterator[T]
     names = _names(record)
     if missing := [name for name in names if name not in table.column_names]:
         raise FormatError.damaged(path, f"column {', '.join(missing)} is missing")
+    names += [part for part in _PARTS if "episode_id" in names and part in table.column_names]
     return (from_dict(record, row, path) for row in table.select(names).to_pylist())
 
 
@@ -215,6 +216,10 @@ def _record(record: Any) -> _Codec:
                 values[name] = codec.read(given.get(name))
             except ValueError as error:
                 raise ValueError(f"{name}: {first_line(error)}") from None
+        for part in _PARTS if identified else ():
+            expected = getattr(values["episode_id"], part)
+            if given.get(part, expected) != expected:
+                raise ValueError(f"{part} of {values['episode_id']} is {given[part]!r}")
         return record(**values)
 
     def write(value: Any) -> Any:

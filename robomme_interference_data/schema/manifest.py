@@ -180,3 +180,4 @@ class ManifestHeader:
     datasets: Annotated[dict[str, ManifestDataset], "The datasets by name."]
     counts: Annotated[dict[str, int], "Numbers of `queries`, `buffers` and `sessions`."]
     rows: Annotated[str, "SHA-256 of `buffers.parquet`."]
+    questions: Annotated[str | None, "SHA-256 of `questions.parquet`; None without one."] = None

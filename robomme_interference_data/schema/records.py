@@ -156,7 +156,9 @@ class DatasetIdentity:
     format_version: Annotated[int, "Version of the file format."]
     kind: Annotated[str, "Name of the dataset in a buffer set, such as `demonstrations`."]
     version: Annotated[str, "Version of the data, such as `1.0.0`."]
-    revision: Annotated[str, "Identity of the content: SHA-256 over all episode records."]
+    revision: Annotated[
+        str, "Identity of the content: SHA-256 over what describes it and all episode records."
+    ]
     exact: Annotated[bool, "Whether all episodes are exact."]
     codec: Annotated[str, "Name of the video settings."]
     cameras: Annotated[tuple[str, ...], "Names of the cameras, sorted."]

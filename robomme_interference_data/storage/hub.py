@@ -7,6 +7,7 @@ into this package's errors.
 
 import os
 import re
+import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -30,6 +31,12 @@ _VERSION = re.compile(r"data-\d+\.\d+\.\d+")
 _ENDPOINT = re.compile(r"https?://([\w.-]+|\[[\da-fA-F:.]+\])(:[1-9]\d{0,4})?(/\S*)?")
 _PUBLIC = "https://huggingface.co"
 _PARALLEL_DOWNLOADS = 8
+
+_FAULTS = (500, 502, 503, 504)
+"""Status of a server that may answer the next request: a download is repeated once."""
+
+_PAUSE_S = 1.0
+"""Seconds before that; the client itself repeats some requests after 429, and no others."""
 
 _LOGIN = (
     "{endpoint} rejects your login",
@@ -296,7 +303,16 @@ class HubCall:
         return f"{constants.ENDPOINT}/{kind}{self.repo_id}"
 
     def run(self, call: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-        """Call a function of the client."""
+        """Call a function of the client; again, once, if a download meets a fault of the Hub."""
+        try:
+            return self._once(call, *arguments, **options)
+        except HubError as error:
+            if self.revision is None or _status(error.__cause__) not in _FAULTS:
+                raise
+        time.sleep(_PAUSE_S)
+        return self._once(call, *arguments, **options)
+
+    def _once(self, call: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
         import httpx
         from huggingface_hub import constants, errors
 
@@ -324,7 +340,7 @@ class HubCall:
         from huggingface_hub import constants
 
         repo = f"the {self.repo_type} repository {self.repo_id!r} on {constants.ENDPOINT}"
-        status = getattr(getattr(error, "response", None), "status_code", None)
+        status = _status(error)
         keys = [*(kind.__name__ for kind in type(error).__mro__), status]
         key = next((key for key in _ERRORS if key in keys), None)
         if key is not None:
@@ -341,3 +357,9 @@ class HubCall:
             hint = "Wait some minutes, then run the same command again to resume."
         missing_locally = "is not in the cache, and " if self.revision else ""
         return HubError(f"{what} {missing_locally}cannot be reached: {reason}", hint)
+
+
+def _status(error: BaseException | None) -> int | None:
+    """Return the HTTP status of an error of the client, if it has one."""
+    status: int | None = getattr(getattr(error, "response", None), "status_code", None)
+    return status

@@ -115,10 +115,13 @@ class LeRobotFiles:
             column = table[name] if name in table.column_names else pa.nulls(1)
             if column.null_count or not pa.types.is_integer(column.type):
                 raise FormatError.damaged(where, f"its episodes have no whole numbers {name!r}")
-        table = table.sort_by("episode_index")
+        if self.version == "v2.1":
+            table = table.sort_by("episode_index")
+        # LeRobot finds an episode of v3.0 by its place, not by its number.
         if not np.array_equal(table["episode_index"].to_numpy(), np.arange(len(self))):
             raise FormatError.damaged(
-                where, f"meta/ does not list the episodes 0 to {len(self) - 1}, each once"
+                where,
+                f"meta/ does not list the episodes 0 to {len(self) - 1}, each once and in order",
             )
         return table.combine_chunks()
 

@@ -1,6 +1,7 @@
 """Create a folder atomically, by one process at a time."""
 
 import fcntl
+import os
 import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -69,3 +70,19 @@ def replace_folder(made: Path, out: Path) -> None:
         out.rename(before)
     made.rename(out)
     shutil.rmtree(before, ignore_errors=True)
+
+
+def copy_folder(source: Path, out: Path) -> None:
+    """Copy a folder whose files are never written in place: as hard links, on the same disk."""
+
+    def copy(path: str, to: str) -> None:
+        try:
+            os.link(os.path.realpath(path), to)
+        except OSError:  # another disk, or one without hard links
+            shutil.copyfile(path, to)
+
+    with staging_dir(out) as work:
+        made = work / "made"
+        shutil.rmtree(made, ignore_errors=True)
+        shutil.copytree(source, made, copy_function=copy)
+        replace_folder(made, out)

@@ -160,7 +160,7 @@ class HistoryDataset:
             shifts=shifted,
             planned=not redraw,
         )
-        self.buffer_set.check_tables(self._conditions.names)
+        self.buffer_set.check_tables(self._conditions.names, planned=not redraw)
         for dataset in datasets.values():
             dataset.check_records()
         size = check_size(self.buffer_set, self.cameras, image_size)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from support.buffer_sets import CONDITIONS, GOLDEN, QUERIES
 from support.damage import HEADER, ROWS, edit, renew_header
@@ -303,7 +304,10 @@ def other_first_view(root: Path) -> None:
     ("change", "message"),
     [
         (other_goals, "does not have the SHA-256 in manifest.json"),
-        (other_goals_with_their_sum, "goals of MoveCube/test/0 under k3 does not fit its query"),
+        (
+            other_goals_with_their_sum,
+            "goals of MoveCube/test/0 under k3 is not what the rules give",
+        ),
         (shorter_lesson, "episode records of .* are not those of its revision"),
         (other_first_view, "first live view .*frames 48 to 48.* recorded SHA-256"),
     ],
@@ -317,14 +321,69 @@ def test_a_verified_load_checks_the_query(
         load_buffer_set(own_buffers).load("MoveCube/test/0", "k3", verify=True)
 
 
-def test_a_session_of_no_dataset(own_buffers: Path) -> None:
+@pytest.mark.parametrize("name", ["distractors", "demonstrations"])
+@pytest.mark.parametrize("other", [None, "with a look-alike letter", "../elsewhere"])
+def test_datasets_have_their_names(own_buffers: Path, name: str, other: str | None) -> None:
     header = own_buffers / HEADER
     edited = json.loads(header.read_text())
-    del edited["datasets"]["distractors"]
+    dataset = edited["datasets"].pop(name)
+    if other is not None:
+        renamed = name.replace("a", "\N{CYRILLIC SMALL LETTER A}") if " " in other else other
+        edited["datasets"][renamed] = dataset
     header.write_text(json.dumps(edited))
-    assert load_buffer_set(own_buffers).load("MoveCube/test/0", "k0").frames().any()
-    with pytest.raises(FormatError, match=r"buffers\.parquet: .* unknown dataset 'distractors'"):
-        load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
+    with pytest.raises(FormatError, match=r"manifest\.json: datasets .*expected demonstrations"):
+        load_buffer_set(own_buffers)
+
+
+def exchanged(rows: list[list[dict[str, Any]]]) -> list[list[dict[str, Any]]]:
+    """The units of the first and the last k3 buffer, exchanged."""
+    first, last = (number for number, row in enumerate(rows) if len(row) == 4), len(rows) - 2
+    number = next(first)
+    rows[number][1:], rows[last][1:] = rows[last][1:], rows[number][1:]
+    return rows
+
+
+@pytest.mark.parametrize("change", [exchanged, lambda rows: [row[:1] + row[:0:-1] for row in rows]])
+def test_rows_that_the_rules_do_not_give(own_buffers: Path, change: Callable[[Any], Any]) -> None:
+    rows = pq.read_table(own_buffers / ROWS)["sessions"].to_pylist()
+    edit_columns(own_buffers / ROWS, sessions=change(rows))
+    renew_header(own_buffers)
+    made = load_buffer_set(own_buffers)
+    for episode in ("VideoRepick/test/0", "PatternLock/test/0"):
+        assert len(made.load(episode, "k3").sessions) == 4
+        with pytest.raises(HashMismatchError, match="is not what the rules give"):
+            made.load(episode, "k3", verify=True)
+        with pytest.raises(HashMismatchError, match="is not what the rules give"):
+            next(made.buffers(condition="k3")).verify()
+        made.load(episode, "k0", verify=True)
+    with pytest.raises(HashMismatchError, match="is not what the rules give"):
+        made.check_tables(["k0", "k3"])
+    made.check_tables(["k0", "no-history"])
+    made.check_tables(["k3"], planned=False)
+
+
+def test_rows_of_other_rules(own_buffers: Path) -> None:
+    renew_header(own_buffers, rule_version=2)
+    made = load_buffer_set(own_buffers)
+    assert made.load("MoveCube/test/0", "k3")
+    with pytest.raises(FormatError, match="follows version 2 of the rules"):
+        made.load("MoveCube/test/0", "k3", verify=True)
+
+
+@pytest.mark.parametrize(
+    ("part", "value"), [("family", "VideoRepick"), ("split", "train"), ("index", 9)]
+)
+def test_parts_of_an_id_are_those_of_the_id(own_buffers: Path, part: str, value: Any) -> None:
+    """The columns for filters: nothing of this package trusts them."""
+    edit_columns(own_buffers / ROWS, **{part: [value] * 15})
+    made = load_buffer_set(own_buffers)
+    assert made.families == ("VideoRepick", "MoveCube", "PatternLock")
+    with pytest.raises(FormatError, match=rf"buffers\.parquet: {part} of .*/test/0 is {value!r}"):
+        list(made.buffers(family="PatternLock"))
+    for path in ("interference.parquet", "episodes/chunk-000/file-000.parquet"):
+        edit_columns(own_buffers / "demonstrations/meta" / path, **{part: [value] * 3})
+    with pytest.raises(FormatError, match=f"{part} of .*/test/0 is {value!r}"):
+        load_buffer_set(own_buffers).query("PatternLock/test/0")
 
 
 @pytest.mark.parametrize(

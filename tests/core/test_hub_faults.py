@@ -69,6 +69,18 @@ def test_what_does_not_come_whole(hub: HubServer, path: str, what: dict[str, Any
     assert whole()
 
 
+@pytest.mark.parametrize("status", [500, 503])
+@pytest.mark.parametrize(
+    ("method", "path"), [("GET", VIDEO), ("HEAD", ROWS), ("GET", "/refs|/tree|/revision")]
+)
+def test_a_single_fault_of_the_server_is_no_error(
+    hub: HubServer, method: str, path: str, status: int
+) -> None:
+    fault = hub.fault(method, path, status=status)
+    assert whole()
+    assert fault.times == 0
+
+
 # --- this machine --------------------------------------------------------------------------------
 
 

@@ -168,16 +168,16 @@ def test_a_server_that_computes_for_long_is_not_dropped(
 def test_an_interrupt_leaves_no_answer_behind(
     server: PolicyServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    receive = ClientConnection.recv
+    receive = ClientConnection.recv_streaming
 
     def interrupted(opened: ClientConnection) -> Any:
-        receive(opened)
+        list(receive(opened))
         raise KeyboardInterrupt
 
     with client(server) as policy:
         rollout(policy, 0, [], [])
         with monkeypatch.context() as patch:
-            patch.setattr(ClientConnection, "recv", interrupted)
+            patch.setattr(ClientConnection, "recv_streaming", interrupted)
             with pytest.raises(KeyboardInterrupt):
                 policy.act(observation(0), "pick")
         rollout(policy, 1, [1], [])  # a fresh connection, or the order would be wrong

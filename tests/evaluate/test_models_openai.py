@@ -16,6 +16,7 @@ from support.chat_server import (
     BUSY_FOR_AN_HOUR,
     BUSY_SOME_TIME,
     CLOSED,
+    DEEP,
     DRIPS,
     DRIPS_HEADERS,
     EMPTY,
@@ -101,7 +102,7 @@ def test_budgets(lengths: list[int], single: int, images: int) -> None:
 # --- faults --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("fault", [BUSY, BUSY_SOME_TIME, BROKEN, GARBAGE, EMPTY, CLOSED])
+@pytest.mark.parametrize("fault", [BUSY, BUSY_SOME_TIME, BROKEN, GARBAGE, DEEP, EMPTY, CLOSED])
 def test_temporary_failures_are_retried(server: ChatServer, fault: str) -> None:
     server.faults = [fault, fault]
     reply = model_of(server).reply(ASKED)
@@ -186,6 +187,12 @@ def test_a_missing_model_is_an_error_that_lists_those_served(server: ChatServer)
         assert "tiny" in str(raised.value.hint)
     assert len(server.seen) == 1
     assert model_of(server).metadata() == {"model": "tiny"}
+
+
+def test_a_list_of_models_that_cannot_be_read(server: ChatServer) -> None:
+    server.faults = [DEEP]
+    with pytest.raises(ModelError, match="does not list its models"):
+        model_of(server).metadata()
 
 
 def test_no_server_listens() -> None:

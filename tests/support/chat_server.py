@@ -29,7 +29,8 @@ from PIL import Image
 SLOW, BUSY, BUSY_SOME_TIME, BUSY_FOR_AN_HOUR = "slow", "busy", "busy some time", "busy for an hour"
 BROKEN, GARBAGE, EMPTY, CLOSED, REFUSED = "broken", "garbage", "empty", "closed", "refused"
 GONE, LOCKED, UNCOUNTED = "gone", "locked", "uncounted"
-DRIPS, DRIPS_HEADERS, ENDLESS = "drips", "drips headers", "endless"
+DRIPS, DRIPS_HEADERS, ENDLESS, DEEP = "drips", "drips headers", "endless", "deep"
+BRACKETS = b"[" * 8_000_000
 
 
 @dataclass(frozen=True)
@@ -92,6 +93,9 @@ class ChatServer:
             def do_GET(self) -> None:
                 if self.path != "/v1/models":
                     self._send(404, {"error": {"message": "no such page"}})
+                    return
+                if outer.faults[:1] == [DEEP]:
+                    self._send(200, BRACKETS)
                     return
                 models = [{"id": outer.model, "object": "model"}]
                 self._send(200, {"object": "list", "data": models})
@@ -158,6 +162,7 @@ class ChatServer:
             LOCKED: (401, {"error": {"message": "who are you"}}, {}),
             BROKEN: (500, {"error": {"message": "out of memory"}}, {}),
             GARBAGE: (200, b"<html>busy</html>", {}),
+            DEEP: (200, BRACKETS, {}),
             EMPTY: (200, {"object": "chat.completion", "choices": []}, {}),
             GONE: (404, {"error": {"message": "no such model"}}, {}),
         }

@@ -45,3 +45,14 @@ def renew_header(root: Path, **changes: Any) -> None:
     path = root / HEADER
     header = json.loads(path.read_text())
     path.write_text(json.dumps({**header, "rows": sha256_file(root / ROWS), **changes}))
+
+
+def reverse_sessions(root: Path) -> None:
+    """Reverse the sessions of all buffers, and renew the sum of the rows."""
+
+    def change(table: pa.Table) -> pa.Table:
+        sessions = table["sessions"].to_pylist()
+        return put(table, "sessions", [row[::-1] for row in sessions])
+
+    edit(root / ROWS, change)
+    renew_header(root)

@@ -78,7 +78,7 @@ def write_metadata(
         "video_path": "videos/{video_key}/file-{file_index:03d}.mp4",
     }
     write_json(root / INFO_PATH, info)
-    identity = identity_of(listed, kind, "1.0.0", "av1-lossless", (), "0" * 64)
+    identity = identity_of(listed, info, kind, "1.0.0", "av1-lossless", (), "0" * 64)
     write_json(root / IDENTITY_PATH, to_dict(identity))
     path = root / RECORDS_PATH
     pq.write_table(to_table(listed, arrow_schema(EpisodeRecord, sorted(shapes))), path)

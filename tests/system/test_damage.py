@@ -15,15 +15,21 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from support.asking import ask
 from support.buffer_sets import GOLDEN, copy_buffer_set, renew_sums
+from support.damage import reverse_sessions
 from support.own_policies import Hashing
 from support.runs import run as evaluate
 from support.runs import untimed
+from support.tabletop import copy_tabletop
 from support.worlds import BUFFER_SET
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.verify import verify_buffer_set
-from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.errors import HashMismatchError, InterferenceError
+from robomme_interference_data.evaluate.ceiling import ceiling
+from robomme_interference_data.evaluate.run.config import CeilingConfig
+from robomme_interference_data.retrieval.commands import _measured
 from robomme_interference_data.storage.files import read_json, sha256_file, write_json
 
 MANIFEST, ROWS = "manifests/manifest.json", "manifests/buffers.parquet"
@@ -268,3 +274,31 @@ def reported(root: Path) -> bool:
         )
     except InterferenceError:
         return True
+
+
+@pytest.mark.parametrize("reader", ["evaluate", "ask", "ceiling", "train", "grade"])
+def test_no_reader_takes_rows_that_the_rules_do_not_give(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reader: str
+) -> None:
+    """The sums are renewed, so only the rules tell; all readers share one check."""
+    copy = copy_buffer_set if reader == "evaluate" else copy_tabletop
+    root = copy(tmp_path / "buffer_set")
+    reverse_sessions(root)
+    monkeypatch.setenv(BUFFER_SET, str(root))
+
+    def train() -> object:
+        from robomme_interference_data.training import HistoryDataset
+
+        return HistoryDataset(root, conditions=("k1",), cameras=("front",), chunk=0, quiet=True)
+
+    read: dict[str, Callable[[], object]] = {
+        "evaluate": lambda: evaluate(tmp_path / "run", conditions=("k1",), families=("MoveCube",)),
+        "ask": lambda: ask(tmp_path / "run", buffer_set=root, conditions=("k1",)),
+        "ceiling": lambda: ceiling(load_buffer_set(root), CeilingConfig(conditions=("k1",))),
+        "train": train,
+        "grade": lambda: _measured(
+            str(root), "thumbnail", "front", "none", (), ("k1",), quiet=True
+        ),
+    }
+    with pytest.raises(HashMismatchError, match="is not what the rules give"):
+        read[reader]()

@@ -14,6 +14,7 @@ from support.buffer_sets import GOLDEN
 from support.hub import BASE, push_buffer_set, running_hub
 from support.hub_server import HubServer
 from support.recordings import make_episode, rows_of, write_images, write_table
+from support.tabletop import copy_tabletop
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.verify import verify_buffer_set
@@ -63,7 +64,7 @@ def test_a_buffer_set_for_published_demonstrations(
 
 @pytest.mark.slow
 def test_a_buffer_set_for_demonstrations_in_a_folder(mine: str, tmp_path: Path, run: Any) -> None:
-    """The demonstrations are linked, stay unchanged, and are exported with the buffer set."""
+    """The demonstrations are copied, stay unchanged, and are exported with the buffer set."""
     base = shutil.copytree(GOLDEN / "demonstrations", tmp_path / "base/demonstrations")
     before = {path: path.read_bytes() for path in base.rglob("*") if path.is_file()}
     out, export = tmp_path / "own", tmp_path / "export"
@@ -77,9 +78,10 @@ def test_a_buffer_set_for_demonstrations_in_a_folder(mine: str, tmp_path: Path, 
     exported = load_buffer_set(export).load("MoveCube/test/0", "k2", verify=True)
     assert np.array_equal(local.frames(), exported.frames())
     assert {path: path.read_bytes() for path in base.rglob("*") if path.is_file()} == before
-    other = shutil.copytree(base, tmp_path / "other")
+    assert not (out / "demonstrations").is_symlink()  # it would lead out of the buffer set
+    other = copy_tabletop(tmp_path / "other") / "demonstrations"
     code, _, err = run("new-buffer-set", out, *given, "--demonstrations", other)
-    assert code == 1 and "exists, and is not" in err
+    assert code == 1 and "exists, and is not a copy of" in err
 
 
 def test_retrieval_on_published_demonstrations(
