@@ -37,6 +37,9 @@ BATCH = 1000
 LONGEST_S = 20
 """Seconds that one input may take."""
 
+LONGEST_BOMB = 1 << 20
+"""Bytes of a bomb that is mutated, too."""
+
 MOST_BYTES = 4 << 30
 """Address space that a child gets beside what it has."""
 
@@ -79,11 +82,19 @@ def _options() -> argparse.Namespace:
 
 
 def _place(target: Any, folder: str) -> tuple[list[bytes], Any]:
-    """Return the sound files of a target, and what reads bytes in their place."""
+    """Return sound files of a target and bombs, and what reads bytes in their place."""
+    from support.bombs import BOMBS
     from support.hostile import places
 
     root = places(Path(folder))
-    return target.sound(root), lambda data: target(root, data)
+    kind = {".parquet": "parquet", ".mp4": "video"}.get(Path(target.path).suffix)
+    bombs = []
+    for bomb in BOMBS.values():
+        if bomb.kind == kind:
+            bomb.write(root / "bomb")
+            if (root / "bomb").stat().st_size <= LONGEST_BOMB:
+                bombs.append((root / "bomb").read_bytes())
+    return [*target.sound(root), *bombs], lambda data: target(root, data)
 
 
 def _keep(out: Path, name: str, what: str, data: bytes, told: str) -> str:

@@ -20,16 +20,18 @@ from numpy.typing import NDArray
 from robomme_interference_data.errors import FormatError, InterferenceError
 
 from .files import atomic_path
-from .untrusted.parquet_pages import MAX_FOOTER_BYTES, decoded_size, read_chunks
+from .parquet_pages import decoded_size
 
 _IMAGES_AT_ONCE = 8
+
+_MAX_METADATA_BYTES = 16 << 20
+"""Files of LeRobot of 100 MB, with a row group for each episode, have half of it."""
 
 _MAX_LIST = 1 << 14
 """Length of a list in the metadata, such as row groups: pyarrow allocates memory for it first."""
 
-_MAX_ROWS = 1 << 26
 _MAX_VALUES = 1 << 26
-"""Rows of a file and values of a read: a million rows of a run have a third of them."""
+"""Values of a read: a million rows of a run have a third of them."""
 
 _MAX_BYTES = 2 << 30
 """Decoded bytes of a read, or of the images of a row group."""
@@ -50,24 +52,30 @@ def reading(path: Path) -> Iterator[None]:
 def open_parquet(path: Path) -> pq.ParquetFile:
     """Open a parquet file for reading piece by piece."""
     with reading(path):
-        chunks = read_chunks(path)
+        _check_metadata_size(path)
         file = pq.ParquetFile(
             pa.OSFile(os.fsencode(path)),  # as pyarrow cannot encode names that are not UTF-8
             buffer_size=1 << 20,
+            pre_buffer=False,
             page_checksum_verification=True,  # of pages that have one
-            thrift_string_size_limit=MAX_FOOTER_BYTES,
             thrift_container_size_limit=_MAX_LIST,
         )
         metadata = file.metadata
-        if [len(group) for group in chunks] != [metadata.num_columns] * metadata.num_row_groups:
-            raise ValueError("its row groups do not have the columns of its schema")
         rows = [metadata.row_group(group).num_rows for group in range(metadata.num_row_groups)]
         if min(rows, default=0) < 0 or sum(rows) != metadata.num_rows:
             raise ValueError(f"{metadata.num_rows} rows; its row groups have {sum(rows)}")
-        if metadata.num_rows > _MAX_ROWS:
-            raise ValueError(f"{metadata.num_rows:,} rows; expected at most {_MAX_ROWS:,}")
         _ = file.schema_arrow.names  # raises if a name is not UTF-8
         return file
+
+
+def _check_metadata_size(path: Path) -> None:
+    """Raise if a file has more metadata than it needs: parsed, it takes up to 240 times as much."""
+    with path.open("rb") as file:
+        end = file.seek(0, os.SEEK_END)
+        file.seek(max(0, end - 8))
+        size = int.from_bytes(file.read(4), "little")
+    if size > _MAX_METADATA_BYTES:
+        raise ValueError(f"{size:,} bytes of metadata; expected at most {_MAX_METADATA_BYTES:,}")
 
 
 def read_table(
@@ -95,21 +103,26 @@ def _check_size(
     file: pq.ParquetFile, path: Path, columns: list[str] | None, groups: Sequence[int]
 ) -> None:
     """Raise if a read would take too much memory."""
-    size = values = 0
-    every = [file.metadata.schema.column(number) for number in range(file.metadata.num_columns)]
+    schema = file.metadata.schema
+    every = [schema.column(number) for number in range(file.metadata.num_columns)]
     prefixes = None if columns is None else tuple(f"{name}." for name in columns)
     chosen = [
-        (number, column)
+        (number, column.length or 0)
         for number, column in enumerate(every)
         if prefixes is None or f"{column.path}.".startswith(prefixes)
     ]
-    chunks = read_chunks(path)
+    # Batches of no rows read no page, but raise if the metadata of a column is damaged: asking for
+    # that metadata would then end the process.
+    numbers = [number for number, _ in chosen]
+    for _ in file.reader.iter_batches(0, list(groups), numbers, use_threads=False):
+        pass
+    size = values = 0
     with path.open("rb") as raw:
         for group in groups:
-            for number, column in chosen:
-                chunk = chunks[group][number]
-                values += chunk.values
-                size += decoded_size(raw, chunk, column.physical_type, column.length, _MAX_BYTES)
+            for number, fixed_length in chosen:
+                column = file.metadata.row_group(group).column(number)
+                values += column.num_values
+                size += decoded_size(raw, column, fixed_length, _MAX_BYTES)
                 if size > _MAX_BYTES or values > _MAX_VALUES:
                     what = f"over {_MAX_BYTES:,} bytes or {_MAX_VALUES:,} values once decoded"
                     raise ValueError(what)

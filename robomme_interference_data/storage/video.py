@@ -14,13 +14,16 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError, MissingFileError
 
-from .untrusted.video_boxes import find_container, unreadable
+from .mp4_samples import check_samples
 
 MOST_PIXELS = 1 << 24
 """Upper bound on the pixels of a frame: twice 3840 × 2160."""
 
 _LATEST = 1 << 62
 """Upper bound on the ticks of a container to which FFmpeg can seek."""
+
+_MP4 = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide")
+"""The first box of an MP4 or QuickTime file."""
 
 _DECODERS = (
     *("libdav1d", "libaom-av1", "av1", "h264", "hevc", "vp8", "vp9", "mpeg4", "mjpeg"),
@@ -67,6 +70,26 @@ def _to_rgb(path: Path, frame: av.VideoFrame) -> NDArray[np.uint8]:
         raise FormatError.damaged(path, f"a frame cannot be converted to RGB: {error}") from None
 
 
+def find_container(path: Path) -> str:
+    """Return FFmpeg's name of a video file's container: `mp4`, `matroska` or `avi`.
+
+    FFmpeg must not guess it: it would accept a playlist as a video, whatever the file's name.
+    """
+    with path.open("rb") as file:
+        start = file.read(12)
+    if start.startswith(b"\x1a\x45\xdf\xa3"):
+        return "matroska"
+    if start.startswith(b"RIFF") and start.endswith(b"AVI "):
+        return "avi"
+    if start[4:8] in _MP4:
+        return "mp4"
+    raise _unreadable(path, "no MP4, Matroska or AVI file")
+
+
+def _unreadable(path: Path, why: object) -> FormatError:
+    return FormatError(f"{path} is not a readable video: {why}", "Download or build it again.")
+
+
 @contextmanager
 def open_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
     """Open a video file and its first video stream, before anything is decoded."""
@@ -74,25 +97,25 @@ def open_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.Vid
     allowed = {"protocol_whitelist": "file", "codec_whitelist": ",".join(_DECODERS)}
     try:
         kind = find_container(path)
+        if kind == "mp4":
+            check_samples(path)
         container = av.open(str(path), format=kind, options=limits, container_options=allowed)
     except FileNotFoundError:
         raise MissingFileError(f"{path} does not exist") from None
     except FormatError:
         raise
     except (av.error.FFmpegError, OSError, ValueError) as error:  # ValueError: a damaged header
-        raise unreadable(path, error) from error
+        raise _unreadable(path, error) from error
     with container:
         if not container.streams.video:
             raise FormatError(f"{path} holds no video stream")
         stream = container.streams.video[0]
         context = stream.codec_context
         if context is None:  # a header cut short; PyAV would crash the process
-            raise unreadable(path, "its codec is unknown")
+            raise _unreadable(path, "its codec is unknown")
         if context.name not in _DECODERS or not stream.time_base:
             what = f"codec {context.name}, time base {stream.time_base}"
-            raise unreadable(path, what)
-        if context.width * context.height > MOST_PIXELS:
-            raise unreadable(path, f"frames of {context.width}×{context.height} pixels")
+            raise _unreadable(path, what)
         context.options = limits
         stream.thread_count = 1  # sessions are decoded in parallel
         yield container, stream

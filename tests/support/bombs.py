@@ -43,6 +43,14 @@ def _zeros(path: Path) -> None:
     _repeated(path, values, 40, compression="zstd", use_dictionary=False)
 
 
+def _one_page(path: Path) -> None:
+    """A page of 128 MiB of zeros, which its header takes for 2 GiB."""
+    _repeated(path, [bytes(128 * _MEGABYTE)], 1, compression="zstd", use_dictionary=False)
+    data = path.read_bytes()
+    start = data.index(b"\x80\x80\x80\x01") - 1  # the end of the size, as Thrift writes it
+    path.write_bytes(data[:start] + b"\xfe\xff\xff\xff\x0f" + data[start + 5 :])
+
+
 def _page_that_lies(path: Path) -> None:
     """A page of more values than in the metadata."""
     values = np.zeros(1 << 14, np.int64)
@@ -71,27 +79,96 @@ def _many_groups(path: Path) -> None:
     _footer(path, b"\x15\x02\x19\x2c" + schema + b"\x16\x00\x19" + count)
 
 
+def _many_columns(path: Path) -> None:
+    """Metadata of a row group that declare a million columns, and end there."""
+    schema = b"\x48\x01r\x15\x02\x00" + b"\x15\x02\x25\x02\x18\x01x\x00"
+    count = b"\xfc\xbf\x84\x3d"
+    _footer(path, b"\x15\x02\x19\x2c" + schema + b"\x16\x00\x19\x1c\x19" + count)
+
+
 def _large_footer(path: Path) -> None:
     _footer(path, bytes(20 * _MEGABYTE))
 
 
-def _declared_frames(path: Path) -> None:
-    """A video of a billion frames of a hundred bytes."""
-    data = bytearray(_VIDEO.read_bytes())
+def _declare(data: bytearray, samples: int) -> None:
+    """Let the first track of a video have samples of a hundred bytes, all in one chunk."""
     sizes, runs = data.find(b"stsz"), data.find(b"stsc")
-    data[sizes + 8 : sizes + 16] = struct.pack(">II", 100, 10**9)
-    data[runs + 16 : runs + 20] = struct.pack(">I", 10**9)
+    data[sizes + 8 : sizes + 16] = struct.pack(">II", 100, samples)
+    data[runs + 16 : runs + 20] = struct.pack(">I", samples)
+
+
+def _declared_frames(path: Path, samples: int = 10**9) -> None:
+    data = bytearray(_VIDEO.read_bytes())
+    _declare(data, samples)
     path.write_bytes(data)
+
+
+def _many_frames(path: Path) -> None:
+    _declared_frames(path, 5 * 10**7)
+
+
+def _many_fragments(path: Path) -> None:
+    """Fragments of 50 million frames."""
+    with av.open(str(path), "w", format="mp4", options={"movflags": "empty_moov"}) as container:
+        _add_track(container, 32)
+    data = bytearray(path.read_bytes())
+    run = data.find(b"trun")
+    data[run + 4 : run + 12] = struct.pack(">II", 0, 5 * 10**7)
+    path.write_bytes(data)
+
+
+def _replace(data: bytearray, table: bytes, entries: list[bytes]) -> None:
+    """Replace the entries of the first table of a name, and correct the sizes of boxes around."""
+    start = data.find(table)
+    change = 12 + len(b"".join(entries)) + 4 - int.from_bytes(data[start - 4 : start])
+    stop = start - 4 + int.from_bytes(data[start - 4 : start])
+    for box in (b"stbl", b"minf", b"mdia", b"edts", b"trak", b"moov", table):
+        place = data.rfind(box, 0, start + 4) - 4
+        size = int.from_bytes(data[place : place + 4])
+        if place >= 0 and place + size >= stop:
+            data[place : place + 4] = struct.pack(">I", size + change)
+    data[start + 4 : stop] = struct.pack(">II", 0, len(entries)) + b"".join(entries)
+
+
+def _many_edits(path: Path) -> None:
+    """A million frames, and 200 edits of all of them."""
+    data = bytearray(_VIDEO.read_bytes())
+    _declare(data, 10**6)
+    durations = data.find(b"stts")
+    data[durations + 12 : durations + 16] = struct.pack(">I", 10**6)
+    _replace(data, b"elst", [struct.pack(">III", 2**31 - 1, 0, 1 << 16)] * 200)
+    path.write_bytes(data)
+
+
+def _long_chunks(path: Path) -> None:
+    """Sound of 60 chunks of a billion samples, of which a number of 1024 is declared, too."""
+    with av.open(str(path), "w", format="mov") as container:
+        sound = container.add_stream("pcm_u8", rate=8000, layout="mono")
+        _add_track(container, 32)
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.uint8), "u8", "mono")
+        frame.sample_rate = 8000
+        container.mux(sound.encode(frame))
+        container.mux(sound.encode(None))
+    data = bytearray(path.read_bytes())
+    runs = data.find(b"stsc")
+    data[runs + 16 : runs + 20] = struct.pack(">I", 1 << 30)
+    _replace(data, b"stco", [struct.pack(">I", 36)] * 60)
+    path.write_bytes(data)
+
+
+def _add_track(container: Any, side: int) -> None:
+    """Add a video of one frame."""
+    stream = container.add_stream("mjpeg", rate=10)
+    stream.pix_fmt, stream.height, stream.width = "yuvj420p", side, side
+    container.mux(stream.encode(av.VideoFrame(side, side, "yuvj420p")))
+    container.mux(stream.encode(None))
 
 
 def _large_frames(path: Path) -> None:
     """Frames larger than any that are read, whatever the container says."""
     side = int(MOST_PIXELS**0.5) + 16
     with av.open(str(path), "w", format="mp4") as container:
-        stream = container.add_stream("mjpeg", rate=10)
-        stream.pix_fmt, stream.height, stream.width = "yuvj420p", side, side
-        container.mux(stream.encode(av.VideoFrame(side, side, "yuvj420p")))
-        container.mux(stream.encode(None))
+        _add_track(container, side)
 
 
 def _larger_than_declared(path: Path) -> None:
@@ -163,13 +240,19 @@ class Bomb(NamedTuple):
 
 BOMBS = {
     "one text many times": Bomb("parquet", _one_text_many_times, "once decoded"),
-    "many equal numbers": Bomb("parquet", _many_equal_numbers, "83,886,080 rows"),
+    "many equal numbers": Bomb("parquet", _many_equal_numbers, "once decoded"),
     "compressed zeros": Bomb("parquet", _zeros, "once decoded"),
+    "one page of 2 GiB": Bomb("parquet", _one_page, "once decoded"),
     "a page that lies": Bomb("parquet", _page_that_lies, "values; its metadata has 16384"),
     "common prefixes": Bomb("parquet", _common_prefixes, "common prefixes"),
     "many row groups": Bomb("parquet", _many_groups, "cannot be read"),
+    "many columns": Bomb("parquet", _many_columns, "cannot be read"),
     "large metadata": Bomb("parquet", _large_footer, "bytes of metadata"),
     "a billion frames": Bomb("video", _declared_frames, "it declares 1000000000 frames"),
+    "50 million frames": Bomb("video", _many_frames, "it declares 50000000 frames"),
+    "fragments of 50 million frames": Bomb("video", _many_fragments, "it declares 50000000 frames"),
+    "many edits": Bomb("video", _many_edits, "and 200 edits"),
+    "long chunks of sound": Bomb("video", _long_chunks, "chunks of up to 1073741824 samples"),
     "large frames": Bomb("video", _large_frames, "decoding stopped"),
     "larger than declared": Bomb("video", _larger_than_declared, "decoding stopped"),
     "a playlist": Bomb("video", _playlist, "no MP4, Matroska or AVI file"),
