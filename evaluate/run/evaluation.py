@@ -26,7 +26,7 @@ from robomme_interference_data.runtime.executor import (
 from robomme_interference_data.schema.rollouts import Rollout, Status
 from robomme_interference_data.storage.files import atomic_path
 
-from .config import AskConfig, RunConfig
+from .config import AskConfig, RunConfig, check_shared, with_camera
 from .identity import invocation, now, plain, run_identity
 from .kind import Job, Run, RunKind
 from .log import RunLog, count_statuses, is_done, open_log, read_record, row_line, row_of
@@ -102,7 +102,9 @@ def run_evaluation(
         MissingExtraError: A library is not installed.
     """
     end_if_starting()
+    check_shared(config)  # before anything is loaded
     buffer_set, folder = load_buffer_set(config.buffer_set), Path(config.out)
+    config = with_camera(config, buffer_set)
     kind = _kind(dataclasses.replace(config, buffer_set=buffer_set.location), buffer_set)
     with kind.lock(folder), ExitStack() as stack:
         kind.prepare()

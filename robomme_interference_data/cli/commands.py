@@ -96,9 +96,7 @@ def show(
     episode: QueryName,
     condition: ConditionName,
     out: Picture = None,
-    camera: Annotated[
-        str | None, typer.Option(help="Camera to draw; default: front, or else the first.")
-    ] = None,
+    camera: Annotated[str | None, typer.Option(help="Camera to draw; default: the first.")] = None,
     shift: Annotated[str, typer.Option(help=f"{SHIFT_HELP} Requires --out.")] = NO_SHIFT,
     as_json: AsJson = False,
 ) -> None:
@@ -118,17 +116,18 @@ def show(
 
     check_output(out)
     scene_shift = parse_shift(shift)
-    if scene_shift is not None and out is None:
-        raise InvalidOptionError(
-            f"--shift {shift} has no effect without --out", "Add --out strip.png, or omit --shift."
-        )
+    for name, given in (("shift", scene_shift and shift), ("camera", camera)):
+        if given is not None and out is None:
+            raise InvalidOptionError(
+                f"--{name} {given} has no effect without --out",
+                f"Add --out strip.png, or omit --{name}.",
+            )
     opened = load_buffer_set(buffer_set)
     buffer = opened.load(episode, condition)
     if out is not None:
-        from robomme_interference_data.viz.filmstrip import draw_strip, shown_camera
+        from robomme_interference_data.viz.filmstrip import draw_strip
 
-        camera = camera or shown_camera(buffer)
-        buffer.query.dataset.shape(camera)  # raises for an unknown one
+        camera = buffer.query.dataset.camera(camera)
         live = live_frame(opened, buffer, scene_shift, camera)
         draw_strip(buffer, out, camera=camera, live=live)
         print_status(f"{out} written")

@@ -155,9 +155,11 @@ def test_the_simulator_is_made_before_the_folder_and_only_for_remaining_rollouts
         run_one(tmp_path / "whole", conditions=("no-history", "k0"), **sample)
 
 
-def test_only_cameras_in_use_are_rendered() -> None:
+def test_only_cameras_in_use_are_rendered(tiny_buffers: Path) -> None:
+    demonstrations = load_buffer_set(tiny_buffers).datasets["demonstrations"]
+
     def options(name: str, *watched: str, **changes: Any) -> dict[str, Any]:
-        return simulator_options(config(simulator=name, **changes), watched)
+        return simulator_options(config(simulator=name, **changes), watched, demonstrations)
 
     assert options("tabletop") == {"cameras": (), "shift": "none"}
     assert options("tabletop", shift="light:2") == {"cameras": (), "shift": "light:2"}
