@@ -4,15 +4,17 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from robomme_interference_data.constants import DEMONSTRATIONS, SAMPLE_FRAMES, SPLITS
-from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.runtime.executor import WorkersConfig
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.settings import setting
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP
+
+if TYPE_CHECKING:
+    from robomme_interference_data.data.buffer_set import BufferSet
 
 _EPISODES, _POLICY, _MODEL, _SUBGOALS = "Episodes", "Policy", "Model", "Subgoals"
 _RETRIEVAL, _SIMULATOR, _EXECUTION = "Retrieval", "Simulator", "Execution"
@@ -241,7 +243,7 @@ def check_unused(config: WorkConfig, names: Iterable[str], on: str, hint: str) -
             raise InvalidOptionError(f"`{name}` has no effect on {on}", hint)
 
 
-def with_camera[C: RetrievalConfig](config: C, buffer_set: BufferSet) -> C:
+def with_camera[C: RetrievalConfig](config: C, buffer_set: "BufferSet") -> C:
     """Return the settings with the name of the retrieval step's camera, by default the first."""
     if config.retrieval is None:
         return config

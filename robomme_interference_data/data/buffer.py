@@ -123,17 +123,19 @@ class Buffer:
         numbers = np.arange(len(self.sessions), dtype=np.int64)
         return np.repeat(numbers, list(map(len, self.sessions)))
 
-    @cached_property
+    @property
     def states(self) -> NDArray[np.float32]:
-        """Robot states, `(T, 8) float32`: 7 joint positions in rad, gripper opening; read-only."""
-        states = self.gather(
+        """Robot states, `(T, 8) float32`: 7 joint positions in rad, the gripper; a new array."""
+        return self._states.copy()
+
+    @cached_property
+    def _states(self) -> NDArray[np.float32]:
+        return self.gather(
             lambda entry: self._datasets[entry.dataset].read_vectors(
                 entry.episode_index, STATE, entry.start, entry.stop
             ),
             np.empty((0, *self.query.dataset.features[STATE]), np.float32),
         )
-        states.setflags(write=False)
-        return states
 
     def gather[Value: np.generic](
         self, read: Callable[[SessionEntry], NDArray[Value]], empty: NDArray[Value]
@@ -269,7 +271,7 @@ class Buffer:
                     for image in frames[name]:
                         image[...] = next(decoders[name])
                 yield Chunk(
-                    indices_now, frames, self.states[indices_now], session_index[indices_now]
+                    indices_now, frames, self._states[indices_now], session_index[indices_now]
                 )
         finally:
             for decoder in decoders.values():

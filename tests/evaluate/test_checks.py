@@ -66,6 +66,7 @@ SAYS = {"policy": "python:support.own_policies:says"}
         (STEP | {"system": "retrieval-framesamp-modul"}, InvalidOptionError, "nothing to retrieve"),
         ({"system": "retrieval-framesamp-modul"}, InvalidOptionError, "`retrieval` is None"),
         ({"retrieval_rule": "oracle"}, InvalidOptionError, "`retrieval_rule` has no effect"),
+        ({"retrieval": "foo", "policy": "lerobot:no/where"}, UnknownNameError, "no encoder 'foo'"),
         (STEP | {"retrieval_camera": "nose"}, UnknownNameError, "camera 'nose'"),
         (STEP, MissingFileError, "'thumbnail'"),
         (SAYS | {"policy_options": ("what=nan",)}, PolicyError, "holds nan"),
