@@ -8,6 +8,7 @@ It is a LeRobot dataset in which every episode has its own files, with our colum
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -244,6 +245,16 @@ class Dataset:
         """Return the paths of the files that hold an episode's vectors and the given cameras."""
         stored = self.lerobot.locate(episode_index)
         return [stored.data, *(stored.videos[self._feature(camera)][0] for camera in cameras)]
+
+    def video_of(self, episode_index: int, camera: str) -> tuple[Path, int]:
+        """Return the video file of an episode, and the number of its first frame there.
+
+        Raises:
+            UnknownNameError: There is no such camera.
+            MissingFileError: The file is missing.
+        """
+        path, first = self.lerobot.locate(episode_index).videos[self._feature(camera)]
+        return self.files.path(path), first
 
     def index(self, encoder: str, camera: str | None = None) -> "EmbeddingIndex":
         """Return the embeddings of the stored frames, opened once.

@@ -137,6 +137,17 @@ def index_folder(encoder: str, camera: str) -> str:
     return f"{INDEX_DIR}/{'@'.join(re.sub(r'[^A-Za-z0-9._-]+', '-', part) for part in parts)}"
 
 
+def indexed_encoders(dataset: "Dataset", camera: str) -> list[str]:
+    """Return the names of the encoders of which a dataset has embeddings of a camera, sorted."""
+    names = []
+    for path in dataset.files.list(INDEX_DIR, INDEX_HEADER):
+        header = read_header(dataset.files.path(path), IndexHeader)
+        # An index that is being made is in a hidden folder.
+        if header.camera == camera and path.startswith(index_folder(header.encoder.name, camera)):
+            names.append(header.encoder.name)
+    return sorted(names)
+
+
 def center_of(episodes: Iterable[NDArray[np.float16]]) -> NDArray[np.float32]:
     """Return the mean of each episode's mean, `(D,) float32`, of features `(T, D) float16`."""
     means = [features.mean(axis=0, dtype=np.float64) for features in episodes if len(features)]
