@@ -15,7 +15,12 @@ from robomme_interference_data.cli.console import (
     print_status,
 )
 from robomme_interference_data.cli.options import AsJson, BufferSetFolder, with_settings
-from robomme_interference_data.errors import InvalidOptionError, MissingFileError, counted
+from robomme_interference_data.errors import (
+    InvalidOptionError,
+    MissingExtraError,
+    MissingFileError,
+    counted,
+)
 from robomme_interference_data.evaluate.score.config import Expected
 
 from .publication import OTHER, Publication, PublishConfig
@@ -147,6 +152,15 @@ def publish(
     from .publisher import Publisher
     from .repo import HubRepository
 
+    missing = publishing.missing_extras()
+    install = f'pip install "robomme-interference-data[{",".join(missing)}]"'
+    if missing and not dry_run:
+        raise MissingExtraError("publishing needs libraries that are not installed", install)
+    if missing:
+        print_status(
+            "This dry run leaves out what needs more libraries: cards with their pictures (extra "
+            f"score), opening the datasets with LeRobot (extra build). For these: {install}"
+        )
     opened = load_buffer_set(buffer_set)
     unpublished = opened.header.datasets[DEMONSTRATIONS].location is None
     if unpublished and not opened.dataset_files(DEMONSTRATIONS).list(INDEX_DIR):

@@ -36,7 +36,7 @@ from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, pars
 from robomme_interference_data.schema.manifest import BufferManifest
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.files import read_json, sha256_file
-from robomme_interference_data.viz.filmstrip import shown_camera, strip_png
+from robomme_interference_data.viz.filmstrip import strip_png
 
 from .facts import CardTable, Facts, data_limits, dataset_rows, repositories_of, source_kinds_of
 from .markdown import Raw, code
@@ -183,7 +183,7 @@ def _facts(
 
     `shown` is the buffer whose film strip the card shows, drawn once and only when needed.
     """
-    camera = shown_camera(shown)
+    camera = shown.query.dataset.camera()
     sessions = ", ".join(f"{one.role} {one.source}" for one in shown.sessions) or "no session"
     simulators = {one.simulator for dataset in datasets.values() for one in dataset.records()}
     named = sorted(filter(None, simulators))

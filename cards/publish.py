@@ -5,10 +5,10 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
+from importlib.util import find_spec
 from pathlib import Path, PurePosixPath
 
 from robomme_interference_data.build_dataset.audit import audit_buffer_set
-from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
 from robomme_interference_data.build_dataset.verify import verify_buffer_set
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
@@ -154,7 +154,8 @@ class BufferSetContent:
 
         first = Version.parse(dataset.identity.version) or Version(1, 0, 0)
         lerobot = str(dataset.lerobot.version)
-        return RepoContent(repo_id, first, files, parts, card, IDENTITY_PATH, lerobot)
+        made = None if "score" in missing_extras() else card
+        return RepoContent(repo_id, first, files, parts, made, IDENTITY_PATH, lerobot)
 
 
 def plan_buffer_set(content: BufferSetContent, publisher: Publisher) -> list[RepoPlan]:
@@ -230,9 +231,21 @@ def parts_of_questions(buffer_set: BufferSet) -> dict[str, str]:
 # --- checks --------------------------------------------------------------------------------------
 
 
+_EXTRAS = {"build": ("lerobot", "datasets"), "score": ("jinja2", "matplotlib")}
+"""Extras that publishing needs, and their libraries."""
+
+
+def missing_extras() -> list[str]:
+    """Return the extras that publishing needs, and that are not installed."""
+    return [
+        extra
+        for extra, libraries in _EXTRAS.items()
+        if any(find_spec(library) is None for library in libraries)
+    ]
+
+
 def check_buffer_set(buffer_set: BufferSet, progress: WorkProgress | None = None) -> None:
-    """Check hashes, rules and leaks, and that LeRobot opens the datasets."""
-    require_lerobot()
+    """Check hashes, rules and leaks, and that LeRobot, if installed, opens the datasets."""
     violations = list(verify_buffer_set(buffer_set, progress=progress))
     if violations:
         first = violations[0]
@@ -250,7 +263,7 @@ def check_buffer_set(buffer_set: BufferSet, progress: WorkProgress | None = None
             "List all leaks.",
             f"audit {buffer_set.location}",
         )
-    for name in buffer_set.header.datasets:
+    for name in buffer_set.header.datasets if "build" not in missing_extras() else ():
         files = buffer_set.dataset_files(name)
         if isinstance(files, LocalFiles):  # one on the Hub was checked when it was published
             open_with_lerobot(name, files.root)

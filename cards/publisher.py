@@ -27,7 +27,8 @@ class RepoContent:
     """What a repository is to hold.
 
     `data` are its files without the card, `parts` the digests that decide the next version (one
-    for each episode, buffer, question or rollout), `card` makes the card of a version, `first` is
+    for each episode, buffer, question or rollout), `card` makes the card of a version (None in a
+    dry run without the libraries for it: cards are then not compared), `first` is
     the version of an empty repository, `marker_file` a file that only such a repository has, and
     `lerobot` the tag by which LeRobot finds the format of its dataset.
 
@@ -39,7 +40,7 @@ class RepoContent:
     first: Version
     data: RepoFiles
     parts: Mapping[str, str]
-    card: Callable[[Version], Mapping[str, bytes]]
+    card: Callable[[Version], Mapping[str, bytes]] | None
     marker_file: str
     lerobot: str | None = None
     pending: bool = False
@@ -47,7 +48,7 @@ class RepoContent:
     def files(self, version: Version) -> RepoFiles:
         """Return all files of a version."""
         parts = {PARTS_PATH: indented_json(dict(self.parts)).encode()}
-        card = {} if self.pending else self.card(version)
+        card = {} if self.pending or self.card is None else self.card(version)
         return self.data | {path: LocalFile(data) for path, data in (parts | dict(card)).items()}
 
 
@@ -129,7 +130,12 @@ class Publisher:
         repository = HubRepository(content.repo_id)
         revisions = repository.revisions() or {}
         head = revisions.get("main")
-        files_at = cache(repository.files)  # the files of a commit never change
+
+        @cache  # the files of a commit never change
+        def files_at(commit: str) -> Any:
+            files = repository.files(commit)
+            return files if content.card is not None else _without_card(files)
+
         existing = files_at(head) if head else {}
         versions = versions_of(revisions)
         if not versions:

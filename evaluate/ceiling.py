@@ -21,7 +21,7 @@ from robomme_interference_data.schema.shifts import NO_SHIFT, parse_shift
 from robomme_interference_data.simulators.registry import recorded_scene
 from robomme_interference_data.viz.tables import Table
 
-from .run.config import CeilingConfig, non_default_retrieval, nothing_to_retrieve
+from .run.config import CeilingConfig, check_retrieval, nothing_to_retrieve, with_camera
 
 _Kept = tuple[float | None, float | None]
 """Share of the evidence that a memory keeps, and the ideal observer's chance."""
@@ -53,7 +53,8 @@ def ceiling(buffer_set: BufferSet, config: CeilingConfig) -> list[Ceiling]:
     check_memory(config.memory, "ceiling")
     if config.frames < 1:
         raise InvalidOptionError.expected("frames", config.frames, "1 or more")
-    non_default_retrieval(config)
+    check_retrieval(config)
+    config = with_camera(config, buffer_set)
     if config.shift != NO_SHIFT and config.retrieval is None:
         raise InvalidOptionError(
             f"the shift {config.shift} has no effect without a retrieval step",

@@ -32,7 +32,7 @@ class Cues:
         evidence: The evidence of its lesson.
         length: Number of frames of its lesson.
         goal: Its goal in words.
-        view: The first live front image, `(H, W, 3) uint8` RGB; None if it was not stored.
+        view: The first live image of the first camera, `(H, W, 3) uint8` RGB; None without images.
     """
 
     family: str
@@ -78,7 +78,7 @@ def cues_of(buffer_set: BufferSet) -> list[Cues]:
             one.record.evidence or (),
             one.lesson_frames,
             one.goal,
-            one.frame() if "front" in one.dataset.cameras else None,
+            one.frame() if one.dataset.cameras else None,
         )
         for one in queries_with_evidence(buffer_set)
     ]

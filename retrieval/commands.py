@@ -25,13 +25,20 @@ from robomme_interference_data.cli.options import (
     QueryName,
     with_settings,
 )
-from robomme_interference_data.constants import EXECUTIONS, IDENTITY_PATH, MANIFEST_PATH
+from robomme_interference_data.constants import (
+    DEMONSTRATIONS,
+    EXECUTIONS,
+    IDENTITY_PATH,
+    MANIFEST_PATH,
+)
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError, counted
 from robomme_interference_data.runtime.executor import Serial, WorkersConfig, make_executor
 from robomme_interference_data.schema.settings import setting
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
 
 if TYPE_CHECKING:
+    from robomme_interference_data.data.buffer_set import BufferSet
+
     from .select import Similarities
 
 _RETRIEVAL = "Retrieval"
@@ -41,10 +48,10 @@ _ENCODER_HELP = (
     "thumbnail (no weights), siglip (the paper's model), or siglip:ID with the id or folder of "
     "another SigLIP or SigLIP 2 model."
 )
-_CAMERA_HELP = "Camera whose frames are compared."
+_CAMERA_HELP = "Camera whose frames are compared; default: the first."
 
 EncoderName = Annotated[str, typer.Option(help=_ENCODER_HELP, rich_help_panel=_RETRIEVAL)]
-Camera = Annotated[str, typer.Option(help=_CAMERA_HELP, rich_help_panel=_RETRIEVAL)]
+Camera = Annotated[str | None, typer.Option(help=_CAMERA_HELP, rich_help_panel=_RETRIEVAL)]
 Shift = Annotated[str, typer.Option(help=SHIFT_HELP, rich_help_panel=_RETRIEVAL)]
 
 
@@ -53,7 +60,7 @@ class IndexConfig:
     """The settings of `index`."""
 
     encoder: str = setting("thumbnail", help=_ENCODER_HELP, group=_RETRIEVAL)
-    camera: str = setting("front", help="Camera to embed.", group=_RETRIEVAL)
+    camera: str | None = setting(None, help="Camera to embed.", shown="the first", group=_RETRIEVAL)
     force: bool = setting(False, help="Build the index again.", group=_RETRIEVAL)
     device: str | None = setting(
         None,
@@ -117,7 +124,7 @@ def index(
             force=config.force,
             executor=Serial() if workers == WorkersConfig() else make_executor(workers),
         )
-    for message in look_on_hub(planned, image_encoder, config.camera) if planned else ():
+    for message in look_on_hub(planned, image_encoder, reports[0].header.camera) if planned else ():
         print_status(message)
     if as_json:
         print_json([to_dict(report) for report in reports])
@@ -142,7 +149,7 @@ def retrieve(
     rule: Annotated[
         str, typer.Option(help="RULE, as in retrieval-score.", rich_help_panel=_RETRIEVAL)
     ] = "max",
-    camera: Camera = "front",
+    camera: Camera = None,
     shift: Shift = NO_SHIFT,
     out: Picture = None,
     as_json: AsJson = False,
@@ -168,6 +175,7 @@ def retrieve(
     parsed = select.Rule.parse(rule, encoders.published_threshold(name))
     under, opened = parse_shift(shift), load_buffer_set(buffer_set)
     buffer = opened.load(episode, condition)
+    camera = buffer.query.dataset.camera(camera)
     query = live_embedding(opened, buffer, under, name, camera)
     measured = select.measure(buffer, name, camera, query)
     choice = select.choose(measured, parsed)
@@ -197,7 +205,7 @@ def retrieval_score(
     ] = ["max"],  # noqa: B006 - typer copies it
     families: Families = [],  # noqa: B006
     conditions: Conditions = [],  # noqa: B006
-    camera: Camera = "front",
+    camera: Camera = None,
     shift: Shift = NO_SHIFT,
     out: Annotated[
         Path | None,
@@ -214,6 +222,7 @@ def retrieval_score(
     robomme-interference retrieval-score my-buffers --shift light:2 --conditions k7
     ```
     """
+    from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.schema.codec import to_dict
     from robomme_interference_data.storage.files import write_text
     from robomme_interference_data.viz.tables import Table
@@ -223,7 +232,9 @@ def retrieval_score(
     check_output(out)
     name = encoders.encoder_name(encoder)
     parsed = select.parse_rules(rules, encoders.published_threshold(name))
-    about, measured = _measured(buffer_set, name, camera, shift, families, conditions, as_json)
+    opened = load_buffer_set(buffer_set)
+    camera = opened.datasets[DEMONSTRATIONS].camera(camera)
+    about, measured = _measured(opened, name, camera, shift, families, conditions, as_json)
     grades = [grade.grade(one, rule) for rule in parsed for one in measured]
     cells = list(grade.cells(grades))
     title = f"Retrieval on {about['buffer_set']}, encoder {name}, camera {camera}"
@@ -253,7 +264,7 @@ def calibrate(
     ] = (0.80, 0.99),
     families: Families = [],  # noqa: B006
     conditions: Conditions = [],  # noqa: B006
-    camera: Camera = "front",
+    camera: Camera = None,
     out: Picture = None,
     as_json: AsJson = False,
 ) -> None:
@@ -268,6 +279,7 @@ def calibrate(
     robomme-interference calibrate my-buffers --sweep 0.30 0.99 --out thresholds.png
     ```
     """
+    from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.schema.codec import to_dict
 
     from . import calibrate as fitting
@@ -276,7 +288,9 @@ def calibrate(
     check_output(out)
     name = encoders.encoder_name(encoder)
     thresholds = fitting.sweep_steps(*sweep)
-    about, measured = _measured(buffer_set, name, camera, NO_SHIFT, families, conditions, as_json)
+    opened = load_buffer_set(buffer_set)
+    camera = opened.datasets[DEMONSTRATIONS].camera(camera)
+    about, measured = _measured(opened, name, camera, NO_SHIFT, families, conditions, as_json)
     rule = select.Rule.parse("max", encoders.published_threshold(name))
     calibration = fitting.calibrate(measured, rule, thresholds)
     title = f"Threshold of {name}, camera {camera}, on {about['buffer_set']}"
@@ -290,7 +304,7 @@ def calibrate(
 
 
 def _measured(
-    buffer_set: str,
+    opened: "BufferSet",
     encoder: str,
     camera: str,
     shift: str,
@@ -299,13 +313,12 @@ def _measured(
     quiet: bool,
 ) -> tuple[dict[str, Any], list["Similarities"]]:
     """Return what the buffers belong to, and the similarities of each with frames of the lesson."""
-    from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.data.views import live_embedding
     from robomme_interference_data.runtime.progress import WorkProgress
 
     from .select import measure
 
-    under, opened = parse_shift(shift), load_buffer_set(buffer_set)
+    under = parse_shift(shift)
     selected: dict[str, Any] = {"family": families, "condition": conditions}
     total = sum(1 for _ in opened.manifests(**selected))
     opened.check_tables(conditions or opened.conditions)
@@ -320,7 +333,7 @@ def _measured(
     left_out = total - len(measured)
     if not measured:
         raise InvalidOptionError(
-            f"none of the {left_out} buffers of {buffer_set} holds a lesson, which grading needs",
+            f"none of the {left_out} buffers of {opened.name} holds a lesson, which grading needs",
             command=opened.planning("k0", "k3"),
         )
     if left_out and not quiet:

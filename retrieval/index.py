@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import (
-    CAMERA_PREFIX,
     DISTRACTORS,
     EXECUTIONS,
     FORMAT_VERSION,
@@ -86,7 +85,7 @@ def build_index(
     encoder: Encoder,
     progress: WorkProgress,
     *,
-    camera: str = "front",
+    camera: str | None = None,
     threads: int = 1,
     force: bool = False,
     executor: Executor | None = None,
@@ -101,7 +100,7 @@ def build_index(
         roots: Folders of the datasets.
         encoder: The encoder.
         progress: Shows the progress.
-        camera: Camera to embed, with or without `observation.images.`.
+        camera: Camera to embed; None for the first.
         threads: Threads that decode and preprocess.
         force: Build all of it again.
         executor: Runs the episodes; None for this process.
@@ -125,7 +124,7 @@ def build_index(
         return reports
 
 
-def look_on_hub(buffer_set: BufferSet, encoder: Encoder, camera: str = "front") -> Iterator[str]:
+def look_on_hub(buffer_set: BufferSet, encoder: Encoder, camera: str) -> Iterator[str]:
     """Yield for each dataset on the Hub a message on whether it has embeddings by this encoder."""
     for name, recorded in buffer_set.header.datasets.items():
         files = buffer_set.dataset_files(name)
@@ -186,14 +185,13 @@ class _EmbedTask:
 class _IndexBuilder:
     """Builds the index of one dataset."""
 
-    def __init__(self, root: Path, encoder: Encoder, camera: str):
+    def __init__(self, root: Path, encoder: Encoder, camera: str | None):
         self.dataset, self.encoder = Dataset(LocalFiles(root)), encoder
-        self.dataset.shape(camera)  # an error for an unknown camera
         self.units = self.dataset.kind == DISTRACTORS
-        self.camera = camera.removeprefix(CAMERA_PREFIX)
+        self.camera = self.dataset.camera(camera)
         self.lengths = [record.length for record in self.dataset.records()]
         self.computed = {"in": encoder.computed_in, "batch": encoder.batch}
-        self.folder = root / index_folder(encoder.name, camera)
+        self.folder = root / index_folder(encoder.name, self.camera)
         # Features of other settings go to another folder, so that they are never mixed.
         made_of = canonical_json([encoder.fingerprint, self.computed, self.dataset.revision])
         self.made = staging_path(self.folder) / sha256(made_of.encode()).hexdigest()[:16]

@@ -144,7 +144,10 @@ class Similarities:
 
 
 def measure(
-    buffer: Buffer, encoder: str, camera: str = "front", query: NDArray[np.floating] | None = None
+    buffer: Buffer,
+    encoder: str,
+    camera: str | None = None,
+    query: NDArray[np.floating] | None = None,
 ) -> Similarities:
     """Return the similarities of a buffer from its stored embeddings.
 

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import CAMERA_PREFIX
 from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.embeddings import BufferSetIndex, index_folder
@@ -24,18 +23,18 @@ class RetrievalStep:
     Args:
         encoder: Name of the encoder of the index, see `make_encoder`.
         rule: Rule of the choice, see `Rule.parse`.
-        camera: Camera whose frames are compared.
+        camera: Camera whose frames are compared; None for the first.
     """
 
-    def __init__(self, encoder: str, *, rule: str = "max", camera: str = "front"):
+    def __init__(self, encoder: str, *, rule: str = "max", camera: str | None = None):
         self.encoder = encoder_name(encoder)
         self.rule = Rule.parse(rule, published_threshold(self.encoder))
-        self.camera = camera.removeprefix(CAMERA_PREFIX)
+        self.camera = camera
 
-    @property
-    def name(self) -> str:
-        """Encoder, camera unless it is the front one, and rule, such as `siglip/max/0.923`."""
-        return f"{PurePath(index_folder(self.encoder, self.camera)).name}/{self.rule}"
+    def label(self, buffer: Buffer) -> str:
+        """Return index and rule, such as `siglip/max/0.923`, for buffers like this one."""
+        camera = buffer.query.dataset.camera(self.camera)
+        return f"{PurePath(index_folder(self.encoder, camera)).name}/{self.rule}"
 
     def _chosen(self, buffer: Buffer, query: NDArray[np.floating]) -> NDArray[np.int64]:
         """Choose the frames of a buffer that match the embedding of a live image, `(D,)`."""
@@ -73,7 +72,12 @@ class Selector(RetrievalStep):
     """
 
     def __init__(
-        self, encoder: str, *, rule: str = "max", camera: str = "front", device: str | None = None
+        self,
+        encoder: str,
+        *,
+        rule: str = "max",
+        camera: str | None = None,
+        device: str | None = None,
     ):
         super().__init__(encoder, rule=rule, camera=camera)
         self._encoder = make_encoder(encoder, device=device)
@@ -92,7 +96,7 @@ class Selector(RetrievalStep):
         return {
             "encoder": index.units.header.encoder.name,
             "fingerprint": index.units.header.encoder.sha256,
-            "camera": self.camera,
+            "camera": index.units.header.camera,
             "method": self.rule.method,
             "boundary": self.rule.boundary,
             "threshold": self.rule.threshold(index.units.typical_cosine),

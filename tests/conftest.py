@@ -1,5 +1,6 @@
 """Isolation: every test runs without the network and tokens, and with separate caches."""
 
+import logging
 import os
 import shutil
 import signal
@@ -228,6 +229,8 @@ def run(
     from robomme_interference_data.cli.main import main
 
     def call(*arguments: object) -> tuple[int, str, str]:
+        # `caplog` of later tests needs what the command line turns off.
+        monkeypatch.setattr(logging.getLogger("robomme_interference_data"), "propagate", True)
         monkeypatch.setattr(sys, "argv", ["robomme-interference", *map(str, arguments)])
         capsys.readouterr()
         with pytest.raises(SystemExit) as ended:

@@ -1,11 +1,16 @@
 """Sources of recorded episodes, opened by a specification such as `robomme-h5:recordings/`."""
 
-import re
-from importlib.util import find_spec
 from typing import Any
 
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.runtime.specs import Kind, Registry, Spec, signature_of
+from robomme_interference_data.runtime.specs import (
+    OWN,
+    Kind,
+    Registry,
+    Spec,
+    import_factory,
+    signature_of,
+)
 from robomme_interference_data.simulators.registry import SIMULATORS, simulator_class
 
 from .base import Frame, Recording, Robot, Source, SourceEpisode
@@ -13,7 +18,6 @@ from .base import Frame, Recording, Robot, Source, SourceEpisode
 __all__ = ["SOURCES", "Frame", "Recording", "Robot", "Source", "SourceEpisode", "open_source"]
 
 _LOCATION = "(?P<location>.+)"
-_OWN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 SOURCES = Registry(
     "source",
@@ -65,7 +69,12 @@ def open_source(specification: str, *, shifted: bool = False, **options: Any) ->
 def _parse(specification: str) -> Spec:
     """Parse the text of a source; a simulator of the user is one like the embedded one."""
     module = specification.partition(":")[0]
-    own = _OWN.fullmatch(specification) and module not in SOURCES.kinds
-    if own and (module == "__main__" or find_spec(module.partition(".")[0])):
-        return Spec("tabletop", given={"name": specification})
-    return SOURCES.parse(specification)
+    if module in SOURCES.kinds or not OWN.fullmatch(specification):
+        return SOURCES.parse(specification)
+    try:
+        import_factory("source", specification)
+    except InvalidOptionError as error:  # the module, or the name of a kind, is misspelled
+        raise InvalidOptionError(
+            error.message, f"{error.hint} Other sources: {SOURCES.forms}."
+        ) from error
+    return Spec("tabletop", given={"name": specification})

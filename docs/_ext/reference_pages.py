@@ -47,7 +47,8 @@ def command_pages() -> Iterator[str]:
     yield "# Command line\n"
     yield (
         "Every command prints this page's text with `--help`. `--json` writes machine-readable "
-        "output to standard output; messages go to standard error.\n"
+        "output to standard output; messages go to standard error, and an error is the last line "
+        "there: a JSON object with `type`, `message`, `hint` and `command`.\n"
     )
     yield from _commands("robomme-interference", get_command(app), level=2)
 

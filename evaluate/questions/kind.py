@@ -15,7 +15,6 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.evaluate.models.registry import MODELS, model_identity
 from robomme_interference_data.evaluate.run.config import (
     AskConfig,
-    check_shared,
     check_unused,
     nothing_to_retrieve,
     with_retrieval,
@@ -102,7 +101,6 @@ def _check_settings(config: AskConfig) -> None:
             raise InvalidOptionError.one_of(name, getattr(config, name), known)
     if config.frames < 2:
         raise InvalidOptionError.expected("frames", config.frames, "2 or more")
-    check_shared(config)
     if config.model in OWN:
         unused = ["model_options", "control", "prompt"]
         if config.model == "guess":

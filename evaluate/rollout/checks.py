@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, EXECUTIONS, STATE
 from robomme_interference_data.data.buffer_set import BufferSet
+from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import InterferenceError, InvalidOptionError, UnknownNameError
 from robomme_interference_data.evaluate.policies.policy import BATCH_METHODS, Policy
 from robomme_interference_data.evaluate.policies.registry import BUILTINS, POLICIES, policy_options
 from robomme_interference_data.evaluate.run.config import (
     RunConfig,
-    check_shared,
     check_unused,
     nothing_to_retrieve,
     with_retrieval,
@@ -86,7 +86,6 @@ def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> 
         )
     find_simulator(config.simulator)
     check_shift(config.simulator, config.shift)
-    check_shared(config)
     _check_policies(config, policy)
     kind = POLICIES.parse(config.policy).kind
     scripts = simulator_class(config.simulator).policies
@@ -99,20 +98,36 @@ def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> 
             if config.offline
             else "Set another simulator, such as tabletop, or another policy.",
         )
-    retrieval = [] if config.retrieval is None else [config.retrieval_camera]
     if kind == "answers":
         check_unused(config, ["retrieval"], config.policy, "Set it for the questions instead.")
-    demonstrations = buffer_set.datasets[DEMONSTRATIONS]
-    for camera in (*policy.history_cameras, *retrieval):
-        demonstrations.shape(camera)  # raises for an unknown camera
-    live = demonstrations if config.offline else simulator_class(config.simulator)
-    for camera in sorted(used_cameras(config, policy.cameras) - {*live.cameras}):
-        raise UnknownNameError.among("live camera", camera, config.simulator, live.cameras)
+    _check_cameras(config, buffer_set.datasets[DEMONSTRATIONS], policy)
     _check_robot(config, buffer_set, kind)
     if config.videos:
         from .clips import check_drawing
 
         check_drawing()
+
+
+def _check_cameras(config: RunConfig, demonstrations: Dataset, policy: Policy) -> None:
+    """Reject cameras that the demonstrations, or the live views, lack."""
+    live = demonstrations if config.offline else simulator_class(config.simulator)
+    used = used_cameras(config, policy.cameras, demonstrations)
+    for where, lacking in (
+        (f"the history of {demonstrations.files.describe()}", {*policy.history_cameras}),
+        ("the live views of the recordings", used if config.offline else set()),
+    ):
+        for camera in sorted(lacking - {*demonstrations.cameras}):
+            raise UnknownNameError(
+                f"the policy {config.policy} reads the camera {camera!r}, which is not in {where}",
+                f"Its cameras: {', '.join(demonstrations.cameras) or 'none'}. Set another policy.",
+            )
+    for camera in sorted(used - {*live.cameras}):
+        raise UnknownNameError(
+            f"the live camera {camera!r} is not in the simulator {config.simulator}, which draws "
+            f"{', '.join(live.cameras)}",
+            "To act along the recordings of this buffer set, without a simulator, set `offline`. "
+            "In the simulator, set another policy, or another `retrieval_camera`.",
+        )
 
 
 def _check_robot(config: RunConfig, buffer_set: BufferSet, kind: str) -> None:

@@ -17,14 +17,13 @@ from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.errors import MissingExtraError, counted
 from robomme_interference_data.evaluate.run.plan import WorkItem
-from robomme_interference_data.evaluate.subgoals.writer import CAMERA
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.sampling import spread
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import EpisodeInfo, Observation
 from robomme_interference_data.storage.encode import CLIP, VideoEncoder
 from robomme_interference_data.viz.figure import Hue
-from robomme_interference_data.viz.filmstrip import session_colors, shown_camera
+from robomme_interference_data.viz.filmstrip import session_colors
 
 _VIEW = 256  # side of a camera's picture
 _VIEWS = 4  # lesson, history and two live cameras
@@ -88,6 +87,7 @@ class Clip:
         self._goal = self._given = ""
         self._views: dict[str, NDArray[np.uint8]] = {}
         self._cameras: list[str] = []
+        self._pointed = ""  # the camera that the points of subgoals are in
         self._lesson: Iterator[NDArray[np.uint8]] = iter(())
         self._subgoal: Subgoal | None = None
         self._steps = 0
@@ -105,6 +105,7 @@ class Clip:
         self._given = f"history given: {counted(len(given), 'frame')}" if given else "no history"
         self._views = {"given": history_picture(buffer, given)}
         self._cameras = sorted(first.images)[: _VIEWS - 2]
+        self._pointed = buffer.query.dataset.camera()
         self._lesson = self._file.enter_context(closing(_lesson_of(buffer)))
         self._show(first)
         self._path = Path(
@@ -149,8 +150,8 @@ class Clip:
                 view = view[::step, ::step]
                 x = place * _VIEW
                 canvas[_HEAD : _HEAD + view.shape[0], x : x + view.shape[1]] = view
-        if self._subgoal and CAMERA in self._cameras:
-            left = (self._cameras.index(CAMERA) + 2) * _VIEW
+        if self._subgoal and self._pointed in self._cameras:
+            left = (self._cameras.index(self._pointed) + 2) * _VIEW
             for y, x in self._subgoal.points:
                 _cross(canvas[_HEAD:, left : left + _VIEW], y, x)
         lines = [*self._heading, "", *textwrap.wrap(self._goal, _LETTERS)]
@@ -166,8 +167,8 @@ class Clip:
 
 
 def _lesson_of(buffer: Buffer) -> Generator[NDArray[np.uint8]]:
-    """Yield the frames of a buffer's lesson, `(H, W, 3) uint8`, of the camera of strips."""
-    camera = shown_camera(buffer)
+    """Yield the frames of a buffer's lesson, `(H, W, 3) uint8`, of the first camera."""
+    camera = buffer.query.dataset.camera()
     lesson = [one for one in buffer.sessions if one.role == "lesson"]
     indices = [index for one in lesson for index in range(one.start, one.stop)]
     for chunk in buffer.stream(1, (camera,), indices):
@@ -185,7 +186,7 @@ def history_picture(buffer: Buffer, given: Sequence[int]) -> NDArray[np.uint8]:
     """Return 64 evenly spread history frames, `(256, 256, 3) uint8`, underlined by session."""
     picture = np.full((_VIEW, _VIEW, 3), 255, np.uint8)
     colors, sessions = session_colors(buffer.sessions), buffer.session_index
-    camera = shown_camera(buffer)
+    camera = buffer.query.dataset.camera()
     for place, chosen in enumerate(spread(0, len(given), _COLUMNS * _COLUMNS)):
         index = given[chosen]
         y, x = (_THUMB * part for part in divmod(place, _COLUMNS))

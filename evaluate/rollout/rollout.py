@@ -98,7 +98,8 @@ def run_rollout(
             check_lesson(buffer.query, demonstration, first, views=config.shift == NO_SHIFT)
         with clock.part("history_s"):
             if selector is not None and len(buffer):
-                given = selector.select(buffer, first.images[selector.camera]).tolist()
+                camera = buffer.query.dataset.camera(selector.camera)
+                given = selector.select(buffer, first.images[camera]).tolist()
                 check_history(name_system(run.system), {item.condition: len(given)})
         if clip is not None:
             clip.begin(buffer, given, first, info)

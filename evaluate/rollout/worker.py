@@ -6,7 +6,8 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from typing import Any, cast
 
-from robomme_interference_data.constants import CAMERA_PREFIX
+from robomme_interference_data.constants import DEMONSTRATIONS
+from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import (
     PolicyError,
     PolicyServerError,
@@ -23,7 +24,7 @@ from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.kind import Job, Run, RunTask
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.subgoals.registry import make_writer
-from robomme_interference_data.evaluate.subgoals.writer import CAMERA, ORACLE, SubgoalWriter
+from robomme_interference_data.evaluate.subgoals.writer import ORACLE, SubgoalWriter
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
@@ -91,7 +92,7 @@ class RolloutTask(RunTask[RunConfig]):
         if opening.what == "simulator":
             simulator = self._open_simulator(policy, worker)
             if opening.episode is not None:
-                cameras = used_cameras(self.run.config, policy.cameras)
+                cameras = used_cameras(self.run.config, policy.cameras, self._demonstrations)
                 self._try_out(simulator, opening.episode, cameras, worker)
             return None
         from robomme_interference_data.evaluate.policies.identity import policy_metadata
@@ -122,6 +123,10 @@ class RolloutTask(RunTask[RunConfig]):
         self._send_files(item, worker, clip, Status(row.status))
         return row, clip.problem if clip else None
 
+    @property
+    def _demonstrations(self) -> Dataset:
+        return self.buffer_set.datasets[DEMONSTRATIONS]
+
     def _open_policy(self, worker: Worker) -> Policy:
         if self._policy is None:
             self._policy = self._make_policy(worker)
@@ -141,7 +146,7 @@ class RolloutTask(RunTask[RunConfig]):
     def _open_simulator(self, policy: Policy, worker: Worker) -> Simulator:
         config = self.run.config
         if self._simulator is None:
-            options = simulator_options(config, policy.cameras)
+            options = simulator_options(config, policy.cameras, self._demonstrations)
             with worker.limit(config.simulator_timeout_s, "the simulator's start"):
                 self._simulator = make_simulator(config.simulator, **options)
         return self._simulator
@@ -252,19 +257,23 @@ class RolloutTask(RunTask[RunConfig]):
             raise WorkerRetiredError(error.message, error.hint) from error
 
 
-def used_cameras(config: RunConfig, policy_cameras: Iterable[str]) -> set[str]:
+def used_cameras(
+    config: RunConfig, policy_cameras: Iterable[str], demonstrations: Dataset
+) -> set[str]:
     """Return the cameras whose live images a run reads."""
     used = {*policy_cameras}
     if config.subgoals not in (None, ORACLE):
-        used.add(CAMERA)
+        used.add(demonstrations.camera())
     if config.retrieval is not None:
-        used.add(config.retrieval_camera.removeprefix(CAMERA_PREFIX))
+        used.add(demonstrations.camera(config.retrieval_camera, "retrieval_camera"))
     return used
 
 
-def simulator_options(config: RunConfig, policy_cameras: Iterable[str]) -> dict[str, Any]:
+def simulator_options(
+    config: RunConfig, policy_cameras: Iterable[str], demonstrations: Dataset
+) -> dict[str, Any]:
     """Return the options of a run's simulator, which draws only the cameras that are used."""
-    used = used_cameras(config, policy_cameras)
+    used = used_cameras(config, policy_cameras, demonstrations)
     if config.videos or config.check_lesson:
         used |= {*simulator_class(config.simulator).cameras}
     settings = {

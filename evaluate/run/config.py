@@ -2,16 +2,19 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-from robomme_interference_data.constants import SAMPLE_FRAMES, SPLITS
+from robomme_interference_data.constants import DEMONSTRATIONS, SAMPLE_FRAMES, SPLITS
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.runtime.executor import WorkersConfig
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.settings import setting
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP
+
+if TYPE_CHECKING:
+    from robomme_interference_data.data.buffer_set import BufferSet
 
 _EPISODES, _POLICY, _MODEL, _SUBGOALS = "Episodes", "Policy", "Model", "Subgoals"
 _RETRIEVAL, _SIMULATOR, _EXECUTION = "Retrieval", "Simulator", "Execution"
@@ -27,8 +30,8 @@ class RetrievalConfig:
     retrieval_rule: str = setting(
         "max", group=_RETRIEVAL, help="METHOD or METHOD/CUT, as for retrieval-score."
     )
-    retrieval_camera: str = setting(
-        "front", group=_RETRIEVAL, help="Camera whose frames are compared."
+    retrieval_camera: str | None = setting(
+        None, group=_RETRIEVAL, help="Camera whose frames are compared.", shown="the first"
     )
 
 
@@ -209,8 +212,6 @@ class CeilingConfig(RetrievalConfig):
 
 def check_shared(config: WorkConfig) -> None:
     """Check the settings that rollouts and questions share."""
-    from robomme_interference_data.retrieval.select import Rule
-
     positive = ("workers", "max_errors", "rollout_timeout_s")
     for name in (*positive, "history_chunk", "simulator_timeout_s"):
         value = getattr(config, name, 1)
@@ -220,6 +221,16 @@ def check_shared(config: WorkConfig) -> None:
             )
     if config.split not in SPLITS:
         raise InvalidOptionError.one_of("split", config.split, SPLITS)
+    check_retrieval(config)
+
+
+def check_retrieval(config: RetrievalConfig) -> None:
+    """Check the names of encoder and rule, without the encoder's library."""
+    from robomme_interference_data.retrieval.encoders import encoder_name
+    from robomme_interference_data.retrieval.select import Rule
+
+    if config.retrieval is not None:
+        encoder_name(config.retrieval)
     Rule.parse(config.retrieval_rule)
     non_default_retrieval(config)
 
@@ -232,11 +243,22 @@ def check_unused(config: WorkConfig, names: Iterable[str], on: str, hint: str) -
             raise InvalidOptionError(f"`{name}` has no effect on {on}", hint)
 
 
+def with_camera[C: RetrievalConfig](config: C, buffer_set: "BufferSet") -> C:
+    """Return the settings with the name of the retrieval step's camera, by default the first."""
+    if config.retrieval is None:
+        return config
+    dataset = buffer_set.datasets[DEMONSTRATIONS]
+    camera = dataset.camera(config.retrieval_camera, "retrieval_camera")
+    return replace(config, retrieval_camera=camera)
+
+
 def non_default_retrieval(config: RetrievalConfig) -> dict[str, str]:
     """Return the settings of the retrieval step that are not the paper's."""
-    defaults = {one.name: one.default for one in fields(RetrievalConfig) if one.name != "retrieval"}
-    values = {name: getattr(config, name) for name in defaults}
-    changed = {name: value for name, value in values.items() if value != defaults[name]}
+    changed = {}
+    if config.retrieval_rule != RetrievalConfig.retrieval_rule:
+        changed["retrieval_rule"] = config.retrieval_rule
+    if config.retrieval_camera not in (None, "front"):
+        changed["retrieval_camera"] = config.retrieval_camera
     if changed and config.retrieval is None:
         raise InvalidOptionError(
             f"`{next(iter(changed))}` has no effect without a retrieval step",

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import load_buffer_set
@@ -23,14 +23,18 @@ from robomme_interference_data.runtime.executor import (
     end_if_starting,
     make_executor,
 )
+from robomme_interference_data.schema.codec import arrow_schema, to_pandas, to_table
 from robomme_interference_data.schema.rollouts import Rollout, Status
 from robomme_interference_data.storage.files import atomic_path
 
-from .config import AskConfig, RunConfig
+from .config import AskConfig, RunConfig, check_shared, with_camera
 from .identity import invocation, now, plain, run_identity
 from .kind import Job, Run, RunKind
 from .log import RunLog, count_statuses, is_done, open_log, read_record, row_line, row_of
 from .plan import Plan, WorkItem, plan_work, shuffle_work
+
+if TYPE_CHECKING:
+    import pandas
 
 _ERROR_LETTERS = 2000
 """Maximum length of an error text in a row."""
@@ -53,6 +57,14 @@ class RunResult:
     planned: int
     counts: dict[str, int]
     stopped: str | None
+
+    def to_pandas(self) -> "pandas.DataFrame":
+        """Return the rows as a pandas `DataFrame`; its columns are those of `rollouts.parquet`.
+
+        Raises:
+            MissingExtraError: pandas is not installed.
+        """
+        return to_pandas(to_table(self.rows, arrow_schema(Rollout)))
 
 
 class ProgressCallback(Protocol):
@@ -102,7 +114,9 @@ def run_evaluation(
         MissingExtraError: A library is not installed.
     """
     end_if_starting()
+    check_shared(config)  # before anything is loaded
     buffer_set, folder = load_buffer_set(config.buffer_set), Path(config.out)
+    config = with_camera(config, buffer_set)
     kind = _kind(dataclasses.replace(config, buffer_set=buffer_set.location), buffer_set)
     with kind.lock(folder), ExitStack() as stack:
         kind.prepare()

@@ -123,7 +123,7 @@ def history_columns(
         "history_frames": len(given),
         "lesson_frames": lesson_frames(buffer.sessions, given),
         "lesson_share": share,
-        "retrieval_model": step.name if step else None,
+        "retrieval_model": step.label(buffer) if step else None,
     }
     if step is not None and share is not None:
         columns |= {"retrieval_start": given[0], "retrieval_stop": given[-1] + 1}

@@ -16,7 +16,7 @@ from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Observation, Simulator
 
 from .prompt import Answer, Prompt, merge_near
-from .writer import CAMERA, History, SubgoalWriter, Turn
+from .writer import History, SubgoalWriter, Turn
 
 
 class ModelWriter(SubgoalWriter):
@@ -65,6 +65,7 @@ class ModelWriter(SubgoalWriter):
     def start(self, history: History, info: RolloutInfo, simulator: Simulator) -> None:
         """Decode the history frames that the model sees."""
         super().start(history, info, simulator)
+        self._camera = history.camera
         places = spread(0, len(history), self._frames)
         self._history: list[Part] = [history.video(places, self._fps)] if places else []
         self._goal = info.goal
@@ -77,12 +78,12 @@ class ModelWriter(SubgoalWriter):
     def watch(self, observations: Sequence[Observation]) -> None:
         """Keep the last live frames, if the prompt shows them."""
         for one in observations:
-            self._seen.append(one.images[CAMERA])
+            self._seen.append(one.images[self._camera])
             self._count += 1
 
     def next(self, observation: Observation, step: int) -> Subgoal:
         """Ask the model; an invalid answer leaves the subgoal unchanged."""
-        image = observation.images[CAMERA]
+        image = observation.images[self._camera]
         size = (image.shape[0], image.shape[1])
         recent = self._recent_frames()
         images = {number: self._seen[number - self._count] for number in recent}

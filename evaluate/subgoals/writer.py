@@ -15,17 +15,20 @@ from robomme_interference_data.evaluate.run.history import HistoryReader
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Observation, Simulator
 
-CAMERA = "front"
-
 ORACLE = "oracle"
 """Name of the writer that reads the simulator."""
 
 
 class History:
-    """The history frames that a policy gets, of the front camera; decoded on request."""
+    """The history frames that a policy gets, of the first camera; decoded on request."""
 
     def __init__(self, buffer: Buffer, given: Sequence[int], reader: HistoryReader):
         self._buffer, self._given, self._reader = buffer, given, reader
+
+    @property
+    def camera(self) -> str:
+        """The camera of the frames; subgoals' points are in its live images."""
+        return self._buffer.query.dataset.camera()
 
     def __len__(self) -> int:
         return len(self._given)
@@ -33,8 +36,8 @@ class History:
     def frames(self, places: Sequence[int]) -> NDArray[np.uint8]:
         """Decode frames by their ascending places, `(n, H, W, 3) uint8` RGB."""
         indices = [self._given[place] for place in places]
-        chunks = self._reader.stream(self._buffer, 64, (CAMERA,), indices)
-        return np.concatenate([chunk.frames[CAMERA] for chunk in chunks])
+        chunks = self._reader.stream(self._buffer, 64, (self.camera,), indices)
+        return np.concatenate([chunk.frames[self.camera] for chunk in chunks])
 
     def video(self, places: Sequence[int], fps: float | None = None) -> Video:
         """Decode frames as a video of `fps` frames per second; None for the recorded pace."""

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import torch
 
-from robomme_interference_data.cli.hints import error_lines
+from robomme_interference_data.cli.hints import shown_error
 from robomme_interference_data.errors import InterferenceError
 
 
@@ -73,7 +73,7 @@ def run(main: Callable[[argparse.Namespace], None], args: argparse.Namespace) ->
         main(args)
     except InterferenceError as error:
         options = {name: f"--{name.replace('_', '-')}" for name in vars(args)}
-        raise SystemExit("error: " + "\n".join(error_lines(error, options))) from None
+        raise SystemExit("error: " + "\n".join(shown_error(error, options).lines)) from None
     except OSError as error:
         raise SystemExit(f"error: {error}") from None
     except KeyboardInterrupt:

@@ -22,6 +22,7 @@ from torch.nn import functional
 from torch.utils.data import BatchSampler, DataLoader
 
 from robomme_interference_data import load_buffer_set
+from robomme_interference_data.constants import CAMERA_PREFIX
 from robomme_interference_data.errors import FormatError, InvalidOptionError
 from robomme_interference_data.storage.files import atomic_path
 from robomme_interference_data.training import HistoryDataset
@@ -44,7 +45,7 @@ def arguments() -> argparse.Namespace:
     add("--conditions", conditions, type=weights, default="k0,k1,k3,k7", metavar="NAMES")
     add("--memory", "framesamp:N, window:N or full", default="framesamp:32")
     add("--retrieval", "encoder of a retrieval step before the memory, such as thumbnail")
-    add("--cameras", "NAME,…", type=names, default="front", metavar="NAMES")
+    add("--cameras", "NAME,…; the first if left out", type=names, metavar="NAMES")
     add("--image-size", "side of the images in pixels", type=whole(4, 4), default=64)
     add("--families", "NAME,…; all if left out", type=names, default=(), metavar="NAMES")
     add("--episodes", "indices of the episodes to use, such as 0-79; all if left out")
@@ -99,7 +100,7 @@ def main(args: argparse.Namespace) -> None:
         task=args.task,
         data=buffer_set.revision,
         memory=args.memory,
-        cameras=args.cameras,
+        cameras=tuple(name.removeprefix(CAMERA_PREFIX) for name in data.cameras),
         image_size=args.image_size,
         points=item["question.points"].shape[1] if args.task == "answer" else 1,
         state=len(item["observation.state"]),

@@ -3,7 +3,7 @@
 from dataclasses import asdict
 from operator import attrgetter
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,6 +22,11 @@ from .options import (
     QueryName,
     with_settings,
 )
+
+if TYPE_CHECKING:
+    from robomme_interference_data.data.buffer import Buffer
+    from robomme_interference_data.data.buffer_set import BufferSet
+    from robomme_interference_data.schema.shifts import Shift
 
 
 def list_buffers(
@@ -96,18 +101,26 @@ def show(
     episode: QueryName,
     condition: ConditionName,
     out: Picture = None,
-    camera: Annotated[
-        str | None, typer.Option(help="Camera to draw; default: front, or else the first.")
+    html: Annotated[
+        Path | None, typer.Option(help="Web page to write, with the videos in it, .html.")
     ] = None,
-    shift: Annotated[str, typer.Option(help=f"{SHIFT_HELP} Requires --out.")] = NO_SHIFT,
+    camera: Annotated[
+        str | None,
+        typer.Option(help="Camera of --out (default: the first) and --html (default: all)."),
+    ] = None,
+    shift: Annotated[str, typer.Option(help=f"{SHIFT_HELP} Needs --out or --html.")] = NO_SHIFT,
     as_json: AsJson = False,
 ) -> None:
-    """Show the sessions of one buffer as a table, and as a film strip with --out.
+    """Show the sessions of one buffer as a table; as a film strip (--out) or a web page (--html).
+
+    The page plays the stored videos, and shows what an even sample and retrieval keep. It needs no
+    other file: it takes about 18 KB per frame and camera of 256 × 256 pixels.
 
     Examples:
     ```
     robomme-interference show my-buffers VideoRepick/test/7 k3
     robomme-interference show my-buffers VideoRepick/test/7 k7 --out strip.png
+    robomme-interference show my-buffers VideoRepick/test/7 k7 --html page.html
     robomme-interference show my-buffers MoveCube/test/0 k1 --shift light:2 --out strip.png
     ```
     """
@@ -116,22 +129,25 @@ def show(
     from robomme_interference_data.schema.codec import to_dict
     from robomme_interference_data.viz.tables import Table
 
-    check_output(out)
+    check_output(out, html)
     scene_shift = parse_shift(shift)
-    if scene_shift is not None and out is None:
-        raise InvalidOptionError(
-            f"--shift {shift} has no effect without --out", "Add --out strip.png, or omit --shift."
-        )
+    for name, given in (("shift", scene_shift and shift), ("camera", camera)):
+        if given is not None and out is None and html is None:
+            raise InvalidOptionError(
+                f"--{name} {given} has no effect without --out or --html",
+                f"Add --out strip.png or --html page.html, or omit --{name}.",
+            )
     opened = load_buffer_set(buffer_set)
     buffer = opened.load(episode, condition)
     if out is not None:
-        from robomme_interference_data.viz.filmstrip import draw_strip, shown_camera
+        from robomme_interference_data.viz.filmstrip import draw_strip
 
-        camera = camera or shown_camera(buffer)
-        buffer.query.dataset.shape(camera)  # raises for an unknown one
-        live = live_frame(opened, buffer, scene_shift, camera)
-        draw_strip(buffer, out, camera=camera, live=live)
+        drawn = buffer.query.dataset.camera(camera)
+        live = live_frame(opened, buffer, scene_shift, drawn)
+        draw_strip(buffer, out, camera=drawn, live=live)
         print_status(f"{out} written")
+    if html is not None:
+        _write_page(opened, buffer, html, camera, scene_shift)
     manifest, evidence = buffer.manifest, buffer.evidence
     if as_json:
         spans = None if evidence is None else [one.to_dict() for one in evidence]
@@ -162,6 +178,37 @@ def show(
         f"\n{len(buffer)} history frames; {manifest.lesson_share:.0%} of an even 32-frame sample "
         "are of the lesson"
     )
+
+
+def _write_page(
+    opened: "BufferSet", buffer: "Buffer", html: Path, camera: str | None, shift: "Shift | None"
+) -> None:
+    """Write the page of a buffer, with what retrieval chooses by each encoder that has an index."""
+    from robomme_interference_data.constants import DISTRACTORS
+    from robomme_interference_data.data.embeddings import indexed_encoders
+    from robomme_interference_data.data.views import live_embedding, live_frame
+    from robomme_interference_data.retrieval.encoders import published_threshold
+    from robomme_interference_data.retrieval.explain import explain
+    from robomme_interference_data.retrieval.select import Rule, choose, measure
+    from robomme_interference_data.viz.buffer_page import RetrievedPart, write_page
+
+    if html.suffix.lower() not in (".html", ".htm"):
+        raise InvalidOptionError.expected("--html", str(html), "a name that ends in .html")
+    dataset = buffer.query.dataset
+    cameras = (dataset.camera(camera),) if camera or not buffer.cameras else buffer.cameras
+    retrieved = []
+    encoders = indexed_encoders(opened.datasets[DISTRACTORS], cameras[0]) if len(buffer) else []
+    for name in encoders:
+        rule = Rule.parse("max", published_threshold(name))
+        query = live_embedding(opened, buffer, shift, name, cameras[0])
+        measured = measure(buffer, name, cameras[0], query)
+        choice = choose(measured, rule)
+        grade = explain(buffer, measured, choice, rule, name, cameras[0]).graded()
+        retrieved.append(RetrievedPart(f"{name}/{rule}", choice.frames.tolist(), grade))
+    buffer.fetch(cameras)
+    live = {name: live_frame(opened, buffer, shift, name) for name in cameras}
+    size = write_page(opened, buffer, html, live, retrieved)
+    print_status(f"{html} written, {size / 1e6:,.1f} MB with {counted(len(cameras), 'camera')}")
 
 
 def show_question(

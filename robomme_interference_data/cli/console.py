@@ -38,6 +38,7 @@ def log_to_stderr() -> None:
     logger = logging.getLogger("robomme_interference_data")
     logger.handlers = [_Messages()]
     logger.setLevel(logging.INFO)
+    logger.propagate = False  # libraries, such as datasets, log to stderr as well
 
 
 def check_output(*paths: Path | None) -> None:

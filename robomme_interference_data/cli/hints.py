@@ -3,6 +3,7 @@
 import re
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from robomme_interference_data.errors import InterferenceError, InvalidOptionError, NoRendererError
@@ -28,8 +29,31 @@ def option_names(root: Any, arguments: Sequence[str]) -> dict[str, str]:
     return {name: option for name, option in options.items() if option.startswith("--")}
 
 
-def error_lines(error: InterferenceError, options: Mapping[str, str]) -> list[str]:
-    """Return the message, the hint and the next command; `options` are those of `option_names`."""
+@dataclass(frozen=True)
+class ShownError:
+    """An error as the command line shows it: as lines, or with `--json` as these fields.
+
+    Attributes:
+        type: Name of its class.
+        message: What was given and what was expected.
+        hint: What to do next, or None.
+        command: A whole command that helps, or None.
+    """
+
+    type: str
+    message: str
+    hint: str | None = None
+    command: str | None = None
+
+    @property
+    def lines(self) -> list[str]:
+        """The message, the hint and the command."""
+        command = self.command and f"Run: {self.command}"
+        return [line for line in (self.message, self.hint, command) if line]
+
+
+def shown_error(error: InterferenceError, options: Mapping[str, str]) -> ShownError:
+    """Name settings in an error by their options; `options` are those of `option_names`."""
 
     def as_option(match: re.Match[str]) -> str:
         option = options.get(match["name"] or match[5])
@@ -41,6 +65,10 @@ def error_lines(error: InterferenceError, options: Mapping[str, str]) -> list[st
     name = isinstance(error, InvalidOptionError) and error.option
     if name and name in options:
         message = re.sub(rf"(?<![\w-]){re.escape(name)}\b", options[name], message, count=1)
-    lines = [_SETTING.sub(as_option, text) for text in (message, error.hint) if text]
     command = error.command or NEXT_COMMANDS.get(type(error))
-    return lines if command is None else [*lines, f"Run: {PROGRAM} {command}"]
+    return ShownError(
+        type(error).__name__,
+        _SETTING.sub(as_option, message),
+        error.hint and _SETTING.sub(as_option, error.hint),
+        command and f"{PROGRAM} {command}",
+    )

@@ -1,17 +1,19 @@
 """The root of the command line, and the display of errors. Each area declares its own commands."""
 
+import json
 import os
 import signal
 import sys
 import traceback
+from dataclasses import asdict
 from importlib import metadata
-from typing import Annotated
+from typing import Annotated, Any, NoReturn
 
 import typer
 
 from robomme_interference_data.build_dataset import commands as building
 from robomme_interference_data.cards import commands as publishing
-from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.errors import InterferenceError, first_line
 from robomme_interference_data.evaluate import commands as evaluating
 from robomme_interference_data.evaluate.score import commands as scoring
 from robomme_interference_data.evaluate.vla_eval import commands as vla_eval
@@ -22,7 +24,7 @@ from robomme_interference_data.storage.hub import check_endpoint
 from . import commands
 from .console import echo, log_to_stderr, print_status
 from .help import App, Group
-from .hints import PROGRAM, error_lines, option_names
+from .hints import PROGRAM, ShownError, option_names, shown_error
 
 
 class _Root(Group):
@@ -90,6 +92,10 @@ _GROUPS = {
 """Commands by title, in their order of use."""
 
 
+_USAGE_ERROR: Any = typer.BadParameter.__mro__[1]
+"""Click's error for a command that is called in a wrong way; Typer gives it no name."""
+
+
 def _print_version(requested: bool) -> None:
     if requested:
         echo(f"{PROGRAM} {metadata.version('robomme-interference-data')}")
@@ -117,34 +123,54 @@ for _commands in _GROUPS.values():
 
 
 def main() -> None:
-    """Run the command line; print known errors without a traceback."""
+    """Run the command line; print known errors without a traceback.
+
+    With `--json`, an error is one line of JSON, the last one on stderr: see `ShownError`.
+    """
     log_to_stderr()
     command = typer.main.get_command(app)
+    as_json = "--json" in sys.argv[1:]
     try:
-        command(prog_name=PROGRAM)
+        # Outside its standalone mode, Typer returns the exit code and raises errors of usage.
+        sys.exit(command(prog_name=PROGRAM, standalone_mode=not as_json))
     except InterferenceError as error:
-        _fail(*error_lines(error, option_names(command, sys.argv[1:])))
+        _fail(shown_error(error, option_names(command, sys.argv[1:])), as_json)
+    except _USAGE_ERROR as error:  # only with --json
+        name, hint = type(error).__name__, None
+        if error.ctx is not None:
+            hint = f"Try: {error.ctx.command_path} --help"
+        _fail(ShownError(name, error.format_message(), hint), as_json, error.exit_code)
+    except typer.Abort as error:
+        _fail(ShownError(type(error).__name__, "aborted"), as_json)
     except KeyboardInterrupt:  # outside `graceful_interrupt`
         sys.exit(128 + signal.SIGINT)
     except BrokenPipeError:  # head or less closed stdout
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except Exception as error:
+        kind = type(error).__name__
         if not isinstance(error, OSError) or error.errno is None:  # a bug
             print_status(traceback.format_exc())
+            if as_json:
+                _fail(ShownError(kind, first_line(error)), as_json)
             sys.exit(1)
         names = [str(name) for name in (error.filename, error.filename2) if name is not None]
         hint = "Check the path, its permissions and the free disk space."
         if isinstance(error, FileExistsError | NotADirectoryError):
             hint = "The path must be a folder, but a file has this name. Use another path."
-        _fail(": ".join(filter(None, (" -> ".join(names), error.strerror))), hint)
+        message = ": ".join(filter(None, (" -> ".join(names), error.strerror)))
+        _fail(ShownError(kind, message, hint), as_json)
 
 
-def _fail(message: str, *further: str) -> None:
-    print_status(f"Error: {message}", fg=typer.colors.RED)
+def _fail(error: ShownError, as_json: bool, code: int = 1) -> NoReturn:
+    if as_json:
+        print_status(json.dumps(asdict(error)))
+        sys.exit(code)
+    first, *further = error.lines
+    print_status(f"Error: {first}", fg=typer.colors.RED)
     for line in further:
         print_status(line)
-    sys.exit(1)
+    sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -124,17 +124,19 @@ class Buffer:
         numbers = np.arange(len(self.sessions), dtype=np.int64)
         return np.repeat(numbers, list(map(len, self.sessions)))
 
-    @cached_property
+    @property
     def states(self) -> NDArray[np.float32]:
-        """Robot states, `(T, 8) float32`: 7 joint positions in rad, gripper opening; read-only."""
-        states = self.gather(
+        """Robot states, `(T, 8) float32`: 7 joint positions in rad, the gripper; a new array."""
+        return self._states.copy()
+
+    @cached_property
+    def _states(self) -> NDArray[np.float32]:
+        return self.gather(
             lambda entry: self._datasets[entry.dataset].read_vectors(
                 entry.episode_index, STATE, entry.start, entry.stop
             ),
             np.empty((0, *self.query.dataset.features[STATE]), np.float32),
         )
-        states.setflags(write=False)
-        return states
 
     def gather[Value: np.generic](
         self, read: Callable[[SessionEntry], NDArray[Value]], empty: NDArray[Value]
@@ -189,11 +191,11 @@ class Buffer:
         for dataset, episodes in episodes_of.items():  # lazily: local datasets need no paths
             dataset.files.fetch(path for one in episodes for path in dataset.files_of(*one))
 
-    def frames(self, camera: str = "front") -> NDArray[np.uint8]:
+    def frames(self, camera: str | None = None) -> NDArray[np.uint8]:
         """Decode all frames of a camera, on several threads.
 
         Args:
-            camera: Name of the camera, with or without `observation.images.`.
+            camera: Name of the camera, with or without `observation.images.`; None for the first.
 
         Returns:
             `(T, H, W, 3) uint8` RGB; a new array.
@@ -202,12 +204,13 @@ class Buffer:
             UnknownNameError: There is no such camera.
             MissingFileError, FormatError: A video cannot be read.
         """
-        out = allocate_frames(len(self), self.query.dataset.shape(camera))
-        self._fetch([[camera]] * len(self.sessions))
-        self._reader.read(camera, out)
+        name = self.query.dataset.camera(camera)
+        out = allocate_frames(len(self), self.query.dataset.shape(name))
+        self._fetch([[name]] * len(self.sessions))
+        self._reader.read(name, out)
         return out
 
-    def frame(self, index: int, camera: str = "front") -> NDArray[np.uint8]:
+    def frame(self, index: int, camera: str | None = None) -> NDArray[np.uint8]:
         """Decode one frame of the buffer, `(H, W, 3) uint8` RGB.
 
         Args:
@@ -269,18 +272,18 @@ class Buffer:
                     for image in frames[name]:
                         image[...] = next(decoders[name])
                 yield Chunk(
-                    indices_now, frames, self.states[indices_now], session_index[indices_now]
+                    indices_now, frames, self._states[indices_now], session_index[indices_now]
                 )
         finally:
             for decoder in decoders.values():
                 decoder.close()
 
-    def index(self, encoder: str, camera: str = "front") -> "BufferSetIndex":
+    def index(self, encoder: str, camera: str | None = None) -> "BufferSetIndex":
         """Open the embedding indexes of the datasets that the buffer needs.
 
         Args:
             encoder: Name of the encoder, such as `thumbnail`.
-            camera: Name of the camera, with or without `observation.images.`.
+            camera: Name of the camera, with or without `observation.images.`; None for the first.
 
         Raises:
             MissingFileError: A dataset has no embeddings of this encoder and camera, or they were
@@ -294,7 +297,7 @@ class Buffer:
         datasets = {name: self._datasets[name] for name in sorted(needed)}
         return BufferSetIndex(datasets, encoder, camera)
 
-    def embeddings(self, encoder: str, camera: str = "front") -> NDArray[np.float32]:
+    def embeddings(self, encoder: str, camera: str | None = None) -> NDArray[np.float32]:
         """Read the stored embeddings of all frames; no video is decoded.
 
         Args and errors are those of `index`.
@@ -308,7 +311,7 @@ class Buffer:
             np.empty((0, index.size), np.float32),
         )
 
-    def query_embedding(self, encoder: str, camera: str = "front") -> NDArray[np.float32]:
+    def query_embedding(self, encoder: str, camera: str | None = None) -> NDArray[np.float32]:
         """Read the stored embedding of the first live observation, `(D,) float32`.
 
         Use it to grade retrieval without a simulator; a rollout embeds the live image instead.

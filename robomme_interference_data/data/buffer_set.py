@@ -6,10 +6,12 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import (
@@ -32,7 +34,7 @@ from robomme_interference_data.errors import (
     counted,
 )
 from robomme_interference_data.ids import EpisodeId, whole_number
-from robomme_interference_data.schema.codec import from_table, to_dict
+from robomme_interference_data.schema.codec import arrow_schema, from_table, to_dict, to_pandas
 from robomme_interference_data.schema.conditions import Condition, datasets_of, parse_condition
 from robomme_interference_data.schema.manifest import BufferManifest, ManifestHeader
 from robomme_interference_data.storage.files import (
@@ -51,6 +53,8 @@ from .query import Query
 from .query_sessions import SessionSource
 
 if TYPE_CHECKING:
+    import pandas
+
     from robomme_interference_data.storage.cache import DecodedCache
 
 logger = logging.getLogger(__name__)
@@ -312,6 +316,36 @@ class BufferSet:
         Raises:
             UnknownNameError: No buffer has this family, condition or difficulty.
         """
+        return self._records(self._matching(family, condition, k, difficulty))
+
+    def to_pandas(
+        self,
+        *,
+        family: str | Sequence[str] | None = None,
+        condition: Condition | str | Sequence[Condition | str] | None = None,
+        k: int | None = None,
+        difficulty: str | None = None,
+    ) -> "pandas.DataFrame":
+        """Return the manifests as a pandas `DataFrame`, a row per buffer; see `manifests`.
+
+        Its columns are those of `buffers.parquet`; `sessions` holds a list of dicts.
+
+        Raises:
+            MissingExtraError: pandas is not installed.
+            UnknownNameError: No buffer has this family, condition or difficulty.
+        """
+        tables = [*self._tables(self._matching(family, condition, k, difficulty))]
+        none = arrow_schema(BufferManifest).empty_table()
+        return to_pandas(pa.concat_tables(tables) if tables else none)
+
+    def _matching(
+        self,
+        family: str | Sequence[str] | None,
+        condition: Condition | str | Sequence[Condition | str] | None,
+        k: int | None,
+        difficulty: str | None,
+    ) -> NDArray[np.bool_]:
+        """Return whether each row has all the given properties."""
         given = (condition,) if isinstance(condition, Condition | str) else tuple(condition or ())
         if k is not None:
             given = (self.planned(given[0] if given else None, k),)
@@ -328,18 +362,22 @@ class BufferSet:
                     raise UnknownNameError.among(column, value, self.location, known)
             if values:
                 keep &= np.array([one in values for one in self._keys[column]])
-        return self._read_rows(keep)
+        return keep
 
     def planned_manifests(self) -> Iterator[BufferManifest]:
         """Yield the manifests of all buffers, including those that a partial copy lacks."""
-        return self._read_rows(np.ones(self.planned_buffers, bool))
+        return self._records(np.ones(self.planned_buffers, bool))
 
-    def _read_rows(self, keep: NDArray[np.bool_]) -> Iterator[BufferManifest]:
+    def _records(self, keep: NDArray[np.bool_]) -> Iterator[BufferManifest]:
+        return chain.from_iterable(
+            from_table(BufferManifest, table, self._path) for table in self._tables(keep)
+        )
+
+    def _tables(self, keep: NDArray[np.bool_]) -> Iterator[pa.Table]:
         for first in range(0, len(keep), _BATCH_ROWS):
             mask = keep[first : first + _BATCH_ROWS]
             if mask.any():
-                table = self._rows.part(first, first + len(mask)).table()
-                yield from from_table(BufferManifest, table.filter(mask), self._path)
+                yield self._rows.part(first, first + len(mask)).table().filter(mask)
 
     def load(
         self,

@@ -8,6 +8,7 @@ It is a LeRobot dataset in which every episode has its own files, with our colum
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -163,17 +164,42 @@ class Dataset:
 
     @cached_property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras, such as `front` and `wrist`, sorted."""
+        """Names of the cameras, such as `front` and `wrist`, sorted; the first is every default."""
         names = (n for n in self.features if n.startswith(CAMERA_PREFIX))
         return tuple(sorted(name.removeprefix(CAMERA_PREFIX) for name in names))
 
-    def shape(self, camera: str) -> tuple[int, ...]:
-        """Return the shape of a camera's frames, `(H, W, 3)`.
+    def camera(self, name: str | None = None, option: str = "camera") -> str:
+        """Return the name of a camera without `observation.images.`: every default is taken here.
+
+        Args:
+            name: Name of the camera, with or without `observation.images.`; None for the first.
+            option: The setting that takes the name, for errors.
+
+        Raises:
+            UnknownNameError: There is no such camera, or none at all.
+        """
+        plain = None if name is None else camera_feature(name).removeprefix(CAMERA_PREFIX)
+        if not self.cameras:
+            raise UnknownNameError(
+                f"{self._name} was stored without images; a camera is needed",
+                "Build a buffer set with `cameras`, such as front.",
+            )
+        if plain is None:
+            return self.cameras[0]
+        if plain not in self.cameras:
+            raise UnknownNameError(
+                f"camera {plain!r} is not in {self._name}",
+                f"Set `{option}` to one of its cameras: {', '.join(self.cameras)}.",
+            )
+        return plain
+
+    def shape(self, camera: str | None = None) -> tuple[int, ...]:
+        """Return the shape of a camera's frames, `(H, W, 3)`; see `camera`.
 
         Raises:
             UnknownNameError: There is no such camera.
         """
-        return self.features[self._camera(camera)]
+        return self.features[self._feature(camera)]
 
     def record(self, episode_index: int) -> EpisodeRecord:
         """Return the record of an episode.
@@ -238,14 +264,24 @@ class Dataset:
     def files_of(self, episode_index: int, cameras: Iterable[str]) -> list[str]:
         """Return the paths of the files that hold an episode's vectors and the given cameras."""
         stored = self.lerobot.locate(episode_index)
-        return [stored.data, *(stored.videos[self._camera(camera)][0] for camera in cameras)]
+        return [stored.data, *(stored.videos[self._feature(camera)][0] for camera in cameras)]
 
-    def index(self, encoder: str, camera: str = "front") -> "EmbeddingIndex":
+    def video_of(self, episode_index: int, camera: str) -> tuple[Path, int]:
+        """Return the video file of an episode, and the number of its first frame there.
+
+        Raises:
+            UnknownNameError: There is no such camera.
+            MissingFileError: The file is missing.
+        """
+        path, first = self.lerobot.locate(episode_index).videos[self._feature(camera)]
+        return self.files.path(path), first
+
+    def index(self, encoder: str, camera: str | None = None) -> "EmbeddingIndex":
         """Return the embeddings of the stored frames, opened once.
 
         Args:
             encoder: Name of the encoder, such as `thumbnail`.
-            camera: Name of the camera, with or without `observation.images.`.
+            camera: Name of the camera; None for the first.
 
         Raises:
             UnknownNameError: There is no such camera.
@@ -257,23 +293,23 @@ class Dataset:
 
         if not isinstance(encoder, str):
             raise InvalidOptionError.expected("encoder", encoder, "its name, such as 'thumbnail'")
-        key = encoder, self._camera(camera)
+        key = encoder, self.camera(camera)
         if key not in self._indexes:
-            self._indexes[key] = EmbeddingIndex(self.files, self.revision, encoder, camera)
+            self._indexes[key] = EmbeddingIndex(self.files, self.revision, *key)
         return self._indexes[key]
 
     def iter_frames(
-        self, episode_index: int, camera: str, start: int, stop: int
+        self, episode_index: int, camera: str | None, start: int, stop: int
     ) -> Iterator[NDArray[np.uint8]]:
         """Decode frames `start` to `stop` (excluded) of an episode, `(H, W, 3) uint8`, in order.
 
         Raises:
             MissingFileError, FormatError: See `video.iter_frames`.
         """
-        return self.lerobot.iter_frames(episode_index, self._camera(camera), start, stop)
+        return self.lerobot.iter_frames(episode_index, self._feature(camera), start, stop)
 
     def read_frames(
-        self, episode_index: int, camera: str, start: int, out: NDArray[np.uint8]
+        self, episode_index: int, camera: str | None, start: int, out: NDArray[np.uint8]
     ) -> None:
         """Decode frames from `start` on into `out`, `(T, H, W, 3) uint8`.
 
@@ -324,14 +360,5 @@ class Dataset:
             raise FormatError.damaged(path, f"not the SHA-256 in {IDENTITY_PATH}")
         return read_sums(path)
 
-    def _camera(self, camera: str) -> str:
-        name = camera_feature(camera)
-        if name not in self.features:
-            plain = camera.removeprefix(CAMERA_PREFIX)
-            if not self.cameras:
-                raise UnknownNameError(
-                    f"{self._name} was stored without images; camera {plain!r} is needed",
-                    "Build a buffer set with `cameras`, such as front.",
-                )
-            raise UnknownNameError.among("camera", plain, self._name, self.cameras)
-        return name
+    def _feature(self, camera: str | None) -> str:
+        return camera_feature(self.camera(camera))

@@ -125,7 +125,7 @@ def encoder_id(encoder: str) -> str:
     return kind if model == PAPER_ENCODER else f"{kind}:{model}"
 
 
-def index_folder(encoder: str, camera: str = "front") -> str:
+def index_folder(encoder: str, camera: str) -> str:
     """Return the folder of an index inside a dataset, such as `index/thumbnail@wrist`.
 
     Of a model's id, only the last part is used: `index/siglip-siglip2-base-patch16-224`.
@@ -135,6 +135,17 @@ def index_folder(encoder: str, camera: str = "front") -> str:
     camera = camera.removeprefix(CAMERA_PREFIX)
     parts = [name] if camera == "front" else [name, camera]
     return f"{INDEX_DIR}/{'@'.join(re.sub(r'[^A-Za-z0-9._-]+', '-', part) for part in parts)}"
+
+
+def indexed_encoders(dataset: "Dataset", camera: str) -> list[str]:
+    """Return the names of the encoders of which a dataset has embeddings of a camera, sorted."""
+    names = []
+    for path in dataset.files.list(INDEX_DIR, INDEX_HEADER):
+        header = read_header(dataset.files.path(path), IndexHeader)
+        # An index that is being made is in a hidden folder.
+        if header.camera == camera and path.startswith(index_folder(header.encoder.name, camera)):
+            names.append(header.encoder.name)
+    return sorted(names)
 
 
 def center_of(episodes: Iterable[NDArray[np.float16]]) -> NDArray[np.float32]:
@@ -165,7 +176,7 @@ class EmbeddingIndex:
     `remedy` is the hint and the command of errors: how to make the index.
     """
 
-    def __init__(self, files: Files, revision: str, encoder: str, camera: str = "front"):
+    def __init__(self, files: Files, revision: str, encoder: str, camera: str):
         self._files = files
         self._checked: set[str] = set()
         self._folder = index_folder(encoder, camera)
@@ -298,10 +309,10 @@ class BufferSetIndex:
         datasets: The datasets that are needed, among them the distractor units, whose index
             (`units`) has the center and the typical cosine of all.
         encoder: Name of the encoder, such as `thumbnail`.
-        camera: Name of the camera, with or without `observation.images.`.
+        camera: Name of the camera; None for the first.
     """
 
-    def __init__(self, datasets: Mapping[str, "Dataset"], encoder: str, camera: str = "front"):
+    def __init__(self, datasets: Mapping[str, "Dataset"], encoder: str, camera: str | None):
         if DISTRACTORS not in datasets:
             raise MissingFileError(f"embeddings need the {DISTRACTORS}, which are missing")
         self._indexes = {name: one.index(encoder, camera) for name, one in datasets.items()}

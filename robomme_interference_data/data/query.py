@@ -104,8 +104,8 @@ class Query:
             sessions=sessions,
         )
 
-    def frame(self, camera: str = "front") -> NDArray[np.uint8]:
-        """Decode the first live observation, `(H, W, 3) uint8` RGB.
+    def frame(self, camera: str | None = None) -> NDArray[np.uint8]:
+        """Decode the first live observation, `(H, W, 3) uint8` RGB; of the first camera by default.
 
         Raises:
             UnknownNameError: There is no such camera.

@@ -15,7 +15,7 @@ from .loading import open_dataset
 
 
 def live_frame(
-    buffer_set: BufferSet, buffer: Buffer, shift: Shift | None, camera: str = "front"
+    buffer_set: BufferSet, buffer: Buffer, shift: Shift | None, camera: str | None = None
 ) -> NDArray[np.uint8]:
     """Decode the stored first live view of a buffer's query, `(H, W, 3) uint8` RGB."""
     if shift is None:
@@ -26,7 +26,11 @@ def live_frame(
 
 
 def live_embedding(
-    buffer_set: BufferSet, buffer: Buffer, shift: Shift | None, encoder: str, camera: str = "front"
+    buffer_set: BufferSet,
+    buffer: Buffer,
+    shift: Shift | None,
+    encoder: str,
+    camera: str | None = None,
 ) -> NDArray[np.float32]:
     """Read the embedding of the stored first live view of a buffer's query, `(D,) float32`."""
     if shift is None:

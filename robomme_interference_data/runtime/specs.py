@@ -18,6 +18,9 @@ from robomme_interference_data.lazy import load_extra
 
 Factory = Callable[..., Any]
 
+OWN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+"""`MODULE:NAME`, a class or function of the user."""
+
 _TYPES = {
     str: "text",
     int: "a whole number",
@@ -79,11 +82,11 @@ class Registry:
         """Parse a text: `UnknownNameError` for an unknown kind, else `InvalidOptionError`."""
         name, colon, target = text.partition(":")
         if name not in self.kinds:
-            forms = ", ".join(kind.form for kind in self.kinds.values())
-            forms += f", {self._also}" if self._also else ""
+            hint = nearest(name, self.kinds, more="")
+            if "python" in self.kinds and OWN.fullmatch(text):
+                hint = f"For a class or function of your own, write python:{text}."
             raise UnknownNameError(
-                f"there is no {self._what} {text!r}; expected {forms}",
-                nearest(name, self.kinds, more=""),
+                f"there is no {self._what} {text!r}; expected {self.forms}", hint
             )
         kind = self.kinds[name]
         target = target if colon else kind.default
@@ -91,6 +94,11 @@ class Registry:
         if match is None or bool(colon) > bool(target) or not kind.valid(target):
             raise InvalidOptionError.expected(self._what, text, kind.form)
         return Spec(name, target, {**kind.given, **match.groupdict()})
+
+    @property
+    def forms(self) -> str:
+        """The syntax of all kinds, for messages."""
+        return ", ".join(filter(None, [*(kind.form for kind in self.kinds.values()), self._also]))
 
     def pin(self, text: str) -> str:
         """Return the full text, with the commit of a model on the Hub: a branch may move."""

@@ -15,7 +15,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import pyarrow as pa
 
-from robomme_interference_data.errors import FormatError, first_line
+from robomme_interference_data.errors import FormatError, MissingExtraError, first_line
 from robomme_interference_data.ids import EpisodeId
 
 _SCALARS: dict[Any, tuple[pa.DataType, tuple[type, ...], str]] = {
@@ -84,6 +84,17 @@ def _column(field: pa.Field, records: Sequence[Any]) -> pa.Array:
     items = pa.array(converted, field.type.value_type).take(order)
     offsets = pa.array([0, *accumulate(map(len, values))], pa.int32())
     return pa.ListArray.from_arrays(offsets, items, type=field.type)
+
+
+def to_pandas(table: pa.Table) -> Any:
+    """Return a table as a pandas `DataFrame`; pandas is not a dependency of this package."""
+    try:
+        import pandas  # noqa: F401 - pyarrow imports it with a less helpful error
+    except ImportError as error:
+        raise MissingExtraError(
+            "to_pandas needs pandas, which is not installed", "Install it: pip install pandas"
+        ) from error
+    return table.to_pandas()
 
 
 def from_table[T](record: type[T], table: pa.Table, path: object) -> Iterator[T]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from robomme_interference_data.constants import ACTION, EXECUTIONS, SHIFTED, STATE
+from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, EXECUTIONS, SHIFTED, STATE
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import camera_feature
 from robomme_interference_data.data.loading import load_buffer_set
@@ -79,7 +79,7 @@ class HistoryDataset:
         buffer_set: Folder, `namespace/name` on the Hub, or a `BufferSet`.
         conditions: Names of conditions with the weights to draw them, or names with equal weights.
         memory: `framesamp:N`, `window:N` or `full`; N counts the current frame. See `Memory`.
-        cameras: Cameras of current and memory frames; may be empty.
+        cameras: Cameras of current and memory frames, possibly none of them; None for the first.
         image_size: Side of the images in pixels, see `resize`; None for no change of size.
         chunk: Actions per item. If 0, items have no actions and there is one per episode: the
             first live moment. Then the buffer set needs no executions.
@@ -112,14 +112,14 @@ class HistoryDataset:
         conditions: Mapping[str, float] | Sequence[str],
         *,
         memory: str = "framesamp:32",
-        cameras: Sequence[str] = ("front",),
+        cameras: Sequence[str] | None = None,
         image_size: int | None = None,
         chunk: int = 16,
         families: Sequence[str] = (),
         episodes: str | None = None,
         retrieval: str | None = None,
         retrieval_rule: str = "max",
-        retrieval_camera: str = "front",
+        retrieval_camera: str | None = None,
         shifts: Mapping[str, float] | None = None,
         questions: bool = False,
         redraw: bool = False,
@@ -133,8 +133,10 @@ class HistoryDataset:
                 raise InvalidOptionError.expected(option, given, f"a list of names: [{given!r}]")
         opened = isinstance(buffer_set, BufferSet)
         self.buffer_set: BufferSet = buffer_set if opened else load_buffer_set(buffer_set)  # type: ignore[assignment,arg-type]
+        if cameras is None:
+            cameras = (self.buffer_set.datasets[DEMONSTRATIONS].camera(),)
         self._arguments = dict(
-            conditions=conditions, memory=memory, cameras=tuple(cameras), image_size=image_size,
+            conditions=conditions, memory=memory, cameras=cameras, image_size=image_size,
             chunk=chunk, families=tuple(families), episodes=episodes, retrieval=retrieval,
             retrieval_rule=retrieval_rule, retrieval_camera=retrieval_camera, shifts=shifts,
             questions=questions, redraw=redraw, unit_episodes=unit_episodes, seed=seed, store=store,

@@ -55,7 +55,7 @@ def check_arguments(given: Mapping[str, Any], shifts: Sequence[str]) -> None:
     for name, default, needed in (
         ("unit_episodes", None, "redraw"),
         ("retrieval_rule", "max", "retrieval"),
-        ("retrieval_camera", "front", "retrieval"),
+        ("retrieval_camera", None, "retrieval"),
     ):
         if given[name] != default and not given[needed]:
             raise InvalidOptionError(

@@ -21,7 +21,7 @@ class QuestionTensors:
         questions = read_questions(buffer_set)
         options = max(len(one.options) for one in questions.values())
         most = max(1, *(len(points) for one in questions.values() for points in one.pixels))
-        shape = buffer_set.query(episodes[0]).dataset.shape("front")
+        shape = buffer_set.query(episodes[0]).dataset.shape()
         self._questions = [questions[one] for one in episodes]
         points = np.zeros((len(episodes), options, most, 2), np.float32)
         point_is_pad = np.ones(points.shape[:3], bool)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import CAMERA_PREFIX, SAMPLE_FRAMES, UNIT_FRAMES
+from robomme_interference_data.constants import SAMPLE_FRAMES, UNIT_FRAMES
 from robomme_interference_data.schema.manifest import Session
 from robomme_interference_data.schema.sampling import even_sample, spread
 
@@ -85,7 +85,7 @@ def mark_evidence(page: Page, buffer: "Buffer", left: float, scale: float, botto
 
 
 def draw_strip(
-    buffer: "Buffer", out: Path, *, camera: str = "front", live: NDArray[np.uint8] | None = None
+    buffer: "Buffer", out: Path, *, camera: str | None = None, live: NDArray[np.uint8] | None = None
 ) -> None:
     """Draw a buffer: its sessions, a timeline to scale, and the first live observation.
 
@@ -95,10 +95,11 @@ def draw_strip(
     Args:
         buffer: The buffer.
         out: File to write, `.png` or `.svg`.
-        camera: Name of the camera.
+        camera: Name of the camera; None for the first.
         live: Image of the first live observation, for example under a shift; None for the stored
             one.
     """
+    camera = buffer.query.dataset.camera(camera)
     with open_page(out, _WIDTH) as page:
         top = _draw_head(page, buffer, camera)
         top = _draw_sessions(page, buffer, camera, top + 0.1)
@@ -114,18 +115,11 @@ def draw_strip(
         page.height = bottom + 0.28
 
 
-def shown_camera(buffer: "Buffer") -> str:
-    """Return the default camera of a strip: the front camera if there is one."""
-    camera = min(buffer.cameras, key=lambda name: name != "front", default="front")
-    buffer.query.dataset.shape(camera)  # raises without images
-    return camera
-
-
 def strip_png(buffer: "Buffer") -> bytes:
-    """Return the strip of `shown_camera` as PNG."""
+    """Return the strip of the first camera as PNG."""
     with TemporaryDirectory() as folder:
         out = Path(folder) / "strip.png"
-        draw_strip(buffer, out, camera=shown_camera(buffer))
+        draw_strip(buffer, out)
         return out.read_bytes()
 
 
@@ -134,9 +128,8 @@ def _draw_head(page: Page, buffer: "Buffer", camera: str) -> float:
     manifest = buffer.manifest
     title = f"{buffer.episode_id}   {buffer.condition}"
     page.text(_MARGIN, 0.06, title, 10, width=0.63 * _INNER, align="left", bold=True)
-    view = camera.removeprefix(CAMERA_PREFIX)
     simulator = manifest.simulator and f"simulator {manifest.simulator}"
-    facts = ", ".join(filter(None, (f"{view} camera", simulator, manifest.difficulty)))
+    facts = ", ".join(filter(None, (f"{camera} camera", simulator, manifest.difficulty)))
     right = _WIDTH - _MARGIN
     page.text(right, 0.1, facts, 6.5, width=0.35 * _INNER, align="right", color=_GRAY)
     y = 0.28

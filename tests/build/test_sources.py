@@ -125,6 +125,9 @@ def test_actions_marks_and_a_camera_may_be_missing(tmp_path: Path, layout: str) 
         ("frames", "frames:FOLDER"),
         ("robome-h5:recordings", "'robomme-h5'"),
         ("tabletop:fast", "tabletop"),
+        ("lamp:Lamp", "PYTHONPATH"),
+        ("support.nowhere:Lamp", "PYTHONPATH"),
+        ("frame:recordings", "frames:FOLDER"),
     ],
 )
 def test_unknown_source(text: str, expected: str) -> None:

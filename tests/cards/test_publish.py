@@ -2,6 +2,7 @@
 
 import io
 import json
+import logging
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -49,6 +50,33 @@ def _unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
 def writes(hub: HubServer) -> list[str]:
     """Return the requests that change the Hub."""
     return [one for one in hub.requests if not one.startswith(("GET", "HEAD"))]
+
+
+def test_a_dry_run_needs_the_light_core_only(
+    hub: HubServer, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publish(GOLDEN)
+    sent = writes(hub)
+    for name in ("lerobot", "datasets", "jinja2", "matplotlib"):
+        monkeypatch.setitem(sys.modules, name, None)
+    words = ("publish", GOLDEN, "--repo-id", UNITS, "--demonstrations-id", LESSONS, "--json")
+    code, out, err = run(*words, "--dry-run")
+    assert code == 0 and 'pip install "robomme-interference-data[build,score]"' in err
+    assert [(one["sent_files"], one["removed_files"]) for one in json.loads(out)] == [(0, [])] * 2
+    code, out, err = run(*words, "--yes")  # before the checks, which may take hours
+    assert (code, out) == (1, "") and "[build,score]" in err
+    assert writes(hub) == sent
+
+
+def test_each_message_is_printed_once(hub: HubServer, run: Run, _unchecked: None) -> None:
+    other = logging.StreamHandler(sys.stderr)  # as libraries add one
+    logging.root.addHandler(other)
+    try:
+        words = ("publish", GOLDEN, "--repo-id", UNITS, "--demonstrations-id", LESSONS)
+        code, _, err = run(*words, "--yes")
+    finally:
+        logging.root.removeHandler(other)
+    assert code == 0 and err.count(f"{UNITS}: sending") == 1
 
 
 # --- a buffer set --------------------------------------------------------------------------------

@@ -29,12 +29,32 @@ from robomme_interference_data.errors import (
     HashMismatchError,
     InvalidIdError,
     InvalidOptionError,
+    MissingExtraError,
     MissingFileError,
     UnknownNameError,
 )
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.storage.encode import CODECS, VideoEncoder
+
+
+def test_manifests_as_a_data_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    buffer_set = load_buffer_set(GOLDEN)
+    frame = buffer_set.to_pandas()
+    assert frame.to_dict("records")[0]["sessions"].tolist() == []  # no-history
+    listed = [to_dict(one) for one in buffer_set.manifests()]
+    for name in ("episode_id", "family", "condition", "k", "lesson_share", "exact"):
+        assert frame[name].tolist() == [one[name] for one in listed]
+    sessions = frame["sessions"].iloc[-1].tolist()
+    assert sessions == listed[-1]["sessions"] and len(sessions) == 8
+    some = buffer_set.to_pandas(family="MoveCube", condition=["k3", "k7"])
+    assert (some["family"] + some["condition"]).tolist() == ["MoveCubek3", "MoveCubek7"]
+    with pytest.raises(UnknownNameError):
+        buffer_set.to_pandas(k=5)
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(MissingExtraError) as raised:
+        buffer_set.to_pandas()
+    assert raised.value.hint == "Install it: pip install pandas"
 
 
 def test_what_a_buffer_set_lists() -> None:

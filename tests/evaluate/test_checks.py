@@ -66,6 +66,7 @@ SAYS = {"policy": "python:support.own_policies:says"}
         (STEP | {"system": "retrieval-framesamp-modul"}, InvalidOptionError, "nothing to retrieve"),
         ({"system": "retrieval-framesamp-modul"}, InvalidOptionError, "`retrieval` is None"),
         ({"retrieval_rule": "oracle"}, InvalidOptionError, "`retrieval_rule` has no effect"),
+        ({"retrieval": "foo", "policy": "lerobot:no/where"}, UnknownNameError, "no encoder 'foo'"),
         (STEP | {"retrieval_camera": "nose"}, UnknownNameError, "camera 'nose'"),
         (STEP, MissingFileError, "'thumbnail'"),
         (SAYS | {"policy_options": ("what=nan",)}, PolicyError, "holds nan"),
@@ -155,9 +156,11 @@ def test_the_simulator_is_made_before_the_folder_and_only_for_remaining_rollouts
         run_one(tmp_path / "whole", conditions=("no-history", "k0"), **sample)
 
 
-def test_only_cameras_in_use_are_rendered() -> None:
+def test_only_cameras_in_use_are_rendered(tiny_buffers: Path) -> None:
+    demonstrations = load_buffer_set(tiny_buffers).datasets["demonstrations"]
+
     def options(name: str, *watched: str, **changes: Any) -> dict[str, Any]:
-        return simulator_options(config(simulator=name, **changes), watched)
+        return simulator_options(config(simulator=name, **changes), watched, demonstrations)
 
     assert options("tabletop") == {"cameras": (), "shift": "none"}
     assert options("tabletop", shift="light:2") == {"cameras": (), "shift": "light:2"}

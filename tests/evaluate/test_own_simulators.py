@@ -80,7 +80,8 @@ def test_another_shape_of_an_undeclared_simulator(tiny_buffers: Path) -> None:
         check_episode(query, lesson, Observation(first.images, first.state + 1), info)
 
 
-def test_settings_are_those_that_a_class_declares_or_a_function_takes() -> None:
+def test_settings_are_those_that_a_class_declares_or_a_function_takes(tiny_buffers: Path) -> None:
+    demonstrations = load_buffer_set(tiny_buffers).datasets["demonstrations"]
     given = {"cameras": ("top",), "shift": "none", "python": None}
     for name in ("Listed", "make_listed"):
         assert accepted_settings(OWN + name, given) == {"cameras": ("top",)}
@@ -90,7 +91,7 @@ def test_settings_are_those_that_a_class_declares_or_a_function_takes() -> None:
     assert classes[2] is Simulator
 
     def options(name: str, *watched: str, **changes: Any) -> dict[str, Any]:
-        return simulator_options(config(simulator=OWN + name, **changes), watched)
+        return simulator_options(config(simulator=OWN + name, **changes), watched, demonstrations)
 
     assert options("Played", "wrist") == {"cameras": ("wrist",)}
     assert options("Played") == {"cameras": ()}  # draws nothing for nobody

@@ -43,6 +43,7 @@ def test_a_policy_is_parsed() -> None:
     ("text", "error", "words"),
     [
         ("websockets://a:1", UnknownNameError, "Did you mean 'websocket'?"),
+        ("lamp:Lamp", UnknownNameError, "write python:lamp:Lamp"),
         ("zzz", UnknownNameError, "expected replay, replay:framesamp or replay:window, recall,"),
         *(
             (text, InvalidOptionError, f"policy '{text}'; expected {text.partition(':')[0]}")

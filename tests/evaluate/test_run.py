@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pandas
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -41,6 +42,9 @@ def test_a_run_writes_a_row_for_every_rollout(tmp_path: Path) -> None:
     assert start["policy"] == {"policy": "cheat"} and start["started"] <= start["ended"]
     assert {"numpy", "python", "robomme-interference-data"} <= set(start["versions"])
     assert start["settings"]["conditions"] == ["k7", "no-history", "k0"]
+    frame, stored = result.to_pandas(), pandas.read_parquet(tmp_path / "run" / "rollouts.parquet")
+    pandas.testing.assert_frame_equal(frame, stored)
+    assert frame["success"].tolist() == [row.success for row in result.rows]
 
 
 # --- resume ------------------------------------------------------------------------------------

@@ -46,7 +46,7 @@ def test_cells_of_uneven_size_are_means() -> None:
     ],
 )
 def test_folders(encoder: str, folder: str) -> None:
-    assert index_folder(encoder) == index_folder(encoder, "observation.images.front") == folder
+    assert index_folder(encoder, "front") == folder
     assert index_folder(encoder, "wrist") == f"{folder}@wrist"
 
 
@@ -58,8 +58,8 @@ def test_a_model_in_a_folder_is_called_by_its_name(
     monkeypatch.chdir(folder)
     for model in (".", "../tiny", str(folder)):
         assert encoder_id(f"siglip:{model}") == "siglip:tiny"
-        assert index_folder(f"siglip:{model}") == "index/siglip-tiny"
-    assert index_folder("siglip:/") == "index/siglip-"  # not the paper's model
+        assert index_folder(f"siglip:{model}", "front") == "index/siglip-tiny"
+    assert index_folder("siglip:/", "front") == "index/siglip-"  # not the paper's model
     with pytest.raises(InvalidOptionError, match="encoder ''; expected thumbnail"):
         encoder_id("")
 

@@ -14,10 +14,10 @@ from robomme_interference_data.retrieval.selector import Selector, StoredSelecto
 
 def test_it_chooses_what_stored_embeddings_choose(indexed: Path) -> None:
     selector = Selector("thumbnail")
-    assert (selector.name, selector.camera) == ("thumbnail/max/adaptive", "front")
-    for step in (Selector, StoredSelector):
-        assert step("thumbnail", rule="mean/0.9").name == "thumbnail/mean/0.9"
     for buffer in load_buffer_set(indexed).buffers(condition="k3"):
+        assert selector.label(buffer) == "thumbnail/max/adaptive"
+        for step in (Selector, StoredSelector):
+            assert step("thumbnail", rule="mean/0.9").label(buffer) == "thumbnail/mean/0.9"
         stored = choose(measure(buffer, "thumbnail"), selector.rule)
         assert selector.select(buffer, buffer.query.frame()).tolist() == stored.frames.tolist()
         chosen = StoredSelector("thumbnail").select(load_buffer_set(indexed), buffer)

@@ -162,7 +162,7 @@ def _array(root: Path) -> None:
 
 def _index(root: Path) -> None:
     dataset = _sound_datasets(root)["distractors"]
-    index = EmbeddingIndex(dataset.files, dataset.revision, "thumbnail")
+    index = EmbeddingIndex(dataset.files, dataset.revision, "thumbnail", "front")
     assert index.span(0, 0, 1).shape == (1, index.header.size)
     index.check({index: 32 for index in range(len(dataset))}, units=True)
 

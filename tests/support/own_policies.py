@@ -40,6 +40,15 @@ class Still:
     def close(self) -> None: ...
 
 
+class Watcher(Still):
+    """Reads the camera of its option, live and in the history."""
+
+    def __init__(self, camera: str = "top"):
+        super().__init__()
+        self.cameras = self.history_cameras = (camera,)
+        self.wants_history = True
+
+
 class Told(Still):
     """Keeps the subgoals that it was told."""
 

@@ -17,6 +17,7 @@ import typer
 from support.buffer_sets import QUERIES, contents
 
 from robomme_interference_data import load_buffer_set
+from robomme_interference_data.cli import doctor
 from robomme_interference_data.cli.main import app
 from robomme_interference_data.schema.codec import to_dict
 
@@ -151,7 +152,7 @@ def test_usage_errors(arguments: list[str], message: str, run: Run) -> None:
         ("list S/nowhere", ("neither a folder nor", "namespace/name")),
         ("list S --conditions k9", ("'k9'", "--conditions no-history,k0,k1,k3,k7,k9")),
         ("show S MoveCube/test/9 k3", ("MoveCube/test/9", EPISODE)),
-        ("build distractors S/x --source frmes:S", ("frmes", "Did you mean 'frames'?")),
+        ("build distractors S/x --source frmes:S", ("frmes", "frames:FOLDER")),
     ],
 )
 def test_known_errors(arguments: str, words: tuple[str, ...], run: Run, tiny_buffers: Path) -> None:
@@ -159,6 +160,39 @@ def test_known_errors(arguments: str, words: tuple[str, ...], run: Run, tiny_buf
     assert (code, out) == (1, "")
     assert err.startswith("Error: ") and "Traceback" not in err
     assert all(text in err for text in words), err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "kind", "helps"),
+    [
+        (f"show S {EPISODE} k9", 1, "UnknownNameError", "build manifests S"),
+        (f"show S {EPISODE} k3 --camera front", 1, "InvalidOptionError", None),
+        (f"show S {EPISODE}", 2, "MissingParameter", None),
+        ("list S --nope", 2, "NoSuchOption", None),
+    ],
+)
+def test_errors_as_json(
+    arguments: str, code: int, kind: str, helps: str | None, run: Run, own_buffers: Path
+) -> None:
+    words = in_buffer_set(arguments, own_buffers)
+    plain, as_json = run(*words), run(*words, "--json")
+    assert (plain[0], as_json[0], as_json[1]) == (code, code, "")
+    error = json.loads(as_json[2].splitlines()[-1])
+    assert {*error} == {"type", "message", "hint", "command"} and error["type"] == kind
+    assert error["message"].splitlines()[0] in plain[2]
+    if helps is not None:
+        assert helps.replace("S", str(own_buffers)) in error["command"]
+
+
+def test_a_bug_as_json(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken() -> None:
+        raise KeyError("\x9bboom")
+
+    monkeypatch.setattr(doctor, "checks", broken)
+    code, out, err = run("doctor", "--json")
+    assert (code, out) == (1, "") and "Traceback" in err
+    error = json.loads(err.splitlines()[-1])
+    assert (error["type"], error["hint"]) == ("KeyError", None)
 
 
 @pytest.mark.parametrize(

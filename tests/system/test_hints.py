@@ -10,7 +10,7 @@ import typer
 
 from robomme_interference_data.cli import main
 from robomme_interference_data.cli.console import echo, log_to_stderr, print_json
-from robomme_interference_data.cli.hints import error_lines, option_names
+from robomme_interference_data.cli.hints import option_names, shown_error
 from robomme_interference_data.errors import InterferenceError, InvalidOptionError, NoRendererError
 
 EVALUATE = option_names(typer.main.get_command(main.app), ["evaluate", "my-buffers", "--json"])
@@ -37,10 +37,13 @@ EVALUATE = option_names(typer.main.get_command(main.app), ["evaluate", "my-buffe
     ],
 )
 def test_settings_are_printed_as_options(error: InterferenceError, lines: list[str]) -> None:
-    assert error_lines(error, EVALUATE) == lines
+    assert shown_error(error, EVALUATE).lines == lines
 
 
-def test_logged_control_characters_are_escaped(capsys: pytest.CaptureFixture[str]) -> None:
+def test_logged_control_characters_are_escaped(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(logging.getLogger("robomme_interference_data"), "propagate", True)
     log_to_stderr()
     logger = logging.getLogger("robomme_interference_data.storage.hub")
     logger.info("fetched %s", "\x1b[2Jname")
