@@ -7,6 +7,7 @@ from pathlib import Path
 from robomme_interference_data.constants import ACTION, IDENTITY_PATH, REPORT_PATH, STATE, UNITS
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import BuildError
+from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.files import LocalFiles, read_header
 from robomme_interference_data.storage.lerobot import LeRobotFiles
@@ -28,6 +29,11 @@ class ExistingDataset:
     dataset: Dataset
     episodes: tuple[StoredEpisode, ...]
     skipped: dict[str, str]
+
+    @property
+    def ids(self) -> set[EpisodeId]:
+        """Ids of its episodes."""
+        return {episode.record.episode_id for episode in self.episodes}
 
 
 def open_existing(out: Path, plan: BuildPlan) -> ExistingDataset | None:

@@ -20,6 +20,7 @@ from robomme_interference_data.constants import (
     FORMAT_VERSION,
     IDENTITY_PATH,
     MANIFEST_HEADER,
+    MANIFEST_PATH,
     MANIFEST_ROWS,
     MANIFESTS,
     MAX_STEPS,
@@ -31,8 +32,15 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.data.buffer_set import pending_rows
 from robomme_interference_data.data.dataset import Dataset
+from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.data.query_sessions import QuerySessions, SessionSource
-from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
+from robomme_interference_data.errors import (
+    BuildError,
+    FormatError,
+    InvalidOptionError,
+    MissingFileError,
+    SourceError,
+)
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, Condition, in_order
@@ -45,6 +53,8 @@ from robomme_interference_data.storage.files import Files, LocalFiles, sha256_fi
 from robomme_interference_data.storage.hub import HubFiles
 from robomme_interference_data.storage.parquet import writing
 from robomme_interference_data.storage.staging import staging_dir
+
+from .replan import Planned
 
 _BATCH = 1024
 """Rows in a row group: finding one buffer reads few bytes."""
@@ -73,6 +83,31 @@ def in_folder(root: Path) -> dict[str, Files]:
     """Return the datasets of the buffer set that is built in a folder, by name."""
     optional = (name for name in OPTIONAL_DATASETS if (root / name / IDENTITY_PATH).is_file())
     return {name: LocalFiles(root / name) for name in (DEMONSTRATIONS, DISTRACTORS, *optional)}
+
+
+def datasets_now(root: Path, planned: Planned | None) -> dict[str, Files]:
+    """Return the datasets of a folder as `in_folder`, or its demonstrations on the Hub."""
+    files = in_folder(root)
+    if planned is not None and not (root / DEMONSTRATIONS).is_dir():
+        location = planned.header.datasets[DEMONSTRATIONS].location
+        if location is not None:
+            files[DEMONSTRATIONS] = HubFiles.parse(location)
+    return files
+
+
+def read_planned(root: Path) -> Planned | None:
+    """Read what the buffer set in a folder plans now; None if that is nothing."""
+    if not (root / MANIFEST_PATH).is_file():
+        return None
+    try:
+        opened = load_buffer_set(root)
+        return Planned(opened.header, frozenset(opened.episode_ids))
+    except (FormatError, MissingFileError) as error:
+        raise FormatError(
+            error.message,
+            f"Restore it, or remove {root / MANIFESTS} and plan all conditions anew: which ones "
+            "were planned cannot be read.",
+        ) from None
 
 
 def plan_manifests(

@@ -21,9 +21,10 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
 from robomme_interference_data.ids import EpisodeId, parse_numbers
 from robomme_interference_data.runtime.executor import make_executor
-from robomme_interference_data.schema.conditions import datasets_of, in_order
+from robomme_interference_data.schema.conditions import datasets_of
 
-from .config import NO_CAMERAS, AllConfig, BuildConfig, NewConfig, PlanConfig, position_limit
+from .config import NO_CAMERAS, AllConfig, BuildConfig, NewConfig, PlanConfig
+from .replan import Planned, Replan, replan
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from robomme_interference_data.data.dataset import Dataset
     from robomme_interference_data.schema.draw import UnitPool
 
+    from .existing import ExistingDataset
     from .sources import Source, SourceEpisode
 
 
@@ -59,24 +61,29 @@ class BuildPlan:
     unit: Unit = PAPER_UNIT
 
 
-def plan_all(config: AllConfig, plan: PlanConfig) -> dict[str, BuildPlan]:
-    """Plan the datasets of a buffer set, and check everything known before episodes are read."""
+def plan_all(config: AllConfig, request: PlanConfig) -> tuple[dict[str, BuildPlan], Replan]:
+    """Plan a buffer set's datasets and buffers; checks everything known before frames are read."""
+    from .manifests import read_planned
+
+    planned = read_planned(config.buffer_set)
     units = dataclasses.replace(config, families=(), episodes=config.unit_episodes, split="train")
-    optional = {SHIFTED: config.shifted, EXECUTIONS: config.executions}
-    names = [*datasets_of(in_order(plan.conditions)), *(one for one in optional if optional[one])]
+    names = [*datasets_of(replan(planned, request).conditions)]
+    if config.shifted:
+        names.append(SHIFTED)
+    if config.executions:
+        names.append(EXECUTIONS)
     plans = {name: plan_build(name, units if name in UNITS else config) for name in names}
-    queries = (episode.id for _, episode in plans[DEMONSTRATIONS].tasks)
-    _check_plans(queries, plans, config.buffer_set, plan)
-    return plans
+    queries = {episode.id for _, episode in plans[DEMONSTRATIONS].tasks}
+    return plans, _check_plans(queries, plans, config.buffer_set, planned, request)
 
 
-def plan_new(config: NewConfig, plan: PlanConfig) -> "tuple[Dataset, BuildPlan]":
+def plan_new(config: NewConfig, request: PlanConfig) -> "tuple[Dataset, BuildPlan, Replan]":
     """Open published demonstrations, and plan units with their cameras; see `plan_all`."""
     from robomme_interference_data.data.dataset import Dataset
     from robomme_interference_data.storage.files import LocalFiles
     from robomme_interference_data.storage.hub import locate
 
-    from .manifests import check_needs, in_folder
+    from .manifests import check_needs, in_folder, read_planned
 
     base = Dataset(locate(config.demonstrations))
     if base.kind != DEMONSTRATIONS:
@@ -92,29 +99,59 @@ def plan_new(config: NewConfig, plan: PlanConfig) -> "tuple[Dataset, BuildPlan]"
             f"{link} exists, and is not {base.files.root}",
             "Choose another `buffer_set`, or remove the folder first.",
         )
-    check_needs(in_order(plan.conditions), in_folder(config.buffer_set))
+    planned = read_planned(config.buffer_set)
+    check_needs(replan(planned, request).conditions, in_folder(config.buffer_set))
     units = plan_build(DISTRACTORS, _with_cameras_of(base, config))
-    queries = (record.episode_id for record in base.records())
-    _check_plans(queries, {DISTRACTORS: units}, config.buffer_set, plan)
-    return base, units
+    queries = {record.episode_id for record in base.records()}
+    plans = {DISTRACTORS: units}
+    return base, units, _check_plans(queries, plans, config.buffer_set, planned, request)
+
+
+def plan_more_units(units: BuildPlan, root: "Path") -> Replan | None:
+    """Return how further units would change the buffers that are planned; None if none are."""
+    from .existing import open_existing
+    from .manifests import read_planned
+
+    planned = read_planned(root)
+    if planned is None:
+        return None
+    existing = open_existing(root.resolve() / DISTRACTORS, units)
+    return replan(planned, PlanConfig(), units_change=_adds_episodes(units, existing))
 
 
 def _check_plans(
-    queries: Iterable[EpisodeId], plans: dict[str, BuildPlan], root: "Path", plan: PlanConfig
-) -> None:
+    queries: set[EpisodeId],
+    plans: dict[str, BuildPlan],
+    root: "Path",
+    planned: Planned | None,
+    request: PlanConfig,
+) -> Replan:
+    """Check that datasets can be built or extended, and that units suffice; return the plan."""
     from robomme_interference_data.schema.draw import UnitPool
 
     from .existing import open_existing
     from .manifests import check_manifests_folder
 
-    position_limit(plan)
-    pool = UnitPool(episode.id for _, episode in plans[DISTRACTORS].tasks)
-    for query in {one.family: one for one in queries}.values():
-        for condition in in_order(plan.conditions):
+    existing = {kind: open_existing(root.resolve() / kind, one) for kind, one in plans.items()}
+    if (base := existing.get(DEMONSTRATIONS)) is not None:
+        queries = queries | base.ids
+    units, built = plans[DISTRACTORS], existing[DISTRACTORS]
+    following = replan(planned, request, queries=queries, units_change=_adds_episodes(units, built))
+    available = {episode.id for _, episode in units.tasks}
+    pool = UnitPool(available if built is None else available | built.ids)
+    for query in {one.family: one for one in sorted(queries)}.values():
+        for condition in following.conditions:
             condition.sessions(_UnreadSessions(query, pool))
-    for kind, one in plans.items():
-        open_existing(root.resolve() / kind, one)
     check_manifests_folder(root)
+    return following
+
+
+def _adds_episodes(plan: BuildPlan, existing: "ExistingDataset | None") -> bool:
+    """Return whether a dataset lacks episodes that are to be built."""
+    if existing is None:
+        return True
+    known = {*existing.skipped, *map(str, existing.ids)}
+    return any(str(episode.id) not in known for _, episode in plan.tasks)
 
 
 @dataclass(frozen=True)

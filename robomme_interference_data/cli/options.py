@@ -26,6 +26,7 @@ def split_commas(values: Sequence[str] | None) -> list[str] | None:
 _LIST: dict[str, Any] = {"callback": split_commas, "metavar": "NAME,…"}
 
 AsJson = Annotated[bool, typer.Option("--json", help="Write JSON to standard output.")]
+Yes = Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")]
 BufferSetFolder = Annotated[
     str, typer.Argument(metavar="BUFFER_SET", help="Folder of the buffer set, or NAMESPACE/NAME.")
 ]

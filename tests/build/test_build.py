@@ -244,20 +244,21 @@ def config(tmp_path: Path, *source: str, **changes: Any) -> AllConfig:
 def test_units_are_of_train_episodes(tmp_path: Path) -> None:
     plan = plan_build("distractors", config(tmp_path))
     assert {one.id.split for _, one in plan.tasks} == {"train"}
-    plans = plan_all(config(tmp_path, split="test", families=("MoveCube",)), PlanConfig())
+    plans, _ = plan_all(config(tmp_path, split="test", families=("MoveCube",)), PlanConfig())
     assert [str(one.id) for _, one in plans["demonstrations"].tasks] == ["MoveCube/test/0"]
     assert len(plans["distractors"].tasks) == 27
-    few = plan_all(config(tmp_path, episodes="0", unit_episodes="0-1"), PlanConfig())
+    few, _ = plan_all(config(tmp_path, episodes="0", unit_episodes="0-1"), PlanConfig())
     assert len(few["distractors"].tasks) == 18
 
 
 def test_views_under_shifts_and_executions_are_of_the_queries(tmp_path: Path) -> None:
     further = {"shifted": True, "executions": True}
     asked = config(tmp_path, "tabletop", split="test", episodes="0-1", **further)
-    plans = plan_all(asked, PlanConfig(("k1",)))
+    plans, change = plan_all(asked, PlanConfig(("k1",)))
     assert [*plans] == ["demonstrations", "distractors", *further]
     for name in further:
         assert plans[name].tasks == plans["demonstrations"].tasks
+    assert (change.added, change.loses) == (("k1",), False)
 
 
 @pytest.mark.parametrize("kind", ["contradictions", "shifted", "executions"])
