@@ -24,6 +24,7 @@ from robomme_interference_data.constants import (
     FPS,
     FRONT,
     STATE,
+    VALUE_NAMES,
     WRIST,
 )
 from robomme_interference_data.schema.records import EpisodeRecord
@@ -32,7 +33,7 @@ from robomme_interference_data.storage.encode import CODECS, VideoEncoder
 SIDE, LESSON = 32, 8
 CAMERAS = (FRONT, WRIST)
 FEATURES = {FRONT: (SIDE, SIDE, 3), WRIST: (SIDE, SIDE, 3), STATE: (8,)}
-ROBOT = Robot().with_names(FEATURES)
+ROBOT = Robot(FPS, names={STATE: VALUE_NAMES})
 CODEC = CODECS["av1-lossless"]
 
 

@@ -30,7 +30,7 @@ from robomme_interference_data.errors import MissingFileError, counted
 from robomme_interference_data.runtime.executor import WorkersConfig, make_executor
 
 from .config import AllConfig, BuildConfig, NewConfig, PlanConfig
-from .plan import BuildPlan, plan_all, plan_alone, plan_more_units, plan_new
+from .plan import BuildPlan, like, plan_all, plan_alone, plan_more_units, plan_new
 from .replan import Replan, replan
 
 if TYPE_CHECKING:
@@ -214,7 +214,7 @@ def questions(buffer_set: _Folder, as_json: AsJson = False) -> None:
 @app.command(name="all")
 @with_settings
 def build_all(
-    config: AllConfig, plan: PlanConfig, yes: Yes = False, as_json: AsJson = False
+    config: AllConfig, request: PlanConfig, yes: Yes = False, as_json: AsJson = False
 ) -> None:
     r"""Build demonstrations, distractors and manifests, and the datasets that conditions need.
 
@@ -228,15 +228,21 @@ def build_all(
         --conditions no-history,k0,k7,before-k7,held-k7,stale-k0
     ```
     """
+    from robomme_interference_data.data.dataset import Dataset
+    from robomme_interference_data.storage.files import LocalFiles
+
     from .manifests import in_folder
 
     with graceful_interrupt(_KEPT):
-        steps, change = plan_all(config, plan)
+        steps, change = plan_all(config, request)
         _confirm(change, yes=yes)
         taken = ", ".join(f"{kind} {len(step.tasks):,}" for kind, step in steps.items())
         print_status(f"Recorded episodes: {taken}")
         for kind, step in steps.items():
-            _build(step, config.buffer_set / kind, config, as_json=False)
+            plan = step
+            if kind != DEMONSTRATIONS:  # these are built first, so others are compared early
+                plan = like(step, Dataset(LocalFiles(config.buffer_set / DEMONSTRATIONS)))
+            _build(plan, config.buffer_set / kind, config, as_json=False)
         _plan(config.buffer_set, in_folder(config.buffer_set), change, as_json=as_json)
     print_status(f"Next: robomme-interference verify {config.buffer_set}")
 

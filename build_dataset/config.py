@@ -78,6 +78,9 @@ class BuildConfig(WorkersConfig):
         help="Source lerobot: CSV file with each episode's family and, if needed, exec_start_idx.",
         group="Sources",
     )
+    fps: float | None = setting(
+        None, help="Frames per second of recordings that do not state them.", group="Sources"
+    )
     robomme_python: str | None = setting(
         None,
         help="Source robomme: Python interpreter with RoboMME.",

@@ -71,7 +71,7 @@ def open_existing(out: Path, plan: BuildPlan) -> ExistingDataset | None:
             )
     statistics = episode_statistics(LeRobotFiles(dataset.files, statistics=True).table)
     vectors = {name: name for name in (STATE, ACTION) if name in dataset.features}
-    robot = recorded_robot(dataset.lerobot, vectors).with_names(dataset.features)
+    robot = recorded_robot(dataset.lerobot, vectors)
     episodes = map(partial(_stored, dataset, robot), dataset.records(), statistics)
     report = read_header(out / REPORT_PATH, BuildReport)
     return ExistingDataset(dataset, tuple(episodes), report.reasons)

@@ -13,7 +13,6 @@ from pathlib import Path
 import pyarrow.parquet as pq
 
 from robomme_interference_data.constants import (
-    ACTION,
     DEMONSTRATIONS,
     DISTRACTORS,
     EXECUTIONS,
@@ -54,6 +53,7 @@ from robomme_interference_data.storage.hub import HubFiles
 from robomme_interference_data.storage.parquet import writing
 from robomme_interference_data.storage.staging import staging_dir
 
+from .alike import differences, in_buffers
 from .replan import Planned
 
 _BATCH = 1024
@@ -164,16 +164,14 @@ def check_needs(conditions: Iterable[Condition], available: Collection[str]) -> 
 
 def _check_features(datasets: Mapping[str, Dataset]) -> None:
     """Check that sessions of all datasets can follow one another in a buffer."""
-    stored = {
-        name: {feature: s for feature, s in one.features.items() if feature != ACTION}
-        for name, one in datasets.items()
-    }
-    for name, features in stored.items():
-        if features != stored[DEMONSTRATIONS]:
+    looks = {name: in_buffers(dataset.features, dataset.fps) for name, dataset in datasets.items()}
+    base = (f"the {DEMONSTRATIONS}", looks[DEMONSTRATIONS])
+    for name, look in looks.items():
+        if found := differences(base, (f"the {name}", look)):
             raise SourceError(
-                "sessions of the datasets cannot follow one another in a buffer: the "
-                f"demonstrations have {stored[DEMONSTRATIONS]}, the {name} {features}",
-                "Build all with the same `cameras`, from sources with the same sizes.",
+                "sessions of the datasets cannot follow one another in a buffer: "
+                + "; ".join(found),
+                "Build all with the same `cameras`, from sources with the same rates and sizes.",
             )
 
 

@@ -1,6 +1,7 @@
 """The plan that follows from the settings of a build."""
 
 import dataclasses
+import math
 from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -23,6 +24,7 @@ from robomme_interference_data.ids import EpisodeId, parse_numbers
 from robomme_interference_data.runtime.executor import make_executor
 from robomme_interference_data.schema.conditions import datasets_of
 
+from .alike import Look, in_buffers
 from .config import NO_CAMERAS, AllConfig, BuildConfig, NewConfig, PlanConfig
 from .replan import Planned, Replan, replan
 
@@ -49,6 +51,8 @@ class BuildPlan:
         version: Version of the dataset.
         time_limit_s: Limit in seconds for one episode; None for the sources' defaults.
         unit: Size of the distractors' units; of the raw ones, too, by `Unit.of`.
+        fps: Frames per second of recordings that do not state them; None if all do.
+        like: What the episodes must look like, those of the demonstrations; None for anything.
     """
 
     kind: str
@@ -59,6 +63,8 @@ class BuildPlan:
     version: str = "1.0.0"
     time_limit_s: float | None = None
     unit: Unit = PAPER_UNIT
+    fps: float | None = None
+    like: Look | None = None
 
 
 def plan_all(config: AllConfig, request: PlanConfig) -> tuple[dict[str, BuildPlan], Replan]:
@@ -101,7 +107,7 @@ def plan_new(config: NewConfig, request: PlanConfig) -> "tuple[Dataset, BuildPla
         )
     planned = read_planned(config.buffer_set)
     check_needs(replan(planned, request).conditions, in_folder(config.buffer_set))
-    units = plan_build(DISTRACTORS, _with_cameras_of(base, config))
+    units = like(plan_build(DISTRACTORS, _with_cameras_of(base, config)), base)
     queries = {record.episode_id for record in base.records()}
     plans = {DISTRACTORS: units}
     return base, units, _check_plans(queries, plans, config.buffer_set, planned, request)
@@ -180,13 +186,21 @@ def plan_alone(kind: str, config: BuildConfig) -> BuildPlan:
     from robomme_interference_data.storage.files import LocalFiles
 
     folder = config.buffer_set / DEMONSTRATIONS
-    if kind not in (CONTRADICTIONS, SHIFTED, EXECUTIONS) or not folder.is_dir():
+    if kind == DEMONSTRATIONS or not folder.is_dir():
         return plan_build(kind, config)
     base = Dataset(LocalFiles(folder))
+    if kind in UNITS:
+        return like(plan_build(kind, config), base)
     config = _with_cameras_of(base, config)
-    if config.families or config.split or config.episodes:
-        return plan_build(kind, config)
-    return plan_build(kind, config, {record.episode_id for record in base.records()})
+    queries = None
+    if not (config.families or config.split or config.episodes):
+        queries = {record.episode_id for record in base.records()}
+    return like(plan_build(kind, config, queries), base)
+
+
+def like(plan: BuildPlan, base: "Dataset") -> BuildPlan:
+    """Return a plan of a dataset whose episodes must look like those of the demonstrations."""
+    return dataclasses.replace(plan, like=in_buffers(base.features, base.fps))
 
 
 def _with_cameras_of(base: "Dataset", config: BuildConfig) -> BuildConfig:
@@ -206,6 +220,8 @@ def plan_build(
     get_codec(config.codec)
     if config.time_limit_s is not None and not config.time_limit_s > 0:
         raise InvalidOptionError.expected("time_limit_s", config.time_limit_s, "a positive number")
+    if config.fps is not None and not 0 < config.fps < math.inf:
+        raise InvalidOptionError.expected("fps", config.fps, "a positive number")
     for name in ("unit_frames", "unit_stride"):
         if getattr(config, name) < 1:
             raise InvalidOptionError.expected(name, getattr(config, name), "a positive number")
@@ -242,6 +258,7 @@ def plan_build(
         version=config.version,
         time_limit_s=config.time_limit_s,
         unit=unit,
+        fps=config.fps,
     )
 
 

@@ -36,7 +36,7 @@ def mine(tmp_path: Path) -> str:
         name, episode = f"{family}/train/0", make_episode(number, 249, size=(32, 32), actions=False)
         for camera, images in episode.images.items():
             write_images(tmp_path / f"mine/images/{camera}/{name}", images)
-        rows += rows_of(name, episode, is_demo=[False] * 249)
+        rows += rows_of(name, episode, is_demo=[False] * 249, fps=10)
     write_table(tmp_path / "mine", rows)
     return f"frames:{tmp_path / 'mine'}"
 
