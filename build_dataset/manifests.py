@@ -53,7 +53,7 @@ from robomme_interference_data.storage.hub import HubFiles
 from robomme_interference_data.storage.parquet import writing
 from robomme_interference_data.storage.staging import staging_dir
 
-from .alike import differences, in_buffers
+from .alike import differences, in_buffers, unequal
 from .replan import Planned
 
 _BATCH = 1024
@@ -180,8 +180,10 @@ def _check_scenes(shifted: Dataset, base: Dataset) -> None:
     sources, expected = ([*one.identity.sources] for one in (shifted, base))
     views, queries = ({r.episode_id for r in one.records()} for one in (shifted, base))
     problem = f"lacks {min(queries - views)}" if queries - views else ""
-    if not all(one in expected for one in sources):
-        problem = f"was built from {sources}, the demonstrations from {expected}"
+    if other := [source for source in sources if source not in expected]:
+        nearest = next((one for one in expected if one["kind"] == other[0]["kind"]), expected[0])
+        found = unequal(("it", other[0]), (f"the {DEMONSTRATIONS}", nearest))
+        problem = f"is of another source: {'; '.join(found)}"
     if problem:
         raise SourceError(
             f"{shifted.files.describe()} {problem}",
@@ -193,19 +195,26 @@ def _check_scenes(shifted: Dataset, base: Dataset) -> None:
 def _check_executions(executions: Dataset, base: Dataset) -> None:
     """Check that every execution follows a demonstration: the same goals, seed and difficulty."""
 
-    def recorded(dataset: Dataset) -> dict[EpisodeId, tuple[object, ...]]:
+    def recorded(dataset: Dataset) -> dict[EpisodeId, dict[str, object]]:
         return {
-            one.episode_id: (one.goals, one.seed, one.difficulty, one.simulator)
-            for one in dataset.records()
+            record.episode_id: {
+                "goals": " / ".join(record.goals),
+                "seed": record.seed,
+                "difficulty": record.difficulty,
+                "simulator": record.simulator,
+            }
+            for record in dataset.records()
         }
 
     expected = recorded(base)
     for episode, metadata in recorded(executions).items():
         if metadata != expected.get(episode):
-            where, other = executions.files.describe(), expected.get(episode)
+            found = [f"the {DEMONSTRATIONS} lack it"]
+            if episode in expected:
+                found = unequal(("it", metadata), (f"the {DEMONSTRATIONS}", expected[episode]))
             raise SourceError(
-                f"{where} has {episode} with goals, seed, difficulty and simulator {metadata}, "
-                f"and the demonstrations {'lack it' if other is None else f'have {other}'}",
+                f"{executions.files.describe()}: {episode} is of another recording: "
+                + "; ".join(found),
                 "Build both from the same recordings.",
                 f"build {EXECUTIONS}",
             )

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -9,17 +10,19 @@ from typing import TYPE_CHECKING, Any
 
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
+    DATASETS,
     DEMONSTRATIONS,
     DISTRACTORS,
     EXECUTIONS,
     LESSONS,
+    MANIFESTS,
     PAPER_UNIT,
     SHIFTED,
     SPLITS,
     UNITS,
     Unit,
 )
-from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
+from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError, counted
 from robomme_interference_data.ids import EpisodeId, parse_numbers
 from robomme_interference_data.runtime.executor import make_executor
 from robomme_interference_data.schema.conditions import datasets_of
@@ -217,7 +220,10 @@ def plan_build(
     from .frame_selection import unmarked_error
     from .sources import open_source
 
+    _check_root(config.buffer_set)
     get_codec(config.codec)
+    if not re.fullmatch(r"\d+\.\d+\.\d+", config.version, re.ASCII):
+        raise InvalidOptionError.expected("version", config.version, "a version such as 1.0.0")
     if config.time_limit_s is not None and not config.time_limit_s > 0:
         raise InvalidOptionError.expected("time_limit_s", config.time_limit_s, "a positive number")
     if config.fps is not None and not 0 < config.fps < math.inf:
@@ -260,6 +266,22 @@ def plan_build(
         unit=unit,
         fps=config.fps,
     )
+
+
+def _check_root(root: "Path") -> None:
+    """Check that a folder is absent, empty or, as far as a build has come, a buffer set."""
+    from robomme_interference_data.storage.staging import staging_path
+
+    if root.exists() and not root.is_dir():
+        raise BuildError(f"{root} is a file", "Choose another `buffer_set`.")
+    known = [root / name for name in (*DATASETS, MANIFESTS)]
+    if not root.exists() or any(path.exists() or staging_path(path).exists() for path in known):
+        return
+    if other := sorted(path.name for path in root.iterdir() if not path.name.startswith(".")):
+        raise BuildError(
+            f"{root} holds {other[0]}, and nothing of a buffer set",
+            "Choose a new or empty folder as `buffer_set`.",
+        )
 
 
 def _columns(texts: Sequence[str]) -> dict[str, str]:
@@ -317,8 +339,8 @@ def list_episodes(
             )
     if not chosen:
         raise SourceError(
-            f"none of the sources' {len(listed)} episodes matches `families`, `split` and "
-            "`episodes`",
+            f"no episode of {counted(len(listed), 'recorded episode')} matches `families`, `split` "
+            "and `episodes`",
             "Choose others.",
         )
     return tuple(chosen)

@@ -32,6 +32,7 @@ from robomme_interference_data.storage.encode import Codec, VideoEncoder, get_co
 from robomme_interference_data.storage.files import canonical_json, read_header, write_json
 from robomme_interference_data.storage.video import iter_frames
 
+from .alike import Look, differences
 from .frame_selection import NothingToStore, select_frames
 from .image_stats import ImageStats
 from .lerobot_writer import StoredEpisode
@@ -204,8 +205,10 @@ class _Writer:
             self._begin(images, vectors)
         shapes = {name: value.shape for name, value in (images | vectors).items()}
         if shapes != self.features:
+            looks = Look(self.features, self._fps), Look(shapes, self._fps)
+            found = differences(("the first", looks[0]), (f"stored frame {self.length}", looks[1]))
             raise SourceError(
-                f"stored frame {self.length} has {shapes}; the first one {self.features}",
+                f"frames of different sizes: {'; '.join(found)}",
                 "All frames of an episode must have the same cameras and sizes.",
             )
         for name, image in images.items():

@@ -367,6 +367,8 @@ def test_what_goes_with_demonstrations_has_their_episodes_and_cameras(
     [
         ({"workers": 0}, {}, InvalidOptionError),
         ({"time_limit_s": float("nan")}, {}, InvalidOptionError),
+        ({"version": "one"}, {}, InvalidOptionError),
+        ({"fps": 0.0}, {}, InvalidOptionError),
         ({"columns": ("front=a", "front=b")}, {}, InvalidOptionError),
         ({}, {"conditions": ("k0", "k0")}, InvalidOptionError),
         ({}, {"conditions": ("x3",)}, InvalidIdError),
@@ -383,6 +385,21 @@ def test_build_all_checks_options_before_it_reads(
     with pytest.raises(error):
         plan_all(AllConfig(**asked), PlanConfig(**plan))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
+    root = tmp_path / "out"
+    root.mkdir()
+    (root / ".hidden").touch()
+    plan_build("distractors", config(tmp_path))
+    (root / "thesis.txt").write_text("mine")
+    with pytest.raises(BuildError, match=r"out holds thesis.txt, and nothing of a buffer set"):
+        plan_build("distractors", config(tmp_path))
+    staging_path(root / "demonstrations").mkdir()  # a build has begun: the file came later
+    plan_build("distractors", config(tmp_path))
+    file = BuildConfig(source=("sample",), buffer_set=root / "thesis.txt")
+    with pytest.raises(BuildError, match="is a file"):
+        plan_build("distractors", file)
 
 
 @pytest.mark.parametrize("name", ["demonstrations", "distractors", "manifests"])

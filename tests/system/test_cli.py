@@ -133,6 +133,9 @@ run_program()
         (["lits"], "No such command 'lits'"),
         (["list", ".", "--bad"], "No such option: --bad"),
         (["build", "demonstrations", "--source", "frames:."], "Missing argument"),
+        (["list", ".", "--conditions", ""], "has an empty name"),
+        (["build", "manifests", ".", "--conditions", "k0,,k1"], "has an empty name"),
+        (["build", "all", ".", "--source", "sample", "--cameras", " "], "has an empty name"),
     ],
 )
 def test_usage_errors(arguments: list[str], message: str, run: Run) -> None:
