@@ -25,6 +25,7 @@ from robomme_interference_data.constants import (
     FRONT,
     INFO_PATH,
     STATE,
+    VALUE_NAMES,
     WRIST,
 )
 from robomme_interference_data.schema.records import EpisodeRecord
@@ -34,7 +35,7 @@ from robomme_interference_data.storage.files import read_json
 SIDE, LESSON = 32, 8
 CAMERAS = (FRONT, WRIST)
 FEATURES = {FRONT: (SIDE, SIDE, 3), WRIST: (SIDE, SIDE, 3), STATE: (8,)}
-ROBOT = Robot().with_names(FEATURES)
+ROBOT = Robot(FPS, names={STATE: VALUE_NAMES})
 CODEC = CODECS["av1-lossless"]
 
 

@@ -29,6 +29,7 @@ from robomme_interference_data.storage.encode import get_codec
 from robomme_interference_data.storage.files import canonical_json, read_json
 from robomme_interference_data.storage.staging import replace_folder, staging_dir
 
+from .alike import Look, differences, in_buffers
 from .existing import ExistingDataset, open_existing
 from .identity import complete_dataset, identity_of
 from .lerobot_writer import StoredEpisode, load_lerobot, require_lerobot, write_lerobot
@@ -96,6 +97,7 @@ def _stage(
         else:
             stored.append(staged.stored(folder(one)))
             _check_alike(stored[0], stored[-1])
+            _check_like(stored[-1], plan)
 
     missing = []
     progress.start("Reading and encoding", len(todo))
@@ -122,21 +124,32 @@ def _stage(
 
 def _check_alike(one: StoredEpisode, other: StoredEpisode) -> None:
     """Check that two episodes can be in one dataset; one may lack actions."""
-    optional = {ACTION} - (one.features.keys() & other.features.keys())
-    first, second = (
-        (
-            {name: shape for name, shape in episode.features.items() if name not in optional},
-            {name: v for name, v in episode.robot.names.items() if name not in optional},
-            episode.robot.fps,
-            episode.robot.type,
-        )
-        for episode in (one, other)
-    )
-    if first != second:
+    without = {ACTION} - (one.features.keys() & other.features.keys())
+    names = [str(episode.record.episode_id) for episode in (one, other)]
+    looks = [_look(episode, without) for episode in (one, other)]
+    if found := differences((names[0], looks[0]), (names[1], looks[1])):
         raise SourceError(
-            f"{one.record.episode_id} and {other.record.episode_id} cannot be in one dataset: "
-            f"their features, value names, frame rates and robot types are {first} and {second}",
+            f"{names[0]} and {names[1]} cannot be in one dataset: {'; '.join(found)}",
             "Choose `cameras` that all have, or build the sources into separate buffer sets.",
+        )
+
+
+def _look(episode: StoredEpisode, without: set[str]) -> Look:
+    features = {name: shape for name, shape in episode.features.items() if name not in without}
+    return Look(features, episode.fps, episode.robot.type, episode.robot.names)
+
+
+def _check_like(episode: StoredEpisode, plan: BuildPlan) -> None:
+    """Check that an episode can follow the demonstrations in a buffer."""
+    if plan.like is None:
+        return
+    name = str(episode.record.episode_id)
+    look = in_buffers(episode.features, episode.fps)
+    if found := differences(("the demonstrations", plan.like), (name, look)):
+        raise SourceError(
+            f"{name} cannot be in a buffer with the demonstrations: {'; '.join(found)}",
+            "Choose recordings with the rate, cameras and sizes of the demonstrations, or their "
+            "`cameras`.",
         )
 
 

@@ -1,18 +1,26 @@
 """Commands that build and check buffer sets: `build …`, `new-buffer-set`, `verify`, `audit`."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.cli.console import echo, graceful_interrupt, print_json, print_status
+from robomme_interference_data.cli.console import (
+    confirm,
+    echo,
+    graceful_interrupt,
+    print_json,
+    print_status,
+)
 from robomme_interference_data.cli.help import App
-from robomme_interference_data.cli.options import AsJson, BufferSetFolder, with_settings
+from robomme_interference_data.cli.options import AsJson, BufferSetFolder, Yes, with_settings
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
     DEMONSTRATIONS,
     DISTRACTORS,
     EXECUTIONS,
+    MANIFEST_PATH,
     MANIFESTS,
     RAW_DISTRACTORS,
     REPORT_PATH,
@@ -21,8 +29,9 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.errors import MissingFileError, counted
 from robomme_interference_data.runtime.executor import WorkersConfig, make_executor
 
-from .config import AllConfig, BuildConfig, NewConfig, PlanConfig, position_limit
-from .plan import BuildPlan, plan_all, plan_alone, plan_new
+from .config import AllConfig, BuildConfig, NewConfig, PlanConfig
+from .plan import BuildPlan, like, plan_all, plan_alone, plan_more_units, plan_new
+from .replan import Replan, replan
 
 if TYPE_CHECKING:
     from robomme_interference_data.storage.files import Files
@@ -41,7 +50,7 @@ robomme-interference verify my-buffers
 ```
 robomme-interference build demonstrations my-buffers --source robomme-h5:recordings/
 robomme-interference build distractors my-buffers --source robomme-h5:recordings/
-robomme-interference build manifests my-buffers --conditions no-history,k0,k1,k3,k7
+robomme-interference build manifests my-buffers
 ```
 """,
 )
@@ -118,9 +127,14 @@ _DATASETS = {
 
 def _add_command(kind: str, text: str) -> None:
     @with_settings
-    def build(config: BuildConfig, as_json: AsJson = False) -> None:
+    def build(config: BuildConfig, yes: Yes = False, as_json: AsJson = False) -> None:
         with graceful_interrupt(_KEPT):
-            _build(plan_alone(kind, config), config.buffer_set / kind, config, as_json=as_json)
+            plan = plan_alone(kind, config)
+            if kind == DISTRACTORS and (change := plan_more_units(plan, config.buffer_set)):
+                _confirm(change, yes=yes)
+            _build(plan, config.buffer_set / kind, config, as_json=as_json)
+        if (config.buffer_set / MANIFEST_PATH).is_file():
+            print_status(f"Next: robomme-interference build manifests {config.buffer_set}")
 
     app.command(name=kind, help=text)(build)
 
@@ -131,16 +145,32 @@ for _kind, _text in _DATASETS.items():
 
 @app.command()
 @with_settings
-def manifests(buffer_set: _Folder, config: PlanConfig, as_json: AsJson = False) -> None:
-    """Plan the history buffers of all query episodes.
+def manifests(
+    buffer_set: _Folder, config: PlanConfig, yes: Yes = False, as_json: AsJson = False
+) -> None:
+    """Plan the history buffers of all query episodes; what is planned stays planned.
 
-    Example:
+    Examples:
     ```
-    robomme-interference build manifests my-buffers --conditions no-history,k0,k1,k3,k7 --seed 0
+    robomme-interference build manifests my-buffers
+    robomme-interference build manifests my-buffers --conditions before-k7,held-k7
+    robomme-interference build manifests my-buffers --drop held-k7 --yes
     ```
     """
+    from robomme_interference_data.data.dataset import Dataset
+
+    from .manifests import datasets_now, read_planned
+
     with graceful_interrupt("The datasets are kept"):
-        _plan(buffer_set, config, as_json=as_json)
+        planned = read_planned(buffer_set)
+        files = datasets_now(buffer_set, planned)
+        queries = {record.episode_id for record in Dataset(files[DEMONSTRATIONS]).records()}
+        recorded = None if planned is None else planned.header.datasets.get(DISTRACTORS)
+        revision = Dataset(files[DISTRACTORS]).revision
+        changed = recorded is not None and recorded.revision != revision
+        change = replan(planned, config, queries=queries, units_change=changed)
+        _confirm(change, yes=yes)
+        _plan(buffer_set, files, change, as_json=as_json)
 
 
 @app.command()
@@ -183,7 +213,9 @@ def questions(buffer_set: _Folder, as_json: AsJson = False) -> None:
 
 @app.command(name="all")
 @with_settings
-def build_all(config: AllConfig, plan: PlanConfig, as_json: AsJson = False) -> None:
+def build_all(
+    config: AllConfig, request: PlanConfig, yes: Yes = False, as_json: AsJson = False
+) -> None:
     r"""Build demonstrations, distractors and manifests, and the datasets that conditions need.
 
     The filters choose the query episodes. Units come from the train episodes of all families, or
@@ -196,18 +228,29 @@ def build_all(config: AllConfig, plan: PlanConfig, as_json: AsJson = False) -> N
         --conditions no-history,k0,k7,before-k7,held-k7,stale-k0
     ```
     """
+    from robomme_interference_data.data.dataset import Dataset
+    from robomme_interference_data.storage.files import LocalFiles
+
+    from .manifests import in_folder
+
     with graceful_interrupt(_KEPT):
-        steps = plan_all(config, plan)
+        steps, change = plan_all(config, request)
+        _confirm(change, yes=yes)
         taken = ", ".join(f"{kind} {len(step.tasks):,}" for kind, step in steps.items())
         print_status(f"Recorded episodes: {taken}")
         for kind, step in steps.items():
-            _build(step, config.buffer_set / kind, config, as_json=False)
-        _plan(config.buffer_set, plan, as_json=as_json)
+            plan = step
+            if kind != DEMONSTRATIONS:  # these are built first, so others are compared early
+                plan = like(step, Dataset(LocalFiles(config.buffer_set / DEMONSTRATIONS)))
+            _build(plan, config.buffer_set / kind, config, as_json=False)
+        _plan(config.buffer_set, in_folder(config.buffer_set), change, as_json=as_json)
     print_status(f"Next: robomme-interference verify {config.buffer_set}")
 
 
 @with_settings
-def new_buffer_set(config: NewConfig, plan: PlanConfig, as_json: AsJson = False) -> None:
+def new_buffer_set(
+    config: NewConfig, plan: PlanConfig, yes: Yes = False, as_json: AsJson = False
+) -> None:
     r"""Build units and manifests for published demonstrations: a buffer set of your own.
 
     Units come from the train episodes of the sources, of any robot or simulator with the cameras
@@ -225,15 +268,19 @@ def new_buffer_set(config: NewConfig, plan: PlanConfig, as_json: AsJson = False)
     from robomme_interference_data.storage.files import LocalFiles
     from robomme_interference_data.storage.staging import copy_folder
 
+    from .manifests import in_folder
+
     with graceful_interrupt(_KEPT):
-        base, units = plan_new(config, plan)
+        base, units, change = plan_new(config, plan)
+        _confirm(change, yes=yes)
         print_status(f"Demonstrations: {base.files.describe()}; units from {len(units.tasks):,}")
         _build(units, config.buffer_set / DISTRACTORS, config, as_json=False)
         if isinstance(base.files, LocalFiles):
             own = config.buffer_set / DEMONSTRATIONS
             if not own.exists():
                 copy_folder(base.files.root, own)
-        _plan(config.buffer_set, plan, as_json=as_json, base=base.files)
+        files = in_folder(config.buffer_set) | {DEMONSTRATIONS: base.files}
+        _plan(config.buffer_set, files, change, as_json=as_json)
         audit(str(config.buffer_set))
     print_status(f"Next: robomme-interference publish {config.buffer_set} --repo-id NAMESPACE/NAME")
 
@@ -256,16 +303,21 @@ def _build(plan: BuildPlan, out: Path, workers: WorkersConfig, *, as_json: bool)
         print_json({**vars(result), "out": str(result.out)})
 
 
-def _plan(
-    buffer_set: Path, config: PlanConfig, *, as_json: bool, base: "Files | None" = None
-) -> None:
+def _confirm(change: Replan, *, yes: bool) -> None:
+    """Print how the planned buffers change, and ask before any is lost."""
+    for line in change.lines():
+        print_status(line)
+    if change.loses:
+        confirm("Replace these planned buffers?", "replacing planned buffers", yes=yes)
+
+
+def _plan(buffer_set: Path, files: "Mapping[str, Files]", change: Replan, *, as_json: bool) -> None:
     from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.runtime.progress import WorkProgress
 
-    from .manifests import in_folder, plan_manifests, write_manifests
+    from .manifests import plan_manifests, write_manifests
 
-    files = in_folder(buffer_set) | ({} if base is None else {DEMONSTRATIONS: base})
-    plan = plan_manifests(files, config.conditions, config.seed, position_limit(config))
+    plan = plan_manifests(files, change.conditions, change.seed, change.position_limit)
     with WorkProgress(unit="buffers") as progress:
         total = len(plan.demonstrations) * len(plan.conditions)
         progress.start("Planning buffers", total)
@@ -273,7 +325,8 @@ def _plan(
             progress.advance(done)
     counts, out = load_buffer_set(buffer_set).header.counts, buffer_set / MANIFESTS
     if as_json:
-        print_json({"out": str(out), **counts})
+        changes = {"added": change.added, "dropped": change.dropped, "redrawn": change.redrawn}
+        print_json({"out": str(out), **counts, **changes})
     else:
         queries = counted(counts["queries"], "query", "queries")
         print_status(f"{out}: {counted(counts['buffers'], 'buffer')} of {queries}")

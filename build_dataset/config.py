@@ -78,6 +78,9 @@ class BuildConfig(WorkersConfig):
         help="Source lerobot: CSV file with each episode's family and, if needed, exec_start_idx.",
         group="Sources",
     )
+    fps: float | None = setting(
+        None, help="Frames per second of recordings that do not state them.", group="Sources"
+    )
     robomme_python: str | None = setting(
         None,
         help="Source robomme: Python interpreter with RoboMME.",
@@ -118,25 +121,34 @@ class NewConfig(BuildConfig):
 
 @dataclass(frozen=True)
 class PlanConfig:
-    """Settings of a buffer set's manifests."""
+    """Settings of a buffer set's manifests; what is not given stays as planned."""
 
     conditions: tuple[str, ...] = setting(
-        DEFAULT_CONDITIONS,
-        help="Conditions, such as no-history,k0,k7,before-k7; `robomme-interference conditions` "
-        "lists all kinds.",
+        (),
+        help="Conditions to plan in addition to those that are planned; `robomme-interference "
+        "conditions` lists all kinds.",
+        shown=f"planned ones, or {','.join(DEFAULT_CONDITIONS)}",
         group="Conditions",
     )
-    seed: int = setting(0, help="Seed of the draw of distractor units.", group="Conditions")
-    position_limit: str = setting(
-        str(POSITION_LIMIT),
+    drop: tuple[str, ...] = setting(
+        (), help="Planned conditions to leave out from now on.", group="Conditions"
+    )
+    seed: int | None = setting(
+        None,
+        help="Seed of the draw of distractor units.",
+        shown="planned one, or 0",
+        group="Conditions",
+    )
+    position_limit: str | None = setting(
+        None,
         help="Most positions that a policy has for history and rollout, or none.",
+        shown=f"planned one, or {POSITION_LIMIT}",
         group="Conditions",
     )
 
 
-def position_limit(config: PlanConfig) -> int | None:
-    """Return the position limit of a plan; None for none."""
-    text = config.position_limit
+def parse_position_limit(text: str) -> int | None:
+    """Parse the position limit of a plan; None for none."""
     if text == "none":
         return None
     if not text.isdecimal() or int(text) == 0:

@@ -7,10 +7,12 @@ from pathlib import Path
 from robomme_interference_data.constants import ACTION, IDENTITY_PATH, REPORT_PATH, STATE, UNITS
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import BuildError
+from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.files import LocalFiles, read_header
 from robomme_interference_data.storage.lerobot import LeRobotFiles
 
+from .alike import unequal
 from .identity import BuildReport
 from .image_stats import Statistics, before_scaling, episode_statistics
 from .lerobot_writer import StoredEpisode
@@ -29,6 +31,11 @@ class ExistingDataset:
     episodes: tuple[StoredEpisode, ...]
     skipped: dict[str, str]
 
+    @property
+    def ids(self) -> set[EpisodeId]:
+        """Ids of its episodes."""
+        return {episode.record.episode_id for episode in self.episodes}
+
 
 def open_existing(out: Path, plan: BuildPlan) -> ExistingDataset | None:
     """Open the dataset that a build extends; None if there is none."""
@@ -38,19 +45,17 @@ def open_existing(out: Path, plan: BuildPlan) -> ExistingDataset | None:
         raise BuildError(f"{out} exists and is not a dataset of this package", _ADVICE)
     dataset = Dataset(LocalFiles(out))
     identity = dataset.identity
-    existing = (identity.kind, identity.version, identity.codec, identity.cameras)
-    planned = (
-        plan.kind,
-        plan.version,
-        plan.codec,
-        identity.cameras if plan.cameras is None else plan.cameras,
-    )
-    if existing != planned:
-        raise BuildError(
-            f"{out} exists with other settings: kind, version, codec and cameras are {existing}, "
-            f"not {planned}",
-            _ADVICE,
-        )
+    existing = {
+        "kind": identity.kind,
+        "version": identity.version,
+        "codec": identity.codec,
+        "cameras": ", ".join(identity.cameras) or "none",
+    }
+    planned = {"kind": plan.kind, "version": plan.version, "codec": plan.codec}
+    cameras = identity.cameras if plan.cameras is None else plan.cameras
+    planned["cameras"] = ", ".join(cameras) or "none"
+    if found := unequal(("it", existing), ("this build", planned)):
+        raise BuildError(f"{out} exists with other settings: {'; '.join(found)}", _ADVICE)
     if plan.kind in UNITS and dataset.unit != plan.unit.of(plan.kind):
         raise BuildError(
             f"{out} exists with units of {dataset.unit}, not of {plan.unit.of(plan.kind)}", _ADVICE
@@ -60,12 +65,11 @@ def open_existing(out: Path, plan: BuildPlan) -> ExistingDataset | None:
     for source in plan.sources:
         before = recorded.get(source.provenance["kind"], source.provenance)
         if "suite_version" in before and before != source.provenance:
-            raise BuildError(
-                f"{out} exists and was built from {before}, not from {source.provenance}", _ADVICE
-            )
+            found = unequal(("it", before), ("this source", source.provenance))
+            raise BuildError(f"{out} exists, of another source: {'; '.join(found)}", _ADVICE)
     statistics = episode_statistics(LeRobotFiles(dataset.files, statistics=True).table)
     vectors = {name: name for name in (STATE, ACTION) if name in dataset.features}
-    robot = recorded_robot(dataset.lerobot, vectors).with_names(dataset.features)
+    robot = recorded_robot(dataset.lerobot, vectors)
     episodes = map(partial(_stored, dataset, robot), dataset.records(), statistics)
     report = read_header(out / REPORT_PATH, BuildReport)
     return ExistingDataset(dataset, tuple(episodes), report.reasons)

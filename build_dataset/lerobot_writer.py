@@ -6,6 +6,7 @@ and spends as long on image statistics as on encoding. The replacement hands ove
 already encoded and checked.
 """
 
+import json
 import logging
 import os
 import shutil
@@ -20,10 +21,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import ACTION
+from robomme_interference_data.constants import ACTION, INFO_PATH
 from robomme_interference_data.errors import MissingExtraError
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.encode import Codec
+from robomme_interference_data.storage.files import write_text
 
 from .image_stats import STATISTICS
 from .sources.base import Robot
@@ -45,6 +47,12 @@ class StoredEpisode:
     stats: dict[str, dict[str, tuple[float, ...]]]
     vectors: Callable[[str], NDArray[np.float32]]
     robot: Robot
+
+    @property
+    def fps(self) -> float:
+        """Frames per second, which staging makes sure are known."""
+        assert self.robot.fps is not None
+        return self.robot.fps
 
 
 def require_lerobot() -> None:
@@ -74,10 +82,10 @@ def write_lerobot(
         from lerobot.configs.video import RGBEncoderConfig
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-        robot = episodes[0].robot
+        robot, fps = episodes[0].robot, episodes[0].fps
         dataset = LeRobotDataset.create(
             repo_id=name,
-            fps=robot.fps,
+            fps=int(fps) if fps.is_integer() else fps,  # type: ignore[arg-type]
             features=_declared(features, robot),
             root=root,
             robot_type=robot.type,
@@ -102,6 +110,17 @@ def write_lerobot(
             dataset.save_episode()
             yield episode.record.length
         dataset.finalize()
+    if not fps.is_integer():
+        _state_rate(root / INFO_PATH, fps)
+
+
+def _state_rate(path: Path, fps: float) -> None:
+    """Write the rate of the videos to LeRobot's description of them, which it rounds down."""
+    info = json.loads(path.read_text(encoding="utf-8"))
+    for feature in info["features"].values():
+        if feature["dtype"] == "video":
+            feature["info"]["video.fps"] = fps
+    write_text(path, json.dumps(info, indent=4, ensure_ascii=False) + "\n")
 
 
 def _declared(features: dict[str, tuple[int, ...]], robot: Robot) -> dict[str, dict[str, Any]]:
@@ -109,10 +128,13 @@ def _declared(features: dict[str, tuple[int, ...]], robot: Robot) -> dict[str, d
     declared: dict[str, dict[str, Any]] = {}
     for name in sorted(features, key=lambda one: (len(features[one]) == 1, one == ACTION, one)):
         shape = features[name]
-        kind, names = "video", ["height", "width", "channels"]
         if len(shape) == 1:
-            kind, names = "float32", list(robot.names[name])
-        declared[name] = {"dtype": kind, "shape": shape, "names": names}
+            # None is LeRobot's own way to state that names are unknown.
+            names = list(robot.names[name]) if name in robot.names else None
+            declared[name] = {"dtype": "float32", "shape": shape, "names": names}
+        else:
+            names = ["height", "width", "channels"]
+            declared[name] = {"dtype": "video", "shape": shape, "names": names}
     return declared
 
 

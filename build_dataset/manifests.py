@@ -13,13 +13,13 @@ from pathlib import Path
 import pyarrow.parquet as pq
 
 from robomme_interference_data.constants import (
-    ACTION,
     DEMONSTRATIONS,
     DISTRACTORS,
     EXECUTIONS,
     FORMAT_VERSION,
     IDENTITY_PATH,
     MANIFEST_HEADER,
+    MANIFEST_PATH,
     MANIFEST_ROWS,
     MANIFESTS,
     MAX_STEPS,
@@ -32,8 +32,15 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.data.buffer_set import pending_rows
 from robomme_interference_data.data.dataset import Dataset
+from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.data.query_sessions import QuerySessions, SessionSource
-from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
+from robomme_interference_data.errors import (
+    BuildError,
+    FormatError,
+    InvalidOptionError,
+    MissingFileError,
+    SourceError,
+)
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, Condition, in_order
@@ -46,6 +53,9 @@ from robomme_interference_data.storage.files import Files, LocalFiles, sha256_fi
 from robomme_interference_data.storage.hub import HubFiles
 from robomme_interference_data.storage.parquet import writing
 from robomme_interference_data.storage.staging import staging_dir
+
+from .alike import differences, in_buffers, unequal
+from .replan import Planned
 
 _BATCH = 1024
 """Rows in a row group: finding one buffer reads few bytes."""
@@ -74,6 +84,31 @@ def in_folder(root: Path) -> dict[str, Files]:
     """Return the datasets of the buffer set that is built in a folder, by name."""
     optional = (name for name in OPTIONAL_DATASETS if (root / name / IDENTITY_PATH).is_file())
     return {name: LocalFiles(root / name) for name in (DEMONSTRATIONS, DISTRACTORS, *optional)}
+
+
+def datasets_now(root: Path, planned: Planned | None) -> dict[str, Files]:
+    """Return the datasets of a folder as `in_folder`, or its demonstrations on the Hub."""
+    files = in_folder(root)
+    if planned is not None and not (root / DEMONSTRATIONS).is_dir():
+        location = planned.header.datasets[DEMONSTRATIONS].location
+        if location is not None:
+            files[DEMONSTRATIONS] = HubFiles.parse(location)
+    return files
+
+
+def read_planned(root: Path) -> Planned | None:
+    """Read what the buffer set in a folder plans now; None if that is nothing."""
+    if not (root / MANIFEST_PATH).is_file():
+        return None
+    try:
+        opened = load_buffer_set(root)
+        return Planned(opened.header, frozenset(opened.episode_ids))
+    except (FormatError, MissingFileError) as error:
+        raise FormatError(
+            error.message,
+            f"Restore it, or remove {root / MANIFESTS} and plan all conditions anew: which ones "
+            "were planned cannot be read.",
+        ) from None
 
 
 def plan_manifests(
@@ -130,16 +165,14 @@ def check_needs(conditions: Iterable[Condition], available: Collection[str]) -> 
 
 def _check_features(datasets: Mapping[str, Dataset]) -> None:
     """Check that sessions of all datasets can follow one another in a buffer."""
-    stored = {
-        name: {feature: s for feature, s in one.features.items() if feature != ACTION}
-        for name, one in datasets.items()
-    }
-    for name, features in stored.items():
-        if features != stored[DEMONSTRATIONS]:
+    looks = {name: in_buffers(dataset.features, dataset.fps) for name, dataset in datasets.items()}
+    base = (f"the {DEMONSTRATIONS}", looks[DEMONSTRATIONS])
+    for name, look in looks.items():
+        if found := differences(base, (f"the {name}", look)):
             raise SourceError(
-                "sessions of the datasets cannot follow one another in a buffer: the "
-                f"demonstrations have {stored[DEMONSTRATIONS]}, the {name} {features}",
-                "Build all with the same `cameras`, from sources with the same sizes.",
+                "sessions of the datasets cannot follow one another in a buffer: "
+                + "; ".join(found),
+                "Build all with the same `cameras`, from sources with the same rates and sizes.",
             )
 
 
@@ -148,8 +181,10 @@ def _check_scenes(shifted: Dataset, base: Dataset) -> None:
     sources, expected = ([*one.identity.sources] for one in (shifted, base))
     views, queries = ({r.episode_id for r in one.records()} for one in (shifted, base))
     problem = f"lacks {min(queries - views)}" if queries - views else ""
-    if not all(one in expected for one in sources):
-        problem = f"was built from {sources}, the demonstrations from {expected}"
+    if other := [source for source in sources if source not in expected]:
+        nearest = next((one for one in expected if one["kind"] == other[0]["kind"]), expected[0])
+        found = unequal(("it", other[0]), (f"the {DEMONSTRATIONS}", nearest))
+        problem = f"is of another source: {'; '.join(found)}"
     if problem:
         raise SourceError(
             f"{shifted.files.describe()} {problem}",
@@ -161,19 +196,26 @@ def _check_scenes(shifted: Dataset, base: Dataset) -> None:
 def _check_executions(executions: Dataset, base: Dataset) -> None:
     """Check that every execution follows a demonstration: the same goals, seed and difficulty."""
 
-    def recorded(dataset: Dataset) -> dict[EpisodeId, tuple[object, ...]]:
+    def recorded(dataset: Dataset) -> dict[EpisodeId, dict[str, object]]:
         return {
-            one.episode_id: (one.goals, one.seed, one.difficulty, one.simulator)
-            for one in dataset.records()
+            record.episode_id: {
+                "goals": " / ".join(record.goals),
+                "seed": record.seed,
+                "difficulty": record.difficulty,
+                "simulator": record.simulator,
+            }
+            for record in dataset.records()
         }
 
     expected = recorded(base)
     for episode, metadata in recorded(executions).items():
         if metadata != expected.get(episode):
-            where, other = executions.files.describe(), expected.get(episode)
+            found = [f"the {DEMONSTRATIONS} lack it"]
+            if episode in expected:
+                found = unequal(("it", metadata), (f"the {DEMONSTRATIONS}", expected[episode]))
             raise SourceError(
-                f"{where} has {episode} with goals, seed, difficulty and simulator {metadata}, "
-                f"and the demonstrations {'lack it' if other is None else f'have {other}'}",
+                f"{executions.files.describe()}: {episode} is of another recording: "
+                + "; ".join(found),
                 "Build both from the same recordings.",
                 f"build {EXECUTIONS}",
             )

@@ -1,6 +1,8 @@
 """The plan that follows from the settings of a build."""
 
 import dataclasses
+import math
+import re
 from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -8,22 +10,26 @@ from typing import TYPE_CHECKING, Any
 
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
+    DATASETS,
     DEMONSTRATIONS,
     DISTRACTORS,
     EXECUTIONS,
     LESSONS,
+    MANIFESTS,
     PAPER_UNIT,
     SHIFTED,
     SPLITS,
     UNITS,
     Unit,
 )
-from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
+from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError, counted
 from robomme_interference_data.ids import EpisodeId, parse_numbers
 from robomme_interference_data.runtime.executor import make_executor
-from robomme_interference_data.schema.conditions import datasets_of, in_order
+from robomme_interference_data.schema.conditions import datasets_of
 
-from .config import NO_CAMERAS, AllConfig, BuildConfig, NewConfig, PlanConfig, position_limit
+from .alike import Look, in_buffers
+from .config import NO_CAMERAS, AllConfig, BuildConfig, NewConfig, PlanConfig
+from .replan import Planned, Replan, replan
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,6 +37,7 @@ if TYPE_CHECKING:
     from robomme_interference_data.data.dataset import Dataset
     from robomme_interference_data.schema.draw import UnitPool
 
+    from .existing import ExistingDataset
     from .sources import Source, SourceEpisode
 
 
@@ -47,6 +54,8 @@ class BuildPlan:
         version: Version of the dataset.
         time_limit_s: Limit in seconds for one episode; None for the sources' defaults.
         unit: Size of the distractors' units; of the raw ones, too, by `Unit.of`.
+        fps: Frames per second of recordings that do not state them; None if all do.
+        like: What the episodes must look like, those of the demonstrations; None for anything.
     """
 
     kind: str
@@ -57,26 +66,33 @@ class BuildPlan:
     version: str = "1.0.0"
     time_limit_s: float | None = None
     unit: Unit = PAPER_UNIT
+    fps: float | None = None
+    like: Look | None = None
 
 
-def plan_all(config: AllConfig, plan: PlanConfig) -> dict[str, BuildPlan]:
-    """Plan the datasets of a buffer set, and check everything known before episodes are read."""
+def plan_all(config: AllConfig, request: PlanConfig) -> tuple[dict[str, BuildPlan], Replan]:
+    """Plan a buffer set's datasets and buffers; checks everything known before frames are read."""
+    from .manifests import read_planned
+
+    planned = read_planned(config.buffer_set)
     units = dataclasses.replace(config, families=(), episodes=config.unit_episodes, split="train")
-    optional = {SHIFTED: config.shifted, EXECUTIONS: config.executions}
-    names = [*datasets_of(in_order(plan.conditions)), *(one for one in optional if optional[one])]
+    names = [*datasets_of(replan(planned, request).conditions)]
+    if config.shifted:
+        names.append(SHIFTED)
+    if config.executions:
+        names.append(EXECUTIONS)
     plans = {name: plan_build(name, units if name in UNITS else config) for name in names}
-    queries = (episode.id for _, episode in plans[DEMONSTRATIONS].tasks)
-    _check_plans(queries, plans, config.buffer_set, plan)
-    return plans
+    queries = {episode.id for _, episode in plans[DEMONSTRATIONS].tasks}
+    return plans, _check_plans(queries, plans, config.buffer_set, planned, request)
 
 
-def plan_new(config: NewConfig, plan: PlanConfig) -> "tuple[Dataset, BuildPlan]":
+def plan_new(config: NewConfig, request: PlanConfig) -> "tuple[Dataset, BuildPlan, Replan]":
     """Open published demonstrations, and plan units with their cameras; see `plan_all`."""
     from robomme_interference_data.data.dataset import Dataset
     from robomme_interference_data.storage.files import LocalFiles
     from robomme_interference_data.storage.hub import locate
 
-    from .manifests import check_needs, in_folder
+    from .manifests import check_needs, in_folder, read_planned
 
     base = Dataset(locate(config.demonstrations))
     if base.kind != DEMONSTRATIONS:
@@ -92,29 +108,59 @@ def plan_new(config: NewConfig, plan: PlanConfig) -> "tuple[Dataset, BuildPlan]"
             f"{own} exists, and is not a copy of {base.files.describe()}",
             "Choose another `buffer_set`, or remove the folder first.",
         )
-    check_needs(in_order(plan.conditions), in_folder(config.buffer_set))
-    units = plan_build(DISTRACTORS, _with_cameras_of(base, config))
-    queries = (record.episode_id for record in base.records())
-    _check_plans(queries, {DISTRACTORS: units}, config.buffer_set, plan)
-    return base, units
+    planned = read_planned(config.buffer_set)
+    check_needs(replan(planned, request).conditions, in_folder(config.buffer_set))
+    units = like(plan_build(DISTRACTORS, _with_cameras_of(base, config)), base)
+    queries = {record.episode_id for record in base.records()}
+    plans = {DISTRACTORS: units}
+    return base, units, _check_plans(queries, plans, config.buffer_set, planned, request)
+
+
+def plan_more_units(units: BuildPlan, root: "Path") -> Replan | None:
+    """Return how further units would change the buffers that are planned; None if none are."""
+    from .existing import open_existing
+    from .manifests import read_planned
+
+    planned = read_planned(root)
+    if planned is None:
+        return None
+    existing = open_existing(root.resolve() / DISTRACTORS, units)
+    return replan(planned, PlanConfig(), units_change=_adds_episodes(units, existing))
 
 
 def _check_plans(
-    queries: Iterable[EpisodeId], plans: dict[str, BuildPlan], root: "Path", plan: PlanConfig
-) -> None:
+    queries: set[EpisodeId],
+    plans: dict[str, BuildPlan],
+    root: "Path",
+    planned: Planned | None,
+    request: PlanConfig,
+) -> Replan:
+    """Check that datasets can be built or extended, and that units suffice; return the plan."""
     from robomme_interference_data.schema.draw import UnitPool
 
     from .existing import open_existing
     from .manifests import check_manifests_folder
 
-    position_limit(plan)
-    pool = UnitPool(episode.id for _, episode in plans[DISTRACTORS].tasks)
-    for query in {one.family: one for one in queries}.values():
-        for condition in in_order(plan.conditions):
+    existing = {kind: open_existing(root.resolve() / kind, one) for kind, one in plans.items()}
+    if (base := existing.get(DEMONSTRATIONS)) is not None:
+        queries = queries | base.ids
+    units, built = plans[DISTRACTORS], existing[DISTRACTORS]
+    following = replan(planned, request, queries=queries, units_change=_adds_episodes(units, built))
+    available = {episode.id for _, episode in units.tasks}
+    pool = UnitPool(available if built is None else available | built.ids)
+    for query in {one.family: one for one in sorted(queries)}.values():
+        for condition in following.conditions:
             condition.sessions(_UnreadSessions(query, pool))
-    for kind, one in plans.items():
-        open_existing(root.resolve() / kind, one)
     check_manifests_folder(root)
+    return following
+
+
+def _adds_episodes(plan: BuildPlan, existing: "ExistingDataset | None") -> bool:
+    """Return whether a dataset lacks episodes that are to be built."""
+    if existing is None:
+        return True
+    known = {*existing.skipped, *map(str, existing.ids)}
+    return any(str(episode.id) not in known for _, episode in plan.tasks)
 
 
 @dataclass(frozen=True)
@@ -143,13 +189,21 @@ def plan_alone(kind: str, config: BuildConfig) -> BuildPlan:
     from robomme_interference_data.storage.files import LocalFiles
 
     folder = config.buffer_set / DEMONSTRATIONS
-    if kind not in (CONTRADICTIONS, SHIFTED, EXECUTIONS) or not folder.is_dir():
+    if kind == DEMONSTRATIONS or not folder.is_dir():
         return plan_build(kind, config)
     base = Dataset(LocalFiles(folder))
+    if kind in UNITS:
+        return like(plan_build(kind, config), base)
     config = _with_cameras_of(base, config)
-    if config.families or config.split or config.episodes:
-        return plan_build(kind, config)
-    return plan_build(kind, config, {record.episode_id for record in base.records()})
+    queries = None
+    if not (config.families or config.split or config.episodes):
+        queries = {record.episode_id for record in base.records()}
+    return like(plan_build(kind, config, queries), base)
+
+
+def like(plan: BuildPlan, base: "Dataset") -> BuildPlan:
+    """Return a plan of a dataset whose episodes must look like those of the demonstrations."""
+    return dataclasses.replace(plan, like=in_buffers(base.features, base.fps))
 
 
 def _with_cameras_of(base: "Dataset", config: BuildConfig) -> BuildConfig:
@@ -166,9 +220,14 @@ def plan_build(
     from .frame_selection import unmarked_error
     from .sources import open_source
 
+    _check_root(config.buffer_set)
     get_codec(config.codec)
+    if not re.fullmatch(r"\d+\.\d+\.\d+", config.version, re.ASCII):
+        raise InvalidOptionError.expected("version", config.version, "a version such as 1.0.0")
     if config.time_limit_s is not None and not config.time_limit_s > 0:
         raise InvalidOptionError.expected("time_limit_s", config.time_limit_s, "a positive number")
+    if config.fps is not None and not 0 < config.fps < math.inf:
+        raise InvalidOptionError.expected("fps", config.fps, "a positive number")
     for name in ("unit_frames", "unit_stride"):
         if getattr(config, name) < 1:
             raise InvalidOptionError.expected(name, getattr(config, name), "a positive number")
@@ -205,7 +264,24 @@ def plan_build(
         version=config.version,
         time_limit_s=config.time_limit_s,
         unit=unit,
+        fps=config.fps,
     )
+
+
+def _check_root(root: "Path") -> None:
+    """Check that a folder is absent, empty or, as far as a build has come, a buffer set."""
+    from robomme_interference_data.storage.staging import staging_path
+
+    if root.exists() and not root.is_dir():
+        raise BuildError(f"{root} is a file", "Choose another `buffer_set`.")
+    known = [root / name for name in (*DATASETS, MANIFESTS)]
+    if not root.exists() or any(path.exists() or staging_path(path).exists() for path in known):
+        return
+    if other := sorted(path.name for path in root.iterdir() if not path.name.startswith(".")):
+        raise BuildError(
+            f"{root} holds {other[0]}, and nothing of a buffer set",
+            "Choose a new or empty folder as `buffer_set`.",
+        )
 
 
 def _columns(texts: Sequence[str]) -> dict[str, str]:
@@ -263,8 +339,8 @@ def list_episodes(
             )
     if not chosen:
         raise SourceError(
-            f"none of the sources' {len(listed)} episodes matches `families`, `split` and "
-            "`episodes`",
+            f"no episode of {counted(len(listed), 'recorded episode')} matches `families`, `split` "
+            "and `episodes`",
             "Choose others.",
         )
     return tuple(chosen)

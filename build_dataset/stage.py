@@ -10,7 +10,7 @@ import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +32,7 @@ from robomme_interference_data.storage.encode import Codec, VideoEncoder, get_co
 from robomme_interference_data.storage.files import canonical_json, read_header, write_json
 from robomme_interference_data.storage.video import iter_frames
 
+from .alike import Look, differences
 from .frame_selection import NothingToStore, select_frames
 from .image_stats import ImageStats
 from .lerobot_writer import StoredEpisode
@@ -39,7 +40,7 @@ from .plan import BuildPlan
 from .sources import Frame, Recording, Robot, SourceEpisode
 
 _RECORD = "record.json"
-_LAYOUT = 6
+_LAYOUT = 7
 """Version of a staged episode's folder."""
 
 Task = tuple[int, SourceEpisode]
@@ -82,6 +83,7 @@ def staged_name(plan: BuildPlan, task: Task) -> str:
         "cameras": plan.cameras,
         "codec": [codec.vcodec, codec.pix_fmt, dict(codec.options)],
         "layout": _LAYOUT,
+        "fps": plan.fps,
         **({"unit": plan.unit} if plan.unit != PAPER_UNIT else {}),
     }
     return hashlib.sha256(canonical_json(content).encode()).hexdigest()[:24]
@@ -116,7 +118,8 @@ class StageTask:
 
     def _write(self, episode: EpisodeId, recording: Recording, folder: Path) -> Staged:
         codec = get_codec(self.plan.codec)
-        writer = _Writer(codec, folder, recording.robot.fps)
+        fps = recording.robot.at(self.plan.fps)
+        writer = _Writer(codec, folder, fps)
         try:
             for frame in select_frames(self.plan.kind, recording, self.plan.unit):
                 writer.add(frame)
@@ -155,7 +158,8 @@ class StageTask:
             feature: {name: tuple(map(float, values)) for name, values in one.result().items()}
             for feature, one in writer.stats.items()
         }
-        robot = recording.robot.with_names(writer.features)
+        recording.robot.check_names(writer.features)
+        robot = replace(recording.robot, fps=fps)
         return Staged(episode, None, record, writer.features, stats, robot)
 
 
@@ -184,7 +188,7 @@ def read_staged(folder: Path) -> Staged | None:
 class _Writer:
     """Writes the files of a staged episode; all maps are by feature."""
 
-    def __init__(self, codec: Codec, folder: Path, fps: int):
+    def __init__(self, codec: Codec, folder: Path, fps: float):
         self._codec, self._folder, self._fps = codec, folder, fps
         self._encoders: dict[str, VideoEncoder] = {}
         self._vectors: dict[str, list[NDArray[np.float32]]] = {}
@@ -201,8 +205,10 @@ class _Writer:
             self._begin(images, vectors)
         shapes = {name: value.shape for name, value in (images | vectors).items()}
         if shapes != self.features:
+            looks = Look(self.features, self._fps), Look(shapes, self._fps)
+            found = differences(("the first", looks[0]), (f"stored frame {self.length}", looks[1]))
             raise SourceError(
-                f"stored frame {self.length} has {shapes}; the first one {self.features}",
+                f"frames of different sizes: {'; '.join(found)}",
                 "All frames of an episode must have the same cameras and sizes.",
             )
         for name, image in images.items():

@@ -1,6 +1,5 @@
 """The commands `card`, `publish` and `publish-results`."""
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,6 +8,7 @@ import typer
 
 from robomme_interference_data.cli.console import (
     check_output,
+    confirm,
     echo,
     graceful_interrupt,
     print_json,
@@ -261,7 +261,7 @@ def _carry_out(
     print_status(plan_table(plans).text())
     if not dry_run and any(plan.published is None for plan in plans):
         publisher.check_rights(plans)
-        _ask(yes)
+        confirm("Publish this?", "publishing", yes=yes)
         with graceful_interrupt("What was sent is kept; a version exists once it has its tag"):
             plans = run()
     if as_json:
@@ -269,15 +269,3 @@ def _carry_out(
     elif not dry_run:
         print_status(f"{plans[-1].repository.page}/tree/{plans[-1].version.tag}")
     return [] if dry_run else plans
-
-
-def _ask(yes: bool) -> None:
-    """Ask for confirmation; without a terminal, an `InvalidOptionError` names `--yes`."""
-    if yes:
-        return
-    if not sys.stdin.isatty():
-        raise InvalidOptionError(
-            "publishing needs a confirmation, and there is no terminal to ask on",
-            "To confirm, run the same command with --yes.",
-        )
-    typer.confirm("Publish this?", abort=True, err=True)

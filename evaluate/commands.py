@@ -149,9 +149,9 @@ def _run(config: RunConfig | AskConfig, kept: str, unit: str, *, as_json: bool) 
     if result.stopped is not None:
         print_status(f"Stopped: {result.stopped}", fg="red")
     if broken := result.counts["error"]:
+        number = counted(broken, unit.removesuffix("s"))
         print_status(
-            f"{broken} {unit} broke (see {result.folder}/errors.log); re-run them with:\n"
-            f"{command_line()}"
+            f"{number} broke (see {result.folder}/errors.log); re-run with:\n{command_line()}"
         )
         raise typer.Exit(1)
 

@@ -51,6 +51,19 @@ ACTION_CHUNK = 16
 SAMPLE_FRAMES = 32
 """Frames in the memory of FrameSamp."""
 
+VALUE_NAMES = (
+    "joint_1",
+    "joint_2",
+    "joint_3",
+    "joint_4",
+    "joint_5",
+    "joint_6",
+    "joint_7",
+    "gripper",
+)
+"""Values of RoboMME's states and actions: joint positions in rad; the gripper's opening in m in a
+state, −1 closed to 1 open in an action."""
+
 FPS = 10
 """Recorded frames per second."""
 

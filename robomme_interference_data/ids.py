@@ -153,8 +153,8 @@ def _spans(text: str) -> list[range]:
         count += len(spans[-1])
         if count > _MOST_NUMBERS:
             raise InvalidOptionError(
-                f"{text!r} is not a list of episode numbers: it has over {_MOST_NUMBERS:,}",
-                "Give existing episodes, such as 0-49.",
+                f"{text!r} asks for over {_MOST_NUMBERS:,} episodes",
+                "Name those that exist, such as 0-49.",
             )
     return spans
 

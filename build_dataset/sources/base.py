@@ -2,20 +2,19 @@
 
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robomme_interference_data.constants import DIFFICULTIES, FPS
+from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.errors import SourceError, nearest
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EvidenceSpan
 
-_PANDA = ("joint_1", "joint_2", "joint_3", "joint_4", "joint_5", "joint_6", "joint_7", "gripper")
-"""Joint positions in rad; gripper: opening in m in a state, −1 closed to 1 open in an action."""
+from ..alike import same_rate
 
 
 @dataclass(frozen=True)
@@ -60,23 +59,42 @@ class Robot:
     """The robot of an episode; all episodes of a dataset have the same one.
 
     Attributes:
-        fps: Frames per second.
+        fps: Frames per second; None if the recording does not state it.
         type: Name of the robot, as in LeRobot's `robot_type`, or None.
         names: `observation.state` and `action` to the names of their values, where known.
     """
 
-    fps: int = FPS
+    fps: float | None = None
     type: str | None = None
     names: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
-    def with_names(self, features: Mapping[str, Sequence[int]]) -> "Robot":
-        """Return the robot with a name for every value of every vector among the features."""
-        sizes = {name: shape[0] for name, shape in features.items() if len(shape) == 1}
-        default = {
-            name: _PANDA if size == len(_PANDA) else tuple(f"value_{n}" for n in range(size))
-            for name, size in sizes.items()
-        }
-        return replace(self, names=default | self.names)
+    def at(self, given: float | None) -> float:
+        """Return the frame rate: the recorded one or, if that is unknown, the given one.
+
+        Raises:
+            SourceError: Neither is known, or they differ.
+        """
+        if self.fps is None and given is None:
+            raise SourceError(
+                "the recording does not state its frame rate",
+                "Give it with `fps`; in a frames folder a column fps can hold it.",
+            )
+        if self.fps is not None and given is not None and not same_rate(self.fps, given):
+            raise SourceError(
+                f"the recording states {self.fps:g} frames per second; fps is {given:g}",
+                "Leave out `fps`, or correct the recording.",
+            )
+        return self.fps or given  # type: ignore[return-value]
+
+    def check_names(self, features: Mapping[str, Sequence[int]]) -> None:
+        """Check that the known names are one for each value of a vector."""
+        for feature in self.names.keys() & features.keys():
+            names, size = self.names[feature], features[feature][0]
+            if not len({*names}) == len(names) == size:
+                raise SourceError(
+                    f"{feature} has {size} values, and the names {', '.join(names)}",
+                    "Give one name for each value.",
+                )
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,7 @@ def recorded_robot(lerobot: LeRobotFiles, columns: Mapping[str, str]) -> Robot:
     kind = lerobot.info.get("robot_type")
     names = {feature: _value_names(lerobot.features[name]) for feature, name in columns.items()}
     return Robot(
-        fps=max(1, round(lerobot.fps)),
+        fps=lerobot.fps,
         type=kind if isinstance(kind, str) else None,
         names={feature: found for feature, found in names.items() if found},
     )

@@ -96,6 +96,11 @@ def read_families(path: Path, count: int) -> list[dict[str, Any]]:
 
 
 def _number(where: str, name: str, text: str) -> int:
+    if name == "exec_start_idx" and not text:
+        raise ValueError(
+            f"{where}: exec_start_idx is empty; write the number of demonstration frames, or 0 if "
+            "the episode has none"
+        )
     if not (text.isascii() and text.isdigit() and len(text) < 10):
         raise ValueError(f"{where}: {name} is {text[:80]!r}; expected a whole number")
     return int(text)

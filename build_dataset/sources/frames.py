@@ -12,7 +12,6 @@ from typing import Any, override
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import FPS
 from robomme_interference_data.errors import InvalidIdError, SourceError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators.base import choose_cameras
@@ -86,7 +85,8 @@ class FramesSource(Source):
         chosen = choose_cameras(cameras, tuple(key.images))
         if self._state(key.images) != key.state:
             raise SourceError("its files have changed since they were listed", "Start again.")
-        streams, exact, rates = {}, True, set()
+        streams, exact = {}, True
+        rates = set() if key.rows.fps is None else {key.rows.fps}
         for camera in chosen:
             path, length = key.images[camera], key.rows.length
             if path.is_dir():
@@ -95,13 +95,14 @@ class FramesSource(Source):
                 streams[camera] = decode_images(((f, f.read_bytes()) for f in files), exact=True)
             else:
                 rate, lossless = probe_video(path)
-                rates.add(max(1, round(rate)))
+                rates.add(rate)
                 streams[camera] = _iter_video(path, rate, length)
                 exact = exact and lossless
         if len(rates) > 1:
             raise SourceError(
-                f"the cameras' videos have different frame rates: {sorted(rates)}",
-                "Write all videos of an episode at one rate.",
+                f"its videos and {TABLE} state different frame rates: "
+                + ", ".join(f"{rate:g}" for rate in sorted(rates)),
+                "Write all videos of an episode at one rate, the one of the column fps.",
             )
         rows = RowSpan(self._folder / TABLE, key.rows.start, key.rows.start + key.rows.length)
         actions = rows.vectors("action") if "action" in rows.names else None
@@ -112,7 +113,7 @@ class FramesSource(Source):
             simulator=key.rows.simulator,
             exact=exact if key.rows.exact is None else key.rows.exact,
             frames=compose(streams, rows.vectors("state"), actions, key.rows.lesson),
-            robot=Robot(rates.pop() if rates else FPS),
+            robot=Robot(rates.pop() if rates else None, names=key.rows.names),
         )
 
     def _image_paths(self) -> Iterator[tuple[Path, str, str]]:

@@ -1,5 +1,6 @@
 """The table of a frames folder: `frames.parquet`, one row per frame."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -10,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from robomme_interference_data.constants import ACTION, STATE
 from robomme_interference_data.errors import FormatError, InvalidIdError, SourceError, nearest
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.storage.parquet import RowSpan, is_listed
@@ -32,6 +34,15 @@ class EpisodeRows:
     difficulty: str | None
     simulator: str | None
     exact: bool | None
+    fps: float | None
+    state_names: tuple[str, ...] | None
+    action_names: tuple[str, ...] | None
+
+    @property
+    def names(self) -> dict[str, tuple[str, ...]]:
+        """The names of the values of the state and the action, where they are known."""
+        named = {STATE: self.state_names, ACTION: self.action_names}
+        return {feature: names for feature, names in named.items() if names is not None}
 
 
 def _is_text(kind: pa.DataType) -> bool:
@@ -44,7 +55,17 @@ def _is_vector(kind: pa.DataType) -> bool:
     return is_listed(kind) and bool(pa.types.is_floating(kind.value_type))
 
 
+def _is_names(kind: pa.DataType) -> bool:
+    return is_listed(kind) and _is_text(kind.value_type)
+
+
+def _is_number(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_floating(kind) or pa.types.is_integer(kind))
+
+
 _TEXT = _is_text, "text"
+_NAMES = _is_names, "lists of text"
+_RATE = _is_number, "numbers"
 _VECTOR = _is_vector, "lists of floats"
 _NUMBER = pa.types.is_integer, "whole numbers"
 _FLAG = pa.types.is_boolean, "true or false"
@@ -54,7 +75,15 @@ _REQUIRED: dict[str, tuple[Callable[[pa.DataType], bool], str]] = {
     "state": _VECTOR,
     "goal": _TEXT,
 }
-_NULLABLE = {"seed": _NUMBER, "difficulty": _TEXT, "simulator": _TEXT, "exact": _FLAG}
+_NULLABLE = {
+    "seed": _NUMBER,
+    "difficulty": _TEXT,
+    "simulator": _TEXT,
+    "exact": _FLAG,
+    "fps": _RATE,
+    "state_names": _NAMES,
+    "action_names": _NAMES,
+}
 _COLUMNS = {**_REQUIRED, "action": _VECTOR, "is_demo": _FLAG, **_NULLABLE}
 
 
@@ -116,13 +145,23 @@ def _episode(where: str, rows: pa.Table, start: int) -> EpisodeRows:
         )
     values: dict[str, Any] = {}
     for column in ("goal", *_NULLABLE):
-        distinct = pc.unique(rows[column]).to_pylist() if column in rows.column_names else [None]
+        distinct = _distinct(rows[column]) if column in rows.column_names else [None]
         if len(distinct) != 1:
             raise SourceError(
                 f"{where} has several values of {column!r}: {', '.join(map(repr, distinct[:3]))}",
                 "An episode has one: make two episodes of it.",
             )
         values[column] = distinct[0]
+    if values["fps"] is not None and not 0 < values["fps"] < math.inf:
+        raise SourceError(f"{where}: fps is {values['fps']}; expected a positive number")
     marked = "is_demo" in rows.column_names
     lesson = demonstration_length(rows["is_demo"], f"{where}: is_demo") if marked else None
     return EpisodeRows(start, len(rows), lesson, **values)
+
+
+def _distinct(column: pa.ChunkedArray) -> list[Any]:
+    """Return the distinct values of a column; lists, which pyarrow cannot compare, as tuples."""
+    if not is_listed(column.type):
+        return list(pc.unique(column).to_pylist())
+    values = (None if value is None else tuple(value) for value in column.to_pylist())
+    return list(dict.fromkeys(values))

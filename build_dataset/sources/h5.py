@@ -21,8 +21,8 @@ from robomme_interference_data.schema.evidence import spans_of_texts
 from robomme_interference_data.simulators.base import choose_cameras
 from robomme_interference_data.simulators.registry import OFFICIAL
 
-from .base import Frame, Recording, Source, SourceEpisode, demonstration_length, file_state
-from .robomme_families import ROBOMME
+from .base import Frame, Recording, Robot, Source, SourceEpisode, demonstration_length, file_state
+from .robomme_families import ROBOMME, ROBOT
 
 _FILE = re.compile(r"record_dataset_(?P<family>.+)\.h5")
 _CAMERAS = {"front": "front_rgb", "wrist": "wrist_rgb"}
@@ -86,6 +86,7 @@ class H5Source(Source):
     @override
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
         number, path, _ = episode.key
+        official = episode.id.family in ROBOMME
         where = f"{path}: episode_{number}"
         with _opened(path) as file, _complete(where):
             group = file[f"episode_{number}"]
@@ -104,11 +105,13 @@ class H5Source(Source):
                 goals=tuple(_text(goal) for goal in np.atleast_1d(setup["task_goal"][()])),
                 seed=_seed(group),
                 difficulty=_text(setup["difficulty"][()]) if "difficulty" in setup else None,
-                simulator=OFFICIAL,
+                # Other recordings in this layout do not state their rate, robot or simulator.
+                simulator=OFFICIAL if official else None,
                 exact=True,
                 frames=_frames(path, number, steps, lesson, chosen),
                 evidence=spans_of_texts(texts),
                 action_first=True,
+                robot=ROBOT if official else Robot(),
             )
 
 

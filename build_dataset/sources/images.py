@@ -5,6 +5,7 @@ lossless codec or lossless options. Converting to YUV alone already changes 8-bi
 """
 
 from collections.abc import Generator, Iterable
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,8 @@ def probe_video(path: Path) -> tuple[float, bool]:
         raise SourceError(error.message, hint) from None
     if not rate:
         raise SourceError(f"{path} has no frame rate", hint)
-    return float(rate), exact
+    # Containers store a frame's duration in whole ns or ms: 1001 is the denominator of NTSC rates.
+    return float(Fraction(rate).limit_denominator(1001)), exact
 
 
 def info_is_exact(info: dict[str, Any]) -> bool:

@@ -4,7 +4,7 @@ Read with pyarrow and PyAV alone; `docs/reference/sources.md` describes columns 
 """
 
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, override
@@ -12,7 +12,7 @@ from typing import Any, override
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import ACTION, STATE
+from robomme_interference_data.constants import ACTION, STATE, VALUE_NAMES
 from robomme_interference_data.errors import FormatError, SourceError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import from_dict
@@ -25,7 +25,7 @@ from robomme_interference_data.storage.hub import HubFiles, locate
 from robomme_interference_data.storage.lerobot import LeRobotFiles
 from robomme_interference_data.storage.parquet import RowSpan
 
-from .base import Recording, Source, SourceEpisode, compose, demonstration_length, file_state
+from .base import Recording, Robot, Source, SourceEpisode, compose, demonstration_length, file_state
 from .columns import camera_names, find_columns, recorded_robot
 from .families import ids_by_block, ids_by_columns, read_families
 from .images import decode_images, info_is_exact
@@ -131,7 +131,7 @@ class LeRobotSource(Source):
             exact=exact,
             frames=compose(streams, states, actions, lesson),
             evidence=evidence,
-            robot=recorded_robot(self._lerobot, named),
+            robot=self._robot(named, official=simulator == OFFICIAL),
         )
 
     @cached_property
@@ -155,6 +155,16 @@ class LeRobotSource(Source):
     def _metadata(self, index: int, row: dict[str, Any]) -> _Metadata:
         row = row | self._families[index]
         return from_dict(_Metadata, row, f"{self._where}: episode {index}")
+
+    def _robot(self, columns: dict[str, str], *, official: bool) -> Robot:
+        """Return the robot; RoboMME's values have known names, also where its datasets have none.
+
+        `columns` maps features to columns.
+        """
+        robot = recorded_robot(self._lerobot, columns)
+        size = (len(VALUE_NAMES),)
+        named = {f: VALUE_NAMES for f, name in columns.items() if self._lerobot.shape(name) == size}
+        return replace(robot, names=named | robot.names) if official else robot
 
     def _images(
         self, index: int, rows: RowSpan, column: str, exact: bool

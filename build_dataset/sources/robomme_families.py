@@ -9,6 +9,10 @@ newer wordings of the recordings pass. The rules are ours;
 import re
 from typing import NamedTuple
 
+from robomme_interference_data.constants import ACTION, FPS, STATE, VALUE_NAMES
+
+from .base import Robot
+
 
 class _Family(NamedTuple):
     """A family: number in RoboMME's seeds, block of 100 in its LeRobot datasets, and goal patterns.
@@ -57,6 +61,9 @@ ROBOMME = {
     "RouteStick": _Family(16, 11, (_VIDEO, r"\bnavigate around the sticks\b")),
 }
 """By name."""
+
+ROBOT = Robot(FPS, names={STATE: VALUE_NAMES, ACTION: VALUE_NAMES})
+"""RoboMME's robot."""
 
 BLOCKS = tuple(sorted(ROBOMME, key=lambda name: ROBOMME[name].block))
 """The families in the order of their blocks."""

@@ -18,6 +18,7 @@ from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.simulators.base import choose_cameras
 
 from .base import Frame, Recording, Source, SourceEpisode
+from .robomme_families import ROBOT
 
 _CUBES = ((200, 40, 40), (40, 160, 60), (50, 80, 200))
 _EPISODES = {"train": 3, "test": 1}
@@ -67,7 +68,8 @@ class SampleSource(Source):
         goal = f"watch the video carefully, then do the {name.family} task again"
         difficulty = DIFFICULTIES[name.index % 3]
         evidence = scene.evidence(lesson)
-        return Recording((goal,), scene.seed, difficulty, "sample", True, frames, evidence)
+        known = (goal,), scene.seed, difficulty, "sample"
+        return Recording(*known, True, frames, evidence, robot=ROBOT)
 
 
 class _Scene:

@@ -4,6 +4,7 @@ from collections.abc import Generator, Sequence
 from dataclasses import replace
 from typing import Any, override
 
+from robomme_interference_data.constants import ACTION, STATE
 from robomme_interference_data.errors import SimulatorCrashError, SourceError
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.shifts import SHIFTS
@@ -81,7 +82,7 @@ class SimulatorSource(Source):
         drawn = every if chosen and not self._shifted else 0
         lesson, first, info = simulator.reset(str(episode.id), demonstration=drawn)
         known = info.goals, info.seed, info.difficulty, info.simulator
-        robot = Robot(fps=self._class.fps)
+        robot = self._robot()
         if self._shifted:
             views = simulator.views(SHIFTS)
             frames = (Frame(seen.images, seen.state, None, False) for seen in views)
@@ -95,6 +96,11 @@ class SimulatorSource(Source):
         if self._simulator is not None:
             self._simulator.close()
             self._simulator = None
+
+    def _robot(self) -> Robot:
+        names = {STATE: self._class.state_names, ACTION: self._class.action_names}
+        known = {feature: values for feature, values in names.items() if values is not None}
+        return Robot(fps=self._class.fps, names=known)
 
     def _open(self, cameras: tuple[str, ...]) -> Simulator:
         """Return the simulator with these cameras, which is kept for the next episode."""

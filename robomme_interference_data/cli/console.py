@@ -59,6 +59,22 @@ def print_json(value: Any) -> None:
     typer.echo(visible(text, "\\u{:04x}"))
 
 
+def confirm(question: str, what: str, *, yes: bool) -> None:
+    """Ask for confirmation, unless it is given; a refusal ends the command.
+
+    Raises:
+        InvalidOptionError: There is no terminal to ask on; the message names `what` needs it.
+    """
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise InvalidOptionError(
+            f"{what} needs a confirmation, and there is no terminal to ask on",
+            "To confirm, run the same command with --yes.",
+        )
+    typer.confirm(question, abort=True, err=True)
+
+
 def command_line() -> str:
     """Return the current command as text."""
     return shlex.join(["robomme-interference", *sys.argv[1:]])

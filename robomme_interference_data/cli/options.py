@@ -17,15 +17,24 @@ from robomme_interference_data.schema.settings import SETTING
 
 
 def split_commas(values: Sequence[str] | None) -> list[str] | None:
-    """Return the values of a list option."""
+    """Return the values of a list option.
+
+    Raises:
+        typer.BadParameter: One is empty: `--conditions ""` is a mistake, such as an unset variable.
+    """
     if values is None:
         return None
-    return [part for text in values for part in text.split(",") if part]
+    parts = [part.strip() for text in values for part in text.split(",")]
+    if not all(parts):
+        given = ",".join(values)
+        raise typer.BadParameter(f"{given!r} has an empty name. Leave out the option for all.")
+    return parts
 
 
 _LIST: dict[str, Any] = {"callback": split_commas, "metavar": "NAME,…"}
 
 AsJson = Annotated[bool, typer.Option("--json", help="Write JSON to standard output.")]
+Yes = Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")]
 BufferSetFolder = Annotated[
     str, typer.Argument(metavar="BUFFER_SET", help="Folder of the buffer set, or NAMESPACE/NAME.")
 ]

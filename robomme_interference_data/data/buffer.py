@@ -173,11 +173,21 @@ class Buffer:
             cameras: Names of the cameras; None for all.
 
         Raises:
+            InvalidOptionError: `cameras` is one name instead of several.
             UnknownNameError: There is no such camera.
             MissingFileError, HubError: A file is missing, or the Hub cannot be reached.
         """
-        names = self.cameras if cameras is None else cameras
+        names = self._names(cameras)
         self._fetch([names] * len(self.sessions), names)
+
+    def _names(self, cameras: Sequence[str] | None) -> tuple[str, ...]:
+        """Return these cameras, None for all; an unknown one is an error, also in a folder."""
+        if isinstance(cameras, str) or not isinstance(cameras, Iterable | None):
+            raise InvalidOptionError.expected("cameras", cameras, "their names: ['front', 'wrist']")
+        names = self.cameras if cameras is None else tuple(cameras)
+        for name in names:
+            self.query.dataset.shape(name)
+        return names
 
     def _fetch(self, cameras: Iterable[Sequence[str]], query: Sequence[str] | None = None) -> None:
         """Download states and the given cameras of each session, all files of a dataset at once."""
@@ -254,9 +264,7 @@ class Buffer:
         """
         chunk = whole_number("chunk", chunk, "an integer from 1", 1)
         chosen = self._chosen(indices)
-        if isinstance(cameras, str) or not isinstance(cameras, Iterable | None):
-            raise InvalidOptionError.expected("cameras", cameras, "their names: ['front', 'wrist']")
-        names = self.cameras if cameras is None else tuple(cameras)
+        names = self._names(cameras)
         shapes = {name: self.query.dataset.shape(name) for name in names}
         session_index = self.session_index
         used = {*session_index[chosen].tolist()}

@@ -238,17 +238,18 @@ class BufferSet:
             raise UnknownNameError(
                 f"condition {parsed.name!r} is not in {self.location}",
                 f"Planned there: {' '.join(self.conditions)}.",
-                self.planning(*self.conditions, parsed.name),
+                self.planning(parsed.name),
             )
         return parsed
 
     def planning(self, *conditions: str) -> str:
-        """Return the command that plans buffers under these conditions."""
-        command = f"build manifests {self.location}"
+        """Return the command that plans buffers under these conditions too."""
         if isinstance(self.files, HubFiles):  # a published version never changes
             location = self.header.datasets[DEMONSTRATIONS].location
             command = f"new-buffer-set BUFFER_SET --demonstrations {location} --source KIND:PATH"
-        return f"{command} --conditions {','.join(conditions)}"
+            names = [name for name in self.conditions if name not in conditions]
+            return f"{command} --conditions {','.join([*names, *conditions])}"
+        return f"build manifests {self.location} --conditions {','.join(conditions)}"
 
     @property
     def fix(self) -> str:

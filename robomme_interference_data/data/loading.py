@@ -5,12 +5,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robomme_interference_data.constants import MANIFEST_PATH
+from robomme_interference_data.constants import DATASETS, MANIFEST_PATH
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.ids import EpisodeId, whole_number
 from robomme_interference_data.schema.conditions import Condition
 from robomme_interference_data.storage.files import LocalFiles
 from robomme_interference_data.storage.hub import locate
+from robomme_interference_data.storage.staging import staging_path
 
 from .buffer import Buffer
 from .buffer_set import BufferSet
@@ -58,11 +59,20 @@ def load_buffer_set(
                 "Resume it.",
                 fetch_command(files.root, record),
             ) from error
+        hint = "Give a folder with demonstrations/, distractors/ and manifests/, or build one."
+        command: str | None = "build all BUFFER_SET --source KIND:PATH"
+        if isinstance(files, LocalFiles) and _is_unfinished(files.root):
+            hint = "Its build has not finished: run the same build command again to resume it."
+            command = None
         raise MissingFileError(
-            f"{files.describe()} is not a buffer set: {MANIFEST_PATH} is missing",
-            "Give a folder with demonstrations/, distractors/ and manifests/, or build one.",
-            "build all BUFFER_SET --source KIND:PATH",
+            f"{files.describe()} is not a buffer set: {MANIFEST_PATH} is missing", hint, command
         ) from error
+
+
+def _is_unfinished(root: Path) -> bool:
+    """Return whether a folder holds what a build has finished, or has begun."""
+    folders = [root / name for name in DATASETS]
+    return any(path.is_dir() or staging_path(path).is_dir() for path in folders)
 
 
 def load_buffer(

@@ -128,6 +128,8 @@ class Simulator(ABC):
             simulator begins the episode.
         cameras: Names of its cameras, in the order of videos.
         fps: Observations per second: an action is executed for the time between two of them.
+        state_names: Names of the values of a state; None if they have none.
+        action_names: Names of the values of an action; None if they have none.
         settings: Settings of a run that its constructor accepts: `cameras` (to render), `shift`,
             `python` (path of another interpreter), `subgoals` (whether `subgoal` will be called),
             `answer_s` (seconds that a call may take), `buffer_set` (its location). A function
@@ -145,7 +147,9 @@ class Simulator(ABC):
     about: ClassVar[str] = ""
     remote: ClassVar[bool] = False
     cameras: Sequence[str] = CAMERAS
-    fps: ClassVar[int] = FPS
+    fps: ClassVar[float] = FPS
+    state_names: ClassVar[tuple[str, ...] | None] = None
+    action_names: ClassVar[tuple[str, ...] | None] = None
     settings: ClassVar[tuple[str, ...]] = ()
     policies: ClassVar[tuple[str, ...]] = BUILT_IN
     shifts: ClassVar[bool] = False

@@ -106,7 +106,7 @@ class VideoEncoder:
         self,
         path: Path,
         codec: Codec,
-        fps: int,
+        fps: float,
         height: int,
         width: int,
         container: str | None = None,
@@ -120,19 +120,20 @@ class VideoEncoder:
         self._path, self._codec = path, codec
         self._container: Any = None
         os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 prints its settings otherwise
+        rate = Fraction(fps).limit_denominator(1001)  # exact for NTSC rates such as 29.97
         with self._errors():
             # Omits FFmpeg's version.
             self._container = av.open(
                 str(path), "w", format=container, container_options={"fflags": "+bitexact"}
             )
             self._stream = self._container.add_stream(
-                codec.vcodec, rate=fps, options=dict(codec.options)
+                codec.vcodec, rate=rate, options=dict(codec.options)
             )
         self._stream.pix_fmt = codec.pix_fmt
         self._stream.height = height
         self._stream.width = width
         self._stream.codec_context.thread_count = 1  # episodes are encoded in parallel
-        self._time_base = Fraction(1, fps)
+        self._time_base = 1 / rate
         self._stream.time_base = self._time_base
         self._count = 0
 

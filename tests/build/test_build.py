@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from support.buffer_sets import GOLDEN, contents
 from support.made_up import MadeUpSource, record, write_metadata
@@ -12,6 +13,7 @@ from robomme_interference_data.build_dataset.build import BuildResult, build_dat
 from robomme_interference_data.build_dataset.config import AllConfig, BuildConfig, PlanConfig
 from robomme_interference_data.build_dataset.plan import (
     BuildPlan,
+    like,
     list_episodes,
     plan_all,
     plan_alone,
@@ -19,6 +21,7 @@ from robomme_interference_data.build_dataset.plan import (
 )
 from robomme_interference_data.build_dataset.sources import Robot, Source
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
+from robomme_interference_data.constants import FRONT
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import (
     BuildError,
@@ -132,10 +135,89 @@ def test_a_dataset_is_of_one_robot_and_keeps_what_it_is(tmp_path: Path) -> None:
     info = read_json(out / "meta/info.json")
     assert (info["fps"], info["robot_type"]) == (15, "aloha")
     assert info["features"]["observation.state"]["names"] == list("abcdefgh")
-    assert info["features"]["action"]["names"][-1] == "gripper"
-    for other in (replace(robot, fps=10), replace(robot, type=None), Robot(15, "aloha")):
-        with pytest.raises(SourceError, match="cannot be in one dataset"):
-            build(out, MadeUpSource({"A/train/2": (260, None)}, robot=other))
+    assert info["features"]["action"]["names"] is None  # unknown, and not invented
+    others = {
+        "frames per second: 15 in A/train/0, 10 in A/train/2": replace(robot, fps=10),
+        "robot: aloha in A/train/0, unknown in A/train/3": replace(robot, type=None),
+        "values of state: a, b, c, d, e, f, g, h in A/train/0, unknown in": Robot(15, "aloha"),
+    }
+    for number, (difference, other) in enumerate(others.items(), 2):
+        with pytest.raises(SourceError, match="cannot be in one dataset") as caught:
+            build(out, MadeUpSource({f"A/train/{number}": (260, None)}, robot=other))
+        assert difference in caught.value.message and "{" not in caught.value.message
+
+
+@pytest.mark.parametrize("fps", [12.5, 30000 / 1001, 15.0])
+def test_a_frame_rate_is_kept_as_it_is(tmp_path: Path, fps: float) -> None:
+    """LeRobot's files have it, LeRobot opens them, and the frames are the recorded ones."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    out, source = tmp_path / "out", MadeUpSource({"A/train/0": (260, 5)}, robot=Robot(fps))
+    build(out, source)
+    info = read_json(out / "meta/info.json")
+    assert info["fps"] == fps and isinstance(info["fps"], int) == fps.is_integer()
+    assert info["features"]["observation.images.front"]["info"]["video.fps"] == fps
+    dataset = Dataset(LocalFiles(out))
+    frames = [frame for frame in dataset.lerobot.iter_frames(0, FRONT, 0, dataset.record(0).length)]
+    rest = source.read(source.episodes()[0], None).frames
+    expected = [frame.images["front"] for frame in rest][:249:8]
+    assert np.array_equal(frames, expected)
+    opened = LeRobotDataset("any/name", root=out, video_backend="pyav")
+    assert opened.fps == fps and len(opened) == 32
+    assert opened[31]["timestamp"].item() == pytest.approx(31 / fps)
+    image = (opened[31][FRONT].permute(1, 2, 0) * 255).round().byte().numpy()
+    assert np.array_equal(image, expected[31])
+
+
+@pytest.mark.parametrize(
+    ("recorded", "given", "kept"),
+    [
+        (None, None, None),
+        (None, 12.5, 12.5),
+        (15.0, None, 15.0),
+        (15.0, 15.0, 15.0),
+        (15, 10, None),
+    ],
+)
+def test_an_unknown_frame_rate_is_given_or_an_error(
+    tmp_path: Path, recorded: float | None, given: float | None, kept: float | None
+) -> None:
+    source = MadeUpSource({"A/train/0": (260, 5)}, robot=Robot(recorded))
+    if kept is None:
+        with pytest.raises(SourceError):
+            build(tmp_path / "out", source, fps=given)
+        assert not (tmp_path / "out").exists()
+    else:
+        build(tmp_path / "out", source, fps=given)
+        assert Dataset(LocalFiles(tmp_path / "out")).fps == kept
+
+
+def test_names_are_one_for_each_value(tmp_path: Path) -> None:
+    for names in (tuple("abcdefg"), tuple("abcdefgg")):
+        robot = Robot(10, names={"observation.state": names})
+        with pytest.raises(SourceError):
+            build(tmp_path / "out", MadeUpSource({"A/train/0": (260, 5)}, robot=robot))
+
+
+def test_what_cannot_follow_the_demonstrations_is_refused_before_it_is_built(
+    tmp_path: Path,
+) -> None:
+    demonstrations = MadeUpSource({"A/test/0": (20, 5)}, robot=Robot(15))
+    build(tmp_path / "set/demonstrations", demonstrations, kind="demonstrations")
+    base = Dataset(LocalFiles(tmp_path / "set/demonstrations"))
+    out = tmp_path / "set/distractors"
+    slow = MadeUpSource({"B/train/0": (260, None)}, robot=Robot(10))
+    two = MadeUpSource({"B/train/1": (260, None)}, robot=Robot(15), cameras=("front", "top"))
+    clauses = {
+        "frames per second: 15 in the demonstrations, 10 in B/train/0": slow,
+        "camera top: missing in the demonstrations, 24×16 pixels in B/train/1": two,
+    }
+    for clause, source in clauses.items():
+        plan = like(BuildPlan("distractors", (source,), list_episodes((source,))), base)
+        with pytest.raises(SourceError) as caught:
+            build_dataset(plan, out, Serial(), WorkProgress(quiet=True))
+        assert clause in caught.value.message
+        assert not out.exists()
 
 
 TABLETOP = {"kind": "tabletop", "suite_version": 1}
@@ -244,20 +326,21 @@ def config(tmp_path: Path, *source: str, **changes: Any) -> AllConfig:
 def test_units_are_of_train_episodes(tmp_path: Path) -> None:
     plan = plan_build("distractors", config(tmp_path))
     assert {one.id.split for _, one in plan.tasks} == {"train"}
-    plans = plan_all(config(tmp_path, split="test", families=("MoveCube",)), PlanConfig())
+    plans, _ = plan_all(config(tmp_path, split="test", families=("MoveCube",)), PlanConfig())
     assert [str(one.id) for _, one in plans["demonstrations"].tasks] == ["MoveCube/test/0"]
     assert len(plans["distractors"].tasks) == 27
-    few = plan_all(config(tmp_path, episodes="0", unit_episodes="0-1"), PlanConfig())
+    few, _ = plan_all(config(tmp_path, episodes="0", unit_episodes="0-1"), PlanConfig())
     assert len(few["distractors"].tasks) == 18
 
 
 def test_views_under_shifts_and_executions_are_of_the_queries(tmp_path: Path) -> None:
     further = {"shifted": True, "executions": True}
     asked = config(tmp_path, "tabletop", split="test", episodes="0-1", **further)
-    plans = plan_all(asked, PlanConfig(("k1",)))
+    plans, change = plan_all(asked, PlanConfig(("k1",)))
     assert [*plans] == ["demonstrations", "distractors", *further]
     for name in further:
         assert plans[name].tasks == plans["demonstrations"].tasks
+    assert (change.added, change.loses) == (("k1",), False)
 
 
 @pytest.mark.parametrize("kind", ["contradictions", "shifted", "executions"])
@@ -284,6 +367,8 @@ def test_what_goes_with_demonstrations_has_their_episodes_and_cameras(
     [
         ({"workers": 0}, {}, InvalidOptionError),
         ({"time_limit_s": float("nan")}, {}, InvalidOptionError),
+        ({"version": "one"}, {}, InvalidOptionError),
+        ({"fps": 0.0}, {}, InvalidOptionError),
         ({"columns": ("front=a", "front=b")}, {}, InvalidOptionError),
         ({}, {"conditions": ("k0", "k0")}, InvalidOptionError),
         ({}, {"conditions": ("x3",)}, InvalidIdError),
@@ -300,6 +385,21 @@ def test_build_all_checks_options_before_it_reads(
     with pytest.raises(error):
         plan_all(AllConfig(**asked), PlanConfig(**plan))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
+    root = tmp_path / "out"
+    root.mkdir()
+    (root / ".hidden").touch()
+    plan_build("distractors", config(tmp_path))
+    (root / "thesis.txt").write_text("mine")
+    with pytest.raises(BuildError, match=r"out holds thesis.txt, and nothing of a buffer set"):
+        plan_build("distractors", config(tmp_path))
+    staging_path(root / "demonstrations").mkdir()  # a build has begun: the file came later
+    plan_build("distractors", config(tmp_path))
+    file = BuildConfig(source=("sample",), buffer_set=root / "thesis.txt")
+    with pytest.raises(BuildError, match="is a file"):
+        plan_build("distractors", file)
 
 
 @pytest.mark.parametrize("name", ["demonstrations", "distractors", "manifests"])

@@ -140,6 +140,13 @@ def test_datasets_that_do_not_fit(tmp_path: Path) -> None:
     info.write_text(info.read_text().replace("      4,\n", "      8,\n"))
     with pytest.raises(SourceError, match="cannot follow one another"):
         plan_manifests(in_folder(root))
+    info.write_text(info.read_text().replace("      8,\n", "      4,\n"))
+    plan_manifests(in_folder(root))
+    info.write_text(info.read_text().replace('"fps": 10', '"fps": 12.5'))
+    with pytest.raises(SourceError) as caught:
+        plan_manifests(in_folder(root))
+    rates = "frames per second: 10 in the demonstrations, 12.5 in the distractors"
+    assert rates in caught.value.message
     (root / "distractors").rename(root / "units")
     with pytest.raises(MissingFileError):
         plan_manifests(in_folder(root))

@@ -83,6 +83,7 @@ HEADER = "episode_index,family"
         (f"{HEADER},split\n0,A,train\n1,A,trian\n", "episode 1: 'trian' is not a split"),
         (f"{HEADER},index\n0,A,0\n1,A,0\n", "0 and 1 are both named A/train/0"),
         (f"{HEADER},exec_start_idx\n0,A,-1\n", "line 2: exec_start_idx is '-1'"),
+        (f"{HEADER},exec_start_idx\n0,A,\n", "line 2: exec_start_idx is empty.* or 0 if"),
         (f"{HEADER}\n0,{'A' * 200_000}\n", "field larger than"),
     ],
 )

@@ -3,14 +3,17 @@
 import re
 import shutil
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from support.recordings import (
     Rows,
+    check_recording,
     encode_image,
     make_episode,
     rows_of,
@@ -19,8 +22,9 @@ from support.recordings import (
     write_video,
 )
 
+from robomme_interference_data.build_dataset.sources import Recording, Robot
 from robomme_interference_data.build_dataset.sources.frames import FramesSource
-from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.errors import InterferenceError, SourceError
 
 DRAWER, MOVE = "OpenDrawer/train/0", "MoveCube/val/2"
 FOUR = make_episode(4, 4, "open it", cameras=("front",))
@@ -55,6 +59,50 @@ def test_exact(
     )
     source = FramesSource(tmp_path)
     assert source.read(source.episodes()[0], None).exact is exact
+
+
+def test_rate_and_names_are_those_that_are_stated(tmp_path: Path) -> None:
+    """Images have no rate, and no names are made up; a video has its own rate."""
+    write(tmp_path / "images")
+    assert read_one(tmp_path / "images").robot == Robot()
+    names = {
+        "state_names": [f"j{n}" for n in range(8)],
+        "action_names": [f"v{n}" for n in range(8)],
+    }
+    write(
+        tmp_path / "stated",
+        rows_of(DRAWER, FOUR, fps=12.5, **{n: [v] * 4 for n, v in names.items()}),
+    )
+    expected = {"observation.state": names["state_names"], "action": names["action_names"]}
+    assert read_one(tmp_path / "stated").robot == Robot(
+        12.5, names={feature: tuple(values) for feature, values in expected.items()}
+    )
+    write_video(place(tmp_path / "video", kind="videos"), FRONT)
+    write_table(tmp_path / "video", rows_of(DRAWER, FOUR))
+    assert read_one(tmp_path / "video").robot == Robot(10)
+    write_table(tmp_path / "video", rows_of(DRAWER, FOUR, fps=15))
+    with pytest.raises(SourceError, match="different frame rates: 10, 15"):
+        read_one(tmp_path / "video")
+
+
+@pytest.mark.parametrize("rate", [12.5, 15, Fraction(30000, 1001)])
+def test_the_rate_of_a_video(tmp_path: Path, rate: Any) -> None:
+    path = place(tmp_path, kind="videos")
+    path.parent.mkdir(parents=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", Fraction(rate), width=24, height=16, pix_fmt="bgr0")
+        for image in FRONT:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode(None))
+    write_table(tmp_path, rows_of(DRAWER, FOUR))
+    recording = read_one(tmp_path)
+    assert recording.robot.fps == float(rate)
+    check_recording(recording, FOUR, marked=False)
+
+
+def read_one(folder: Path) -> Recording:
+    source = FramesSource(folder)
+    return source.read(source.episodes()[0], None)
 
 
 def test_the_example_in_the_docs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

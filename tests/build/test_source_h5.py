@@ -1,5 +1,6 @@
 """RoboMME's own recordings: what the official files may hold, and what may be wrong with them."""
 
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -9,8 +10,9 @@ import pytest
 from support.damage import flipped_bits
 from support.recordings import EPISODES, check_recording, write_h5
 
-from robomme_interference_data.build_dataset.sources import Recording, open_source
+from robomme_interference_data.build_dataset.sources import Recording, Robot, open_source
 from robomme_interference_data.build_dataset.sources.h5 import H5Source, identify
+from robomme_interference_data.build_dataset.sources.robomme_families import ROBOT
 from robomme_interference_data.errors import InvalidIdError, MissingExtraError, SourceError
 from robomme_interference_data.schema.records import EvidenceSpan
 
@@ -48,6 +50,15 @@ def test_files_that_count_from_one(tmp_path: Path, fingers: int) -> None:
     assert [str(episode.id) for episode in source.episodes()] == list(EPISODES)
     for episode in source.episodes():
         check_recording(source.read(episode, None), EPISODES[str(episode.id)])
+
+
+def test_only_robommes_families_have_robommes_rate_and_names(path: Path) -> None:
+    shutil.copy(path, path.parent / "record_dataset_OpenDrawer.h5")
+    source = open_source(f"robomme-h5:{path.parent}")
+    known, unknown = (source.read(episode, None) for episode in source.episodes())
+    assert (known.robot, known.simulator) == (ROBOT, "robomme")
+    assert (known.robot.fps, len(known.robot.names["action"])) == (10, 8)
+    assert (unknown.robot, unknown.simulator) == (Robot(), None)
 
 
 @pytest.mark.parametrize(

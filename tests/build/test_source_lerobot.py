@@ -127,10 +127,10 @@ def test_another_robot_keeps_its_cameras_rate_names_and_type(tmp_path: Path) -> 
     episode = make_episode(1, 4, MOVE, 2, cameras=cameras)
     root = write_lerobot(tmp_path, one(episode))
     names = {"motors": [f"m{number}" for number in range(8)]}
-    changes: dict[str, Any] = {"fps": 15, "robot_type": "aloha"}
+    changes: dict[str, Any] = {"fps": 12.5, "robot_type": "aloha"}
     edit_info(root, lambda i: i["features"]["action"].update(names=names), **changes)
     recording = read(root)
-    assert recording.robot == Robot(15, "aloha", {"action": tuple(names["motors"])})
+    assert recording.robot == Robot(12.5, "aloha", {"action": tuple(names["motors"])})
     check_recording(recording, episode)
     top = read(root, columns={"top": "observation.images.front"})
     assert set(next(top.frames).images) == {"top", "left", "right"}

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -219,6 +220,14 @@ def test_imports_are_lazy_and_loading_needs_light_libraries_only() -> None:
     assert done.stdout == "[]\n144 []\n"
 
 
+def test_unknown_cameras_are_an_error_in_a_folder_too(tiny_buffers: Path) -> None:
+    load = partial(load_buffer, QUERIES[0], "k1", buffer_set=tiny_buffers)
+    assert len(load(cameras=["front"])) > 0
+    for cameras, error in ((["top"], UnknownNameError), ("front", InvalidOptionError)):
+        with pytest.raises(error):
+            load(cameras=cameras)
+
+
 # --- what is not as it should be ----------------------------------------------------------------
 
 
@@ -227,6 +236,10 @@ def test_what_is_no_buffer_set(tmp_path: Path) -> None:
         with pytest.raises(MissingFileError, match="is not a buffer set") as caught:
             load_buffer_set(folder)
         assert "build all" in str(caught.value.command)
+    (tmp_path / "begun" / ".demonstrations.building").mkdir(parents=True)
+    with pytest.raises(MissingFileError) as caught:
+        load_buffer_set(tmp_path / "begun")
+    assert caught.value.command is None and "to resume it" in str(caught.value.hint)
     with pytest.raises(MissingFileError, match="no folder .*nowhere"):
         load_buffer_set(tmp_path / "nowhere")
     with pytest.raises(InvalidOptionError, match="neither a folder nor"):

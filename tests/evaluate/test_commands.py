@@ -86,7 +86,7 @@ def test_errors_are_printed_with_the_command_to_resume(
     line = f"evaluate {tiny_buffers} --policy noop {USUAL} --families MoveCube"
     done = type_in(f"{line} --conditions no-history --out {tmp_path / 'run'} --max-errors 1")
     assert done.exit_code == 1
-    assert "1 rollouts broke (see" in done.stderr
+    assert "1 rollout broke (see" in done.stderr
     assert "Stopped: 1 in a row broke" in done.stderr
     assert done.stderr.rstrip().splitlines()[-1].startswith("robomme-interference")
 

@@ -277,7 +277,7 @@ def test_the_command_prints_results_and_how_to_resume(
         line = f"ask {TABLETOP} --model openai:{server.url}#tiny --system tiny --families MoveCube"
         line += f" --out {tmp_path / 'run'} --conditions k0 --max-errors 1 --model-option repeats=0"
         code, _, err = run(*line.split())
-        assert code == 1 and "Stopped: 1 in a row broke" in err and "1 questions broke" in err
+        assert code == 1 and "Stopped: 1 in a row broke" in err and "1 question broke" in err
         resume = err.rstrip().splitlines()[-1]
         assert resume.startswith(f"robomme-interference ask {TABLETOP} --model 'openai:")
         server.faults = []

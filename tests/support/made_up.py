@@ -101,7 +101,7 @@ class MadeUpSource(Source):
     actions: bool = True
     cameras: tuple[str, ...] = ("front",)
     evidence: tuple[EvidenceSpan, ...] | None = None
-    robot: Robot = field(default_factory=Robot)
+    robot: Robot = field(default_factory=lambda: Robot(10))
     provenance: dict[str, Any] = field(default_factory=lambda: {"kind": "made-up"})
 
     def episodes(self) -> list[SourceEpisode]:

@@ -134,6 +134,9 @@ run_program()
         (["lits"], "No such command 'lits'"),
         (["list", ".", "--bad"], "No such option: --bad"),
         (["build", "demonstrations", "--source", "frames:."], "Missing argument"),
+        (["list", ".", "--conditions", ""], "has an empty name"),
+        (["build", "manifests", ".", "--conditions", "k0,,k1"], "has an empty name"),
+        (["build", "all", ".", "--source", "sample", "--cameras", " "], "has an empty name"),
     ],
 )
 def test_usage_errors(arguments: list[str], message: str, run: Run) -> None:
@@ -150,7 +153,7 @@ def test_usage_errors(arguments: list[str], message: str, run: Run) -> None:
     ("arguments", "words"),
     [
         ("list S/nowhere", ("neither a folder nor", "namespace/name")),
-        ("list S --conditions k9", ("'k9'", "--conditions no-history,k0,k1,k3,k7,k9")),
+        ("list S --conditions k9", ("'k9'", "build manifests", "--conditions k9")),
         ("show S MoveCube/test/9 k3", ("MoveCube/test/9", EPISODE)),
         ("build distractors S/x --source frmes:S", ("frmes", "frames:FOLDER")),
     ],

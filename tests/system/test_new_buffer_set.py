@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.buffer_sets import GOLDEN
+from support.buffer_sets import GOLDEN, contents
 from support.hub import BASE, push_buffer_set, running_hub
 from support.hub_server import HubServer
 from support.recordings import make_episode, rows_of, write_images, write_table
@@ -37,7 +37,7 @@ def mine(tmp_path: Path) -> str:
         name, episode = f"{family}/train/0", make_episode(number, 249, size=(32, 32), actions=False)
         for camera, images in episode.images.items():
             write_images(tmp_path / f"mine/images/{camera}/{name}", images)
-        rows += rows_of(name, episode, is_demo=[False] * 249)
+        rows += rows_of(name, episode, is_demo=[False] * 249, fps=10)
     write_table(tmp_path / "mine", rows)
     return f"frames:{tmp_path / 'mine'}"
 
@@ -60,6 +60,15 @@ def test_a_buffer_set_for_published_demonstrations(
     lesson = load_buffer_set(GOLDEN).load("MoveCube/test/0", "k0")
     assert np.array_equal(buffer.frames()[: len(lesson)], lesson.frames())
     assert [*verify_buffer_set(buffer_set)] == []
+    # Again: nothing changes. With other units: a question, as planned buffers would get others.
+    made = contents(out)
+    assert run("new-buffer-set", out, *given)[0] == 0
+    assert contents(out) == made
+    code, _, err = run("new-buffer-set", out, *given[:2], "--source", "sample:Cup,Box")
+    assert code == 1 and "k1, k2" in err and "--yes" in err
+    assert contents(out) == made
+    assert run("build", "manifests", out, "--drop", "k2", "--yes")[0] == 0
+    assert load_buffer_set(out).conditions == ("k0", "k1")
 
 
 @pytest.mark.slow

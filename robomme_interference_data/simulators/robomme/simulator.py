@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import FAMILIES, MAX_STEPS
+from robomme_interference_data.constants import FAMILIES, MAX_STEPS, VALUE_NAMES
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EvidenceSpan
@@ -68,6 +68,8 @@ class RoboMMESimulator(Simulator):
         SimulatorCrashError: RoboMME does not start.
     """
 
+    state_names = VALUE_NAMES
+    action_names = VALUE_NAMES
     name = "robomme"
     about = "the official simulator, RoboMME"
     remote = True

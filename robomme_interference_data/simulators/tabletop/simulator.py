@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.constants import VALUE_NAMES
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.lazy import load_extra
 from robomme_interference_data.schema.rollouts import Status
@@ -43,6 +44,8 @@ class TabletopSimulator(Simulator):
     """
 
     name = "tabletop"
+    state_names = VALUE_NAMES
+    action_names = VALUE_NAMES
     about = (
         "tabletop, the simulator embedded in this project, which is not RoboMME: its results stand "
         "beside each other, not beside the paper's"

@@ -1,0 +1,84 @@
+"""Whether episodes can be in one dataset, and datasets in one buffer. Pure rules."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from robomme_interference_data.constants import ACTION, CAMERA_PREFIX
+
+MISSING = "missing"
+_UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True)
+class Look:
+    """What must be alike in episodes that are stored, or played, one after another.
+
+    Attributes:
+        features: Cameras, state and, where they matter, actions, to the shapes of their values.
+        fps: Frames per second.
+        robot_type: Name of the robot; None if unknown.
+        names: Names of the values of the state and the action, where known.
+    """
+
+    features: Mapping[str, tuple[int, ...]]
+    fps: float
+    robot_type: str | None = None
+    names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+def in_buffers(features: Mapping[str, tuple[int, ...]], fps: float) -> Look:
+    """Return what must be alike in the datasets of a buffer set: buffers have no actions."""
+    return Look({name: shape for name, shape in features.items() if name != ACTION}, fps)
+
+
+def differences(one: tuple[str, Look], other: tuple[str, Look]) -> list[str]:
+    """Return how two looks differ, a clause each; every look comes with the name of its owner."""
+    (first, a), (second, b) = one, other
+    facts: dict[str, tuple[str | None, str | None]] = {}
+    for feature in sorted(a.features.keys() | b.features.keys()):
+        title = _title(feature)
+        facts[title] = _size(a.features.get(feature)), _size(b.features.get(feature))
+        facts[f"values of {title}"] = _list(a.names.get(feature)), _list(b.names.get(feature))
+    same = same_rate(a.fps, b.fps)
+    facts["frames per second"] = f"{a.fps:g}", f"{a.fps if same else b.fps:g}"
+    facts["robot"] = a.robot_type, b.robot_type
+    here = {what: values[0] for what, values in facts.items()}
+    return unequal((first, here), (second, {what: values[1] for what, values in facts.items()}))
+
+
+def unequal(one: tuple[str, Mapping[str, Any]], other: tuple[str, Mapping[str, Any]]) -> list[str]:
+    """Return which facts differ, a clause each; every map of facts comes with its owner's name."""
+    (first, here), (second, there) = one, other
+    return [
+        f"{what}: {_shown(here, what)} in {first}, {_shown(there, what)} in {second}"
+        for what in {**here, **there}
+        if here.get(what) != there.get(what)
+    ]
+
+
+def _shown(facts: Mapping[str, Any], what: str) -> object:
+    value = facts.get(what, MISSING)
+    return _UNKNOWN if value is None else value
+
+
+def same_rate(one: float, other: float) -> bool:
+    """Return whether two frame rates are the same, such as 29.97 and 30000 / 1001."""
+    return math.isclose(one, other, rel_tol=1e-5)
+
+
+def _title(feature: str) -> str:
+    if feature.startswith(CAMERA_PREFIX):
+        return f"camera {feature.removeprefix(CAMERA_PREFIX)}"
+    return "action" if feature == ACTION else "state"
+
+
+def _size(shape: tuple[int, ...] | None) -> str:
+    if shape is None:
+        return MISSING
+    return f"{shape[0]} values" if len(shape) == 1 else f"{shape[1]}×{shape[0]} pixels"
+
+
+def _list(names: tuple[str, ...] | None) -> str | None:
+    return None if names is None else ", ".join(names)
