@@ -75,7 +75,7 @@ def results_facts(results: Score | Path) -> Facts:
         for simulator in found.outcomes
         if Data(found, simulator).cells
     }
-    effects, statuses = found.tables["effects"], Counter(row.status for row in found.rows)
+    effects, statuses = found.tables.get("effects"), Counter(row.status for row in found.rows)
     starts = run.starts if run is not None else ()
     return Facts(
         kind="results",
@@ -98,7 +98,7 @@ def results_facts(results: Score | Path) -> Facts:
             "grids": [
                 {"title": one.title, "table": one, "note": Raw(one.note)} for one in found.grids
             ],
-            "effects": {"table": effects, "note": Raw(effects.note)} if effects.rows else None,
+            "effects": {"table": effects, "note": Raw(effects.note)} if effects else None,
             "standing": _standing(found, run),
             "grid": _EXPECTED[found.settings.expected],
             "cells": _cells(found),

@@ -215,6 +215,12 @@ def points(value: float) -> str:
     return "0.0" if text in ("+0.0", "-0.0") else text.replace("-", "−")
 
 
+def error_change(value: float) -> str:
+    """Return a difference of action errors, `+0.0123` or `−0.0040`."""
+    text = f"{value:+.4f}"
+    return "0.0000" if text in ("+0.0000", "-0.0000") else text.replace("-", "−")
+
+
 def p_text(value: float) -> str:
     """Return a p-value as `0.031` or `< 0.001`."""
     return "< 0.001" if value < 0.001 else f"{value:.3f}"

@@ -17,6 +17,7 @@ from robomme_interference_data.evaluate import Policy, RolloutInfo, RunConfig, r
 from robomme_interference_data.evaluate.rollout.rollout import run_rollout
 from robomme_interference_data.evaluate.run.kind import Run
 from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.evaluate.run.progress import error_table
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.schema.rollouts import Rollout
@@ -232,3 +233,16 @@ def test_the_command(buffers: Path, tmp_path: Path, run: Callable[..., Any]) -> 
     code, _, err = run("score", tmp_path / "run", "--out", tmp_path / "score")
     assert code == 0, err
     assert (tmp_path / "score/tables/action_error.csv").is_file()
+
+
+def test_recordings_on_which_a_policy_breaks_are_counted(
+    buffers: Path, tmp_path: Path, run: Callable[..., Any]
+) -> None:
+    policy = "python:support.own_policies:Choosy"
+    done = evaluate(buffers, tmp_path / "run", policy=policy, conditions=("k0",))
+    assert (done.counts["measured"], done.counts["error"]) == (1, 1)
+    [(_, shown), (_, broken), (_, both)] = error_table(done.rows).rows
+    assert (broken, both) == ("1 broke", f"{shown}, 1 broke")
+    code, text, err = run("score", tmp_path / "run", "--out", tmp_path / "score")
+    assert code == 0, err
+    assert f"{shown}† n=1, errors: 1" in text
