@@ -4,7 +4,13 @@ import math
 import re
 from collections.abc import Sequence
 
-from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, EXECUTIONS, STATE
+from robomme_interference_data.constants import (
+    ACTION,
+    ACTION_CHUNK,
+    DEMONSTRATIONS,
+    EXECUTIONS,
+    STATE,
+)
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import InterferenceError, InvalidOptionError, UnknownNameError
 from robomme_interference_data.evaluate.policies.policy import BATCH_METHODS, Policy
@@ -67,6 +73,9 @@ def default_system(config: RunConfig) -> str:
         options = policy_options(config.policy, config.policy_options)
         name += "-extrapolate" if options.get("extrapolate") else ""
         name += "" if options.get("points", True) else "-simple"
+    if spec.kind == "hold":
+        chunk = policy_options(config.policy, config.policy_options)["chunk"]
+        name += "" if chunk == ACTION_CHUNK else f"-chunk{chunk}"
     if spec.kind == "python":
         name = re.sub(r"[^A-Za-z0-9._-]+", "-", name.partition("-")[2]).strip("-")
     return with_retrieval(name, config)
@@ -95,9 +104,7 @@ def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> 
         raise InvalidOptionError(
             f"the policy {config.policy} needs a script of the simulator, and {config.simulator} "
             "has none for it",
-            "Leave out `offline`, or set another policy."
-            if config.offline
-            else "Set another simulator, such as tabletop, or another policy.",
+            _script_hint(config, kind),
         )
     retrieval = [] if config.retrieval is None else [config.retrieval_camera]
     if kind == "answers":
@@ -113,6 +120,14 @@ def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> 
         from .clips import check_drawing
 
         check_drawing()
+
+
+def _script_hint(config: RunConfig, kind: str) -> str:
+    if config.offline:
+        return "Leave out `offline`, or set another policy."
+    if kind in simulator_class(RECORDINGS).policies:
+        return "Set `offline`: it repeats recorded actions."
+    return "Set another simulator, such as tabletop, or another policy."
 
 
 def _check_robot(config: RunConfig, buffer_set: BufferSet, kind: str) -> None:

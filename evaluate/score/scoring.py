@@ -21,8 +21,8 @@ TABLES = (
     *("main", "chance", "systems", "ranks", "family", "difficulty", "lift", "effects"),
     *("interaction", "equivalence", "interference", "by_evidence_kept", "evidence_effects"),
     *("evidence_use", "ceiling", "decay", "model", "steps", "noise", "families", "family_effects"),
-    *("matrix", "coverage", "paper", "paper_family"),
-    *("action_error", offline.CHANGES, offline.SYSTEMS),
+    *("matrix", "action_error", offline.CHANGES, offline.SYSTEMS),
+    *("coverage", "paper", "paper_family"),
 )
 """Every table that a score may have, in order."""
 
@@ -58,6 +58,12 @@ class Score:
     error_cells: Sequence[action_error.ErrorCell]
     tables: Mapping[str, Table]
     grids: Sequence[Table]
+
+    @property
+    def every(self) -> list[Outcomes]:
+        """The outcomes of each simulator, and of recordings."""
+        recordings = [] if self.recordings is None else [self.recordings]
+        return [*self.outcomes.values(), *recordings]
 
 
 def score(settings: Settings, draws: int = DRAWS) -> Score:

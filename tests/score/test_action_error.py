@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from support import scoring as made
 from support.scoring import OWN
+from support.scoring import recording as row
 
 from robomme_interference_data.errors import FormatError, InvalidOptionError, RunError
 from robomme_interference_data.evaluate.run.plan import Plan
@@ -26,20 +27,6 @@ ERRORS = {  # of the values of actions, in episodes 0, 1, 2
     "k1": [(0.1, 0.5), (0.2, 0.4), None],  # 0.3, 0.3
     "held-k1": [(0.1, 0.3), (0.2, 0.2), (0.1, 0.1)],
 }
-
-
-def row(condition: str, episode: int, values: tuple[float, ...] | None) -> Rollout:
-    one = made.row(OWN, condition, "MoveCube", episode, "s")
-    one = replace(one, simulator="recordings", family="OpenDrawer", seed=None)
-    if values is None:
-        return replace(one, status="error", success=None, error="it broke")
-    return replace(
-        one,
-        status="measured",
-        success=None,
-        action_l1=sum(values) / len(values),
-        action_l1_values=" ".join(map(str, values)),
-    )
 
 
 def rows() -> list[Rollout]:
@@ -199,7 +186,7 @@ def test_systems_without_a_revision_are_not_compared(tmp_path: Path) -> None:
 def test_the_report_of_offline_runs_has_no_empty_part(tmp_path: Path) -> None:
     found = made.score(made.write_parquet(tmp_path / "rows.parquet", rows()))
     assert all(table.rows for table in found.tables.values())
-    assert [*found.tables] == ["coverage", "action_error", "action_error_changes"]
+    assert [*found.tables] == ["action_error", "action_error_changes", "coverage"]
     write_score(found, tmp_path / "score", formats=(".png",))
     names = sorted(path.name for path in (tmp_path / "score/figures").iterdir())
     assert names == ["action_error-recordings.png", "action_error-recordings.svg"]

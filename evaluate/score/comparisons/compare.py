@@ -338,8 +338,8 @@ def _stopped(name: str, sides: Iterable[_Side]) -> list[str]:
     ]
     listed = "; ".join(parts)
     note = (
-        f"{name} was stopped early or is still running; planned episodes that do not count: "
-        f"{listed}. Looking again and again finds too much: plan the looks (--looks)."
+        f"{name} was stopped early, is still running, or broke in part; planned episodes that do "
+        f"not count: {listed}. Looking again and again finds too much: plan the looks (--looks)."
     )
     return [note] if parts else []
 

@@ -63,14 +63,19 @@ def draw_figures(
                     drawn[name] = folder / f"{name}.svg"
     if any(cell.n for cell in score.error_cells):
         with open_figure() as figure:
-            figure.set_layout_engine("constrained")
-            offline.action_error(figure, score)
-            _finish(figure)
+            draw_error_figure(figure, score)
             name = f"action_error-{RECORDINGS}"
             for suffix in suffixes:
                 save_figure(figure, folder / (name + suffix))
             drawn[name] = folder / f"{name}.svg"
     return drawn
+
+
+def draw_error_figure(figure: Any, score: Score) -> None:
+    """Draw the figure of offline runs."""
+    figure.set_layout_engine("constrained")
+    offline.action_error(figure, score)
+    _finish(figure)
 
 
 def draw_figure(kind: str, figure: Any, data: Data) -> bool:

@@ -8,7 +8,7 @@ from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.cells import Cell
 from robomme_interference_data.evaluate.score.tables.equivalence import BEYOND, EQUIVALENT, OPEN
 from robomme_interference_data.evaluate.systems import base_of, display_name, is_reference
-from robomme_interference_data.schema.conditions import parse_condition
+from robomme_interference_data.schema.conditions import NO_HISTORY, parse_condition
 from robomme_interference_data.stats.intervals import wilson
 from robomme_interference_data.stats.significance import ALPHA, holm
 from robomme_interference_data.stats.signs import simultaneous
@@ -48,6 +48,11 @@ def _offline(score: Score) -> str:
             f"Offline, {display_name(lowest.system)} has the lowest action error, "
             f"{lowest.error.value:.4f} under {named(lowest.condition)}, over {lowest.n} recordings."
         )
+    with_history = {cell.system for cell in cells if cell.condition != NO_HISTORY}
+    lone = [cell for cell in complete if cell.system not in with_history]
+    if lone and with_history:
+        listed = ", ".join(f"{display_name(one.system)} {one.error.value:.4f}" for one in lone)
+        sentences.append(f"Without history: {listed}.")
     if len(complete) < len(cells):
         sentences.append(f"{len(complete)} of {len(cells)} cells are complete.")
     if errors := sum(cell.errors for cell in cells):

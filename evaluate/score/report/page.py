@@ -19,12 +19,7 @@ from robomme_interference_data.evaluate.run.log import RunHeader
 from robomme_interference_data.evaluate.score.comparisons import offline
 from robomme_interference_data.evaluate.score.comparisons.contrast import START
 from robomme_interference_data.evaluate.score.config import Expected
-from robomme_interference_data.evaluate.score.outcomes import (
-    STATUSES,
-    Outcomes,
-    mean_errors,
-    success,
-)
+from robomme_interference_data.evaluate.score.outcomes import STATUSES, mean_errors, success
 from robomme_interference_data.evaluate.score.plots.data import FEW
 from robomme_interference_data.evaluate.score.plots.figures import FIGURES
 from robomme_interference_data.evaluate.score.rows.reading import Rows
@@ -63,11 +58,11 @@ def write_report(
     score: Score, figures: Mapping[str, Path], out: Path, command: str | None = None
 ) -> None:
     """Write the page: the same bytes for the same rows, options and command."""
-    names = {name for one in _every(score) for name in one.conditions}
+    names = {name for one in score.every for name in one.conditions}
     conditions = [one.name for one in in_order(names)] if names else []
     values = {
         "headlines": headlines(score),
-        "strongest": {one.simulator: strongest(score, one.simulator) for one in _every(score)},
+        "strongest": {one.simulator: strongest(score, one.simulator) for one in score.every},
         "grids": score.grids,
         "tables": score.tables.values(),
         "systems": _names(score),
@@ -86,14 +81,9 @@ def write_report(
     write_text(out, html)
 
 
-def _every(score: Score) -> list[Outcomes]:
-    """Return the outcomes of each simulator, and of recordings."""
-    return [*score.outcomes.values(), *filter(None, [score.recordings])]
-
-
 def headlines(score: Score) -> dict[str, str]:
     """Return the main finding of each simulator, and of recordings."""
-    return {one.simulator: headline(score, one.simulator) for one in _every(score)}
+    return {one.simulator: headline(score, one.simulator) for one in score.every}
 
 
 def _number(text: str) -> str:
@@ -130,7 +120,7 @@ def _inline(figures: Mapping[str, Path]) -> dict[str, str]:
 
 def _names(score: Score) -> dict[str, str]:
     """Return the display names of the systems that have rows."""
-    systems = {one: None for outcomes in _every(score) for one in outcomes.systems}
+    systems = {one: None for outcomes in score.every for one in outcomes.systems}
     return {system: display_name(system) for system in systems}
 
 
@@ -146,7 +136,7 @@ def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
     """
     videos = _videos(score.rows)
     rows = []
-    for outcomes in _every(score):
+    for outcomes in score.every:
         errors = mean_errors(outcomes.action_l1)
         for place, system in enumerate(outcomes.systems):
             counts = outcomes.counts[place].transpose(1, 0, 2).tolist()
@@ -238,7 +228,10 @@ def _facts(score: Score, command: str | None) -> dict[str, list[str]]:
         **call,
         "scored with": versions(),
         "rows": f"{len(rows):,}",
-        "episodes of a complete cell": _GRIDS[settings.expected],
+        "episodes of a complete cell": _GRIDS[settings.expected] if score.outcomes else "",
+        "recordings of a complete cell": "those in any row or in the plan of a run"
+        if score.recordings
+        else "",
         "bootstrap": f"{score.draws:,} draws, seeded by the simulator, clustered by episode",
         "model seeds": ", ".join(map(str, seeds[:20])) if len(seeds) > 1 else "",
         **{
