@@ -89,7 +89,7 @@ def test_what_is_printed(tmp_path: Path) -> None:
     lines = done.stdout.splitlines()
     assert lines[0] == "Success by system and condition, tabletop"
     assert lines[2].split() == ["system", "no-history", "k0", "k1", "k3", "k7"]
-    assert "**58.3%**" in lines[4] and "80.7]" in done.stdout
+    assert "58.3%*" in lines[4] and "80.7]" in done.stdout
     assert "Rows of tabletop are not compared with the paper's RoboMME." in done.stderr
     done = run("compare", path, again(path))
     assert done.stdout.startswith("Two runs compared\n\nsimulator")

@@ -37,8 +37,8 @@ _ERRORS = (
     "depend on the outcome."
 )
 _BEST = (
-    " Best (bold): above zero, and no other system is significantly better, by p after Holm's "
-    "correction over all pairs of systems."
+    " Best (bold, in text *): above zero, and no other system is significantly better, by p after "
+    "Holm's correction over all pairs of systems."
 )
 _FIXED = (
     " fixed low to fixed high: Wilson's interval for other episodes of the same families in the "
