@@ -15,12 +15,7 @@ from robomme_interference_data.cli.console import (
     print_status,
 )
 from robomme_interference_data.cli.options import AsJson, BufferSetFolder, with_settings
-from robomme_interference_data.errors import (
-    InvalidOptionError,
-    MissingExtraError,
-    MissingFileError,
-    counted,
-)
+from robomme_interference_data.errors import MissingExtraError, MissingFileError, counted
 from robomme_interference_data.evaluate.score.config import Expected
 
 from .publication import OTHER, Publication, PublishConfig

@@ -10,7 +10,7 @@ from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import InvalidOptionError, counted
 from robomme_interference_data.evaluate.score.outcomes import TEST_EPISODES
 from robomme_interference_data.schema.records import EpisodeRecord
-from robomme_interference_data.simulators.registry import SIMULATORS, simulator_class
+from robomme_interference_data.simulators.registry import RECORDINGS, SIMULATORS, simulator_class
 from robomme_interference_data.storage.files import sha256_file
 
 from .markdown import code, escape
@@ -85,6 +85,7 @@ def is_whole_grid(records: Sequence[EpisodeRecord]) -> bool:
 def origin_limit(simulators: Sequence[str]) -> str:
     """Return where episodes come from, in a sentence."""
     known = {name: simulator_class(name).about for name in SIMULATORS}
+    known[RECORDINGS] = simulator_class(RECORDINGS).about
     known["sample"] = "sample, made-up pictures without content, for trying the tools out"
     named = [known.get(name, f"the simulator {name}") for name in simulators]
     if not named:

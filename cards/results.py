@@ -10,16 +10,19 @@ from typing import Any
 from robomme_interference_data.constants import PROTOCOL_VERSION, RUN_HEADER, RUN_RECORD, RUN_TABLES
 from robomme_interference_data.errors import InvalidOptionError, PublishError, counted
 from robomme_interference_data.evaluate.run.log import RunHeader, read_record
+from robomme_interference_data.evaluate.score.comparisons import offline as offline_tables
 from robomme_interference_data.evaluate.score.config import Expected, Settings
 from robomme_interference_data.evaluate.score.outcomes import STATUSES
 from robomme_interference_data.evaluate.score.plots.data import Data
-from robomme_interference_data.evaluate.score.plots.figures import draw_figure
-from robomme_interference_data.evaluate.score.report.headline import headline
+from robomme_interference_data.evaluate.score.plots.figures import draw_error_figure, draw_figure
+from robomme_interference_data.evaluate.score.report.page import headlines
 from robomme_interference_data.evaluate.score.scoring import Score, score
+from robomme_interference_data.evaluate.score.tables.cells import Coverage
 from robomme_interference_data.evaluate.score.writing import write_score
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.schema.codec import to_dict
-from robomme_interference_data.schema.rollouts import TIMING_COLUMNS, Rollout
+from robomme_interference_data.schema.rollouts import TIMING_COLUMNS, Rollout, Status
+from robomme_interference_data.simulators.registry import RECORDINGS
 from robomme_interference_data.storage.files import digest_json, sha256_file
 from robomme_interference_data.viz.figure import open_figure, save_figure
 from robomme_interference_data.viz.tables import Table
@@ -30,6 +33,8 @@ from .publication import Publication, Version
 from .publisher import RepoContent
 from .render import card_files
 from .repo import LocalFile, RepoFiles
+
+_ERROR_PICTURE = f"README-{RECORDINGS}.png"
 
 _EXPECTED = {
     Expected.BENCHMARK: "those of the benchmark, nine families with test episodes 0 to 49 each",
@@ -47,10 +52,6 @@ def results_facts(results: Score | Path) -> Facts:
         results: The folder of a run, a file of rows, or the score of either.
     """
     found = results if isinstance(results, Score) else score(Settings(rows=(results,)))
-    if not found.outcomes:
-        raise InvalidOptionError(
-            "the rows are of an offline run", "Publish the results of rollouts or questions."
-        )
     if len(found.rows.sources) != 1:
         raise InvalidOptionError(
             f"the score is of {len(found.rows.sources)} files of rows; expected one run",
@@ -68,43 +69,67 @@ def results_facts(results: Score | Path) -> Facts:
         sha256=sha256_file(file),
         split=splits.pop() if len(splits) == 1 else "mixed",
     )
-    systems = dict.fromkeys(name for one in found.outcomes.values() for name in one.systems)
+    every = found.every
+    systems = dict.fromkeys(name for one in every for name in one.systems)
     names = list(map(display_name, systems))
+    offline = not found.outcomes
     figures = {
         f"README-{re.sub('[^A-Za-z0-9._-]', '-', simulator)}.png": simulator
         for simulator in found.outcomes
         if Data(found, simulator).cells
     }
-    effects, statuses = found.tables["effects"], Counter(row.status for row in found.rows)
+    captions = {file: f"Success by condition, {name}" for file, name in figures.items()}
+    if any(cell.n for cell in found.error_cells):
+        captions[_ERROR_PICTURE] = "Action error by condition, offline"
+    differences = [
+        found.tables[name]
+        for name in ("effects", offline_tables.CHANGES, offline_tables.SYSTEMS)
+        if name in found.tables
+    ]
+    statuses = Counter(row.status for row in found.rows)
+    what = "Action errors of" if offline else "Rollouts of"
     starts = run.starts if run is not None else ()
     return Facts(
         kind="results",
         title="RoboMME-Interference results",
-        description=f"Rollouts of {', '.join(names)} on RoboMME-Interference: "
+        description=f"{what} {', '.join(names)} on RoboMME-Interference: "
         f"{counted(len(found.rows), 'row')}.",
-        origin="A policy was rolled out in a simulator, one row per episode.",
+        origin="A policy acted along recordings, one row per episode."
+        if offline
+        else "A policy was rolled out in a simulator, one row per episode.",
         examples=len(found.rows),
         tables=[rows],
         families=tuple(found.rows.names("family")),
-        simulators=tuple(found.outcomes),
-        simulated=True,
+        simulators=tuple(one.simulator for one in every),
+        simulated=not offline,
         limits=_limits(found),
         provenance=_provenance(found, run, rows),
         pictures=lambda: _pictures(found, figures),
         values={
             "systems": names,
-            "headlines": {name: headline(found, name) for name in found.outcomes},
-            "figures": {file: f"Success by condition, {name}" for file, name in figures.items()},
+            "what": what,
+            "unit": "recording" if offline else "rollout",
+            "error_counts": "does not count"
+            if offline
+            else "counts neither as success nor as failure",
+            "headlines": headlines(found),
+            "figures": captions,
             "grids": [
                 {"title": one.title, "table": one, "note": Raw(one.note)} for one in found.grids
             ],
-            "effects": {"table": effects, "note": Raw(effects.note)} if effects.rows else None,
+            "differences": [{"table": one, "note": Raw(one.note)} for one in differences],
             "standing": _standing(found, run),
-            "grid": _EXPECTED[found.settings.expected],
+            "grid": "all recordings in the rows and in the plan of the run"
+            if offline
+            else _EXPECTED[found.settings.expected],
             "cells": _cells(found),
             "rows": len(found.rows),
             "rows_file": rows.path,
-            "statuses": ", ".join(f"{statuses[one]:,} {one}" for one in STATUSES),
+            "statuses": ", ".join(
+                f"{statuses[one]:,} {one}"
+                for one in STATUSES
+                if statuses[one] or (one is Status.MEASURED) is offline
+            ),
             "refused": found.rows.refused,
         },
         base_kind="buffer set",
@@ -115,23 +140,34 @@ def results_facts(results: Score | Path) -> Facts:
 
 
 def _limits(found: Score) -> list[str]:
-    partial = (
-        "Not every cell is complete: success rates of incomplete and complete cells are not "
-        "comparable."
-    )
-    complete = all(cell.complete for cell in found.cells if not cell.part)
-    return [
-        origin_limit(tuple(found.outcomes)),
-        *found.notes,
-        *[partial] * (not complete),
-        "Repeating an episode on a GPU may give another outcome: judge small differences by the "
-        "paired tests, or repeat the run with other model seeds.",
-    ]
+    limits = [origin_limit([one.simulator for one in found.every]), *found.notes]
+    what = "success rates" if found.outcomes else "action errors"
+    if not all(cell.complete for cell in _whole(found)):
+        limits.append(
+            f"Not every cell is complete: {what} of incomplete and complete cells are not "
+            "comparable."
+        )
+    if found.outcomes:
+        limits.append(
+            "Repeating an episode on a GPU may give another outcome: judge small differences by "
+            "the paired tests, or repeat the run with other model seeds."
+        )
+    if found.error_cells:
+        limits.append(
+            "A small action error does not imply success: the policy never sees the consequences "
+            "of its own actions."
+        )
+    return limits
+
+
+def _whole(found: Score) -> list[Coverage]:
+    """Return the cells over all episodes."""
+    return [cell for cell in (*found.cells, *found.error_cells) if not cell.part]
 
 
 def _standing(found: Score, run: RunHeader | None) -> str:
     """Return how complete the run is, in a sentence."""
-    cells = [cell for cell in found.cells if not cell.part]
+    cells = _whole(found)
     cell_text = f"{sum(cell.complete for cell in cells)} of {len(cells)} cells are complete."
     if run is None:
         return cell_text
@@ -141,13 +177,17 @@ def _standing(found: Score, run: RunHeader | None) -> str:
 
 
 def _pictures(found: Score, figures: dict[str, str]) -> dict[str, bytes]:
-    """Draw success by condition, one picture per simulator."""
+    """Draw success by condition, one picture per simulator, and the action error offline."""
     with TemporaryDirectory() as folder:
         for file, simulator in figures.items():
             with open_figure() as figure:
                 draw_figure("success", figure, Data(found, simulator))
                 save_figure(figure, Path(folder) / file)
-        return {file: (Path(folder) / file).read_bytes() for file in figures}
+        if any(cell.n for cell in found.error_cells):
+            with open_figure() as figure:
+                draw_error_figure(figure, found)
+                save_figure(figure, Path(folder) / _ERROR_PICTURE)
+        return {path.name: path.read_bytes() for path in sorted(Path(folder).iterdir())}
 
 
 def _provenance(found: Score, run: RunHeader | None, table: CardTable) -> Rows:
@@ -185,8 +225,7 @@ def _cells(found: Score) -> Table:
             *(cell.simulator, display_name(cell.system), cell.condition, cell.n, cell.expected),
             *(len(cell.missing), cell.errors, cell.complete),
         )
-        for cell in found.cells
-        if not cell.part
+        for cell in _whole(found)
     ]
     columns = "simulator system condition n:count expected:count missing:count errors:count"
     return Table.make("cells", "Cells", f"{columns} complete:flag", rows)

@@ -137,6 +137,9 @@ _CONTROLS = (
     ),
     *_control("Questions-Recall", retrieval=False, reference=True),
     *_control("Questions-Recall", retrieval=True, reference=True),
+    # Baselines along recordings.
+    System("hold", "Hold", "none", with_history=False, reference=True),
+    System("mean", "Mean", "none", with_history=False, reference=True),
 )
 
 SYSTEMS: dict[str, System] = {system.name: system for system in (*PAPER_SYSTEMS, *_CONTROLS)}

@@ -18,7 +18,7 @@ from robomme_interference_data.runtime.specs import (
 
 from .policy import Policy
 
-BUILTINS = ("replay", "recall", "oracle", "guess", "follow-subgoals", "noop")
+BUILTINS = ("replay", "recall", "oracle", "guess", "follow-subgoals", "noop", "hold", "mean")
 """Policies without learned weights."""
 
 _SERVER = r"(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):[0-9]{1,5}"
@@ -55,6 +55,8 @@ POLICIES = Registry(
         "guess": _builtin("guess", "Privileged", name="guess"),
         "follow-subgoals": _builtin("follow-subgoals", "FollowSubgoals"),
         "noop": _builtin("noop", "Noop"),
+        "hold": Kind("hold", f"{__package__}.baselines:Hold"),
+        "mean": Kind("mean", f"{__package__}.baselines:Mean"),
         "answers": Kind(
             "answers:folder of a run of questions, or answers:file.csv",
             f"{__package__}.answers:ActOutAnswers",

@@ -4,7 +4,13 @@ import math
 import re
 from collections.abc import Sequence
 
-from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, EXECUTIONS, STATE
+from robomme_interference_data.constants import (
+    ACTION,
+    ACTION_CHUNK,
+    DEMONSTRATIONS,
+    EXECUTIONS,
+    STATE,
+)
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import InterferenceError, InvalidOptionError, UnknownNameError
@@ -67,6 +73,9 @@ def default_system(config: RunConfig) -> str:
         options = policy_options(config.policy, config.policy_options)
         name += "-extrapolate" if options.get("extrapolate") else ""
         name += "" if options.get("points", True) else "-simple"
+    if spec.kind == "hold":
+        chunk = policy_options(config.policy, config.policy_options)["chunk"]
+        name += "" if chunk == ACTION_CHUNK else f"-chunk{chunk}"
     if spec.kind == "python":
         name = re.sub(r"[^A-Za-z0-9._-]+", "-", name.partition("-")[2]).strip("-")
     return with_retrieval(name, config)
@@ -94,9 +103,7 @@ def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> 
         raise InvalidOptionError(
             f"the policy {config.policy} needs a script of the simulator, and {config.simulator} "
             "has none for it",
-            "Leave out `offline`, or set another policy."
-            if config.offline
-            else "Set another simulator, such as tabletop, or another policy.",
+            _script_hint(config, kind),
         )
     if kind == "answers":
         check_unused(config, ["retrieval"], config.policy, "Set it for the questions instead.")
@@ -128,6 +135,14 @@ def _check_cameras(config: RunConfig, demonstrations: Dataset, policy: Policy) -
             "To act along the recordings of this buffer set, without a simulator, set `offline`. "
             "In the simulator, set another policy, or another `retrieval_camera`.",
         )
+
+
+def _script_hint(config: RunConfig, kind: str) -> str:
+    if config.offline:
+        return "Leave out `offline`, or set another policy."
+    if kind in simulator_class(RECORDINGS).policies:
+        return "Set `offline`: it repeats recorded actions."
+    return "Set another simulator, such as tabletop, or another policy."
 
 
 def _check_robot(config: RunConfig, buffer_set: BufferSet, kind: str) -> None:

@@ -75,7 +75,8 @@ class RunConfig(WorkConfig):
     policy: str = setting(
         group=_POLICY,
         help="replay or recall (both also with :framesamp or :window), oracle, guess, "
-        "follow-subgoals, noop, answers:FOLDER, websocket://HOST:PORT (several with commas), "
+        "follow-subgoals, noop, hold or mean (both --offline), answers:FOLDER, "
+        "websocket://HOST:PORT (several with commas), "
         "websocket with --serve, vla-eval:ws://HOST:PORT (several with commas), "
         "lerobot:REPO[@REVISION], lerobot:FOLDER or python:module:factory.",
     )

@@ -114,18 +114,25 @@ def rate_table(rows: Iterable[Rollout]) -> Table:
 
 
 def error_table(rows: Iterable[Rollout]) -> Table:
-    """Return the mean action error of an offline run by family and condition."""
-    errors: dict[Cell, list[float]] = {}
+    """Return the mean action error of an offline run by family and condition, and broken rows."""
+    cells: dict[Cell, list[Rollout]] = {}
     for row in rows:
-        if row.action_l1 is not None:
-            errors.setdefault((row.family, row.condition), []).append(row.action_l1)
-    conditions, lines = _lines(errors, [])
+        cells.setdefault((row.family, row.condition), []).append(row)
+    conditions, lines = _lines(cells, [])
     return Table.make(
         "errors",
         "Mean absolute action error by family and condition",
-        " ".join(["family", *(f"{one}:number" for one in conditions)]),
-        ((name, *(fmean(cell) if cell else None for cell in line)) for name, line in lines),
+        " ".join(["family", *conditions]),
+        ((name, *map(_action_error, line)) for name, line in lines),
     )
+
+
+def _action_error(rows: Sequence[Rollout]) -> str:
+    """Return `0.0123`, or `0.0123, 2 broke`: the mean is over the others."""
+    errors = [row.action_l1 for row in rows if row.action_l1 is not None]
+    broken = sum(row.status == Status.ERROR for row in rows)
+    mean = f"{fmean(errors):.4f}" if errors else ""
+    return ", ".join(filter(None, (mean, f"{broken} broke" if broken else "")))
 
 
 def _count(rows: Iterable[Rollout]) -> dict[Cell, Counter[str]]:

@@ -64,9 +64,8 @@ def score(
     from robomme_interference_data.runtime.progress import WorkProgress
     from robomme_interference_data.viz.tables import tables_text
 
-    from .report.headline import headline
+    from .report.page import headlines
     from .scoring import score as compute
-    from .tables.action_error import ERROR_TABLES
     from .writing import write_score
 
     check_output(out, export_to)
@@ -80,9 +79,7 @@ def score(
     if as_json:
         print_json(
             {
-                "headlines": {
-                    simulator: headline(found, simulator) for simulator in found.outcomes
-                },
+                "headlines": headlines(found),
                 "rows": len(found.rows),
                 "bad_rows": found.rows.refused,
                 "notes": list(found.notes),
@@ -91,8 +88,7 @@ def score(
             }
         )
     else:
-        errors = [table for name, table in found.tables.items() if name in ERROR_TABLES[:2]]
-        echo(f"{tables_text([*found.grids, *errors])}\n")
+        echo(f"{tables_text(found.grids)}\n")
     print_status(f"Report: {out / 'report.html'}")
 
 

@@ -1,8 +1,8 @@
-"""The outcomes of all rollouts in one simulator, as one array."""
+"""The outcomes of all rollouts in one simulator, or along recordings, as arrays."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence, Set
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
 from typing import NamedTuple
@@ -22,7 +22,7 @@ from .config import Expected
 from .rows.reading import Rows
 from .rows.values import Row
 
-STATUSES = (Status.SUCCESS, Status.FAIL, Status.TIMEOUT, Status.ERROR)
+STATUSES = (Status.SUCCESS, Status.FAIL, Status.TIMEOUT, Status.ERROR, Status.MEASURED)
 """In the order of their numbers in `Outcomes.status`."""
 
 TEST_EPISODES = 50
@@ -44,6 +44,7 @@ class Outcomes:
     status: Statuses  # index into STATUSES, −1 without a rollout, (S, C, E, M) int8
     evidence: NDArray[np.float64]  # share of the evidence kept, NaN if unknown, (S, C, E, M)
     steps: NDArray[np.float64]  # executed, NaN if unknown, (S, C, E, M)
+    action_l1: NDArray[np.float64]  # action error offline, NaN if not measured, (S, C, E, M)
     difficulty: NDArray[np.int64]  # index into DIFFICULTIES, −1 if unknown, (E,)
     chance: NDArray[np.float64]  # success of guessing, NaN unless a question, (E,)
     expected: Flags  # the episodes of a complete cell, (E,)
@@ -90,7 +91,7 @@ class Outcomes:
 
     @cached_property
     def counts(self) -> NDArray[np.int64]:
-        """Rollouts by status, `(S, C, E, 4) int64`."""
+        """Rollouts by status, `(S, C, E, len(STATUSES)) int64`."""
         return np.stack([(self.status == place).sum(-1) for place in range(len(STATUSES))], -1)
 
     @cached_property
@@ -122,13 +123,20 @@ class Outcomes:
 
 def counting(status: Statuses) -> Flags:
     """Whether rollouts count: an error is neither success nor failure."""
-    return (status >= 0) & (status < _ERROR)
+    return (status >= 0) & (status != _ERROR)
 
 
 def success(status: Statuses) -> NDArray[np.float64]:
     """Return the mean success of an episode's repeats, the last axis, NaN where none counts."""
     with np.errstate(invalid="ignore"):
         return np.asarray((status == _SUCCESS).sum(-1) / counting(status).sum(-1))
+
+
+def mean_errors(action_l1: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mean action error of an episode's repeats, the last axis, NaN without any."""
+    known = ~np.isnan(action_l1)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(known, action_l1, 0).sum(-1) / known.sum(-1))
 
 
 def steps_to_success(status: Statuses, steps: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -175,8 +183,31 @@ def outcomes_of(rows: Rows, expected: Expected) -> dict[str, Outcomes]:
     }
 
 
+def offline_outcomes(rows: Rows) -> Outcomes | None:
+    """Return the outcomes of offline runs, or None without any.
+
+    Recordings have no grid: the expected episodes are those that occur in any row or in the plan
+    of a run, and the expected cells those that have rows.
+    """
+    measured = [row for row in rows if row.simulator == RECORDINGS]
+    if not measured:
+        return None
+    planned = {
+        item.episode
+        for run in rows.sources.values()
+        if run is not None and run.identity.get("simulator") == RECORDINGS
+        for item in run.items
+    }
+    found = _outcomes(measured, RECORDINGS, Expected.OBSERVED, rows.unpinned, planned)
+    return replace(found, due=found.has_rows)
+
+
 def _outcomes(
-    rows: Sequence[Row], simulator: str, which: Expected, unpinned: frozenset[tuple[str, str]]
+    rows: Sequence[Row],
+    simulator: str,
+    which: Expected,
+    unpinned: frozenset[tuple[str, str]],
+    planned: Set[EpisodeId] = frozenset(),
 ) -> Outcomes:
     systems = tuple(sorted({row.system for row in rows}, key=_table_order))
     observed = {row.condition for row in rows}
@@ -184,7 +215,7 @@ def _outcomes(
     conditions = tuple(one.name for one in in_order(observed | due))
     model_seeds = tuple(sorted({row.model_seed for row in rows}))
     ids = {(row.family, row.split, row.episode) for row in rows}
-    expected = ids
+    expected = ids | {(one.family, one.split, one.index) for one in planned}
     if which is Expected.BENCHMARK:
         expected = {
             (family, "test", index) for family in FAMILIES for index in range(TEST_EPISODES)
@@ -200,10 +231,11 @@ def _outcomes(
     )
     shape = tuple(map(len, axes))
     status = np.full(shape, -1, np.int8)
-    evidence, steps = np.full(shape, np.nan), np.full(shape, np.nan)
+    evidence, steps, action_l1 = (np.full(shape, np.nan) for _ in range(3))
     status[at] = [STATUSES.index(row.status) for row in rows]
     evidence[at] = np.array([row.evidence_kept for row in rows], float)  # None becomes NaN
     steps[at] = np.array([row.steps for row in rows], float)
+    action_l1[at] = np.array([row.action_l1 for row in rows], float)
     difficulty, chance = np.full(len(episodes), -1), np.full(len(episodes), np.nan)
     for row, place in zip(rows, at[2].tolist(), strict=True):
         if row.difficulty is not None:
@@ -221,6 +253,7 @@ def _outcomes(
         status,
         evidence,
         steps,
+        action_l1,
         difficulty,
         chance,
         expected=np.array([key in expected for key in axes[2]]),

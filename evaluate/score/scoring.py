@@ -3,16 +3,17 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from robomme_interference_data.errors import FormatError
+from robomme_interference_data.errors import FormatError, RunError, counted
 from robomme_interference_data.evaluate.systems import base_of
+from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.stats.bootstrap import DRAWS
 from robomme_interference_data.viz.tables import Table
 
-from .comparisons import effects, families, ranks, slopes
+from .comparisons import effects, families, offline, ranks, slopes
 from .comparisons.contrast import Contrast
 from .comparisons.tables import SPECS, comparison_table
 from .config import Against, Expected, Settings
-from .outcomes import Outcomes, outcomes_of
+from .outcomes import Outcomes, offline_outcomes, outcomes_of
 from .rows.reading import Rows, read_rows
 from .tables import action_error, cells, chance, equivalence, evidence_kept, model, paper, steps
 
@@ -20,14 +21,10 @@ TABLES = (
     *("main", "chance", "systems", "ranks", "family", "difficulty", "lift", "effects"),
     *("interaction", "equivalence", "interference", "by_evidence_kept", "evidence_effects"),
     *("evidence_use", "ceiling", "decay", "model", "steps", "noise", "families", "family_effects"),
-    *("matrix", "coverage", "paper", "paper_family"),
-    *action_error.ERROR_TABLES,
+    *("matrix", "action_error", offline.CHANGES, offline.SYSTEMS),
+    *("coverage", "paper", "paper_family"),
 )
 """Every table that a score may have, in order."""
-
-_ALWAYS = {"main", "family", "difficulty", "lift", "effects", "decay", "noise", "coverage"}
-_ALWAYS |= {"paper", "paper_family"}
-"""Tables that are written even without rows."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +37,13 @@ class Score:
         rows: The rows.
         notes: Warnings for readers, such as that two systems are not paired.
         outcomes: Outcomes of the rollouts, by simulator.
+        recordings: Outcomes of offline runs; None without any.
         contrasts: All comparisons, in the order of tables.
         published: The published rates, if the score is compared with them.
         cells: System × condition, over all episodes, by family and by difficulty.
-        tables: All tables by name, except the paper's main table.
-        grids: The paper's main table for each simulator.
+        error_cells: The same of offline runs, over all episodes and by family.
+        tables: All tables with rows by name, except the paper's main table.
+        grids: The paper's main table for each simulator, and one of action errors.
     """
 
     settings: Settings
@@ -52,11 +51,19 @@ class Score:
     rows: Rows
     notes: tuple[str, ...]
     outcomes: Mapping[str, Outcomes]
+    recordings: Outcomes | None
     contrasts: Sequence[Contrast]
     published: Sequence[cells.Cell]
     cells: Sequence[cells.Cell]
+    error_cells: Sequence[action_error.ErrorCell]
     tables: Mapping[str, Table]
     grids: Sequence[Table]
+
+    @property
+    def every(self) -> list[Outcomes]:
+        """The outcomes of each simulator, and of recordings."""
+        recordings = [] if self.recordings is None else [self.recordings]
+        return [*self.outcomes.values(), *recordings]
 
 
 def score(settings: Settings, draws: int = DRAWS) -> Score:
@@ -70,9 +77,23 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
             else f"there are no rows {where}",
             "Give at least one valid row.",
         )
+    if all(row.status == Status.ERROR for row in rows):
+        raise RunError(
+            f"{counted(len(rows), 'row')} in {', '.join(map(str, settings.rows))}, and all are "
+            "errors: there is nothing to score",
+            "See errors.log of the run, mend the cause, and run the same evaluate command again.",
+        )
     outcomes = outcomes_of(rows, settings.expected)
+    recordings = offline_outcomes(rows)
     every = tuple(outcomes.values())
     compared, notes = _compared(rows, every, draws)
+    error_cells = list[action_error.ErrorCell]()
+    error_grids = list[Table]()
+    if recordings is not None:
+        error_cells = action_error.error_cells(recordings, draws)
+        error_grids.append(action_error.error_grid(recordings, error_cells))
+        compared += offline.error_contrasts(recordings, draws)
+        notes += _unpinned(recordings)
     by_family = [one for outcome in every for one in families.family_effects(outcome, compared)]
     found = cells.cells_of(every)
     published = paper.published() if settings.against is Against.PAPER else ()
@@ -86,8 +107,8 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         slopes.decay_table(every, draws),
         effects.noise_table(every),
         steps.steps_table(every, draws),
-        cells.coverage_table(found),
-        *action_error.error_tables(rows, draws),
+        cells.coverage_table([*found, *error_cells]),
+        action_error.error_table(error_cells),
     ]
     if settings.margin is not None:
         margin = settings.margin
@@ -99,18 +120,20 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         whole = cells.cells_of(outcomes_of(rows, Expected.BENCHMARK).values())
         tables += [paper.paper_table(whole), paper.paper_table(whole, by_part=True)]
         notes += paper.not_compared(whole)
-    tables = [one for one in tables if one.rows or one.name in _ALWAYS]
+    tables = [one for one in tables if one.rows]
     return Score(
         settings,
         draws,
         rows,
         tuple(notes),
         outcomes,
+        recordings,
         compared,
         published,
         found,
+        error_cells,
         {table.name: table for table in sorted(tables, key=lambda one: TABLES.index(one.name))},
-        cells.main_grids(found),
+        [*cells.main_grids(found), *error_grids],
     )
 
 
@@ -132,6 +155,21 @@ def _compared(
             compared += effects.effects_of(outcomes, system, **beside)
         compared += ranks.systems_of(outcomes) + slopes.interactions_of(outcomes, draws)
     return compared, notes
+
+
+def _unpinned(recordings: Outcomes) -> list[str]:
+    """Return a note on systems offline that are not compared with others, if there are any."""
+    lone = [
+        name
+        for name, unpinned in zip(recordings.systems, recordings.unpinned, strict=True)
+        if unpinned
+    ]
+    if not lone or len(recordings.systems) == 1:
+        return []
+    return [
+        f"Offline, {', '.join(lone)} {'is' if len(lone) == 1 else 'are'} compared with no other "
+        "system: the rows name no revision of a buffer set, so the recordings may differ."
+    ]
 
 
 def _unpaired(rows: Rows, outcomes: Outcomes, system: str, other: str) -> str:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import ACTION, EXECUTIONS, MAX_STEPS, STATE
 from robomme_interference_data.data.dataset import camera_feature
 from robomme_interference_data.data.loading import load_buffer_set, open_dataset
-from robomme_interference_data.errors import HashMismatchError
+from robomme_interference_data.errors import HashMismatchError, SimulatorError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.schema.rollouts import Status
@@ -32,7 +32,7 @@ class Recordings(Simulator):
     name = RECORDINGS
     about = "recordings, played back"
     settings = ("cameras", "buffer_set")
-    policies = ()
+    policies = ("hold", "mean")
 
     def __init__(self, buffer_set: str, cameras: Sequence[str] = ()):
         self._buffer_set = load_buffer_set(buffer_set, threads=1)
@@ -40,6 +40,40 @@ class Recordings(Simulator):
         self.cameras = self._executions.cameras
         self._cameras = choose_cameras(cameras, self.cameras)
         (self.action_size,) = self._executions.features[ACTION]
+        self._sums: dict[int, NDArray[np.float64]] = {}
+
+    def last_action(self) -> NDArray[np.float32] | None:
+        """Return the recorded action of the last step, `(A,) float32`; None before the first."""
+        done = len(self._errors)
+        return self._actions[done - 1] if done else None
+
+    def mean_action(self) -> NDArray[np.float32]:
+        """Return the mean recorded action of other episodes than the current one, `(A,) float32`.
+
+        They are those of its family, or if there are none of all families; all steps have equal
+        weight. The current episode is left out, since a policy cannot know its actions either.
+        """
+        episodes = self._executions.records()
+        others = [one for one in episodes if one.episode_id != self._current.episode_id]
+        others = [
+            one for one in others if one.episode_id.family == self._current.episode_id.family
+        ] or others
+        if not others:
+            raise SimulatorError(
+                f"{self._current.episode_id} is the only recording, so there is no mean action of "
+                "others",
+                "Build the executions of more episodes, or run another policy.",
+            )
+        total = sum(self._sum_of(one.episode_index) for one in others)
+        return np.asarray(total / sum(one.length for one in others), np.float32)
+
+    def _sum_of(self, index: int) -> NDArray[np.float64]:
+        """Return the sum of the recorded actions of an episode, `(A,) float64`."""
+        if index not in self._sums:
+            length = self._executions.record(index).length
+            actions = self._executions.read_vectors(index, ACTION, 0, length)
+            self._sums[index] = actions.sum(axis=0, dtype=np.float64)
+        return self._sums[index]
 
     @override
     def columns(self) -> dict[str, Any]:
@@ -53,7 +87,7 @@ class Recordings(Simulator):
     def _begin(self, episode: EpisodeId, every: int) -> Begun:
         query, executions = self._buffer_set.query(episode), self._executions
         index = executions.index_of(episode)
-        record = executions.record(index)
+        record = self._current = executions.record(index)
         self._actions = executions.read_vectors(index, ACTION, 0, min(record.length, MAX_STEPS))
         self._errors: list[NDArray[np.float64]] = []
         self._observations = self._observed(record, len(self._actions))

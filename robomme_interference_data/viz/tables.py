@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+import re
 import shutil
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -135,10 +136,11 @@ class Table:
         """Return the table for a terminal: title, aligned columns, note.
 
         Cells wrap, and columns continue below, to fit the width: by default the terminal's, at
-        least 80.
+        least 80. The columns that tell rows apart are repeated there. Bold cells end in `*`.
         """
         width = width or max(80, shutil.get_terminal_size().columns)
         sides, heads, rows = self._layout("<", ">")
+        rows = [[_BOLD.sub(r"\1*", cell) for cell in row] for row in rows]
         columns = list(zip(heads, *rows, strict=True))
         widths = [max(map(len, cells)) for cells in columns]
         least = [
@@ -150,11 +152,18 @@ class Table:
         while sum(widths) + 2 * (len(widths) - 1) > width and widths != least:
             wrappable = (i for i, size in enumerate(widths) if size > least[i])
             widths[max(wrappable, key=widths.__getitem__)] -= 1
+        keys = self._keys(rows)
+        while len(keys) > 1 and sum(widths[key] + 2 for key in keys) + max(widths) > width:
+            keys.pop()  # they must leave room for any other column
         blocks: list[list[int]] = [[]]
         for column, size in enumerate(widths):
-            if column > 1 and sum(widths[one] + 2 for one in blocks[-1]) + size > width:
-                blocks.append([0])
-            blocks[-1].append(column)
+            if column in blocks[-1]:
+                continue  # a key of a block that began before it
+            used = sum(widths[other] + 2 for other in blocks[-1])
+            if used + size > width and not {*blocks[-1]} <= {*keys}:
+                blocks.append([*keys])
+            if column not in blocks[-1]:
+                blocks[-1].append(column)
         parts = [fill(self.title, width)]
         for block in blocks:
             formats = [(sides[column], widths[column]) for column in block]
@@ -164,6 +173,21 @@ class Table:
         parts.append(fill(self.note, width))
         return visible("\n\n".join(filter(None, parts)))
 
+    def _keys(self, rows: Sequence[Sequence[str]]) -> list[int]:
+        """Return the columns that tell rows apart: the first ones of names and numbers that do."""
+        keys: list[int] = []
+        apart = 1
+        for place, column in enumerate(self.columns):
+            if column.kind not in ("text", "count") or apart == len(rows):
+                break
+            found = len({tuple(row[key] for key in (*keys, place)) for row in rows})
+            if found > apart:
+                keys.append(place)
+                apart = found
+        return keys or [0]
+
+
+_BOLD = re.compile(r"\*\*(.+?)\*\*")
 
 _MAX_WORD = 26
 """Longer words may be broken to make a table fit."""
@@ -213,6 +237,12 @@ def points(value: float) -> str:
     """Return a difference of fractions in percentage points, `+27.1` or `−3.0`."""
     text = f"{100 * value:+.1f}"
     return "0.0" if text in ("+0.0", "-0.0") else text.replace("-", "−")
+
+
+def error_change(value: float) -> str:
+    """Return a difference of action errors, `+0.0123` or `−0.0040`."""
+    text = f"{value:+.4f}"
+    return "0.0000" if text in ("+0.0000", "-0.0000") else text.replace("-", "−")
 
 
 def p_text(value: float) -> str:

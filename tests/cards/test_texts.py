@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support import scoring
 from support.buffer_sets import plan_again
 from support.cards import OF_BUFFER_SET, OF_DEMONSTRATIONS, OF_RESULTS, RUN
 from support.made_up import record, write_metadata
@@ -232,3 +233,20 @@ def test_results_name_the_buffer_set_that_the_run_names(tmp_path: Path) -> None:
     assert f"| published buffer set | `{place}` |" in text
     assert "source_datasets:\n- people/tiny\n" in text
     assert "| policy | <code>a &#124; &#96;b&#96;</code> |" in text
+
+
+def test_results_of_an_offline_run(tmp_path: Path) -> None:
+    """Two recordings of a policy of an arm; the second one broke under k0."""
+    errors = {("no-history", 0): 0.5, ("no-history", 1): 0.25, ("k0", 0): 0.125, ("k0", 1): None}
+    rows = [
+        scoring.recording(condition, number, None if error is None else (error,))
+        for (condition, number), error in errors.items()
+    ]
+    facts = results_facts(scoring.write_parquet(tmp_path / "rollouts.parquet", rows))
+    assert (facts.simulators, facts.simulated) == (("recordings",), False)
+    files = card_files(facts, Publication("people/results", "1.0.0"))
+    assert files["README-recordings.png"].startswith(b"\x89PNG")
+    text = files["README.md"].decode()
+    assert "| my-memory | 0.3750 n=2 | 0.1250† n=1, errors: 1 |" in text
+    assert "1 error, 3 measured" in text and "recordings, played back" in text
+    assert "success rate" not in text.partition("## Limits")[0].lower()

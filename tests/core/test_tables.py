@@ -50,7 +50,7 @@ def test_csv_has_fractions_and_json_no_nan() -> None:
 
 
 def test_a_table_fits_the_terminal() -> None:
-    """Texts wrap; columns that do not fit continue below, beside the first column."""
+    """Texts wrap; columns that do not fit continue below, beside the key columns."""
     words = Table.make("t", "Title " * 30, "name text", [("a", "word " * 40)], "note " * 30)
     numbers = " ".join(f"column_{n}:count" for n in range(20))
     many = Table.make("t", "", f"name {numbers}", [("row", *range(20))])
@@ -64,3 +64,35 @@ def test_a_note_of_several_tables_is_printed_once() -> None:
     text = tables_text([TABLE, TABLE])
     assert text.count("Rates of systems") == 2 and text.count("How to read it.") == 1
     assert text.endswith("How to read it.")
+
+
+def test_columns_that_continue_below_repeat_what_tells_rows_apart() -> None:
+    """The system is the same in all rows, and the family follows from the other keys."""
+    columns = " ".join(f"a_long_column_{n}:count" for n in range(9))
+    rows = [
+        ("mine", family, condition, f"{family}/{condition}", *range(9))
+        for family in ("MoveCube", "InsertPeg")
+        for condition in ("k0", "k7")
+    ]
+    table = Table.make("t", "Title", f"system family condition cell {columns}", rows)
+    blocks = [block.splitlines() for block in table.text(80).split("\n\n")[1:]]
+    assert len(blocks) > 1 and max(len(line) for block in blocks for line in block) <= 80
+    assert blocks[0][0].split()[:4] == ["system", "family", "condition", "cell"]
+    for head, _, *lines in blocks[1:]:
+        assert head.split()[:2] == ["family", "condition"] and "system" not in head
+        keys = [tuple(line.split()[:2]) for line in lines if line.split()[0].isalpha()]
+        assert keys == [(family, condition) for _, family, condition, *_ in rows]
+
+
+def test_keys_leave_room_for_a_column() -> None:
+    rows = [
+        (*(letter * 26 for letter in letters), 1, 2) for letters in ("abc", "abd", "aec", "fbc")
+    ]
+    text = Table.make("t", "", "first second third one:count two:count", rows).text(80)
+    assert max(map(len, text.splitlines())) <= 80 and "first" in text and "two" in text
+
+
+def test_bold_is_a_star_in_text_and_bold_elsewhere() -> None:
+    table = Table.make("t", "", "system k0", [("mine", "**45.0%** [40.0, 50.0]")])
+    assert "45.0%* [40.0, 50.0]" in table.text() and "**" not in table.text()
+    assert "**45.0%**" in table.markdown() and "\\textbf{45.0\\%}" in table.latex()

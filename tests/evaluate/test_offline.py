@@ -17,6 +17,8 @@ from robomme_interference_data.evaluate import Policy, RolloutInfo, RunConfig, r
 from robomme_interference_data.evaluate.rollout.rollout import run_rollout
 from robomme_interference_data.evaluate.run.kind import Run
 from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.evaluate.run.progress import error_table
+from robomme_interference_data.evaluate.score.rows.reading import read_rows
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.schema.rollouts import Rollout
@@ -168,6 +170,58 @@ def test_robots_with_other_actions(tmp_path: Path) -> None:
         walk(root, Constant(np.ones((4, 8))))
 
 
+@pytest.fixture(scope="module")
+def arms(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two recordings of a family and one of another, of an arm with two states and three values.
+
+    The action of frame n is (n, 2n, 0); live are frames 5 to 24, 5 to 6, and 5 to 9.
+    """
+    root = tmp_path_factory.mktemp("arms")
+    queries = {DRAWER: (25, 5), "OpenDrawer/test/1": (7, 5), CUPS: (10, 5)}
+    build(root, "demonstrations", Arm(queries))
+    build(root, "distractors", Arm(UNITS))
+    build(root, "executions", Arm(queries))
+    plan_again(root, ("no-history", "k0"))
+    return root
+
+
+def baseline(root: Path, out: Path, policy: str, **changes: Any) -> dict[str, list[float]]:
+    """The error of each value of the action, by episode."""
+    changes = {"policy": policy, "conditions": ()} | changes
+    done = evaluate(root, out, **changes)
+    assert {row.condition for row in done.rows} == {"no-history"}
+    return {
+        str(row.episode_id): [float(one) for one in (row.action_l1_values or "").split()]
+        for row in done.rows
+    }
+
+
+def test_the_mean_baseline_is_the_mean_of_other_episodes(arms: Path, tmp_path: Path) -> None:
+    found = baseline(arms, tmp_path / "run", "mean")
+    # Of the family, the other episode: frames 5 and 6, with the mean 5.5; 5 to 24, with 14.5.
+    assert found[DRAWER] == pytest.approx([np.mean(np.abs(np.arange(5, 25) - 5.5)), 18.1, 0])
+    assert found["OpenDrawer/test/1"] == pytest.approx([9, 18, 0])
+    # The family has no other: all 22 frames of the other two, with the mean (290 + 11) / 22.
+    assert found[CUPS][0] == pytest.approx(301 / 22 - 7)
+
+
+def test_the_hold_baseline_repeats_the_last_recorded_action(arms: Path, tmp_path: Path) -> None:
+    """After the first step, which is the mean (5.5): 5 for frames 6 to 21, then 21 for 22 to 24."""
+    found = baseline(arms, tmp_path / "run", "hold")
+    assert found[DRAWER][0] == pytest.approx((0.5 + sum(range(1, 17)) + 1 + 2 + 3) / 20)
+    options = {"policy_options": ("chunk=1",)}
+    found = baseline(arms, tmp_path / "single", "hold", **options)
+    assert found[DRAWER][0] == pytest.approx((0.5 + 19) / 20)
+    names = {row.system for folder in ("run", "single") for row in read_rows([tmp_path / folder])}
+    assert names == {"hold", "hold-chunk1"}
+
+
+def test_one_recording_has_no_mean_of_others(tmp_path: Path) -> None:
+    root = buffer_set(tmp_path / "one", Arm, families=("OpenDrawer",))
+    done = evaluate(root, tmp_path / "run", policy="mean", conditions=(), families=("OpenDrawer",))
+    assert "only recording" in (done.rows[0].error or "")
+
+
 @pytest.mark.parametrize("actions", [np.full((16, 8), np.nan), np.zeros((16, 7)), None])
 def test_actions_that_cannot_be_compared(buffers: Path, actions: Any) -> None:
     with pytest.raises(PolicyError, match=r"(?s)the policy's answer.*expected \(n, 8\) actions"):
@@ -194,6 +248,9 @@ def test_a_run_resumes(buffers: Path, tmp_path: Path) -> None:
     [
         ({"policy": "oracle"}, "needs a script of the simulator.*\nLeave out `offline`"),
         ({"policy": "follow-subgoals"}, "needs a script of the simulator"),
+        ({"policy": "hold", "offline": False}, "needs a script of the simulator.*\nSet `offline`"),
+        ({"policy": "mean", "conditions": ("k0",)}, "takes no history"),
+        ({"policy": "hold", "policy_options": ("chunk=17",)}, "chunk 17; expected 1 to 16"),
         ({"simulator": "robomme"}, "`simulator` has no effect"),
         ({"shift": "light:1"}, "`shift` has no effect"),
         ({"videos": True}, "`videos` has no effect"),
@@ -232,3 +289,16 @@ def test_the_command(buffers: Path, tmp_path: Path, run: Callable[..., Any]) -> 
     code, _, err = run("score", tmp_path / "run", "--out", tmp_path / "score")
     assert code == 0, err
     assert (tmp_path / "score/tables/action_error.csv").is_file()
+
+
+def test_recordings_on_which_a_policy_breaks_are_counted(
+    buffers: Path, tmp_path: Path, run: Callable[..., Any]
+) -> None:
+    policy = "python:support.own_policies:Choosy"
+    done = evaluate(buffers, tmp_path / "run", policy=policy, conditions=("k0",))
+    assert (done.counts["measured"], done.counts["error"]) == (1, 1)
+    [(_, shown), (_, broken), (_, both)] = error_table(done.rows).rows
+    assert (broken, both) == ("1 broke", f"{shown}, 1 broke")
+    code, text, err = run("score", tmp_path / "run", "--out", tmp_path / "score")
+    assert code == 0, err
+    assert f"{shown}† n=1, errors: 1" in text

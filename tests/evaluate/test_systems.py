@@ -17,7 +17,8 @@ CONDITIONS = ("no-history", "k0", "k1", "k3", "k7")
 
 @pytest.mark.parametrize("name", [*SYSTEMS, "my-memory"])
 def test_conditions_of_a_system(name: str) -> None:
-    expected = {"pi05_baseline": ["no-history"]}.get(name, list(CONDITIONS))
+    without_memory = ("pi05_baseline", "hold", "mean")
+    expected = ["no-history"] if name in without_memory else list(CONDITIONS)
     if name.startswith("retrieval-"):
         expected = ["k0", "k1", "k3", "k7"]
     assert [one for one in CONDITIONS if name_system(name).applies(one)] == expected

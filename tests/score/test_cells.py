@@ -63,8 +63,8 @@ def test_cells_without_any_rollout_are_listed(tmp_path: Path) -> None:
     assert coverage == listed
     assert made.records(found, "coverage")[-1]["missing_episodes"] == "test 0-1"
     assert grid_of(found)[:2] == [
-        ("π0.5 (baseline)", "0.0% [0.0, 65.8]", "–", "–"),
-        ("Retrieval-FrameSamp-Modul", "–", "missing†", "50.0% [9.5, 90.5]"),
+        ("π0.5 (baseline)", "0.0% [0.0, 65.8]", "n/a", "n/a"),
+        ("Retrieval-FrameSamp-Modul", "n/a", "missing†", "50.0% [9.5, 90.5]"),
     ]
     assert found.grids[0].note.startswith("n = 2 in each cell. ")  # said once where all are equal
     # In no other table, as there is nothing to say of their parts.

@@ -66,7 +66,7 @@ def test_too_few_episodes_have_no_estimate(tmp_path: Path) -> None:
     found = scored(tmp_path, {(BASE, "k0"): "sssss", (BASE, "k7"): "sffff"})
     assert {one["odds_ratio"] for one in records(found, "model")} == {None}
     assert {one["episodes"] for one in records(found, "model")} == {4}
-    found = scored(tmp_path, {(BASE, "k0"): "eee", (BASE, "k7"): "e-e"})
+    found = scored(tmp_path, {(BASE, "k0"): "sss", (BASE, "k7"): "e-e"})
     assert not found.tables.get("model")
 
 

@@ -127,6 +127,17 @@ class Broken(Still):
         raise ValueError("no such file: caf\udce9\nin two lines")
 
 
+class Choosy(Still):
+    """Raises in every scene but one."""
+
+    wants_history = True
+
+    def act(self, observation: Any, goal: str) -> Any:
+        if "Drawer" not in goal:
+            raise RuntimeError("it broke")
+        return self.action
+
+
 class Filler(Still):
     """Lets no file of this process grow any more, as on a full disk."""
 

@@ -106,6 +106,21 @@ def row(system: str, condition: str, family: str, episode: int, letter: str) -> 
     )
 
 
+def recording(condition: str, episode: int, values: tuple[float, ...] | None) -> Rollout:
+    """A row of an offline run, with the errors of the values of an action; None if it broke."""
+    one = row(OWN, condition, "MoveCube", episode, "s")
+    one = replace(one, simulator="recordings", family="OpenDrawer", seed=None)
+    if values is None:
+        return replace(one, status="error", success=None, error="it broke")
+    return replace(
+        one,
+        status="measured",
+        success=None,
+        action_l1=sum(values) / len(values),
+        action_l1_values=" ".join(map(str, values)),
+    )
+
+
 def rows() -> list[Rollout]:
     """All rows of `OUTCOMES`."""
     return [

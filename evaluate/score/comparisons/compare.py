@@ -8,7 +8,12 @@ from pathlib import Path
 
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.score.config import Expected
-from robomme_interference_data.evaluate.score.outcomes import Outcomes, outcomes_of
+from robomme_interference_data.evaluate.score.outcomes import (
+    Outcomes,
+    mean_errors,
+    offline_outcomes,
+    outcomes_of,
+)
 from robomme_interference_data.evaluate.score.rows.reading import Rows, read_rows
 from robomme_interference_data.evaluate.score.rows.values import unshifted
 from robomme_interference_data.ids import EpisodeId
@@ -17,11 +22,12 @@ from robomme_interference_data.simulators.registry import RECORDINGS
 from robomme_interference_data.stats.intervals import wilson
 from robomme_interference_data.stats.sequential import look_levels
 from robomme_interference_data.stats.significance import ALPHA
+from robomme_interference_data.stats.signs import sign_flips
 from robomme_interference_data.viz.tables import Table, percent
 
 from .contrast import Contrast
-from .pairs import Pairs, pair
-from .tables import TEST, TableSpec, comparison_table
+from .pairs import Pairs, pair, pair_errors
+from .tables import ERROR_NOTE, ERROR_TEST, TEST, TableSpec, comparison_table
 
 
 @dataclass(frozen=True)
@@ -59,10 +65,11 @@ def compare(
     alpha = look_levels(look[1])[look[0] - 1] if look[1] > 1 else ALPHA
     one = read_rows([first], systems[0], lenient)
     other = one if second is None else read_rows([second], systems[1], lenient)
-    if not any(row.simulator != RECORDINGS for rows in (one, other) for row in rows):
+    offline = {row.simulator == RECORDINGS for rows in (one, other) for row in rows}
+    if len(offline) > 1:
         raise InvalidOptionError(
-            "rows of offline runs have no outcomes to compare",
-            f"See the table action_error_changes: score {shlex.quote(str(first))} --out SCORE",
+            "the rows are of rollouts and of offline runs",
+            "Compare runs of one kind: a success rate has no counterpart in an action error.",
         )
     _check_scenes(one, other)
     sides = [_sides(rows) for rows in (one, other)]
@@ -81,7 +88,7 @@ def compare(
                 bounds = compared.at(1 - alpha)
                 more = {"low": bounds.low, "high": bounds.high}
                 found.append(Contrast(*names, compared, complete, family=family, more=more))
-        if a.repeats(b, one, other) and not conditions:
+        if a.repeats(b, one, other) and not conditions and True not in offline:
             notes += _noise(a, b, {c: pairs["", (c, c)] for c, _ in both})
     if not found:
         runs = " and ".join(str(path) for path in (first, second) if path)
@@ -99,15 +106,32 @@ def compare(
             notes += _stopped(name, own.values())
     notes += _left_out("a", sides[0].values(), dict(matched), conditions)
     notes += _left_out("b", sides[1].values(), {b: a for a, b in matched}, conditions[::-1])
+    cells = (
+        "simulator system_a=against_system system_b=system family condition_a=against_condition "
+        "condition_b=condition n "
+    )
+    if True in offline:
+        columns = (
+            f"{cells} action_l1_a:number=against_rate action_l1_b:number=rate {ERROR_TEST} complete"
+        )
+        note = (
+            "Over the n episodes that count in both; difference is the action error of b minus "
+            f"that of a: negative if b is better. {ERROR_NOTE}"
+        )
+    else:
+        columns = f"{cells} rate_a=against_rate rate_b=rate difference {TEST} complete"
+        note = (
+            "Over the n episodes that count in both; difference is b − a, gained and lost are "
+            "changes from a to b. {how}"
+        )
     spec = TableSpec(
         "Two runs compared" if second else "Two conditions compared",
-        "simulator system_a=against_system system_b=system family condition_a=against_condition "
-        f"condition_b=condition n rate_a=against_rate rate_b=rate difference {TEST} complete",
-        "Over the n episodes that count in both; difference is b − a, gained and lost are changes "
-        "from a to b. {how}",
+        columns,
+        note,
         lambda c: (c.simulator, bool(c.family)),
         "the rows of all families, and among those of single families, of a simulator",
         alpha=alpha,
+        power=True not in offline,
     )
     table = comparison_table("compare", found, spec)
     looked = (
@@ -184,9 +208,12 @@ def _sides(rows: Rows) -> _Sides:
     for run in rows.sources.values():
         for item in run.items if run else ():
             planned[item.condition].add(item.episode)
+    every = [*outcomes_of(rows, Expected.OBSERVED).values()]
+    if recordings := offline_outcomes(rows):
+        every.append(recordings)
     return {
-        (simulator, system): _Side(outcomes, system, planned)
-        for simulator, outcomes in outcomes_of(rows, Expected.OBSERVED).items()
+        (outcomes.simulator, system): _Side(outcomes, system, planned)
+        for outcomes in every
         for system in outcomes.systems
     }
 
@@ -238,6 +265,15 @@ def _pairs(a: _Side, b: _Side, conditions: tuple[str, str], family: str) -> Pair
     """Compare two sides over shared episodes, all or those of a family."""
     places = [{one: at for at, one in enumerate(side.outcomes.episodes)} for side in (a, b)]
     shared = [one for one in places[0] if one in places[1] and family in ("", one.family)]
+    if a.outcomes.simulator == RECORDINGS:
+        before, after = (
+            mean_errors(side.outcomes.action_l1)[side.outcomes.cell(side.system, condition)][
+                [at[one] for one in shared]
+            ]
+            for side, condition, at in zip((a, b), conditions, places, strict=True)
+        )
+        [test] = sign_flips((after - before).round(12)[:, None], RECORDINGS)
+        return pair_errors(before, after, test)
     first, second = (
         side.outcomes.status[side.outcomes.cell(side.system, condition)][
             [at[one] for one in shared]
@@ -302,8 +338,8 @@ def _stopped(name: str, sides: Iterable[_Side]) -> list[str]:
     ]
     listed = "; ".join(parts)
     note = (
-        f"{name} was stopped early or is still running; planned episodes that do not count: "
-        f"{listed}. Looking again and again finds too much: plan the looks (--looks)."
+        f"{name} was stopped early, is still running, or broke in part; planned episodes that do "
+        f"not count: {listed}. Looking again and again finds too much: plan the looks (--looks)."
     )
     return [note] if parts else []
 

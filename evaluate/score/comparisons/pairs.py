@@ -23,6 +23,7 @@ from robomme_interference_data.stats.intervals import (
     wilson,
 )
 from robomme_interference_data.stats.significance import mcnemar, sign_flip, two_proportions
+from robomme_interference_data.stats.signs import SignFlips
 
 WITHIN = 0.90
 """Level of the interval that equivalence uses: two one-sided tests at 5%."""
@@ -30,7 +31,10 @@ WITHIN = 0.90
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Two sides of a comparison, paired over the episodes that count on both."""
+    """Two sides of a comparison, paired over the episodes that count on both.
+
+    Offline, the action error takes the place of success.
+    """
 
     n: int  # episodes that count on both sides; of unpaired sides the fewer
     first: float  # mean success over them on the first side
@@ -124,6 +128,21 @@ def _clusters(first: Statuses, second: Statuses, level: float) -> Interval:
     trials = [rate_of(side).trials for side in (first, second)]
     old, new = (wilson(r * m, m, level) for r, m in zip((before, after), trials, strict=True))
     return Interval(round(after - before, 12), *mover_interval(after, new, before, old, phi))
+
+
+def pair_errors(before: Floats, after: Floats, test: SignFlips) -> Pairs:
+    """Compare the action errors of two sides by episode, `(E,)`, NaN where one is unknown.
+
+    `test` is the sign-flip test of `after - before`. A lower error is better, so an episode is
+    gained if its error falls.
+    """
+    known = ~np.isnan(before + after)
+    n = int(known.sum())
+    if not n:
+        return NO_PAIRS
+    gained, lost = int((after < before).sum()), int((after > before).sum())
+    rates = float(before[known].mean()), float(after[known].mean())
+    return Pairs(n, *rates, test.at, "sign-flip", n, gained, lost, test.p, math.nan)
 
 
 def compare_unpaired(first: Rate, second: Rate) -> Pairs:

@@ -81,6 +81,23 @@ _WITHIN: tuple[Callable[[Contrast], Hashable], str] = (
     "the tests of a condition in one simulator",
 )
 
+ERROR_TEST = (
+    "difference:number=difference low:number=low high:number=high gained lost p p_holm:p "
+    "joint_low:number joint_high:number"
+)
+ERROR_NOTE = (
+    "gained and lost: episodes whose error is lower, or higher. p: sign-flip test of the episodes' "
+    "differences; low to high: the 95% interval of all differences that this test does not reject, "
+    "if at least ten episodes differ. {correct}"
+)
+_ERRORS = (
+    f"{CELLS} n action_l1:number=rate against_action_l1:number=against_rate {ERROR_TEST} complete"
+)
+_ERRORS_NOTE = (
+    "difference: action error of the system and condition minus that of those against, over the n "
+    f"episodes that count on both; negative is better. {ERROR_NOTE}"
+)
+
 SPECS = {
     "lift": TableSpec(
         "Lift over no history",
@@ -137,6 +154,21 @@ SPECS = {
         f"{CELLS} family n rate against_rate difference {TEST} complete",
         "The comparisons of the tables lift, effects and interference within each family, over the "
         "n episodes that count on both sides. {how}",
+        power=False,
+    ),
+    "action_error_changes": TableSpec(
+        "Changes of the action error between conditions",
+        _ERRORS,
+        _ERRORS_NOTE,
+        among="the tests of this table",
+        power=False,
+    ),
+    "action_error_systems": TableSpec(
+        "Differences of the action error between systems",
+        _ERRORS,
+        "All pairs of systems under each condition; a system that ran without history only, such "
+        f"as a baseline, under all conditions of the others. {_ERRORS_NOTE}",
+        among="the tests of this table",
         power=False,
     ),
 }

@@ -48,7 +48,8 @@ class Data:
         found = [one for one in score.cells if one.simulator == simulator and one.n]
         self.systems = list(dict.fromkeys(one.system for one in found))
         self.contrasts = [one for one in score.contrasts if one.simulator == simulator]
-        repeats = [row[3:5] for row in score.tables["noise"].rows if row[0] == simulator]
+        noise = score.tables.get("noise")
+        repeats = [row[3:5] for row in noise.rows if row[0] == simulator] if noise else []
         pairs, flips = map(sum, zip(*repeats, strict=True)) if repeats else (0, 0)
         self.flips = flips / pairs if pairs else None
         self.distinguishable = {

@@ -12,10 +12,11 @@ from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
+from robomme_interference_data.simulators.registry import RECORDINGS
 from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.viz.figure import INK, ink_on, mapped, open_figure, save_figure
 
-from . import curves, forests
+from . import curves, forests, offline
 from .curves import curve, explained, legend
 from .data import FEW, Data
 
@@ -38,6 +39,7 @@ FIGURES = {
     "by_evidence_kept": "Success by whether the memory kept the evidence",
     "ceiling": "Gap to the ideal observer with the same memory",
     "matrix": "Which systems differ significantly",
+    "action_error": "Action error by condition",
 }
 """Figure to its title."""
 
@@ -52,14 +54,28 @@ def draw_figures(
     drawn = {}
     for simulator in score.outcomes:
         data = Data(score, simulator)
-        for kind in FIGURES:
+        for kind in _DRAWERS:
             with open_figure() as figure:
                 if draw_figure(kind, figure, data):
                     name = f"{kind}-{simulator}"
                     for suffix in suffixes:
                         save_figure(figure, folder / (name + suffix))
                     drawn[name] = folder / f"{name}.svg"
+    if any(cell.n for cell in score.error_cells):
+        with open_figure() as figure:
+            draw_error_figure(figure, score)
+            name = f"action_error-{RECORDINGS}"
+            for suffix in suffixes:
+                save_figure(figure, folder / (name + suffix))
+            drawn[name] = folder / f"{name}.svg"
     return drawn
+
+
+def draw_error_figure(figure: Any, score: Score) -> None:
+    """Draw the figure of offline runs."""
+    figure.set_layout_engine("constrained")
+    offline.action_error(figure, score)
+    _finish(figure)
 
 
 def draw_figure(kind: str, figure: Any, data: Data) -> bool:
@@ -68,11 +84,16 @@ def draw_figure(kind: str, figure: Any, data: Data) -> bool:
     figure.set_layout_engine("constrained")
     if not (shown.cells and _DRAWERS[kind](figure, shown)):
         return False
+    _finish(figure)
+    return True
+
+
+def _finish(figure: Any) -> None:
+    """Lay out a drawn figure, and give its marked elements ids."""
     figure.get_layout_engine().execute(figure)
     figure.set_layout_engine("none")  # once, not again for each file
     for number, artist in enumerate(figure.findobj(lambda one: one.get_gid())):
         artist.set_gid(f"{artist.get_gid()}:{number}")  # ids must be unique in a file
-    return True
 
 
 def _success(figure: Any, data: Data) -> bool:

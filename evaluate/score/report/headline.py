@@ -14,14 +14,18 @@ from robomme_interference_data.stats.significance import ALPHA, holm
 from robomme_interference_data.stats.signs import simultaneous
 from robomme_interference_data.viz.tables import percent, points
 
+from .strongest import named, shown
+
 
 def headline(score: Score, simulator: str) -> str:
-    """Return the main finding of one simulator's rows.
+    """Return the main finding of one simulator's rows, or of recordings.
 
     Only complete cells are compared. The leader has the highest rate at k0; systems that are not
     distinguishable from the best are named, and intervals and p-values are corrected for the choice
     of the leader. A reference leads only if there is no other system.
     """
+    if score.recordings is not None and simulator == score.recordings.simulator:
+        return _offline(score)
     found = [one for one in score.cells if one.simulator == simulator and not one.part]
     cells = [cell for cell in found if not is_reference(cell.system)] or found
     complete = [cell for cell in cells if cell.complete]
@@ -29,6 +33,30 @@ def headline(score: Score, simulator: str) -> str:
     if not all(cell.complete for cell in found):
         done = sum(cell.complete for cell in found)
         sentences.append(f"{done} of {len(found)} cells are complete.")
+    return " ".join(sentences)
+
+
+def _offline(score: Score) -> str:
+    """Return the main finding of offline runs."""
+    cells = [cell for cell in score.error_cells if not cell.part]
+    complete = [cell for cell in cells if cell.complete]
+    sentences = list[str]()
+    starts = [cell for cell in complete if cell.condition == START] or complete
+    if starts:
+        lowest = min(starts, key=lambda cell: cell.error.value)
+        sentences.append(
+            f"Offline, {display_name(lowest.system)} has the lowest action error, "
+            f"{lowest.error.value:.4f} under {named(lowest.condition)}, over {lowest.n} recordings."
+        )
+    with_history = {cell.system for cell in cells if cell.condition != NO_HISTORY}
+    lone = [cell for cell in complete if cell.system not in with_history]
+    if lone and with_history:
+        listed = ", ".join(f"{display_name(one.system)} {one.error.value:.4f}" for one in lone)
+        sentences.append(f"Without history: {listed}.")
+    if len(complete) < len(cells):
+        sentences.append(f"{len(complete)} of {len(cells)} cells are complete.")
+    if errors := sum(cell.errors for cell in cells):
+        sentences.append(f"Errors, which do not count: {errors}.")
     return " ".join(sentences)
 
 
@@ -48,7 +76,7 @@ def _leading(score: Score, complete: Sequence[Cell]) -> list[str]:
     )
     interval = _chosen_interval(leader, complete)
     if leader.condition != START or not falls:
-        first = f"{rate}under {_named(leader.condition)} ({interval})."
+        first = f"{rate}under {named(leader.condition)} ({interval})."
         return [first, *_tied(complete, leader), *_hurting(score, leader)]
     fall = max(falls, key=lambda one: parse_condition(one.condition).k)
     first = f"{rate}if the history holds only the lesson ({START}, {interval}), "
@@ -56,8 +84,8 @@ def _leading(score: Score, complete: Sequence[Cell]) -> list[str]:
     if fall.complete:
         highest = _best(complete, fall.condition)[0]
         if highest.system != leader.system:
-            named = f"{percent(highest.rate)}, of {display_name(highest.system)}"
-            sentences.append(f"The highest rate at {fall.condition} is {named}.")
+            highest_rate = f"{percent(highest.rate)}, of {display_name(highest.system)}"
+            sentences.append(f"The highest rate at {fall.condition} is {highest_rate}.")
         sentences += _tied(complete, highest)
     sentences += _equal(score, fall) + _beside_base(score, fall)
     return sentences + _hurting(score, leader)
@@ -79,7 +107,7 @@ def _tied(complete: Sequence[Cell], first: Cell) -> list[str]:
         return []
     be = "is" if len(cells) == 1 else "are"
     names = f"{_listed(cells)} {be} not distinguishable from the best"
-    return [f"Under {_named(first.condition)}, {names}."]
+    return [f"Under {named(first.condition)}, {names}."]
 
 
 def _listed(cells: Sequence[Cell]) -> str:
@@ -95,7 +123,7 @@ def _nothing_complete(cells: Sequence[Cell]) -> str:
     other = f", and {len(nearest.other)} are outside the grid" if nearest.other else ""
     return (
         f"In {nearest.simulator}, no cell is complete, so no system leads. The most complete is "
-        f"{display_name(nearest.system)} under {_named(nearest.condition)}: {len(nearest.missing)} "
+        f"{display_name(nearest.system)} under {named(nearest.condition)}: {len(nearest.missing)} "
         f"of {nearest.expected} episodes are missing{other}."
     )
 
@@ -117,21 +145,8 @@ def _from_start(score: Score, fall: Contrast) -> str:
     counts = f"{pairs.gained} episodes gained, {pairs.lost} lost"
     return (
         f"and in {percent(pairs.second)} with {k} {sessions} after it ({fall.condition}{over}): "
-        f"{_shown(fall, falls, 'the falls of {} systems', counts)}."
+        f"{shown(fall, falls, 'the falls of {} systems', counts)}."
     )
-
-
-def _shown(one: Contrast, among: Sequence[Contrast], correction: str, counts: str = "") -> str:
-    """State a difference that was chosen among some, with interval and p corrected for all."""
-    change = one.pairs.at(simultaneous(len(among)))
-    p = holm([other.pairs.p for other in among])[among.index(one)]
-    name = "McNemar" if one.pairs.interval == "newcombe" else "sign-flip"
-    text = f"{points(change.value)} points ({points(change.low)} to {points(change.high)}; "
-    text += f"{counts}, " * bool(counts) + f"{name} p = {_p(p)}"
-    if p >= ALPHA and (change.low > 0 or change.high < 0):
-        text += f", not significant although the interval excludes 0: mid-p = {_p(one.pairs.p_mid)}"
-    several = f", corrected for {correction.format(len(among))}" * (len(among) > 1)
-    return f"{text}{several}{'' if one.complete else ', provisional'})"
 
 
 def _hurting(score: Score, leader: Cell) -> list[str]:
@@ -145,7 +160,7 @@ def _hurting(score: Score, leader: Cell) -> list[str]:
     loss = "largest loss is by" if p < ALPHA else "largest loss, which is not significant, is by"
     return [
         f"Under the conditions beyond the paper's, its {loss} {worst.asks}: {worst.condition} "
-        f"minus {_named(worst.against[1])} is {_shown(worst, found, '{} comparisons')}."
+        f"minus {named(worst.against[1])} is {shown(worst, found, '{} comparisons')}."
     ]
 
 
@@ -190,11 +205,3 @@ def _best(cells: Sequence[Cell], condition: str | None = None) -> list[Cell]:
     found = [cell for cell in cells if condition in (None, cell.condition)]
     highest = max((cell.rate for cell in found), default=math.nan)
     return [cell for cell in found if cell.rate == highest]
-
-
-def _named(condition: str) -> str:
-    return "no history" if condition == NO_HISTORY else condition
-
-
-def _p(value: float) -> str:
-    return "1" if value == 1 else f"{value:.2g}" if value >= 0.001 else f"{value:.1e}"

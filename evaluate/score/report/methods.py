@@ -28,11 +28,12 @@ def methods(score: Score) -> tuple[str, str]:
         for record in table.records()
         if record.get("interval")
     }
-    lifts = score.tables["lift"].records()
+    lifts = score.tables["lift"].records() if "lift" in score.tables else []
     values: dict[str, Any] = {
         "parts": [_part(score, outcomes) for outcomes in score.outcomes.values()],
-        "repeats": bool(score.tables["noise"].rows),
-        "tables": {name for name, table in score.tables.items() if table.rows},
+        "offline": None if score.recordings is None else _offline(score, score.recordings),
+        "repeats": "noise" in score.tables,
+        "tables": set(score.tables),
         "intervals": intervals,
         "retention": any(one["retention"] is not None for one in lifts),
         "margin": score.settings.margin,
@@ -47,6 +48,19 @@ def methods(score: Score) -> tuple[str, str]:
     entries = file.read_text(encoding="utf-8").strip().split("\n\n")
     chosen = [one for one in entries if one.partition("{")[2].partition(",")[0] in cited]
     return text, "\n\n".join(chosen) + "\n"
+
+
+def _offline(score: Score, recordings: Outcomes) -> dict[str, Any]:
+    cells = [cell for cell in score.error_cells if not cell.part]
+    return {
+        "systems": list(map(display_name, recordings.systems)),
+        "conditions": recordings.conditions,
+        "rollouts": sum(sum(cell.counts) for cell in cells),
+        "episodes": len(recordings.episodes),
+        "complete": sum(cell.complete for cell in cells),
+        "cells": len(cells),
+        "errors": sum(cell.errors for cell in cells),
+    }
 
 
 def _part(score: Score, outcomes: Outcomes) -> dict[str, Any]:

@@ -16,9 +16,10 @@ import numpy as np
 
 from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.evaluate.run.log import RunHeader
+from robomme_interference_data.evaluate.score.comparisons import offline
 from robomme_interference_data.evaluate.score.comparisons.contrast import START
 from robomme_interference_data.evaluate.score.config import Expected
-from robomme_interference_data.evaluate.score.outcomes import STATUSES, success
+from robomme_interference_data.evaluate.score.outcomes import STATUSES, mean_errors, success
 from robomme_interference_data.evaluate.score.plots.data import FEW
 from robomme_interference_data.evaluate.score.plots.figures import FIGURES
 from robomme_interference_data.evaluate.score.rows.reading import Rows
@@ -30,6 +31,7 @@ from robomme_interference_data.storage.files import sha256_file, write_text
 from robomme_interference_data.viz.templates import fill
 
 from .headline import headline
+from .strongest import strongest
 
 _LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
 """Libraries that numbers and figures depend on."""
@@ -42,6 +44,7 @@ _SHOWN_IN = {
     "by_evidence_kept": ("by_evidence_kept", "evidence_effects", "evidence_use"),
     "ceiling": ("ceiling",),
     **{"matrix": ("matrix", "systems", "ranks")},
+    "action_error": ("action_error", offline.CHANGES, offline.SYSTEMS),
 }
 """Figure to the tables with its numbers."""
 
@@ -55,10 +58,11 @@ def write_report(
     score: Score, figures: Mapping[str, Path], out: Path, command: str | None = None
 ) -> None:
     """Write the page: the same bytes for the same rows, options and command."""
-    names = {name for one in score.outcomes.values() for name in one.conditions}
+    names = {name for one in score.every for name in one.conditions}
     conditions = [one.name for one in in_order(names)] if names else []
     values = {
-        "headlines": {simulator: headline(score, simulator) for simulator in score.outcomes},
+        "headlines": headlines(score),
+        "strongest": {one.simulator: strongest(score, one.simulator) for one in score.every},
         "grids": score.grids,
         "tables": score.tables.values(),
         "systems": _names(score),
@@ -77,9 +81,14 @@ def write_report(
     write_text(out, html)
 
 
+def headlines(score: Score) -> dict[str, str]:
+    """Return the main finding of each simulator, and of recordings."""
+    return {one.simulator: headline(score, one.simulator) for one in score.every}
+
+
 def _number(text: str) -> str:
     """Return the sort key of a cell of a grid; empty without a rate."""
-    found = re.match(r"\**([0-9.]+)%", text)
+    found = re.match(r"\**([0-9.]+)", text)
     return found[1] if found else ""
 
 
@@ -111,7 +120,7 @@ def _inline(figures: Mapping[str, Path]) -> dict[str, str]:
 
 def _names(score: Score) -> dict[str, str]:
     """Return the display names of the systems that have rows."""
-    systems = {one: None for outcomes in score.outcomes.values() for one in outcomes.systems}
+    systems = {one: None for outcomes in score.every for one in outcomes.systems}
     return {system: display_name(system) for system in systems}
 
 
@@ -127,20 +136,27 @@ def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
     """
     videos = _videos(score.rows)
     rows = []
-    for outcomes in score.outcomes.values():
+    for outcomes in score.every:
+        errors = mean_errors(outcomes.action_l1)
         for place, system in enumerate(outcomes.systems):
             counts = outcomes.counts[place].transpose(1, 0, 2).tolist()
             rates = success(outcomes.status[place]).T.tolist()
+            measured = errors[place].T.tolist()
             for number in np.flatnonzero(outcomes.has_episode[place]).tolist():
                 episode, hard = outcomes.episodes[number], int(outcomes.difficulty[number])
-                came = dict(zip(outcomes.conditions, counts[number], strict=True))
+                came = {
+                    c: _outcome(statuses, error)
+                    for c, statuses, error in zip(
+                        outcomes.conditions, counts[number], measured[number], strict=True
+                    )
+                }
                 found = [
                     videos.get((outcomes.simulator, system, c, str(episode))) for c in conditions
                 ]
                 row = (
                     *(outcomes.simulator, system, episode.family),
                     *(f"{episode.split}/{episode.index}", DIFFICULTIES[hard] if hard >= 0 else ""),
-                    [_outcome(came[c]) if c in came else "" for c in conditions],
+                    [came.get(c, "") for c in conditions],
                     flips(outcomes.conditions, rates[number]),
                     [_address(one, folder) if one else "" for one in found],
                 )
@@ -164,11 +180,13 @@ def flips(conditions: Sequence[str], rates: Sequence[float]) -> str:
     )
 
 
-def _outcome(counts: Sequence[int]) -> str:
+def _outcome(counts: Sequence[int], action_l1: float) -> str:
+    if not math.isnan(action_l1):
+        return f"{action_l1:.4f}"
     if sum(counts) == 1:
         return STATUSES[counts.index(1)]
-    won, *others, errors = counts
-    scored = won + sum(others)
+    won, failed, timed_out, errors, _ = counts
+    scored = won + failed + timed_out
     return f"{won}/{scored}" if scored else "error" if errors else ""
 
 
@@ -210,7 +228,10 @@ def _facts(score: Score, command: str | None) -> dict[str, list[str]]:
         **call,
         "scored with": versions(),
         "rows": f"{len(rows):,}",
-        "episodes of a complete cell": _GRIDS[settings.expected],
+        "episodes of a complete cell": _GRIDS[settings.expected] if score.outcomes else "",
+        "recordings of a complete cell": "those in any row or in the plan of a run"
+        if score.recordings
+        else "",
         "bootstrap": f"{score.draws:,} draws, seeded by the simulator, clustered by episode",
         "model seeds": ", ".join(map(str, seeds[:20])) if len(seeds) > 1 else "",
         **{

@@ -16,8 +16,9 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.evaluate.run.log import RunHeader
 from robomme_interference_data.evaluate.systems import name_system
-from robomme_interference_data.schema.rollouts import FINAL, success_of
+from robomme_interference_data.schema.rollouts import FINAL, Status, success_of
 from robomme_interference_data.schema.shifts import NO_SHIFT
+from robomme_interference_data.simulators.registry import RECORDINGS
 
 from .files import Part, find_sources, read_file, system_of
 from .values import DEFAULTS, Row, parse, shifted
@@ -134,9 +135,8 @@ class _Checks:
         ]
         rows = map(Row._make, zip(*columns, strict=True))
         for at, (line, row) in enumerate(zip(part.lines, rows, strict=True)):
-            if at not in wrong and row.success is not _SUCCESS[row.status]:
-                shown = "(empty)" if row.success is None else row.success
-                wrong[at] = f"success {shown} contradicts status {row.status!r}"
+            if at not in wrong and (contradiction := _contradiction(row)):
+                wrong[at] = contradiction
             if at in wrong:
                 self.reasons[number, line] = wrong[at]
             elif row.shift == NO_SHIFT:
@@ -185,6 +185,19 @@ class _Checks:
         for at, reason in list(rows):
             del self.sound[at]
             self.reasons[at] = reason
+
+
+def _contradiction(row: Row) -> str:
+    """Return which columns of a row contradict each other; empty if none do."""
+    if row.success is not _SUCCESS[row.status]:
+        shown = "(empty)" if row.success is None else row.success
+        return f"success {shown} contradicts status {row.status!r}"
+    offline = row.simulator == RECORDINGS
+    if row.status != Status.ERROR and (row.status == Status.MEASURED) is not offline:
+        return f"status {row.status!r} contradicts simulator {row.simulator!r}"
+    if row.status == Status.MEASURED and row.action_l1 is None:
+        return f"action_l1 (empty) contradicts status {row.status!r}"
+    return ""
 
 
 def _parsed(name: str, values: Sequence[Any], run: Path | None, wrong: dict[int, str]) -> list[Any]:

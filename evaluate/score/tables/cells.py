@@ -3,8 +3,9 @@
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 
@@ -36,37 +37,33 @@ _ERRORS = (
     "depend on the outcome."
 )
 _BEST = (
-    " Best (bold): above zero, and no other system is significantly better, by p after Holm's "
-    "correction over all pairs of systems."
+    " Best (bold, in text *): above zero, and no other system is significantly better, by p after "
+    "Holm's correction over all pairs of systems."
 )
 _FIXED = (
     " fixed low to fixed high: Wilson's interval for other episodes of the same families in the "
     "same numbers, narrower because the families' rates differ."
 )
 
+NOT_EXPECTED = "n/a"
+"""A cell of a grid that nobody expects, unlike a missing one."""
+
 
 @dataclass(frozen=True)
-class Cell:
-    """The results of one system under one condition, in all or some of the episodes."""
+class Coverage:
+    """Which episodes count of one system under one condition, in all or some of the episodes."""
 
     simulator: str
     system: str
     condition: str
     part: str  # family or difficulty; empty for all episodes
     n: int  # episodes that count: at least one rollout that is not an error
-    rate: float  # mean over them of the success of their repeats; NaN if n is 0
-    interval: tuple[float, float]  # 95% Wilson; (0, 1) if n is 0
-    trials: float  # effective number of independent trials: n, and more with repeats
-    fixed: tuple[float, float] = (math.nan, math.nan)  # interval for just these families
-    if_errors_fail: float = math.nan  # rate if every error were a failure; NaN without rollouts
-    counts: tuple[int, ...] = (0,) * len(STATUSES)  # rollouts by status
-    chance: float = math.nan  # mean success of guessing; NaN unless all episodes are questions
-    expected: int = 0  # number of expected episodes
-    missing: Sequence[EpisodeId] = ()  # expected, but do not count with every model seed
-    broken: Sequence[EpisodeId] = ()  # with an error
-    other: Sequence[EpisodeId] = ()  # count without being expected
-    rank: int | None = None  # among complete cells, 1 for the highest rate; None for references
-    best: bool = False  # one of several, and no other one is significantly better
+    counts: tuple[int, ...] = field(default=(0,) * len(STATUSES), kw_only=True)  # by status
+    expected: int = field(default=0, kw_only=True)  # number of expected episodes
+    # Expected, but do not count with every model seed.
+    missing: Sequence[EpisodeId] = field(default=(), kw_only=True)
+    broken: Sequence[EpisodeId] = field(default=(), kw_only=True)  # with an error
+    other: Sequence[EpisodeId] = field(default=(), kw_only=True)  # count without being expected
 
     @property
     def part_of(self) -> str:
@@ -74,11 +71,6 @@ class Cell:
         if self.part in ("", *DIFFICULTIES):
             return "difficulty" if self.part else "main"
         return "family"
-
-    @property
-    def as_rate(self) -> Rate:
-        """Its rate, for comparisons."""
-        return Rate(self.n, self.rate, self.trials)
 
     @property
     def complete(self) -> bool:
@@ -89,6 +81,44 @@ class Cell:
     def errors(self) -> int:
         """The number of errors."""
         return self.counts[_ERROR]
+
+    @property
+    def mark(self) -> str:
+        """† if the cell is not complete."""
+        return "" if self.complete else "†"
+
+
+@dataclass(frozen=True)
+class Cell(Coverage):
+    """The success rate of one system under one condition, in all or some of the episodes."""
+
+    rate: float  # mean over them of the success of their repeats; NaN if n is 0
+    interval: tuple[float, float]  # 95% Wilson; (0, 1) if n is 0
+    trials: float  # effective number of independent trials: n, and more with repeats
+    fixed: tuple[float, float] = (math.nan, math.nan)  # interval for just these families
+    if_errors_fail: float = math.nan  # rate if every error were a failure; NaN without rollouts
+    chance: float = math.nan  # mean success of guessing; NaN unless all episodes are questions
+    rank: int | None = None  # among complete cells, 1 for the highest rate; None for references
+    best: bool = False  # one of several, and no other one is significantly better
+
+    @property
+    def as_rate(self) -> Rate:
+        """Its rate, for comparisons."""
+        return Rate(self.n, self.rate, self.trials)
+
+
+def coverage_of(
+    outcomes: Outcomes, system: int, condition: int, here: Flags, due: Flags
+) -> dict[str, Any]:
+    """Return what is counted of a cell: its episodes `here`, those expected in it are `due`."""
+    counts = outcomes.counts[system, condition]
+    return {
+        "counts": tuple(counts[here].sum(axis=0).tolist()),
+        "expected": int((due & outcomes.expected).sum()),
+        "missing": outcomes.chosen(due & outcomes.missing[system, condition]),
+        "broken": outcomes.chosen(here & (counts[:, _ERROR] > 0)),
+        "other": outcomes.chosen(here & outcomes.other[system, condition]),
+    }
 
 
 def cells_of(every: Iterable[Outcomes]) -> list[Cell]:
@@ -114,7 +144,7 @@ def _cells(outcomes: Outcomes) -> list[Cell]:
         for name, (here, due) in parts.items():
             if not ((here & outcomes.has_episode[s]) | (due & outcomes.expected)).any():
                 continue
-            counted, counts = here & outcomes.counted[s, c], outcomes.counts[s, c]
+            counted = here & outcomes.counted[s, c]
             status = outcomes.status[s, c, here]
             rate = rate_of(status)
             names = (outcomes.simulator, outcomes.systems[s], outcomes.conditions[c], name)
@@ -123,12 +153,8 @@ def _cells(outcomes: Outcomes) -> list[Cell]:
                     *(*names, rate.n, rate.value, rate.interval, rate.trials),
                     fixed=(math.nan, math.nan) if name else _fixed(outcomes, s, c, rate),
                     if_errors_fail=rate_of(np.where(status == _ERROR, _FAIL, status)).value,
-                    counts=tuple(counts[here].sum(axis=0).tolist()),
                     chance=float(outcomes.chance[counted].mean()) if rate.n else math.nan,
-                    expected=int((due & outcomes.expected).sum()),
-                    missing=outcomes.chosen(due & outcomes.missing[s, c]),
-                    broken=outcomes.chosen(here & (counts[:, _ERROR] > 0)),
-                    other=outcomes.chosen(here & outcomes.other[s, c]),
+                    **coverage_of(outcomes, s, c, here, due),
                 )
             )
     return _ranked(outcomes, cells, {name: here for name, (here, _) in parts.items()})
@@ -174,7 +200,7 @@ def rate_table(cells: Sequence[Cell], name: str) -> Table:
             bounds = cell.interval if cell.n else (math.nan, math.nan)
             fixed = () if parts else (*cell.fixed, cell.if_errors_fail)
             more = (cell.complete, len(cell.missing), cell.rank, cell.best)
-            rows.append((*key, cell.n, cell.rate, *bounds, *fixed, *cell.counts, *more))
+            rows.append((*key, cell.n, cell.rate, *bounds, *fixed, *cell.counts[:4], *more))
     return Table.make(
         name,
         f"Success by {name if parts else 'system and condition'}",
@@ -201,15 +227,19 @@ def main_grids(cells: Sequence[Cell]) -> list[Table]:
         at = {(cell.system, cell.condition): cell for cell in found}
         episodes = {cell.n for cell in found if cell.n}
         several = len(episodes) > 1
-        rows = (
+        rows = [
             (display_name(system), *(_shown(at.get((system, c)), several) for c in conditions))
             for system in dict.fromkeys(cell.system for cell in found)
-        )
+        ]
         errors = sum(cell.errors for cell in found)
         references = dict.fromkeys(display_name(c.system) for c in found if is_reference(c.system))
         notes = [] if several or not episodes else [f"n = {episodes.pop()} in each cell."]
         if not grids:  # once for all grids
             notes.append(_NOTE + _BEST * any(cell.best for cell in whole))
+        if any(NOT_EXPECTED in row for row in rows):
+            notes.append(
+                f"{NOT_EXPECTED}: the condition does not apply to the system, or is not expected."
+            )
         if references:
             notes.append(f"References, not ranked: {', '.join(references)}.")
         if chances := [cell.chance for cell in found if not math.isnan(cell.chance)]:
@@ -224,18 +254,17 @@ def main_grids(cells: Sequence[Cell]) -> list[Table]:
 
 def _shown(cell: Cell | None, with_n: bool) -> str:
     if cell is None:
-        return "–"
+        return NOT_EXPECTED
     errors = f", errors: {cell.errors}" if cell.errors else ""
     if not cell.n:
         return f"no result†{errors}" if any(cell.counts) else "missing†"
     low, high = cell.interval
     rate = f"**{percent(cell.rate)}**" if cell.best else percent(cell.rate)
-    mark = "" if cell.complete else "†"
     n = f" n={cell.n}" if with_n else ""
-    return f"{rate}{mark} [{100 * low:.1f}, {100 * high:.1f}]{n}{errors}"
+    return f"{rate}{cell.mark} [{100 * low:.1f}, {100 * high:.1f}]{n}{errors}"
 
 
-def coverage_table(cells: Iterable[Cell]) -> Table:
+def coverage_table(cells: Iterable[Coverage]) -> Table:
     """Return which episodes each cell of a family lacks, and which have errors."""
     rows = (
         (
