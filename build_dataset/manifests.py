@@ -30,9 +30,9 @@ from robomme_interference_data.constants import (
     SHIFTED,
     UNITS,
 )
-from robomme_interference_data.data.buffer_set import pending_rows
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.loading import load_buffer_set
+from robomme_interference_data.data.manifest_table import pending_rows
 from robomme_interference_data.data.query_sessions import QuerySessions, SessionSource
 from robomme_interference_data.errors import (
     BuildError,

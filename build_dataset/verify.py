@@ -17,8 +17,9 @@ from robomme_interference_data.constants import (
     QUESTIONS_PATH,
     RULE_VERSION,
 )
-from robomme_interference_data.data.buffer_set import BufferSet, pending_rows
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
+from robomme_interference_data.data.manifest_table import pending_rows
 from robomme_interference_data.data.questions import Question, read_questions
 from robomme_interference_data.errors import FormatError, InterferenceError
 from robomme_interference_data.runtime.progress import WorkProgress

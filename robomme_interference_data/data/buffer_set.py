@@ -6,51 +6,34 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from itertools import chain
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import (
-    DATASETS,
-    DEMONSTRATIONS,
-    DISTRACTORS,
-    MANIFEST_HEADER,
-    MANIFEST_PATH,
-    MANIFEST_ROWS,
-    MANIFESTS,
-    OPTIONAL_DATASETS,
-    RULE_VERSION,
-)
+from robomme_interference_data.constants import DATASETS, DEMONSTRATIONS, DISTRACTORS, MANIFEST_PATH
 from robomme_interference_data.errors import (
     FormatError,
-    HashMismatchError,
     InvalidOptionError,
     MissingFileError,
     UnknownNameError,
     counted,
 )
 from robomme_interference_data.ids import EpisodeId, whole_number
-from robomme_interference_data.schema.codec import arrow_schema, from_table, to_dict, to_pandas
+from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_pandas
 from robomme_interference_data.schema.conditions import Condition, datasets_of, parse_condition
 from robomme_interference_data.schema.manifest import BufferManifest, ManifestHeader
-from robomme_interference_data.storage.files import (
-    LocalFiles,
-    digest_json,
-    read_header,
-    sha256_file,
-)
+from robomme_interference_data.storage.files import LocalFiles, digest_json, read_header
 from robomme_interference_data.storage.hub import HubFiles
-from robomme_interference_data.storage.parquet import RowSpan
 
 from .buffer import Buffer
 from .dataset import Dataset
 from .fetched_copy import FetchedCopy, read_fetch_record
+from .manifest_table import ManifestTable
 from .query import Query
 from .query_sessions import SessionSource
+from .set_datasets import SetDatasets, dataset_files
 
 if TYPE_CHECKING:
     import pandas
@@ -60,13 +43,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 _LOCATION = re.compile(r"\.|[\w.-]+(?:/[\w.-]+)+@[0-9a-f]{40}")
 _DIGEST = re.compile(r"[0-9a-f]{64}")
-_BATCH_ROWS = 1024
-_KEYS = ("episode_id", "condition", "difficulty")
-
-
-def pending_rows(header: ManifestHeader) -> str:
-    """Return the path of the rows while a build replaces those of an earlier header."""
-    return f"{MANIFESTS}/.{header.rows}.parquet"
 
 
 class BufferSet:
@@ -125,7 +101,7 @@ class BufferSet:
     @property
     def planned_buffers(self) -> int:
         """Number of buffers, including those that a partial copy lacks."""
-        return len(self._keys["episode_id"])
+        return len(self._table)
 
     @property
     def name(self) -> str:
@@ -163,32 +139,11 @@ class BufferSet:
         Raises:
             HashMismatchError: On access, if the manifests were made for another revision.
         """
-        return _Datasets(self)
+        return SetDatasets(self)
 
     def dataset_files(self, name: str) -> LocalFiles | HubFiles:
-        """Return access to a dataset's files.
-
-        A folder with the dataset's name in a local buffer set takes precedence over the location
-        that the manifests record.
-        """
-        location, files = self.header.datasets[name].location, self.files
-        if isinstance(files, LocalFiles) and (location is None or (files.root / name).is_dir()):
-            folder = files.root / name
-            if not folder.resolve().is_relative_to(files.root.resolve()):
-                raise FormatError(
-                    f"{folder} is a link that leads out of the buffer set",
-                    "Replace the link by the folder.",
-                )
-            return LocalFiles(folder, files.refetch)
-        if location is None and isinstance(files, HubFiles) and name in OPTIONAL_DATASETS:
-            return files.inside(name)
-        if location is None:
-            raise MissingFileError(
-                f"the manifests of {self.location} do not record the location of its {name}",
-                "Those of a published buffer set do.",
-                "publish BUFFER_SET --repo-id NAMESPACE/NAME",
-            )
-        return files if location == "." else HubFiles.parse(location)
+        """Return access to a dataset's files; see `set_datasets.dataset_files`."""
+        return dataset_files(self.files, self.header, name)
 
     @cached_property
     def episode_ids(self) -> tuple[EpisodeId, ...]:
@@ -289,14 +244,14 @@ class BufferSet:
     ) -> BufferManifest:
         """Return the manifest of one buffer; for arguments and errors see `load_buffer`."""
         episode, name = EpisodeId.parse(episode_id), self.planned(condition, k).name
-        row = self._row_of.get((str(episode), name))
+        row = self._table.row_of.get((str(episode), name))
         if row is None:
             self._check_episode(episode)
-            raise FormatError.damaged(self._path, f"no row of {episode} under {name}")
+            raise FormatError.damaged(self._table.path, f"no row of {episode} under {name}")
         if not self._is_present[row]:
             options = f"--families {episode.family} --episodes {episode.index} --conditions {name}"
             raise self._not_fetched(f"{episode} under {name}", options)
-        return next(from_table(BufferManifest, self._rows.part(row, row + 1).table(), self._path))
+        return self._table.record(row)
 
     def manifests(
         self,
@@ -317,7 +272,7 @@ class BufferSet:
         Raises:
             UnknownNameError: No buffer has this family, condition or difficulty.
         """
-        return self._records(self._matching(family, condition, k, difficulty))
+        return self._table.records(self._matching(family, condition, k, difficulty))
 
     def to_pandas(
         self,
@@ -335,7 +290,7 @@ class BufferSet:
             MissingExtraError: pandas is not installed.
             UnknownNameError: No buffer has this family, condition or difficulty.
         """
-        tables = [*self._tables(self._matching(family, condition, k, difficulty))]
+        tables = [*self._table.tables(self._matching(family, condition, k, difficulty))]
         none = arrow_schema(BufferManifest).empty_table()
         return to_pandas(pa.concat_tables(tables) if tables else none)
 
@@ -362,23 +317,12 @@ class BufferSet:
                 if value not in known:
                     raise UnknownNameError.among(column, value, self.location, known)
             if values:
-                keep &= np.array([one in values for one in self._keys[column]])
+                keep &= np.array([one in values for one in self._table.keys[column]])
         return keep
 
     def planned_manifests(self) -> Iterator[BufferManifest]:
         """Yield the manifests of all buffers, including those that a partial copy lacks."""
-        return self._records(np.ones(self.planned_buffers, bool))
-
-    def _records(self, keep: NDArray[np.bool_]) -> Iterator[BufferManifest]:
-        return chain.from_iterable(
-            from_table(BufferManifest, table, self._path) for table in self._tables(keep)
-        )
-
-    def _tables(self, keep: NDArray[np.bool_]) -> Iterator[pa.Table]:
-        for first in range(0, len(keep), _BATCH_ROWS):
-            mask = keep[first : first + _BATCH_ROWS]
-            if mask.any():
-                yield self._rows.part(first, first + len(mask)).table().filter(mask)
+        return self._table.records(np.ones(self.planned_buffers, bool))
 
     def load(
         self,
@@ -393,7 +337,7 @@ class BufferSet:
         buffer = self._buffer(self.manifest(episode_id, condition, k=k))
         buffer.fetch(cameras)
         if verify:
-            self._check_rows()
+            self._table.check(self.fix)
             buffer.verify()
         return buffer
 
@@ -415,7 +359,7 @@ class BufferSet:
         for name in datasets_of(parsed):
             self.datasets[name].check_records()
         if planned:
-            self._check_rows()
+            self._table.check(self.fix)
             for manifest in self.manifests(condition=parsed):
                 self._source.check(manifest)
 
@@ -423,17 +367,6 @@ class BufferSet:
     def _source(self) -> SessionSource:
         """What the rules depend on."""
         return SessionSource(self.datasets, self.header.seed)
-
-    def _check_rows(self) -> None:
-        if self.header.rule_version != RULE_VERSION:
-            raise FormatError(
-                f"{self.location} follows version {self.header.rule_version} of the rules; this "
-                f"package can check {RULE_VERSION}",
-                "Install the version of robomme-interference-data that made it.",
-            )
-        if sha256_file(self._path) != self.header.rows:
-            what = f"{self._path} does not have the SHA-256 in {MANIFEST_HEADER}"
-            raise HashMismatchError(what, self.fix, "verify BUFFER_SET")
 
     def buffers(self, **properties: Any) -> Iterator[Buffer]:
         """Yield all buffers, or those with all the given properties; see `manifests`."""
@@ -443,7 +376,7 @@ class BufferSet:
         for entry in manifest.sessions:
             if entry.dataset not in self.datasets:
                 what = f"{manifest} has a session of the unknown dataset {entry.dataset!r}"
-                raise FormatError.damaged(self._path, what)
+                raise FormatError.damaged(self._table.path, what)
         return Buffer(
             manifest,
             self.query(manifest.episode_id),
@@ -464,7 +397,7 @@ class BufferSet:
     def _check_episode(self, episode: EpisodeId) -> None:
         if episode in self._episodes:
             return
-        if self.copy is not None and str(episode) in {*self._keys["episode_id"]}:
+        if self.copy is not None and str(episode) in {*self._table.keys["episode_id"]}:
             options = f"--families {episode.family} --episodes {episode.index}"
             raise self._not_fetched(f"the buffers of {episode}", options)
         if episode.family not in self.families:
@@ -472,31 +405,8 @@ class BufferSet:
         raise UnknownNameError.among("episode", str(episode), self.location, self.episode_ids)
 
     @cached_property
-    def _rows(self) -> RowSpan:
-        return RowSpan(self._path)
-
-    @cached_property
-    def _path(self) -> Path:
-        pending, files = pending_rows(self.header), self.files
-        replaced = isinstance(files, LocalFiles) and (files.root / pending).is_file()
-        return files.path(pending if replaced else f"{MANIFESTS}/{MANIFEST_ROWS}")
-
-    @cached_property
-    def _keys(self) -> dict[str, list[str | None]]:
-        """The columns that identify and filter buffers."""
-        keys: dict[str, list[str | None]] = self._rows.table([*_KEYS]).to_pydict()
-        for column, values in keys.items():
-            if not all(value is None or isinstance(value, str) for value in values):
-                raise FormatError.damaged(self._path, f"column {column} is not text")
-        pairs = Counter(zip(keys["episode_id"], keys["condition"], strict=True))
-        for (episode, condition), count in pairs.most_common(1):
-            if count > 1:
-                raise FormatError.damaged(
-                    self._path, f"{count} rows of {episode} under {condition}"
-                )
-        # Not the column of that name, which a reader of the table alone may filter by.
-        keys["family"] = [EpisodeId.parse(text or "").family for text in keys["episode_id"]]
-        return keys
+    def _table(self) -> ManifestTable:
+        return ManifestTable(self.files, self.header)
 
     @cached_property
     def _is_present(self) -> NDArray[np.bool_]:
@@ -517,63 +427,17 @@ class BufferSet:
 
     @cached_property
     def _present(self) -> dict[str, list[str | None]]:
-        """The columns `_keys` of the buffers that can be loaded."""
+        """The columns of the table's `keys` for the buffers that can be loaded."""
         if self.copy is None:
-            return self._keys
+            return self._table.keys
         return {
             name: [value for value, here in zip(values, self._is_present, strict=True) if here]
-            for name, values in self._keys.items()
+            for name, values in self._table.keys.items()
         }
-
-    @cached_property
-    def _row_of(self) -> dict[tuple[str | None, str | None], int]:
-        pairs = zip(self._keys["episode_id"], self._keys["condition"], strict=True)
-        return {pair: row for row, pair in enumerate(pairs)}
 
     @cached_property
     def _episodes(self) -> frozenset[EpisodeId]:
         return frozenset(self.episode_ids)
-
-
-class _Datasets(Mapping[str, Dataset]):
-    """The datasets of a buffer set, each opened on first access."""
-
-    def __init__(self, buffer_set: BufferSet):
-        self._buffer_set = buffer_set
-        self._opened: dict[str, Dataset] = {}
-
-    def __getitem__(self, name: str) -> Dataset:
-        if name not in self._opened:
-            recorded = self._buffer_set.header.datasets[name]
-            dataset = Dataset(self._buffer_set.dataset_files(name))
-            if dataset.revision != recorded.revision:
-                local = isinstance(self._buffer_set.files, LocalFiles)
-                raise HashMismatchError(
-                    f"{dataset.files.describe()} has revision {dataset.revision[:12]}…; the "
-                    f"manifests were made for {recorded.revision[:12]}…",
-                    self._buffer_set.fix,
-                    f"build manifests {self._buffer_set.location}" if local else None,
-                )
-            self._opened[name] = dataset
-        return self._opened[name]
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._names
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
-
-    def __len__(self) -> int:
-        return len(self._names)
-
-    @cached_property
-    def _names(self) -> tuple[str, ...]:
-        """All that are planned; in a partial copy, those that are there."""
-        buffer_set, names = self._buffer_set, tuple(self._buffer_set.header.datasets)
-        copy = buffer_set.copy
-        if copy is None:
-            return names
-        return tuple(n for n in names if copy.has_dataset(n, buffer_set.dataset_files(n)))
 
 
 def _condition(condition: Condition | str | None, k: int | None) -> Condition:

@@ -1,0 +1,120 @@
+"""The table of a buffer set's manifests: a row for each buffer."""
+
+from collections import Counter
+from collections.abc import Iterator
+from functools import cached_property
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import (
+    MANIFEST_HEADER,
+    MANIFEST_ROWS,
+    MANIFESTS,
+    RULE_VERSION,
+)
+from robomme_interference_data.errors import FormatError, HashMismatchError
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.schema.codec import from_table
+from robomme_interference_data.schema.manifest import BufferManifest, ManifestHeader
+from robomme_interference_data.storage.files import Files, LocalFiles, sha256_file
+from robomme_interference_data.storage.parquet import RowSpan
+
+_BATCH_ROWS = 1024
+_KEYS = ("episode_id", "condition", "difficulty")
+
+
+def pending_rows(header: ManifestHeader) -> str:
+    """Return the path of the rows while a build replaces those of an earlier header."""
+    return f"{MANIFESTS}/.{header.rows}.parquet"
+
+
+class ManifestTable:
+    """`buffers.parquet`, of which only the rows in use are read.
+
+    Attributes:
+        path: The file.
+    """
+
+    def __init__(self, files: Files, header: ManifestHeader):
+        pending = pending_rows(header)
+        replaced = isinstance(files, LocalFiles) and (files.root / pending).is_file()
+        self.path: Path = files.path(pending if replaced else f"{MANIFESTS}/{MANIFEST_ROWS}")
+        self._header, self._where = header, files.describe()
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.keys["episode_id"])
+
+    @cached_property
+    def keys(self) -> dict[str, list[str | None]]:
+        """The columns that identify and filter buffers.
+
+        Raises:
+            FormatError: One is not text, or two rows are of one buffer.
+        """
+        keys: dict[str, list[str | None]] = self._rows.table([*_KEYS]).to_pydict()
+        for column, values in keys.items():
+            if not all(value is None or isinstance(value, str) for value in values):
+                raise FormatError.damaged(self.path, f"column {column} is not text")
+        pairs = Counter(zip(keys["episode_id"], keys["condition"], strict=True))
+        for (episode, condition), count in pairs.most_common(1):
+            if count > 1:
+                raise FormatError.damaged(self.path, f"{count} rows of {episode} under {condition}")
+        # Not the column of that name, which a reader of the table alone may filter by.
+        keys["family"] = [EpisodeId.parse(text or "").family for text in keys["episode_id"]]
+        return keys
+
+    @cached_property
+    def row_of(self) -> dict[tuple[str | None, str | None], int]:
+        """The number of each row, by episode id and condition."""
+        pairs = zip(self.keys["episode_id"], self.keys["condition"], strict=True)
+        return {pair: row for row, pair in enumerate(pairs)}
+
+    def record(self, row: int) -> BufferManifest:
+        """Return the manifest in a row."""
+        return next(from_table(BufferManifest, self._rows.part(row, row + 1).table(), self.path))
+
+    def records(self, keep: NDArray[np.bool_]) -> Iterator[BufferManifest]:
+        """Yield the manifests in some rows; `keep` has a truth value for each row."""
+        return chain.from_iterable(
+            from_table(BufferManifest, table, self.path) for table in self.tables(keep)
+        )
+
+    def tables(self, keep: NDArray[np.bool_]) -> Iterator[pa.Table]:
+        """Yield some rows as tables; `keep` has a truth value for each row."""
+        for first in range(0, len(keep), _BATCH_ROWS):
+            mask = keep[first : first + _BATCH_ROWS]
+            if mask.any():
+                yield self._rows.part(first, first + len(mask)).table().filter(mask)
+
+    def check(self, fix: str) -> None:
+        """Check the file against its hash in the header.
+
+        Args:
+            fix: Hint for the error.
+
+        Raises:
+            HashMismatchError: It differs.
+            FormatError: The rows follow rules of an unknown version.
+        """
+        version = self._header.rule_version
+        if version != RULE_VERSION:
+            raise FormatError(
+                f"{self._where} follows version {version} of the rules; this package can check "
+                f"{RULE_VERSION}",
+                "Install the version of robomme-interference-data that made it.",
+            )
+        if sha256_file(self.path) != self._header.rows:
+            raise HashMismatchError(
+                f"{self.path} does not have the SHA-256 in {MANIFEST_HEADER}",
+                fix,
+                "verify BUFFER_SET",
+            )
+
+    @cached_property
+    def _rows(self) -> RowSpan:
+        return RowSpan(self.path)
