@@ -1,11 +1,16 @@
 import os
 import signal
+import sys
 
 
 def run_program() -> None:
     """Run the command line as a program: Ctrl-C never prints a traceback."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # during the imports
-    from .main import main
+    try:
+        from .main import main
+    except ImportError as error:  # a required library is missing or broken, so nothing can run
+        fix = "pip install --force-reinstall robomme-interference-data"
+        sys.exit(f"Error: a required library cannot be imported: {error}\nReinstall it: {fix}")
 
     signal.signal(signal.SIGINT, _interrupt)
     try:

@@ -297,8 +297,8 @@ class HubCall:
 
     def run(self, call: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
         """Call a function of the client."""
-        import httpx
         from huggingface_hub import constants, errors
+        from huggingface_hub.utils import httpx  # the client's HTTP library: httpx, or httpx2
 
         try:
             return call(*arguments, **options)
@@ -308,7 +308,7 @@ class HubCall:
             RuntimeError,
             errors.EntryNotFoundError,
             errors.RevisionResolutionError,
-            httpx.TransportError,
+            httpx.HTTPError,
             httpx.InvalidURL,
         ) as error:
             cause: BaseException = error
