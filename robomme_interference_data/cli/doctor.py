@@ -12,14 +12,13 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from importlib import metadata, util
+from importlib import import_module, metadata, util
 from pathlib import Path
 
 from packaging.requirements import Requirement
 
 from robomme_interference_data.errors import InterferenceError, first_line
 from robomme_interference_data.storage.hub import check_endpoint
-from robomme_interference_data.viz.tables import Table
 
 DISTRIBUTION = "robomme-interference-data"
 
@@ -76,15 +75,19 @@ def guarded(name: str, check: Callable[[], Check]) -> Check:
         return Check(name, False, f"{type(error).__name__}: {first_line(error)}")
 
 
-def report(rows: Sequence[Check]) -> Table:
-    """Return the results as a table for a terminal, each fix below its problem."""
+def report(rows: Sequence[Check]) -> str:
+    """Return the results as text for a terminal, each fix below its problem.
+
+    Fixes are not wrapped, so that they can be copied.
+    """
     states = {True: "ok", False: "FAILS", None: "optional"}
-    lines: list[tuple[str, str, str]] = []
+    longest = max(len(row.name) for row in rows)
+    lines = []
     for row in rows:
-        lines.append((states[row.ok], row.name, row.detail))
+        lines.append(f"{states[row.ok]:8}  {row.name:{longest}}  {row.detail}")
         if row.fix is not None:
-            lines.append(("", "", f"fix: {row.fix}"))
-    return Table.make("doctor", "", "state part result", lines)
+            lines.append(f"{'':8}  fix: {row.fix}")
+    return "\n".join(lines)
 
 
 def extras() -> list[str]:
@@ -101,12 +104,24 @@ def check_packages(extra: str = "") -> Check:
     name = f"Extra [{extra}]" if extra else "Core libraries"
     required = _requirements(DISTRIBUTION, extra)
     problems = [problem for requirement in required for problem in _problems(requirement)]
+    if not problems and not extra:
+        problems = [*_unusable()]
     if not problems:
         versions = ", ".join(f"{one.name} {metadata.version(one.name)}" for one in required)
         return Check(name, True, versions)
     if extra:
         return Check(name, None, ", ".join(problems), f'pip install "{DISTRIBUTION}[{extra}]"')
-    return Check(name, False, ", ".join(problems), f"pip install --upgrade {DISTRIBUTION}")
+    fix = f"pip install --force-reinstall {DISTRIBUTION}"
+    return Check(name, False, ", ".join(problems), fix)
+
+
+def _unusable() -> Iterator[str]:
+    """Yield required libraries that cannot be imported; PyAV has a check of its own."""
+    for module in ("numpy", "pyarrow", "huggingface_hub"):
+        try:
+            import_module(module)
+        except Exception as error:  # a broken library may raise anything
+            yield f"{module} cannot be imported: {first_line(error)}"
 
 
 def _requirements(distribution: str, extra: str) -> list[Requirement]:

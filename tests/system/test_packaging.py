@@ -11,6 +11,8 @@ import yaml
 from packaging.requirements import Requirement
 from support.package import CONFIG, HEAVY, MAPPING, PACKAGE, ROOT, committable, module_files
 
+from robomme_interference_data.constants import DOCS_URL
+
 MODULES = {
     name.removesuffix(".py").removesuffix("/__init__").replace("/", "."): path
     for name, path in module_files().items()
@@ -109,6 +111,10 @@ def test_no_file_names_a_path_of_one_machine() -> None:
     pattern = re.compile(r"(?<![\w.])/(?:work|root|home|Users|tmp/[a-z])\b[\w./-]*")
     named = [(name, match[0]) for name, text in text_files() for match in pattern.finditer(text)]
     assert named == []
+
+
+def test_the_metadata_name_the_documentation() -> None:
+    assert CONFIG["project"]["urls"]["Documentation"] == DOCS_URL
 
 
 def test_citation_names_this_version() -> None:
