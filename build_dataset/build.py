@@ -193,7 +193,8 @@ def _write(
     identity = identity_of(records, plan.kind, plan.version, plan.codec, sources, unit=plan.unit)
     with progress.status("Hashing"):
         complete_dataset(made, records, identity, skipped)
-        os.sync()
+        if hasattr(os, "sync"):  # not on Windows
+            os.sync()
     replace_folder(made, out)
 
 
