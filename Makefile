@@ -1,7 +1,7 @@
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help setup install vulkan demo test check docs format types bench pins
+.PHONY: help setup install vulkan demo test bare check docs format types bench pins
 
 BIN := .venv/bin
 # The folders that pyproject.toml maps under robomme_interference_data.
@@ -29,6 +29,9 @@ demo: install  ## Set up, then go the whole way on real or recorded episodes.
 
 test: setup  ## Set up, then run the tests; ARGS="-m ''" adds the slow ones.
 	@$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
+
+bare: setup  ## Install the wheel without pins, newest and lowest versions, and use it.
+	@PYTHONPATH=tests $(BIN)/python scripts/bare_install.py
 
 check: setup types  ## Lint; check the format, the types and who imports whom.
 	@$(BIN)/ruff check .

@@ -209,7 +209,8 @@ def _write(
     )
     with progress.status("Hashing"):
         complete_dataset(made, records, identity, skipped)
-        os.sync()
+        if hasattr(os, "sync"):  # not on Windows
+            os.sync()
     replace_folder(made, out)
 
 

@@ -11,6 +11,9 @@ PROTOCOL_VERSION = 1
 RULE_VERSION = 1
 """Version of the rule that draws distractor units (see `draw.py`)."""
 
+DOCS_URL = "https://robotmemorybench.com/docs"
+"""Address of the documentation; hints, help and the package's metadata name it."""
+
 # --- protocol (paper, section "The Benchmark") -----------------------------------------------
 
 FAMILIES = (

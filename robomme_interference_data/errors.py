@@ -2,7 +2,8 @@
 
 Each is also a fitting builtin, so that callers can catch either, and carries a `hint` on what to do
 next. Messages and hints name settings as in Python: `workers`, `executor="ray"`. The command line
-prints names in backticks, and any `name="value"`, as its options (`cli/hints.py`).
+prints names in backticks, and any `name="value"`, as its options (`cli/hints.py`). Hints name pages
+of the documentation as in a checkout, `docs/how-to/vla-eval.md`, and show their address.
 """
 
 import re
@@ -10,11 +11,16 @@ from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from typing import Self
 
+from .constants import DOCS_URL
+
 _LONGEST_MESSAGE = 4000
 """Most characters of a message, which may quote an untrusted file."""
 
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 """Characters that a terminal interprets instead of showing; line breaks and tabs excepted."""
+
+_PAGE = re.compile(r"(?<![\w/.-])docs/([\w/-]+)\.md\b")
+"""A page of the documentation, as in a checkout."""
 
 _COLOR = re.compile(r"\x1b\[[0-?]*[ -/]*[@-~]")
 
@@ -46,7 +52,7 @@ class InterferenceError(Exception):
         message = visible(message)
         super().__init__(message)
         self.message = message
-        self.hint = visible(hint) if hint else None
+        self.hint = with_addresses(visible(hint)) if hint else None
         self.command = command
         self.option = option
 
@@ -277,6 +283,11 @@ def nearest(given: str, known: Iterable[str], *, more: str = "Known: ") -> str:
         return ""
     rest = f", … ({len(names)} in all)" if len(names) > 10 else ""
     return more + ", ".join(names[:10]) + rest
+
+
+def with_addresses(text: str) -> str:
+    """Return text with pages of the documentation, `docs/PAGE.md`, as their addresses."""
+    return _PAGE.sub(rf"{DOCS_URL}/\1.html", text)
 
 
 def counted(count: int, noun: str, plural: str | None = None) -> str:

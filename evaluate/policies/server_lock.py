@@ -28,10 +28,12 @@ def lock_server(host: str, port: int, holder: str) -> Iterator[None]:
     machine = socket.gethostname() if host in _THIS_MACHINE else host
     folder = default_cache_folder().parent / "servers"
     lock = folder / f"{machine.replace(':', '_')}_{port}.lock"
+    about = lock.with_suffix(".holder")  # Windows lets nobody else read a locked file
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock.touch()
-        other = lock.read_text(encoding="utf-8", errors="replace")
+        about.touch()
+        other = about.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
         logger.warning(
             "Nothing keeps other runs from the policy server %s:%s: %s", host, port, error
@@ -45,7 +47,7 @@ def lock_server(host: str, port: int, holder: str) -> Iterator[None]:
     )
     with file_lock(lock, busy):
         with suppress(OSError):  # such as a full disk: the lock holds all the same
-            lock.write_text(f"{holder} (process {os.getpid()})", "utf-8")
+            about.write_text(f"{holder} (process {os.getpid()})", "utf-8")
         yield
 
 

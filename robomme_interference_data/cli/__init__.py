@@ -1,5 +1,6 @@
 import os
 import signal
+import sys
 
 from robomme_interference_data.runtime.safe_path import set_safe_path
 
@@ -8,7 +9,11 @@ def run_program() -> None:
     """Run the command line as a program: Ctrl-C never prints a traceback."""
     set_safe_path()
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # during the imports
-    from .main import main
+    try:
+        from .main import main
+    except ImportError as error:  # a required library is missing or broken, so nothing can run
+        fix = "pip install --force-reinstall robomme-interference-data"
+        sys.exit(f"Error: a required library cannot be imported: {error}\nReinstall it: {fix}")
 
     signal.signal(signal.SIGINT, _interrupt)
     try:

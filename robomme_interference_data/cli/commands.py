@@ -318,6 +318,6 @@ def doctor(as_json: AsJson = False) -> None:
     if as_json:
         print_json([asdict(row) for row in rows])
     else:
-        echo(module.report(rows).text())
+        echo(module.report(rows))
     if any(row.ok is False for row in rows):
         raise typer.Exit(1)

@@ -1,21 +1,24 @@
 """Check which parts of the package work on this machine, and how to fix the others.
 
 Nothing heavy is imported: versions come from the metadata of installed packages, and the simulators
-are tried in other processes.
+are tried in other processes. A check that raises is a failed check, and the others still run.
 """
 
 import os
 import platform
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from importlib import metadata, util
+from functools import partial
+from importlib import import_module, metadata, util
+from pathlib import Path
 
 from packaging.requirements import Requirement
 
 from robomme_interference_data.errors import InterferenceError, first_line
-from robomme_interference_data.viz.tables import Table
+from robomme_interference_data.storage.hub import check_endpoint
 
 DISTRIBUTION = "robomme-interference-data"
 
@@ -51,29 +54,48 @@ def checks() -> list[Check]:
     """Run all checks, which takes some seconds."""
     return [
         Check("Python", True, f"{platform.python_version()} ({sys.executable})"),
-        check_packages(),
-        check_video(),
-        *map(check_packages, extras()),
-        check_renderer(),
-        check_robomme(),
-        check_hub(),
+        guarded("Core libraries", check_packages),
+        guarded("Video (PyAV)", check_video),
+        *[guarded(f"Extra [{extra}]", partial(check_packages, extra)) for extra in extras()],
+        guarded("OpenCV", check_opencv),
+        guarded("Vulkan", check_renderer),
+        guarded("Official simulator", check_robomme),
+        guarded("Hub cache", check_cache),
+        guarded("Hugging Face Hub", check_hub),
     ]
 
 
-def report(rows: Sequence[Check]) -> Table:
-    """Return the results as a table for a terminal, each fix below its problem."""
+def guarded(name: str, check: Callable[[], Check]) -> Check:
+    """Run a check; an exception becomes a failed check."""
+    try:
+        return check()
+    except InterferenceError as error:
+        return Check(name, False, error.message, error.hint)
+    except Exception as error:
+        return Check(name, False, f"{type(error).__name__}: {first_line(error)}")
+
+
+def report(rows: Sequence[Check]) -> str:
+    """Return the results as text for a terminal, each fix below its problem.
+
+    Fixes are not wrapped, so that they can be copied.
+    """
     states = {True: "ok", False: "FAILS", None: "optional"}
-    lines: list[tuple[str, str, str]] = []
+    longest = max(len(row.name) for row in rows)
+    lines = []
     for row in rows:
-        lines.append((states[row.ok], row.name, row.detail))
+        lines.append(f"{states[row.ok]:8}  {row.name:{longest}}  {row.detail}")
         if row.fix is not None:
-            lines.append(("", "", f"fix: {row.fix}"))
-    return Table.make("doctor", "", "state part result", lines)
+            lines.append(f"{'':8}  fix: {row.fix}")
+    return "\n".join(lines)
 
 
 def extras() -> list[str]:
-    """Return the names of this package's extras."""
-    names = metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or ()
+    """Return the names of this package's extras; none if its metadata are broken."""
+    try:
+        names = metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or ()
+    except metadata.PackageNotFoundError:  # `check_packages` reports it
+        return []
     return [name for name in names if name != "all"]
 
 
@@ -82,12 +104,24 @@ def check_packages(extra: str = "") -> Check:
     name = f"Extra [{extra}]" if extra else "Core libraries"
     required = _requirements(DISTRIBUTION, extra)
     problems = [problem for requirement in required for problem in _problems(requirement)]
+    if not problems and not extra:
+        problems = [*_unusable()]
     if not problems:
         versions = ", ".join(f"{one.name} {metadata.version(one.name)}" for one in required)
         return Check(name, True, versions)
     if extra:
         return Check(name, None, ", ".join(problems), f'pip install "{DISTRIBUTION}[{extra}]"')
-    return Check(name, False, ", ".join(problems), f"pip install --upgrade {DISTRIBUTION}")
+    fix = f"pip install --force-reinstall {DISTRIBUTION}"
+    return Check(name, False, ", ".join(problems), fix)
+
+
+def _unusable() -> Iterator[str]:
+    """Yield required libraries that cannot be imported; PyAV has a check of its own."""
+    for module in ("numpy", "pyarrow", "huggingface_hub"):
+        try:
+            import_module(module)
+        except Exception as error:  # a broken library may raise anything
+            yield f"{module} cannot be imported: {first_line(error)}"
 
 
 def _requirements(distribution: str, extra: str) -> list[Requirement]:
@@ -170,12 +204,43 @@ def check_robomme() -> Check:
     return Check(name, status == "success", detail, None if status == "success" else fix)
 
 
+def check_opencv() -> Check:
+    """Check that one distribution installs `cv2`: two overwrite each other's files."""
+    name = "OpenCV"
+    found = sorted({*metadata.packages_distributions().get("cv2", ())})
+    if not found:
+        return Check(name, None, "not installed; only the extras build and sim need it")
+    versions = [f"{distribution} {metadata.version(distribution)}" for distribution in found]
+    if len(found) == 1:
+        return Check(name, True, versions[0])
+    problem = f"{' and '.join(versions)} overwrite each other's files"
+    # LeRobot requires the headless one, and for sapien it is enough.
+    fix = f'pip uninstall --yes {" ".join(found)} && pip install "opencv-python-headless<4.14"'
+    return Check(name, None, problem, fix)
+
+
+def check_cache() -> Check:
+    """Check that downloads can be written to the Hub's cache."""
+    check_endpoint()
+    from huggingface_hub.constants import HF_HUB_CACHE
+
+    existing = next(
+        path for path in (Path(HF_HUB_CACHE), *Path(HF_HUB_CACHE).parents) if path.exists()
+    )
+    try:
+        tempfile.TemporaryFile(dir=existing).close()
+    except OSError as error:
+        problem = f"{HF_HUB_CACHE} cannot be written: {error.strerror}"
+        return Check("Hub cache", False, problem, "export HF_HOME=FOLDER, one that you can write")
+    return Check("Hub cache", True, HF_HUB_CACHE)
+
+
 def check_hub() -> Check:
     """Check that the Hub answers and accepts the token, which is never shown."""
-    import httpx
+    check_endpoint()
     from huggingface_hub import HfApi, constants, get_token
     from huggingface_hub.errors import HfHubHTTPError
-    from huggingface_hub.utils import get_session
+    from huggingface_hub.utils import get_session, httpx  # its HTTP library: httpx, or httpx2
 
     name, hub, token = "Hugging Face Hub", constants.ENDPOINT, get_token()
     if constants.HF_HUB_OFFLINE:

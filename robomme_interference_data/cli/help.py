@@ -8,6 +8,8 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from robomme_interference_data.errors import with_addresses
+
 _Rows = list[tuple[str, str]]
 
 
@@ -40,6 +42,7 @@ class _Layout:
         last: _Rows = []
         for param in self.get_params(ctx):
             name, text = param.get_help_record(ctx)
+            text = with_addresses(text)
             group = getattr(param, "rich_help_panel", None) or "Options"
             if param.param_type_name == "argument":
                 name = param.metavar or param.name.upper()

@@ -104,6 +104,7 @@ def _print_version(requested: bool) -> None:
 
 @app.callback()
 def _root(
+    context: typer.Context,
     version: Annotated[
         bool,
         typer.Option(
@@ -111,7 +112,8 @@ def _root(
         ),
     ] = False,
 ) -> None:
-    check_endpoint()  # before libraries that use the Hub are imported
+    if context.invoked_subcommand != "doctor":  # which reports it beside the other checks
+        check_endpoint()  # before libraries that use the Hub are imported
 
 
 for _commands in _GROUPS.values():

@@ -12,7 +12,7 @@ import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,8 +53,17 @@ def allocate_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> NDArray[An
     with path.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, header)  # type: ignore[no-untyped-call]
         start, size = file.tell(), math.prod(shape) * np.dtype(dtype).itemsize
-        os.posix_fallocate(file.fileno(), 0, start + size)
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(file.fileno(), 0, start + size)
+        else:  # macOS and Windows
+            _write_zeros(file, size)
     return np.memmap(path, dtype, "r+", start, shape)
+
+
+def _write_zeros(file: BinaryIO, size: int) -> None:
+    block = bytes(1 << 20)
+    for written in range(0, size, len(block)):
+        file.write(block[: size - written])
 
 
 def map_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:

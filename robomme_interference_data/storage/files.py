@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from robomme_interference_data.constants import FORMAT_VERSION
@@ -105,12 +105,12 @@ def all_files(root: Path) -> list[str]:
 
 def check_relative(relative: str, where: str) -> str:
     """Return a path if it is relative and stays in its folder."""
-    path = PurePosixPath(relative)
+    paths = (PurePosixPath(relative), PureWindowsPath(relative))  # the data may move to Windows
     try:
         os.fsencode(relative)
     except UnicodeEncodeError:
         raise FormatError.damaged(where, f"{relative!r} is not a valid path") from None
-    if path.is_absolute() or ".." in path.parts or "\0" in relative:
+    if "\0" in relative or any(path.anchor or ".." in path.parts for path in paths):
         raise FormatError.damaged(where, f"the path {relative!r} leads out of it")
     return relative
 
@@ -255,7 +255,7 @@ def atomic_path(path: Path, *, flush: bool = True) -> Iterator[Path]:
             yield partial
             partial.chmod(0o644)
             if flush:
-                with partial.open("rb") as file:
+                with partial.open("rb+") as file:  # Windows flushes only what is open for writing
                     os.fsync(file.fileno())
             partial.replace(path)
     finally:

@@ -258,7 +258,8 @@ class HubFiles:
         digests = {40: lambda blob: git_hash(blob.read_bytes()), 64: sha256_file}
         for relative, path in downloaded.items():
             blob = path.resolve()
-            digest = digests.get(len(blob.name))
+            # Where Windows allows no links, the cache holds the file under its own name.
+            digest = digests.get(len(blob.name)) if blob.parent.name == "blobs" else None
             if digest is not None and digest(blob) != blob.name:
                 path.unlink()
                 blob.unlink(missing_ok=True)
@@ -313,8 +314,8 @@ class HubCall:
         return self._once(call, *arguments, **options)
 
     def _once(self, call: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-        import httpx
         from huggingface_hub import constants, errors
+        from huggingface_hub.utils import httpx  # the client's HTTP library: httpx, or httpx2
 
         try:
             return call(*arguments, **options)
@@ -324,7 +325,7 @@ class HubCall:
             RuntimeError,
             errors.EntryNotFoundError,
             errors.RevisionResolutionError,
-            httpx.TransportError,
+            httpx.HTTPError,
             httpx.InvalidURL,
         ) as error:
             cause: BaseException = error

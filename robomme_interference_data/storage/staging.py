@@ -1,11 +1,12 @@
 """Create a folder atomically, by one process at a time."""
 
-import fcntl
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 from robomme_interference_data.errors import BusyError, InterferenceError
 
@@ -22,12 +23,11 @@ def file_lock(lock: Path, busy: InterferenceError) -> Iterator[None]:
     The file remains. A folder cannot be locked: network file systems lock only files that are open
     for writing.
     """
-    with ExitStack() as stack:
-        try:
-            file = stack.enter_context(lock.open("a"))
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except (FileNotFoundError, BlockingIOError):  # its owner ends, and removes the folder
-            raise busy from None
+    try:
+        held = FileLock(lock, timeout=0).acquire()
+    except (FileNotFoundError, Timeout):  # its owner ends, and removes the folder
+        raise busy from None
+    with held:
         yield
 
 

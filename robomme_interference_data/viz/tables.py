@@ -7,6 +7,7 @@ import re
 import shutil
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from html import escape
 from itertools import zip_longest
 from textwrap import fill, wrap
@@ -164,13 +165,13 @@ class Table:
                 blocks.append([*keys])
             if column not in blocks[-1]:
                 blocks[-1].append(column)
-        parts = [fill(self.title, width)]
+        parts = [_fill(self.title, width)]
         for block in blocks:
             formats = [(sides[column], widths[column]) for column in block]
             rule = "  ".join("-" * size for _, size in formats)
             lines = [_aligned([row[column] for column in block], formats) for row in [heads, *rows]]
             parts.append("\n".join([lines[0], rule, *lines[1:]]))
-        parts.append(fill(self.note, width))
+        parts.append(_fill(self.note, width))
         return visible("\n\n".join(filter(None, parts)))
 
     def _keys(self, rows: Sequence[Sequence[str]]) -> list[int]:
@@ -189,6 +190,10 @@ class Table:
 
 _BOLD = re.compile(r"\*\*(.+?)\*\*")
 
+# Names of commands and options have hyphens, and are copied.
+_wrap = partial(wrap, break_on_hyphens=False)
+_fill = partial(fill, break_on_hyphens=False, break_long_words=False)
+
 _MAX_WORD = 26
 """Longer words may be broken to make a table fit."""
 
@@ -199,7 +204,7 @@ def _longest_word(cells: Iterable[str]) -> int:
 
 def _aligned(cells: Sequence[str], formats: Sequence[tuple[str, int]]) -> str:
     """Return a row, whose cells may take several lines; `formats` has their side and width."""
-    wrapped = [wrap(cell, size) for cell, (_, size) in zip(cells, formats, strict=True)]
+    wrapped = [_wrap(cell, size) for cell, (_, size) in zip(cells, formats, strict=True)]
     return "\n".join(
         "  ".join(f"{c:{s}{w}}" for c, (s, w) in zip(line, formats, strict=True)).rstrip()
         for line in zip_longest(*wrapped, fillvalue="")

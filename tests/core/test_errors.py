@@ -1,13 +1,16 @@
 """What every error promises: a fitting builtin, a message, a hint; and the nearest names."""
 
 import pickle
+import re
 import time
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.package import ROOT, module_files
 
 from robomme_interference_data import errors
+from robomme_interference_data.constants import DOCS_URL
 from robomme_interference_data.errors import InterferenceError, InvalidOptionError, counted, nearest
 
 CLASSES = [
@@ -83,3 +86,22 @@ def test_nearest_of_very_many_names_is_quick() -> None:
 )
 def test_counted(count: int, nouns: tuple[str, ...], text: str) -> None:
     assert counted(count, *nouns) == text
+
+
+def test_pages_in_hints_are_addresses() -> None:
+    error = InterferenceError("docs/my.md is no prompt", "See docs/how-to/vla-eval.md.")
+    assert error.message == "docs/my.md is no prompt"
+    assert error.hint == f"See {DOCS_URL}/how-to/vla-eval.html."
+    assert error.about("x").hint == error.hint
+
+
+def test_every_page_that_the_code_names_exists() -> None:
+    named = {
+        page
+        for path in module_files().values()
+        if path.suffix == ".py"
+        for page in re.findall(r"\bdocs/[\w/-]+\.md", path.read_text(encoding="utf-8"))
+    }
+    named -= {"docs/PAGE.md"}  # in a docstring
+    assert len(named) > 5
+    assert [page for page in named if not (ROOT / page).is_file()] == []

@@ -1,11 +1,14 @@
 """The checks of the doctor, and how they are printed."""
 
+import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -16,14 +19,15 @@ from robomme_interference_data.cli.doctor import Check
 def test_the_table_shows_state_name_detail_and_fix(
     run: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rows = [Check("fine", True, "1.0"), Check("optional", None, "not installed", "pip install it")]
+    command = "pip install " + "a-long-name " * 20
+    rows = [Check("fine", True, "1.0"), Check("optional", None, "not installed", command)]
     monkeypatch.setattr(doctor, "checks", lambda: rows)
     code, out, err = run("doctor")
     assert (code, err) == (0, "")
-    assert out.splitlines()[2:] == [
+    assert out.splitlines() == [
         "ok        fine      1.0",
         "optional  optional  not installed",
-        "                    fix: pip install it",
+        f"          fix: {command}",
     ]
     rows.append(Check("needed", False, "broken"))
     assert run("doctor")[0] == 1
@@ -64,7 +68,11 @@ BAD = {"numpy": "1.26.4", "lerobot": "0.6.1", "datasets": "5.0.0"}
         (
             BAD,
             "",
-            (False, "numpy 1.26.4 is not >=2.0", "pip install --upgrade robomme-interference-data"),
+            (
+                False,
+                "numpy 1.26.4 is not >=2.0",
+                "pip install --force-reinstall robomme-interference-data",
+            ),
         ),
         (
             BAD,
@@ -157,3 +165,95 @@ def test_a_hub_that_cannot_be_reached_is_optional(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
     row = doctor.check_hub()
     assert row.ok is None and "127.0.0.1:9 does not answer" in row.detail
+
+
+BREAKS = {
+    "av.codecs_available": None,
+    "huggingface_hub.get_token": Mock(side_effect=PermissionError(13, "Permission denied")),
+    "subprocess.run": Mock(side_effect=OSError(8, "Exec format error")),
+    "importlib.metadata.packages_distributions": Mock(side_effect=KeyError("Name")),
+    "importlib.metadata.requires": Mock(side_effect=metadata.PackageNotFoundError("x")),
+    "tempfile.TemporaryFile": Mock(side_effect=PermissionError(13, "Permission denied")),
+}
+
+
+def test_checks_that_raise_are_failed_checks(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("sapien", reason="needs the extra sim")
+    for name, broken in BREAKS.items():
+        monkeypatch.setattr(name, broken)
+    rows = {row.name: row for row in doctor.checks()}
+    failed = ["Core libraries", "Video (PyAV)", *[f"Extra [{one}]" for one in doctor.extras()]]
+    failed += ["OpenCV", "Vulkan", "Hub cache", "Hugging Face Hub"]
+    assert [name for name, row in rows.items() if row.ok is False] == failed
+    assert [name for name in rows if name not in failed] == ["Python", "Official simulator"]
+
+
+def test_packages_without_metadata(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "DISTRIBUTION", "not-installed-at-all")
+    assert doctor.extras() == []
+    row = doctor.guarded("Core libraries", doctor.check_packages)
+    assert row.ok is False and "not-installed-at-all" in row.detail
+
+
+def test_an_unusable_endpoint_is_a_failed_check(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HF_ENDPOINT", "hub")
+    code, out, err = run("doctor", "--json")
+    rows = {row["name"]: row for row in json.loads(out)}
+    assert (code, err) == (1, "")
+    for name in ("Hub cache", "Hugging Face Hub"):
+        assert rows[name]["ok"] is False and "HF_ENDPOINT 'hub'" in rows[name]["detail"]
+        assert "unset HF_ENDPOINT" in rows[name]["fix"]
+
+
+PROGRAM = "from robomme_interference_data.cli import run_program; run_program()"
+
+
+def test_a_broken_library_is_reported(tmp_path: Path) -> None:
+    (tmp_path / "pyarrow.py").write_text("raise ImportError('libarrow.so is missing')")
+    command = [sys.executable, "-c", PROGRAM, "doctor", "--json"]
+    env = os.environ | {"PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+    (row,) = [row for row in json.loads(done.stdout) if row["name"] == "Core libraries"]
+    assert (done.returncode, done.stderr, row["ok"]) == (1, "", False)
+    assert "libarrow.so is missing" in row["detail"]
+    assert row["fix"] == "pip install --force-reinstall robomme-interference-data"
+
+
+def test_without_the_library_of_the_command_line(tmp_path: Path) -> None:
+    (tmp_path / "typer.py").write_text("raise ImportError('no typer')")
+    command = [sys.executable, "-c", PROGRAM, "doctor"]
+    env = os.environ | {"PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("Error: ") and "no typer" in done.stderr
+    assert done.stderr.endswith("pip install --force-reinstall robomme-interference-data\n")
+    assert len(done.stderr.splitlines()) == 2
+
+
+@pytest.mark.parametrize(
+    ("installed", "ok"),
+    [
+        ([], None),
+        (["opencv-python-headless"], True),
+        (["opencv-python", "opencv-python-headless"], None),
+    ],
+)
+def test_two_opencvs_are_found(
+    installed: list[str], ok: bool | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(metadata, "packages_distributions", lambda: {"cv2": installed * 2})
+    monkeypatch.setattr(metadata, "version", lambda name: "4.13")
+    row = doctor.check_opencv()
+    assert row.ok is ok
+    assert all(f"{name} 4.13" in row.detail for name in installed)
+    uninstall = "pip uninstall --yes opencv-python opencv-python-headless && pip install"
+    assert (row.fix or "").startswith(uninstall) is (len(installed) == 2)
+
+
+def test_a_cache_that_cannot_be_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "new" / "hub"))
+    assert doctor.check_cache().ok is True
+    assert [*tmp_path.iterdir()] == []
+    (tmp_path / "new").write_bytes(b"")
+    row = doctor.check_cache()
+    assert row.ok is False and row.fix and "HF_HOME" in row.fix

@@ -11,6 +11,8 @@ import yaml
 from packaging.requirements import Requirement
 from support.package import CONFIG, HEAVY, MAPPING, PACKAGE, ROOT, committable, module_files
 
+from robomme_interference_data.constants import DOCS_URL
+
 MODULES = {
     name.removesuffix(".py").removesuffix("/__init__").replace("/", "."): path
     for name, path in module_files().items()
@@ -38,12 +40,16 @@ print(len({names!r}), sorted(heavy & set(sys.modules)))
 """
 
 
-def test_the_core_needs_no_heavy_library() -> None:
+def core_modules() -> list[str]:
     """All of it but the areas, the simulators, and the cluster, which are loaded at use."""
     others = {*MAPPING, f"{PACKAGE}.simulators", f"{PACKAGE}.runtime.ray_cluster"} - {PACKAGE}
-    names = sorted(
+    return sorted(
         name for name in MODULES if not any(f"{name}.".startswith(f"{one}.") for one in others)
     )
+
+
+def test_the_core_needs_no_heavy_library() -> None:
+    names = core_modules()
     code = LIGHT_IMPORT.format(heavy=HEAVY, names=names)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -111,7 +117,73 @@ def test_no_file_names_a_path_of_one_machine() -> None:
     assert named == []
 
 
+def test_the_metadata_name_the_documentation() -> None:
+    assert CONFIG["project"]["urls"]["Documentation"] == DOCS_URL
+
+
 def test_citation_names_this_version() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert citation["version"] == CONFIG["project"]["version"]
     assert citation["license"] == CONFIG["project"]["license"]
+
+
+ABSENT = {
+    "windows": {
+        "modules": "fcntl grp pwd resource termios pty",
+        "os": "O_DIRECTORY fork getpgrp geteuid getuid killpg posix_fallocate pread setpgid setsid "
+        "statvfs sync mkfifo sched_getaffinity",
+        "signal": "SIGALRM SIGHUP SIGKILL SIGUSR1",
+    },
+    "macos": {"modules": "", "os": "posix_fallocate sched_getaffinity", "signal": ""},
+}
+"""What Python lacks there, of what the light core could be tempted to use."""
+
+ELSEWHERE = """
+import asyncio, multiprocessing.connection, os, platform, shutil, signal, ssl, subprocess, sys
+import tempfile, uuid
+absent, names, buffers, run, out = {absent!r}, {names!r}, *sys.argv[1:]
+for name in absent["modules"].split():
+    sys.modules[name] = None
+for module in (os, signal):
+    for name in absent[module.__name__].split():
+        delattr(module, name)
+
+import importlib
+for name in names:
+    importlib.import_module(name)
+
+from robomme_interference_data import load_buffer
+from robomme_interference_data.cli.main import main
+from robomme_interference_data.storage.arrays import allocate_array
+from robomme_interference_data.storage.files import Path
+buffer = load_buffer("MoveCube/test/0", "k3", buffer_set=buffers, verify=True)
+print(buffer.frames().shape)
+made = allocate_array(Path(out, "array.npy"), "float32", (300_000, 2))
+print(made.shape, made.any())
+for command in (
+    ["list", buffers],
+    ["show", buffers, "MoveCube/test/0", "k3", "--out", os.path.join(out, "strip.png")],
+    ["score", run, "--out", os.path.join(out, "score")],
+):
+    sys.argv = ["robomme-interference", *command]
+    try:
+        main()
+    except SystemExit as end:
+        print(command[0], end.code)
+"""
+
+
+@pytest.mark.parametrize("platform", ABSENT)
+def test_the_light_core_needs_nothing_of_one_platform(platform: str, tmp_path: Path) -> None:
+    code = ELSEWHERE.format(absent=ABSENT[platform], names=core_modules())
+    golden = [ROOT / "tests" / "golden" / name for name in ("buffer_set", "run")]
+    command = [sys.executable, "-c", code, *map(str, golden), str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[:2] == ["(144, 32, 32, 3)", "(300000, 2) False"]
+    assert [line for line in lines if re.fullmatch(r"(list|show|score) \d+", line)] == [
+        "list 0",
+        "show 0",
+        "score 0",
+    ]
