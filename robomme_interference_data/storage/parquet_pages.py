@@ -124,7 +124,7 @@ def _read_struct(file: BinaryIO) -> dict[tuple[int, int], Any]:
             raise ValueError("the fields of a page's header are not in order")
         number += head >> 4
         kind = head & 15
-        value = None
+        value: Any = None
         if kind in (_I32, _I64):
             value = _read_unsigned(file)
             value = (value >> 1) ^ -(value & 1)
