@@ -126,8 +126,8 @@ def _read_struct(file: BinaryIO) -> dict[tuple[int, int], Any]:
         kind = head & 15
         value: Any = None
         if kind in (_I32, _I64):
-            value = _read_unsigned(file)
-            value = (value >> 1) ^ -(value & 1)
+            coded = _read_unsigned(file)
+            value = (coded >> 1) ^ -(coded & 1)
         elif kind == _STRUCT:
             value = _read_struct(file)
         elif kind == _BINARY:
