@@ -113,9 +113,9 @@ def _mutate(name: str, options: argparse.Namespace) -> tuple[int, int, Counter[s
 
     target, found, refused, number = TARGETS[name], Counter[str](), 0, 0
     progress = mmap.mmap(-1, 8)
-    end = time.monotonic() + (options.seconds or float("inf"))
     with tempfile.TemporaryDirectory(dir="/dev/shm") as folder:
         sound, bombs, read = _place(target, folder)
+        end = time.monotonic() + (options.seconds or float("inf"))
 
         def made(index: int) -> bytes:
             return mutated(sound, random.Random(f"{options.seed} {index}"), bombs)
