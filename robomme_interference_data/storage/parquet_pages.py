@@ -1,6 +1,6 @@
 """Bound what the pages of a parquet file declare, before pyarrow reads them.
 
-pyarrow allocates what the headers of pages declare, whatever the file's metadata states, and
+pyarrow allocates what the headers of pages declare, regardless of the file's metadata, and
 expands a text that is stored once as often as it occurs: a file of 294 bytes became 8 GB. The
 format's `parquet.thrift` describes the headers.
 """
