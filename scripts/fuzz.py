@@ -52,7 +52,7 @@ def main() -> None:
     for name in TARGETS if options.target == "all" else [options.target]:
         if options.read:
             with tempfile.TemporaryDirectory() as folder:
-                print(repr(_place(TARGETS[name], folder)[1](options.read.read_bytes())))
+                print(repr(_place(TARGETS[name], folder)[2](options.read.read_bytes())))
             continue
         started = time.monotonic()
         count, refused, found = _mutate(name, options)
@@ -81,8 +81,8 @@ def _options() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _place(target: Any, folder: str) -> tuple[list[bytes], Any]:
-    """Return sound files of a target and bombs, and what reads bytes in their place."""
+def _place(target: Any, folder: str) -> tuple[list[bytes], list[bytes], Any]:
+    """Return sound files of a target, bombs of its kind, and what reads bytes in their place."""
     from support.bombs import BOMBS
     from support.hostile import places
 
@@ -94,7 +94,7 @@ def _place(target: Any, folder: str) -> tuple[list[bytes], Any]:
             bomb.write(root / "bomb")
             if (root / "bomb").stat().st_size <= LONGEST_BOMB:
                 bombs.append((root / "bomb").read_bytes())
-    return [*target.sound(root), *bombs], lambda data: target(root, data)
+    return target.sound(root), bombs, lambda data: target(root, data)
 
 
 def _keep(out: Path, name: str, what: str, data: bytes, told: str) -> str:
@@ -113,12 +113,12 @@ def _mutate(name: str, options: argparse.Namespace) -> tuple[int, int, Counter[s
 
     target, found, refused, number = TARGETS[name], Counter[str](), 0, 0
     progress = mmap.mmap(-1, 8)
-    end = time.monotonic() + (options.seconds or float("inf"))
     with tempfile.TemporaryDirectory(dir="/dev/shm") as folder:
-        sound, read = _place(target, folder)
+        sound, bombs, read = _place(target, folder)
+        end = time.monotonic() + (options.seconds or float("inf"))
 
         def made(index: int) -> bytes:
-            return mutated(sound, random.Random(f"{options.seed} {index}"))
+            return mutated(sound, random.Random(f"{options.seed} {index}"), bombs)
 
         while number < options.inputs and time.monotonic() < end:
             stop = min(number + BATCH, options.inputs)

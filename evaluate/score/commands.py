@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
 _OUTPUT = "Output"
 
+_MEMORY_BYTES = 8 << 30
+"""Memory for scoring rows, which may come from strangers: reading a million takes 1.4 GB."""
+
 
 @with_settings
 def score(
@@ -61,6 +64,7 @@ def score(
         --against paper --out my-score
     ```
     """
+    from robomme_interference_data.runtime.memory import memory_limit
     from robomme_interference_data.runtime.progress import WorkProgress
     from robomme_interference_data.viz.tables import tables_text
 
@@ -69,7 +73,8 @@ def score(
     from .writing import write_score
 
     check_output(out, export_to)
-    found = compute(settings)
+    with memory_limit(_MEMORY_BYTES):
+        found = compute(settings)
     _print_notes([found.rows], found.notes)
     with WorkProgress() as progress, progress.status("Drawing the figures"):
         formats = [".png"] * png + [".pdf"] * pdf
@@ -135,10 +140,13 @@ def compare(
     robomme-interference compare my-run rollouts.csv --system-b retrieval-framesamp-modul
     ```
     """
+    from robomme_interference_data.runtime.memory import memory_limit
+
     from .comparisons.compare import compare as compute
 
     look = _look(looks)
-    found = compute(run_a, run_b, (system_a, system_b), lenient, conditions or (), look)
+    with memory_limit(_MEMORY_BYTES):
+        found = compute(run_a, run_b, (system_a, system_b), lenient, conditions or (), look)
     _print_notes(found.runs, found.notes)
     if as_json:
         bad = [rows.refused for rows in found.runs]

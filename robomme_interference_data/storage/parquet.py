@@ -42,7 +42,7 @@ def reading(path: Path) -> Iterator[None]:
     """Turn pyarrow's errors on a damaged file into `FormatError`."""
     try:
         yield
-    except InterferenceError:
+    except (InterferenceError, MemoryError):  # of pyarrow's, one is an `ArrowException`, too
         raise
     except (pa.ArrowException, OSError, ValueError, OverflowError, RecursionError) as error:
         text = str(error).partition("\n")[0]

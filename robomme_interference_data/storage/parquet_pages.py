@@ -1,6 +1,6 @@
 """Bound what the pages of a parquet file declare, before pyarrow reads them.
 
-pyarrow allocates what the headers of pages declare, whatever the file's metadata states, and
+pyarrow allocates what the headers of pages declare, regardless of the file's metadata, and
 expands a text that is stored once as often as it occurs: a file of 294 bytes became 8 GB. The
 format's `parquet.thrift` describes the headers.
 """
@@ -124,10 +124,10 @@ def _read_struct(file: BinaryIO) -> dict[tuple[int, int], Any]:
             raise ValueError("the fields of a page's header are not in order")
         number += head >> 4
         kind = head & 15
-        value = None
+        value: Any = None
         if kind in (_I32, _I64):
-            value = _read_unsigned(file)
-            value = (value >> 1) ^ -(value & 1)
+            coded = _read_unsigned(file)
+            value = (coded >> 1) ^ -(coded & 1)
         elif kind == _STRUCT:
             value = _read_struct(file)
         elif kind == _BINARY:

@@ -2,9 +2,11 @@
 
 import html
 import json
+import os
 import re
 import shlex
 import shutil
+import subprocess
 import sys
 from dataclasses import replace
 from operator import attrgetter
@@ -13,6 +15,7 @@ from typing import Any
 
 import pytest
 from support import scoring as made
+from support.bombs import write_rows_bomb
 from support.scoring import OWN, RETRIEVAL, run
 
 from robomme_interference_data.errors import (
@@ -214,3 +217,45 @@ def test_what_cannot_be_exported_is_refused_before_anything_is_written(tmp_path:
     for reason in ("2 model seeds", "1 rows of train or val episodes", "1 bad rows"):
         assert reason in str(done.exception)
     assert files(tmp_path) == {"a.csv"}
+
+
+_WITH_LESS_MEMORY = """
+import resource, sys
+from robomme_interference_data.cli.main import main
+from robomme_interference_data.evaluate.score import commands
+
+commands._MEMORY_BYTES = 900 << 20
+before = resource.getrlimit(resource.RLIMIT_DATA)
+try:
+    main()
+finally:
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10)
+    print(resource.getrlimit(resource.RLIMIT_DATA) == before)
+"""
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["score", "--out", "out"],
+        pytest.param(["compare", "--conditions", "k0,k7"], marks=pytest.mark.slow),
+    ],
+)
+def test_rows_of_a_stranger_cannot_take_all_memory(tmp_path: Path, command: list[str]) -> None:
+    write_rows_bomb(tmp_path / "rows.parquet")
+    assert (tmp_path / "rows.parquet").stat().st_size < 1 << 20
+    done = subprocess.run(
+        [sys.executable, "-c", _WITH_LESS_MEMORY, command[0], "rows.parquet", *command[1:]],
+        cwd=tmp_path,
+        env=os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith("Error: the files need more than")
+    most, restored = done.stdout.split()
+    assert int(most) < 900
+    assert restored == "True"
+    assert not (tmp_path / "out").exists()

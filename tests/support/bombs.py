@@ -230,6 +230,16 @@ def _large_image(path: Path) -> None:
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
 
 
+def write_rows_bomb(path: Path) -> None:
+    """Rows of rollouts that take 1 GiB in pyarrow, and as much again in Python."""
+    count = 1 << 17
+    values = {"family": "MoveCube", "condition": "k0", "status": "success", "success": "1"}
+    columns: dict[str, Any] = {"episode": np.arange(count)}
+    for name, value in (values | {"system": "x" * 8000}).items():
+        columns[name] = pa.DictionaryArray.from_arrays(np.zeros(count, np.int8), [value])
+    pq.write_table(pa.table(columns), path, store_schema=False)
+
+
 class Bomb(NamedTuple):
     """The kind of file, what writes it, and a part of the error of reading it."""
 

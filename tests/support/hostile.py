@@ -8,7 +8,7 @@ import io
 import json
 import random
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -236,10 +236,12 @@ _JSON = [
 ]
 
 
-def mutated(sound: list[bytes], draw: random.Random) -> bytes:
-    """Return a sound file with one to six things wrong in it."""
-    chosen = draw.choice(sound)
-    if chosen[:4] == b"PAR1" and draw.random() < 0.3:
+def mutated(sound: list[bytes], draw: random.Random, bombs: Sequence[bytes] = ()) -> bytes:
+    """Return a sound file, or one of the bombs, with one to six things wrong in it."""
+    place = draw.randrange(len(sound) + len(bombs))
+    chosen = [*sound, *bombs][place]
+    # A bomb must not be read here.
+    if place < len(sound) and chosen[:4] == b"PAR1" and draw.random() < 0.3:
         return _with_other_values(chosen, draw)
     data = bytearray(chosen)
     for _ in range(draw.randint(1, 6)):
