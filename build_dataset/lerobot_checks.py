@@ -113,8 +113,6 @@ def _columns(dataset: Dataset, table: pa.Table) -> Iterator[tuple[str, str]]:
 def _names(where: str, names: list[str], expected: set[str]) -> Iterator[tuple[str, str]]:
     for name in sorted(expected.symmetric_difference(names)):
         yield where, f"{name} is {'missing' if name in expected else 'undeclared'}"
-    if len({*names}) < len(names):
-        yield where, "has two columns of one name"
 
 
 def _info(dataset: Dataset) -> Iterator[tuple[str, str]]:

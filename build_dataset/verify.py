@@ -2,8 +2,12 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from robomme_interference_data.constants import (
     DATASETS,
@@ -20,6 +24,7 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.manifest_table import pending_rows
+from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.questions import Question, read_questions
 from robomme_interference_data.errors import FormatError, InterferenceError
 from robomme_interference_data.runtime.progress import WorkProgress
@@ -40,7 +45,7 @@ from .dataset_checks import (
     index_violations,
 )
 from .manifests import plan_manifests, planned_buffers
-from .questions import planned_questions
+from .questions import Marks, planned_questions
 from .set_files import further_files
 
 _ROWS = f"{MANIFESTS}/{MANIFEST_ROWS}"
@@ -54,8 +59,9 @@ def verify_buffer_set(
     Checked are: the SHA-256 of every file, and that none is missing or unlisted; with `decode`,
     every frame and vector of every episode against its recorded hashes; LeRobot's columns and
     statistics; the hashes of embeddings, which are not recomputed; every manifest row and question,
-    which are planned again from the datasets, rules and seed and compared, except the questions'
-    pictures; with `decode`, the first frame of every execution against the query frame.
+    which are planned again from the datasets, rules and seed and compared; with `decode`, the first
+    frame of every execution against the query frame, and the questions' pictures, if Pillow is
+    installed.
 
     Args:
         buffer_set: The buffer set; one on the Hub is downloaded completely.
@@ -91,7 +97,7 @@ def verify_buffer_set(
     copy = buffer_set.copy
     if header.questions is not None and (copy is None or copy.lists(root, QUESTIONS_PATH)):
         yield from caught(QUESTIONS_PATH, _table(root, QUESTIONS_PATH, Question))
-        yield from caught(QUESTIONS_PATH, _questions(buffer_set))
+        yield from caught(QUESTIONS_PATH, _questions(buffer_set, decode=decode))
     elif (root / QUESTIONS_PATH).exists():
         yield Violation(QUESTIONS_PATH, f"is not listed in {HEADER}")
 
@@ -175,20 +181,29 @@ def _executions(executions: Dataset, demonstrations: Dataset) -> Iterator[Violat
             yield Violation(f"{EXECUTIONS} {record.episode_id}", what)
 
 
-def _questions(buffer_set: BufferSet) -> Iterator[Violation]:
-    """Plan all questions again, and compare them with the stored ones."""
+def _questions(buffer_set: BufferSet, *, decode: bool) -> Iterator[Violation]:
+    """Plan all questions again, draw their pictures, and compare them with the stored ones."""
     stored = read_questions(buffer_set)
-    for question, _ in planned_questions(buffer_set):
+    drawn = decode and find_spec("PIL") is not None
+    for question, marks in planned_questions(buffer_set):
         where = f"{QUESTIONS_PATH} {question.episode_id}"
         one = stored.pop(question.episode_id)
         if (found := replace(one, picture=b"")) != question:
             yield Violation(where, f"is {_difference(to_dict(found), to_dict(question))}")
             continue
-        try:  # not compared: versions of Pillow draw letters a little differently
-            decode_image(one.picture)
+        try:
+            shown = decode_image(one.picture)
+            if drawn and not _is_picture(shown, buffer_set.query(question.episode_id), marks):
+                yield Violation(where, "has a picture of something else")
         except FormatError as error:
             yield Violation(where, error.message)
     yield from (Violation(f"{QUESTIONS_PATH} {one}", "belongs to no query") for one in stored)
+
+
+def _is_picture(stored: NDArray[np.uint8], query: Query, marks: Marks) -> bool:
+    from .question_pictures import is_picture
+
+    return is_picture(stored, query.frame(), marks)
 
 
 def _difference(stored: Any, expected: Any) -> str:

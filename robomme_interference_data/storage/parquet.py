@@ -64,7 +64,9 @@ def open_parquet(path: Path) -> pq.ParquetFile:
         rows = [metadata.row_group(group).num_rows for group in range(metadata.num_row_groups)]
         if min(rows, default=0) < 0 or sum(rows) != metadata.num_rows:
             raise ValueError(f"{metadata.num_rows} rows; its row groups have {sum(rows)}")
-        _ = file.schema_arrow.names  # raises if a name is not UTF-8
+        names = file.schema_arrow.names  # raises if one is not UTF-8
+        if len({*names}) < len(names):
+            raise ValueError("two columns have the same name")
         return file
 
 
@@ -94,8 +96,6 @@ def read_table(
         _check_size(file, path, names, chosen)
         table = file.read_row_groups(list(chosen), columns=names)
         table.validate(full=True)
-        if len(set(table.column_names)) < table.num_columns:
-            raise ValueError("two columns have the same name")
     return table
 
 

@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,8 +15,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from support.buffer_sets import GOLDEN, QUERIES, UNITS, renew_sums, violations
+from numpy.typing import NDArray
+from support.buffer_sets import GOLDEN, QUERIES, UNITS, plan_again, renew_sums, violations
 from support.damage import HEADER, ROWS, edit, flipped_bits, put, renew_header
+from support.mutations import Place, mutate, renew
 from support.retrieval import QUIET, TwoSums, make_index
 from support.tabletop import TABLETOP, copy_tabletop
 
@@ -24,9 +27,17 @@ from robomme_interference_data.build_dataset.image_stats import QUANTILES
 from robomme_interference_data.build_dataset.lerobot_checks import differing_statistics
 from robomme_interference_data.build_dataset.verify import verify_buffer_set
 from robomme_interference_data.constants import QUESTIONS_PATH
+from robomme_interference_data.data.dataset import Dataset, revision_of
 from robomme_interference_data.data.questions import read_questions
-from robomme_interference_data.errors import FormatError, MissingFileError
+from robomme_interference_data.errors import (
+    FormatError,
+    HashMismatchError,
+    InterferenceError,
+    MissingFileError,
+)
 from robomme_interference_data.retrieval.index import build_index
+from robomme_interference_data.storage.encode import decode_image, png
+from robomme_interference_data.storage.files import LocalFiles
 
 EPISODES = "distractors/meta/episodes/chunk-000/file-000.parquet"
 RECORDS = "distractors/meta/interference.parquet"
@@ -320,11 +331,15 @@ def test_questions_are_planned_anew(tmp_path: Path) -> None:
     sound = path.read_bytes()
     for name, value in (("right", 2), ("text", "Which?"), ("options", ["a", "b", "c"])):
         edit(path, first_changed(name, value))
+        expect(root, r"questions\.parquet does not have the SHA-256 in manifests/manifest\.json")
+        renew_header(root)
         expect(root, rf"questions\.parquet VideoRepick/test/0: is .*{name}.*the rules give")
         path.write_bytes(sound)
     edit(path, first_changed("picture", b"a picture"))
+    renew_header(root)
     expect(root, r"questions\.parquet VideoRepick/test/0: an image starts with the bytes")
     edit(path, lambda table: table[1:])
+    renew_header(root)
     expect(root, r"questions\.parquet.* lacks the question of VideoRepick/test/0")
 
 
@@ -337,3 +352,158 @@ def test_a_flipped_bit_in_questions_is_told_or_changes_none(tmp_path: Path) -> N
         except FormatError as error:
             errors += "questions.parquet" in error.message
     assert errors > 30
+
+
+def painted(view: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    view = view.copy()
+    view[-20:-10, -20:-10] = (255, 255, 0)
+    return view
+
+
+@pytest.mark.parametrize("change", [np.zeros_like, painted, lambda view: view[::2, ::2].copy()])
+def test_a_picture_of_something_else(tmp_path: Path, change: Callable[[Any], Any]) -> None:
+    root = copy_tabletop(tmp_path / "buffer_set")
+    path = root / QUESTIONS_PATH
+    pictures = pq.read_table(path)["picture"].to_pylist()
+    edit(path, first_changed("picture", png(change(decode_image(pictures[0])))))
+    renew_header(root)
+    expect(root, r"questions\.parquet VideoRepick/test/0: has a picture of", decode=True)
+
+
+def test_exchanged_pictures(tmp_path: Path) -> None:
+    root = copy_tabletop(tmp_path / "buffer_set")
+
+    def exchange(table: pa.Table) -> pa.Table:
+        first, second, *others = table["picture"].to_pylist()
+        return put(table, "picture", [second, first, *others])
+
+    edit(root / QUESTIONS_PATH, exchange)
+    renew_header(root)
+    number = r"questions\.parquet VideoRepick/test/{}: has a picture of something else"
+    expect(root, number.format(0), number.format(2), decode=True)
+
+
+def test_questions_that_are_not_listed(tmp_path: Path) -> None:
+    root = copy_tabletop(tmp_path / "buffer_set")
+    header = json.loads((root / HEADER).read_text())
+    (root / HEADER).write_text(json.dumps(header | {"questions": None}))
+    expect(root, r"questions\.parquet: is not listed in manifests/manifest\.json")
+    with pytest.raises(FormatError, match="does not have the SHA-256 in manifests"):
+        read_questions(load_buffer_set(root))
+    (root / QUESTIONS_PATH).unlink()
+    assert violations(root, decode=False) == []
+    (root / HEADER).write_text(json.dumps(header))
+    expect(root, r"questions\.parquet.* missing")
+
+
+# --- values that follow from nothing else --------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", [EPISODES, RECORDS])
+def test_records_out_of_order(own_buffers: Path, path: str) -> None:
+    """LeRobot finds an episode by its place."""
+
+    def exchange(table: pa.Table) -> pa.Table:
+        return table.take([1, 0, *range(2, len(table))])
+
+    edit(own_buffers / path, exchange)
+    renew(own_buffers, path)
+    expect(own_buffers, "does not list the episodes 0 to 16, each once and in order")
+
+
+def test_data_files_out_of_order(own_buffers: Path) -> None:
+    """LeRobot reads all data files in the order of their names."""
+    first, second = (own_buffers / f"distractors/data/chunk-000/file-00{n}.parquet" for n in (1, 2))
+    saved = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    second.write_bytes(saved)
+    for path in (EPISODES, RECORDS):
+        edit(own_buffers / path, lambda t: put(t, "data/file_index", [0, 2, 1, *range(3, UNITS)]))
+        renew(own_buffers, path)
+    expect(own_buffers, "does not have the data files in the order of the episodes")
+
+
+@pytest.mark.parametrize(
+    ("path", "place"),
+    [
+        ("distractors/meta/interference.json", ("codec",)),
+        ("distractors/meta/interference.json", ("unit", "stride")),
+        ("demonstrations/meta/interference.json", ("sources", 0, "kind")),
+        ("demonstrations/meta/info.json", ("features", "observation.state", "names", 0)),
+        ("demonstrations/meta/info.json", ("robot_type",)),
+    ],
+)
+def test_what_describes_the_content_is_in_the_revision(
+    own_buffers: Path, path: str, place: Place
+) -> None:
+    mutate(own_buffers / path, place)
+    renew(own_buffers, path)
+    expect(own_buffers, r"interference\.json: revision is .*; the episodes give")
+    name = path.split("/", maxsplit=1)[0]
+    with pytest.raises(HashMismatchError, match="not those of its revision"):
+        load_buffer_set(own_buffers).load("MoveCube/test/0", "k1", verify=True)
+    assert name in {"demonstrations", "distractors"}
+
+
+def test_a_codec_that_the_videos_do_not_have(own_buffers: Path) -> None:
+    """With the revision renewed and all buffers planned again, the videos themselves tell."""
+    path = own_buffers / "distractors/meta/interference.json"
+    stored = json.loads(path.read_text())
+    path.write_text(json.dumps(stored | {"codec": "lerobot-default"}))
+    made = Dataset(LocalFiles(own_buffers / "distractors"))
+    revision = revision_of(made.identity, made.lerobot.info, made.records())
+    path.write_text(json.dumps(stored | {"codec": "lerobot-default", "revision": revision}))
+    plan_again(own_buffers)
+    assert violations(own_buffers, decode=False) == []
+    expect(own_buffers, "distractors .*: has videos in gbrp, not lerobot-default", decode=True)
+
+
+def test_where_a_dataset_is_downloaded_from_is_no_content(own_buffers: Path) -> None:
+    """A folder takes precedence, and what is downloaded must have the revision."""
+    revision, header = load_buffer_set(own_buffers).revision, own_buffers / HEADER
+    changed = json.loads(header.read_text())
+    changed["datasets"]["distractors"]["location"] = "someone/else@" + "0" * 40
+    header.write_text(json.dumps(changed))
+    assert violations(own_buffers, decode=False) == []
+    assert load_buffer_set(own_buffers).revision == revision
+
+
+def test_an_index_of_other_numbers(own_buffers: Path) -> None:
+    make_index(own_buffers)
+    path = "distractors/index/thumbnail/index.json"
+    saved = (own_buffers / path).read_bytes()
+    for place, words in {
+        ("typical_cosine",): "the embeddings give",
+        ("encoder", "sha256"): "fingerprint does not have its SHA-256",
+        ("frames",): "frames; the dataset has",
+        ("revision",): "with revision",
+    }.items():
+        mutate(own_buffers / path, place)
+        renew(own_buffers, path)
+        expect(own_buffers, f"index/thumbnail: .*{words}")
+        (own_buffers / path).write_bytes(saved)
+
+
+@pytest.mark.parametrize("name", ["demonstrations", "distractors"])
+def test_a_dataset_that_is_a_link_out_of_the_buffer_set(own_buffers: Path, name: str) -> None:
+    outside = own_buffers.parent / "outside"
+    (own_buffers / name).rename(outside)
+    (own_buffers / name).symlink_to(outside)
+    expect(own_buffers, f"{name}: .* is a link that leads out of the buffer set")
+    with pytest.raises(FormatError, match="is a link that leads out of the buffer set"):
+        load_buffer_set(own_buffers).load("MoveCube/test/0", "k1")
+    (own_buffers / name).unlink()
+    (own_buffers / name).symlink_to(outside.rename(own_buffers / "inside"))
+    assert load_buffer_set(own_buffers).load("MoveCube/test/0", "k1")
+
+
+@pytest.mark.parametrize("path", [EPISODES, RECORDS, ROWS, DATA, "distractors/meta/tasks.parquet"])
+def test_two_columns_of_one_name(own_buffers: Path, path: str) -> None:
+    def twice(table: pa.Table) -> pa.Table:
+        return table.append_column(table.schema.names[0], table.column(0))
+
+    edit(own_buffers / path, twice)
+    renew(own_buffers, path)
+    expect(own_buffers, "same name|two columns", decode=True)
+    with suppress(InterferenceError):  # whatever is read without that file
+        load_buffer_set(own_buffers).load("MoveCube/test/0", "k7").frames()

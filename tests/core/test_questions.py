@@ -112,6 +112,7 @@ def test_damage_is_one_error(tmp_path: Path, name: str) -> None:
     change, words = DAMAGED[name]
     root = copy_tabletop(tmp_path / "buffer_set")
     damage.edit(root / QUESTIONS_PATH, change)
+    damage.renew_header(root)
     with pytest.raises(FormatError) as raised:
         read_questions(load_buffer_set(root))
     assert words in raised.value.message and str(root / QUESTIONS_PATH) in raised.value.message
@@ -121,7 +122,10 @@ def test_damage_is_one_error(tmp_path: Path, name: str) -> None:
     ("change", "words"),
     [
         (put("revision", "0" * 64), "other demonstrations"),
-        (put("episode_id", "MoveCube/test/49"), "lacks the question of VideoRepick/test/0"),
+        (
+            lambda table: put("index", 49)(put("episode_id", "VideoRepick/test/49")(table)),
+            "lacks the question of VideoRepick/test/0",
+        ),
     ],
 )
 def test_questions_of_other_demonstrations_are_stale(
@@ -129,6 +133,7 @@ def test_questions_of_other_demonstrations_are_stale(
 ) -> None:
     root = copy_tabletop(tmp_path / "buffer_set")
     damage.edit(root / QUESTIONS_PATH, change)
+    damage.renew_header(root)
     with pytest.raises(FormatError, match=words) as raised:
         read_questions(load_buffer_set(root))
     assert raised.value.command == f"build questions {root}"
@@ -137,6 +142,7 @@ def test_questions_of_other_demonstrations_are_stale(
 def test_further_columns_are_left_aside(tmp_path: Path) -> None:
     root = copy_tabletop(tmp_path / "buffer_set")
     edit_columns(root / QUESTIONS_PATH, colour=pa.array(["red"] * len(QUERIES)))
+    damage.renew_header(root)
     assert len(read_questions(load_buffer_set(root))) == len(QUERIES)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from robomme_interference_data.constants import QUESTIONS_PATH
 from robomme_interference_data.storage.files import sha256_file
 
 HEADER = "manifests/manifest.json"
@@ -41,10 +42,13 @@ def put(table: pa.Table, name: str, values: Any) -> pa.Table:
 
 
 def renew_header(root: Path, **changes: Any) -> None:
-    """Record the rows as they are now in a buffer set's header, and change its fields."""
+    """Record rows and questions as they are now in a buffer set's header; change its fields."""
     path = root / HEADER
     header = json.loads(path.read_text())
-    path.write_text(json.dumps({**header, "rows": sha256_file(root / ROWS), **changes}))
+    header["rows"] = sha256_file(root / ROWS)
+    if (root / QUESTIONS_PATH).is_file():
+        header["questions"] = sha256_file(root / QUESTIONS_PATH)
+    path.write_text(json.dumps(header | changes))
 
 
 def reverse_sessions(root: Path) -> None:
