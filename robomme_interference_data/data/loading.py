@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robomme_interference_data.constants import DATASETS, MANIFEST_PATH
+from robomme_interference_data.constants import DATASETS, IDENTITY_PATH, MANIFEST_PATH
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.ids import EpisodeId, whole_number
 from robomme_interference_data.schema.conditions import Condition
@@ -136,7 +136,11 @@ def open_dataset(buffer_set: BufferSet, name: str, more: str = "") -> Dataset:
     if name in buffer_set.datasets:
         return buffer_set.datasets[name]
     hint, command = "Ask its publisher to add them.", None
-    if isinstance(buffer_set.files, LocalFiles):
+    files = buffer_set.files
+    if isinstance(files, LocalFiles) and (files.root / name / IDENTITY_PATH).is_file():
+        hint = "It is built; plan the buffers again to include it."
+        command = f"build manifests {buffer_set.location}"
+    elif isinstance(files, LocalFiles):
         hint = "Build them from the source of its demonstrations, then run build manifests again."
         command = f"build {name} {buffer_set.location} --source KIND:PATH"
     raise MissingFileError(
