@@ -30,6 +30,7 @@ from robomme_interference_data.storage.files import canonical_json, read_json
 from robomme_interference_data.storage.staging import replace_folder, staging_dir
 
 from .alike import Look, differences, in_buffers
+from .estimate import BuildEstimate
 from .existing import ExistingDataset, open_existing
 from .identity import complete_dataset, identity_of
 from .lerobot_writer import StoredEpisode, load_lerobot, require_lerobot, write_lerobot
@@ -107,6 +108,7 @@ def _stage(
             missing.append(one)
         else:
             take(one, done, before=True)
+    estimate = BuildEstimate(work, len(missing), executor.workers)
     failures: list[Outcome] = []
     # Closing ends the workers, also after an error.
     with closing(executor.run(StageTask(plan), missing, time_limit=limit)) as outcomes:
@@ -114,6 +116,7 @@ def _stage(
             if outcome.error is None:
                 keep_staged(folder(outcome.task), outcome.value, outcome.files)
                 take(outcome.task, outcome.value, before=False, node=outcome.node)
+                estimate.take(folder(outcome.task))
                 continue
             failures.append(outcome)
             if isinstance(outcome.error, InvalidOptionError | MissingExtraError | SimulatorError):

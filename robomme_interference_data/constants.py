@@ -170,3 +170,5 @@ RUN_HEADER = "run.json"
 RUN_RECORD = "rollouts.jsonl"
 RUN_TABLES = ("rollouts.parquet", "rollouts.csv")
 """Exported from the record at the end of a run."""
+RUN_METRICS = "metrics.csv"
+"""Written while a run proceeds, with `--track csv`."""

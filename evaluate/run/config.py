@@ -63,6 +63,12 @@ class WorkConfig(WorkersConfig, RetrievalConfig):
     max_errors: int = setting(
         10, group=_EXECUTION, metavar="N", help="Stop after N errors in a row."
     )
+    track: str | None = setting(
+        None,
+        group=_EXECUTION,
+        metavar="TRACKER",
+        help="Send success rates to wandb, trackio or csv (OUT/metrics.csv) as rollouts end.",
+    )
     no_resume: bool = setting(
         False, group=_EXECUTION, help="Fail if the folder already holds a run."
     )
@@ -213,6 +219,8 @@ class CeilingConfig(RetrievalConfig):
 
 def check_shared(config: WorkConfig) -> None:
     """Check the settings that rollouts and questions share."""
+    from .tracking import check_tracker
+
     positive = ("workers", "max_errors", "rollout_timeout_s")
     for name in (*positive, "history_chunk", "simulator_timeout_s"):
         value = getattr(config, name, 1)
@@ -223,6 +231,7 @@ def check_shared(config: WorkConfig) -> None:
     if config.split not in SPLITS:
         raise InvalidOptionError.one_of("split", config.split, SPLITS)
     check_retrieval(config)
+    check_tracker(config.track)
 
 
 def check_retrieval(config: RetrievalConfig) -> None:

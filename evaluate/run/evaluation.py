@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -32,6 +33,7 @@ from .identity import invocation, now, plain, run_identity
 from .kind import Job, Run, RunKind
 from .log import RunLog, count_statuses, is_done, open_log, read_record, row_line, row_of
 from .plan import Plan, WorkItem, plan_work, shuffle_work
+from .tracking import Tracking, open_tracker
 
 if TYPE_CHECKING:
     import pandas
@@ -136,7 +138,11 @@ def run_evaluation(
             log.begin(invocation(kind, plan, command))
             # The buffer set may have moved to another folder: its label in rows stays the same.
             run = dataclasses.replace(run, buffer_set=log.header.buffer_set)
-            return _run_items(run, kind, session, items, log, progress)
+            callbacks = [] if progress is None else [progress]
+            if config.track is not None:
+                opened = partial(open_tracker, config.track, folder, plain(identity))
+                callbacks.append(stack.enter_context(Tracking(config.track, opened)))
+            return _run_items(run, kind, session, items, log, callbacks)
 
 
 def plan_run(kind: RunKind[Any]) -> tuple[Plan, tuple[WorkItem, ...]]:
@@ -178,12 +184,12 @@ def _run_items(
     session: Session | None,
     items: Sequence[WorkItem],
     log: RunLog,
-    progress: ProgressCallback | None,
+    callbacks: Sequence[ProgressCallback],
 ) -> RunResult:
     """Run what is not finished, and write its rows as they come."""
     done = {item: row for item, row in log.rows.items() if is_done(row)}
-    if progress is not None:
-        progress.start(items, [done[item] for item in items if item in done])
+    for callback in callbacks:
+        callback.start(items, [done[item] for item in items if item in done])
     stopped: str | None = "interrupted"
     errors, full = 0, False
     with ExitStack() as stack:
@@ -199,8 +205,8 @@ def _run_items(
             for outcome in outcomes:
                 row, trace = _row(run, outcome, kind.buffer_set, log)
                 log.append(row, trace)
-                if progress is not None:
-                    progress.row(row, outcome.node)
+                for callback in callbacks:
+                    callback.row(row, outcome.node)
                 errors = 0 if is_done(row) else errors + 1
                 if errors >= run.config.max_errors:
                     stopped = f"{errors} in a row broke; the last: {row.error}"

@@ -92,7 +92,13 @@ Session = Scheduler[Any]
 
 
 class Executor(ABC):
-    """Runs tasks."""
+    """Runs tasks.
+
+    Attributes:
+        workers: Maximum number of tasks that run at once.
+    """
+
+    workers: int
 
     @property
     def host(self) -> str:
@@ -132,6 +138,8 @@ class Executor(ABC):
 @dataclass(frozen=True)
 class Serial(Executor):
     """Runs tasks in this process, one after the other, without time limits."""
+
+    workers = 1
 
     @contextmanager
     def session(self, function: Task) -> Iterator[Session]:

@@ -17,6 +17,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.errors import counted
 from robomme_interference_data.schema.manifest import Session
 from robomme_interference_data.schema.sampling import even_sample, runs
 from robomme_interference_data.storage.encode import png
@@ -82,7 +83,12 @@ def write_page(
         "sample": _sample(buffer, next(iter(live))),
         "evidence": _evidence(buffer, retrieved),
         "retrieved": [
-            {"part": one, "runs": list(runs(one.frames)), "sample": _counted(one, buffer)}
+            {
+                "part": one,
+                "runs": runs(one.frames),
+                "chosen": counted(len(one.frames), "frame"),
+                "sample": _counted(one, buffer),
+            }
             for one in retrieved
         ],
         "ticks": _ticks(len(buffer)),

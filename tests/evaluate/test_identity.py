@@ -42,7 +42,7 @@ FREE = {
     WorkConfig: {
         *("families", "episodes", "conditions", "shard"),  # the plan, which may grow
         *("workers", "executor", "ray_address", "cpus_per_worker", "gpus_per_worker"),
-        *("no_resume", "cache", "rollout_timeout_s", "max_errors"),
+        *("no_resume", "cache", "rollout_timeout_s", "max_errors", "track"),
     },
     RunConfig: {
         *("out", "robomme_python", "videos", "check_lesson", "simulator_timeout_s"),
