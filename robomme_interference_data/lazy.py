@@ -35,11 +35,3 @@ def load_extra(module: str, name: str, what: str, extra: str) -> Callable[..., A
             raise
         raise MissingExtraError.needs(what, missing or "a library", extra) from error
     return getattr(loaded, name)  # type: ignore[no-any-return]
-
-
-def check_pillow(what: str) -> None:
-    """Check that Pillow, which writes on videos, is installed; `what` needs it, for the message."""
-    try:
-        import PIL  # noqa: F401
-    except ImportError as error:
-        raise MissingExtraError.needs(what, "pillow", "retrieval") from error

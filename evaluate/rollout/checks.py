@@ -31,7 +31,6 @@ from robomme_interference_data.evaluate.systems import (
     known_system,
     name_system,
 )
-from robomme_interference_data.lazy import check_pillow
 from robomme_interference_data.retrieval.select import Rule
 from robomme_interference_data.runtime.executor import is_share
 from robomme_interference_data.schema.conditions import NO_HISTORY
@@ -118,6 +117,8 @@ def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> 
         raise UnknownNameError.among("live camera", camera, config.simulator, live.cameras)
     _check_robot(config, buffer_set, kind)
     if config.videos:
+        from robomme_interference_data.simulators.play import check_pillow
+
         check_pillow("`videos`")
 
 

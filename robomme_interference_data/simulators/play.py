@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import FPS
-from robomme_interference_data.lazy import check_pillow
+from robomme_interference_data.errors import MissingExtraError
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.storage.encode import CLIP, VideoEncoder
 from robomme_interference_data.storage.files import atomic_path
@@ -54,6 +54,14 @@ def play(simulator: Simulator, episode: str, policy: str, video: Path | None) ->
         "lesson_frames": len(lesson),
         "steps": steps,
     }
+
+
+def check_pillow(what: str) -> None:
+    """Check that Pillow, which writes on videos, is installed; `what` needs it, for the message."""
+    try:
+        import PIL  # noqa: F401
+    except ImportError as error:
+        raise MissingExtraError.needs(what, "pillow", "retrieval") from error
 
 
 @contextmanager
