@@ -65,15 +65,25 @@ def draw_calibration(found: Calibration, title: str, out: Path) -> None:
         left.set_ylabel("share at or below, %", size=8, color=INK)
         last = found.sweep[-1].condition
         trials = [trial for trial in found.sweep if trial.condition == last]
-        for share, color in zip(_SHARES, (Hue.BLUE, Hue.VERMILION), strict=True):
+        lines = ((Hue.BLUE, "-"), (Hue.VERMILION, "--"))  # both are seen where they are equal
+        for share, (color, line) in zip(_SHARES, lines, strict=True):
             means = [100 * getattr(trial, share) for trial in trials]
-            right.plot([trial.threshold for trial in trials], means, color=color, label=share)
+            right.plot(
+                [trial.threshold for trial in trials],
+                means,
+                color=color,
+                linestyle=line,
+                label=share,
+            )
         right.set_xlabel(f"threshold, under {last}", size=8, color=INK)
         right.set_ylabel("mean over queries, %", size=8, color=INK)
         _percent(right)
         for axes in (left, right):
             tidy(axes)
-            axes.legend(edgecolor="none", fontsize=7)
+            # Below the axes: a curve may be anywhere in them.
+            axes.legend(
+                loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, frameon=False, fontsize=7
+            )
 
 
 @contextmanager

@@ -110,9 +110,9 @@ def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> 
     _check_cameras(config, buffer_set.datasets[DEMONSTRATIONS], policy)
     _check_robot(config, buffer_set, kind)
     if config.videos:
-        from .clips import check_drawing
+        from robomme_interference_data.simulators.play import check_pillow
 
-        check_drawing()
+        check_pillow("`videos`")
 
 
 def _check_cameras(config: RunConfig, demonstrations: Dataset, policy: Policy) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.data.buffer import Buffer
-from robomme_interference_data.errors import MissingExtraError, counted
+from robomme_interference_data.errors import counted
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.sampling import spread
@@ -45,14 +45,6 @@ _LETTERS = 34
 
 _LINES = 14
 """Maximum lines of text."""
-
-
-def check_drawing() -> None:
-    """Check that Pillow is installed."""
-    try:
-        import PIL  # noqa: F401
-    except ImportError as error:
-        raise MissingExtraError.needs("`videos`", "pillow", "retrieval") from error
 
 
 def _harmless[**P](method: Callable[P, None]) -> Callable[P, None]:

@@ -46,8 +46,8 @@ def simulate(
 ) -> None:
     """Play one episode: its demonstration, then a built-in policy.
 
-    The video shows both cameras side by side, under a blue bar during the demonstration and an
-    orange bar while the policy acts.
+    The video shows the cameras side by side, under a bar that names them and what is shown: blue
+    during the demonstration, orange while the policy acts.
 
     Examples:
     ```

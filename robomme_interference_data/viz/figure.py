@@ -236,6 +236,13 @@ def mapped(color_map: str, share: float) -> str:
     return str(to_hex(colormaps[color_map](share)))
 
 
+def cell_box(x: float, y: float) -> Any:
+    """Return the light gray box of a cell of a picture, whose center is given."""
+    from matplotlib.patches import Rectangle
+
+    return Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor="#f0f0f0", edgecolor="white", zorder=0)
+
+
 def right_of(axes: Any, inches: float) -> Any:
     """Return the transform for artists some inches right of axes; y is in data units."""
     from matplotlib.transforms import ScaledTranslation

@@ -30,8 +30,8 @@ _INNER = _WIDTH - 2 * _MARGIN
 _GAP = 0.15  # between sessions
 _EDGE = 0.03  # border of a session around its frames
 _FRAME_GAP = 0.03  # minimum between frames of a session
-_BAND = 0.16  # colored title of a session
-_FOOT = 0.42  # frame numbers, family and episode id below the frames
+_BAND = 0.18  # colored title of a session
+_FOOT = 0.46  # frame numbers, family and episode id below the frames
 _LIVE = 0.95  # live observation
 _BAR = 0.28  # timeline
 _MARK = 0.045  # dark line below evidence
@@ -39,6 +39,9 @@ _MARK = 0.045  # dark line below evidence
 _GRAY = "#555555"
 _COLUMNS = 12
 """Frames in a row of the page."""
+
+# Sizes of letters, in points. Pages show the picture smaller than it is: nothing below 7.
+_TITLE, _GOAL, _TEXT, _NUMBER = 10.5, 8.5, 7.5, 7
 
 
 @dataclass(frozen=True)
@@ -105,14 +108,14 @@ def draw_strip(
         top = _draw_sessions(page, buffer, camera, top + 0.1)
         _draw_timeline(page, buffer, top)
         right = _WIDTH - _MARGIN
-        page.text(right, top, "what the robot sees now", 6.5, align="right", bold=True)
+        page.text(right, top, "what the robot sees now", _TEXT, align="right", bold=True)
         bottom = top + 0.15
         image = buffer.query.frame(camera) if live is None else live
         bottom += page.picture(image, right - _LIVE, bottom, _LIVE, line=1.5)
         middle = right - _LIVE / 2
-        page.text(middle, bottom + 0.03, str(len(buffer)), 5.5, color=_GRAY)
-        page.text(middle, bottom + 0.13, "first live observation", 6, width=_LIVE)
-        page.height = bottom + 0.28
+        page.text(middle, bottom + 0.03, str(len(buffer)), _NUMBER, color=_GRAY)
+        page.text(middle, bottom + 0.14, "first live observation", _NUMBER, width=_LIVE)
+        page.height = bottom + 0.3
 
 
 def strip_png(buffer: "Buffer") -> bytes:
@@ -127,14 +130,14 @@ def _draw_head(page: Page, buffer: "Buffer", camera: str) -> float:
     """Write the title and return the y below it."""
     manifest = buffer.manifest
     title = f"{buffer.episode_id}   {buffer.condition}"
-    page.text(_MARGIN, 0.06, title, 10, width=0.63 * _INNER, align="left", bold=True)
+    page.text(_MARGIN, 0.06, title, _TITLE, width=0.63 * _INNER, align="left", bold=True)
     simulator = manifest.simulator and f"simulator {manifest.simulator}"
     facts = ", ".join(filter(None, (f"{camera} camera", simulator, manifest.difficulty)))
     right = _WIDTH - _MARGIN
-    page.text(right, 0.1, facts, 6.5, width=0.35 * _INNER, align="right", color=_GRAY)
+    page.text(right, 0.1, facts, _TEXT, width=0.35 * _INNER, align="right", color=_GRAY)
     y = 0.28
-    for line in page.wrap(f"Goal: {buffer.goal}", 8, _INNER, most=4):
-        page.text(_MARGIN, y, line, 8, width=_INNER, align="left")
+    for line in page.wrap(f"Goal: {buffer.goal}", _GOAL, _INNER, most=4):
+        page.text(_MARGIN, y, line, _GOAL, width=_INNER, align="left")
         y += 0.15
     frames: Counter[str] = Counter()
     for session in buffer.sessions:
@@ -142,7 +145,7 @@ def _draw_head(page: Page, buffer: "Buffer", camera: str) -> float:
     parts = " + ".join(f"{count} {role}" for role, count in frames.items())
     counts = f"{len(buffer)} history frames" + (f" = {parts}" if parts else "")
     share = f"an even {SAMPLE_FRAMES}-frame sample holds {manifest.lesson_share:.0%} lesson"
-    page.text(_MARGIN, y + 0.03, f"{counts};  {share}", 7, align="left", color=_GRAY)
+    page.text(_MARGIN, y + 0.03, f"{counts};  {share}", _TEXT, align="left", color=_GRAY)
     return y + 0.17
 
 
@@ -168,7 +171,7 @@ def _draw_sessions(page: Page, buffer: "Buffer", camera: str, top: float) -> flo
             if any(one.seen([index]) for one in buffer.evidence or ()):
                 foot = y + _BAND + tall - _MARK
                 page.box(x, foot, size, _MARK, fill=INK, edge="white", line=0.3)
-            page.text(x + size / 2, y + _BAND + tall + 0.015, str(index), 5.5, color=_GRAY)
+            page.text(x + size / 2, y + _BAND + tall + 0.015, str(index), _NUMBER, color=_GRAY)
             x += step
     return y + height + _GAP if blocks else top
 
@@ -186,11 +189,11 @@ def _draw_card(
     frames = len(session)
     count = f"{frames} frame{'s' if frames > 1 else ''}"
     ink = ink_on(color)
-    page.text(left, y + 0.03, role, 6.5, width=0.54 * inner, align="left", bold=lesson, color=ink)
-    page.text(right, y + 0.03, count, 6.5, width=0.4 * inner, align="right", color=ink)
-    under = y + height - 0.27
-    page.text(left, under, session.family, 7, width=inner, align="left", bold=True)
-    page.text(left, under + 0.13, str(session.source), 6, width=inner, align="left")
+    page.text(left, y + 0.03, role, _TEXT, width=0.54 * inner, align="left", bold=lesson, color=ink)
+    page.text(right, y + 0.03, count, _TEXT, width=0.4 * inner, align="right", color=ink)
+    under = y + height - 0.3
+    page.text(left, under, session.family, _TEXT, width=inner, align="left", bold=True)
+    page.text(left, under + 0.14, str(session.source), _NUMBER, width=inner, align="left")
 
 
 def _draw_timeline(page: Page, buffer: "Buffer", top: float) -> None:
@@ -200,33 +203,33 @@ def _draw_timeline(page: Page, buffer: "Buffer", top: float) -> None:
     caption = "history to scale; ticks: the even sample, and its frames in each session"
     if buffer.evidence:
         caption += "; dark line: shows the answer"
-    page.text(_MARGIN, top, caption, 6.5, align="left", color=_GRAY)
+    page.text(_MARGIN, top, caption, _TEXT, width=_INNER - _LIVE - 0.6, align="left", color=_GRAY)
     bar, sample = top + 0.44, even_sample(len(buffer))
     for number, color in enumerate(session_colors(buffer.sessions)):
         session = buffer.sessions[number]
         x, wide = _MARGIN + session.start * scale, len(session) * scale
         page.box(x, bar, wide, _BAR, fill=color, edge="white", line=0.5)
         for name in (f"{number} {session.role}", str(number)):  # the first that fits
-            if page.text_width(name, 6, bold=True) < wide:
+            if page.text_width(name, _NUMBER, bold=True) < wide:
                 y = bar + _BAR / 2 - 0.05
-                page.text(x + wide / 2, y, name, 6, bold=True, color=ink_on(color))
+                page.text(x + wide / 2, y, name, _NUMBER, bold=True, color=ink_on(color))
                 break
     mark_evidence(page, buffer, _MARGIN, scale, bar + _BAR)
     for index in sample:
         page.tick(_MARGIN + (index + 0.5) * scale, bar - 0.1, bar - 0.02)
     for session in buffer.sessions:
         inside = str(sum(session.start <= index < session.stop for index in sample))
-        if page.text_width(inside, 6, bold=True) < len(session) * scale:
+        if page.text_width(inside, _NUMBER, bold=True) < len(session) * scale:
             x = _MARGIN + (session.start + session.stop) / 2 * scale
-            page.text(x, bar - 0.21, inside, 6, bold=True)
+            page.text(x, bar - 0.22, inside, _NUMBER, bold=True)
     end = _MARGIN + width
     page.box(end - scale, bar, scale, _BAR, fill="black", edge="black", line=0.8)
-    page.text(end + 0.02, bar - 0.21, "+1 live", 6, align="left", color=_GRAY)
+    page.text(end + 0.02, bar - 0.21, "+1 live", _NUMBER, align="left", color=_GRAY)
     page.arrow(end + 0.05, end + 0.37, bar + _BAR / 2)
     steps = (digit * 10**power for power in range(9) for digit in (1, 2, 5))
     step = next(n for n in steps if n * 10 >= len(buffer))
     for index in range(0, len(buffer) + 1, step):
         x = _MARGIN + (index + 0.5) * scale
         page.tick(x, bar + _BAR, bar + _BAR + 0.04)
-        page.text(x, bar + _BAR + 0.06, str(index), 6, color=_GRAY)
-    page.text(_MARGIN + width / 2, bar + _BAR + 0.19, "frame in the buffer", 6.5, color=_GRAY)
+        page.text(x, bar + _BAR + 0.06, str(index), _NUMBER, color=_GRAY)
+    page.text(_MARGIN + width / 2, bar + _BAR + 0.19, "frame in the buffer", _TEXT, color=_GRAY)

@@ -1,10 +1,14 @@
 """Calibration against values worked out by hand."""
 
+from pathlib import Path
+from typing import Any
+
 import pytest
 from support.retrieval import made
 
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.retrieval.calibrate import Calibration, calibrate
+from robomme_interference_data.retrieval import charts
+from robomme_interference_data.retrieval.calibrate import Calibration, Trial, calibrate
 from robomme_interference_data.retrieval.grade import ALL
 from robomme_interference_data.retrieval.select import Rule, Similarities
 
@@ -93,3 +97,22 @@ def test_nothing_to_fit() -> None:
     with pytest.raises(InvalidOptionError, match="without any session of two frames"):
         found_in(short)
     assert found_in(*three()[:2]).held_out == ()  # one family
+
+
+def test_legends_of_the_chart_cover_no_curve(tmp_path: Path) -> None:
+    """They are below the axes, wherever the curves are."""
+    sweep = tuple(Trial(0.5 + n / 10, "all", "k7", n / 4, 1.0) for n in range(5))
+    found = Calibration("max", 0.923, 0.9, (0.2, 0.5, 0.9), (0.9, 1.0), 99, 1, (), sweep)
+    seen: list[tuple[float, float]] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(charts, "save_figure", lambda figure, out: seen.extend(legends(figure)))
+        charts.draw_calibration(found, "Thresholds", tmp_path / "thresholds.png")
+    assert len(seen) == 2 and all(legend_top < axes_bottom for legend_top, axes_bottom in seen)
+
+
+def legends(figure: Any) -> list[tuple[float, float]]:
+    """The top of each legend, and the bottom of its axes."""
+    return [
+        (axes.get_legend().get_window_extent().y1, axes.get_window_extent().y0)
+        for axes in figure.axes
+    ]

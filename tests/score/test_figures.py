@@ -12,9 +12,13 @@ from hypothesis import strategies as st
 from support import scoring as made
 from support.scoring import BASE, OWN, cells
 
-from robomme_interference_data.evaluate.score.plots.curves import spread
+from robomme_interference_data.evaluate.score.plots.curves import WIDTH, spread
 from robomme_interference_data.evaluate.score.plots.data import Data
-from robomme_interference_data.evaluate.score.plots.figures import draw_figure
+from robomme_interference_data.evaluate.score.plots.figures import (
+    FIGURES,
+    draw_figure,
+    draw_figures,
+)
 from robomme_interference_data.evaluate.score.plots.styles import SeriesStyle, styles_of
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import PAPER_SYSTEMS, SYSTEMS
@@ -169,8 +173,37 @@ def test_systems_of_equal_rates_keep_the_order_of_tables(tmp_path: Path, figure:
     given = {(name, "k0"): "sf" if place % 2 else "fs" for place, name in enumerate(systems)}
     assert draw_figure("matrix", figure, data(tmp_path, cells(given)))
     (axes,) = figure.axes
-    assert [label.get_text() for label in axes.get_yticklabels()] == systems
+    assert [label.get_text() for label in axes.get_yticklabels()] == systems[:-1]
+    assert [label.get_text() for label in axes.get_xticklabels()] == systems[1:]
     assert {text.get_text() for text in axes.texts} == {"0"}  # and not −0
+
+
+def test_two_systems_have_no_matrix(tmp_path: Path, figure: Any) -> None:
+    given = {(name, "k0"): "ssff" for name in ("a", "b")}
+    assert not draw_figure("matrix", figure, data(tmp_path, cells(given)))
+
+
+def test_figures_are_as_wide_as_each_other_and_hold_their_notes(tmp_path: Path) -> None:
+    """A page scales all figures to one width: then letters of one size look alike."""
+    found = Data(made.kinds(tmp_path), "tabletop")
+    drawn = 0
+    for kind in FIGURES:
+        with open_figure() as figure:
+            if kind == "action_error" or not draw_figure(kind, figure, found):
+                continue
+            drawn += 1
+            assert figure.get_figwidth() == WIDTH, kind
+            page = figure.bbox
+            for note in figure.legends:
+                box = note.get_window_extent()
+                assert page.x0 <= box.x0 and box.x1 <= page.x1, kind
+    assert drawn > 6
+
+
+def test_conditions_beyond_the_papers_come_first(tmp_path: Path) -> None:
+    found = made.kinds(tmp_path)
+    names = [name.partition("-")[0] for name in draw_figures(found, tmp_path / "figures")]
+    assert names[:2] == ["interference", "kinds"]
 
 
 @given(st.lists(st.floats(0, 100), min_size=1, max_size=12).map(sorted), st.floats(0.1, 9))

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from itertools import groupby
+from textwrap import fill
 from typing import Any
 
 from robomme_interference_data.schema.conditions import NO_HISTORY, parse_condition
@@ -10,6 +11,15 @@ from robomme_interference_data.viz.figure import INK, connect_right, right_of, t
 
 from .data import CHANCE, PUBLISHED, Data
 from .styles import SeriesStyle
+
+WIDTH = 10
+"""Width of every figure in inches: a page scales all of them alike, so texts keep their sizes."""
+
+TITLE, HEADING, LABEL, SMALL = 10, 9, 8, 7
+"""Sizes of letters in points: of a figure, of a panel, of axes, and of cells in them."""
+
+_LETTERS = 15
+"""Letters of a note in an inch."""
 
 
 def shifts(systems: Sequence[str], step: float = 0.09) -> dict[str, float]:
@@ -121,7 +131,7 @@ def set_axes(axes: Any, data: Data, systems: Sequence[str], ylabel: str) -> None
     axes.set_xlim(min(places) - 0.4, max(places) + 0.4)
     axes.set_ylim(0, min(max(axes.get_ylim()[1], 10), 103))
     if ylabel:
-        axes.set_ylabel(ylabel, size=8, color=INK)
+        axes.set_ylabel(ylabel, size=LABEL, color=INK)
 
 
 def short(condition: str) -> str:
@@ -139,10 +149,12 @@ def explained(data: Data, systems: Sequence[str], parts: Sequence[str], *notes: 
 
 
 def legend(figure: Any, note: str) -> None:
-    """Write a note below a figure, if there is one."""
+    """Write a note below a figure, if there is one, in lines that fit its width."""
     if note:
+        letters = round(_LETTERS * figure.get_figwidth())
+        lines = "\n".join(fill(line, letters) for line in note.splitlines())
         place = {"loc": "outside lower center", "frameon": False}
-        figure.legend([], [], title=note, title_fontsize=7.5, **place)
+        figure.legend([], [], title=lines, title_fontsize=LABEL - 0.5, **place)
 
 
 def label_ends(

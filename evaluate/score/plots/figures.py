@@ -1,7 +1,7 @@
 """Figures of a score, one set for each simulator."""
 
 from collections.abc import Mapping, Sequence
-from itertools import combinations, product
+from itertools import product
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -9,12 +9,20 @@ from typing import Any
 import numpy as np
 
 from robomme_interference_data.constants import DIFFICULTIES
+from robomme_interference_data.evaluate.score.comparisons.contrast import Contrast
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
 from robomme_interference_data.simulators.registry import RECORDINGS
 from robomme_interference_data.stats.significance import ALPHA
-from robomme_interference_data.viz.figure import INK, ink_on, mapped, open_figure, save_figure
+from robomme_interference_data.viz.figure import (
+    INK,
+    cell_box,
+    ink_on,
+    mapped,
+    open_figure,
+    save_figure,
+)
 
 from . import curves, forests, offline
 from .curves import curve, explained, legend
@@ -27,6 +35,8 @@ _ALL_KINDS = ("heatmap", "kinds", "interference", "ceiling")
 _ALL = "All families"
 
 FIGURES = {
+    "interference": "Effect of each kind of interference",
+    "kinds": "Success by condition and kind of condition",
     "effects": "Effect of each condition, paired over episodes",
     "success": "Success by condition, all families",
     "families": "Success by condition and family",
@@ -34,14 +44,16 @@ FIGURES = {
     "retention": "Share of the lift that is left at the most sessions",
     "heatmap": "Success by family and condition",
     "retrieval": "Systems with and without retrieval",
-    "kinds": "Success by condition and kind of condition",
-    "interference": "Effect of each kind of interference",
     "by_evidence_kept": "Success by whether the memory kept the evidence",
     "ceiling": "Gap to the ideal observer with the same memory",
     "matrix": "Which systems differ significantly",
     "action_error": "Action error by condition",
 }
-"""Figure to its title."""
+"""Figure to its title, in the order of the report.
+
+The first ones show conditions beyond the paper's, where there are any: they are what such a run is
+about, and the figures after them leave them out.
+"""
 
 
 def draw_figures(
@@ -101,7 +113,7 @@ def _success(figure: Any, data: Data) -> bool:
     systems = [*data.systems, *data.absent]
     places = curves.shifts(systems, min(0.09, 0.55 / len(systems)))
     high = 4.2 if few else 5.5
-    figure.set_size_inches(9, high)
+    figure.set_size_inches(curves.WIDTH, high)
     axes = figure.subplots()
     ends: dict[str, float] = {}
     for name, shift in places.items():
@@ -113,11 +125,11 @@ def _success(figure: Any, data: Data) -> bool:
         curve(axes, data, name, "", shift, bars=False)
     ends |= curves.chance_level(axes, data, "")
     curves.set_axes(axes, data, [*places, *beside], "success, %")
-    curves.label_ends(axes, ends, data.styles, high - 1, 8)
+    curves.label_ends(axes, ends, data.styles, high - 1, curves.LABEL)
     note = "published rates: in the table “paper”" if len(beside) < len(data.beside) else ""
     legend(figure, explained(data, [*places, *beside], [""], note))
     title = f"Success by condition, {data.simulator}, with 95% Wilson intervals"
-    axes.set_title(title, loc="left", size=10, color=INK)
+    axes.set_title(title, loc="left", size=curves.TITLE, color=INK)
     return True
 
 
@@ -159,7 +171,7 @@ def _panels(
         return False
     wide, bars = 3, len(systems) <= FEW
     high = 2.0 if bars else 2.4
-    figure.set_size_inches(10.5, 0.9 + high * -(-len(panels) // wide))
+    figure.set_size_inches(curves.WIDTH, 0.9 + high * -(-len(panels) // wide))
     grid = curves.panel_grid(figure, len(panels), wide)
     ends: list[dict[str, float]] = []
     for axes, (title, (shown, part)) in zip(grid, panels.items(), strict=True):
@@ -167,11 +179,13 @@ def _panels(
         for system, shift in curves.shifts(systems, 0.09 * bars).items():
             ends[-1] |= curve(axes, shown, system, part, shift, bars=bars)
         ends[-1] |= curves.chance_level(axes, shown, part)
-        axes.set_title(title, size=9, color=INK, weight="bold" if title == _ALL else "normal")
+        axes.set_title(
+            title, size=curves.HEADING, color=INK, weight="bold" if title == _ALL else "normal"
+        )
     for number, axes in enumerate(grid):
         curves.set_axes(axes, data, systems, "" if number % wide else "success, %")
     for axes, found in zip(grid, ends, strict=True):
-        curves.label_ends(axes, found, data.styles, high - 0.45, 6.5)
+        curves.label_ends(axes, found, data.styles, high - 0.45, curves.SMALL)
     note = f"95% {'Wilson intervals' if bars else 'intervals: in the table'}"
     legend(figure, explained(data, systems, [p for _, p in panels.values()], note))
     return True
@@ -184,7 +198,7 @@ def _heatmap(figure: Any, data: Data) -> bool:
     many = max(5, len(conditions))
     rows = -(-len(data.systems) // max(1, 25 // many))
     wide = -(-len(data.systems) // rows)
-    figure.set_size_inches(1.3 + 1.65 * wide * many / 5, 0.6 + (0.6 + 0.24 * len(names)) * rows)
+    figure.set_size_inches(curves.WIDTH, 0.6 + (0.6 + 0.24 * len(names)) * rows)
     panels = curves.panel_grid(figure, len(data.systems), wide, sharex=False)
     colors = "cividis"  # readable with color vision deficiency, and in gray
     highest = max(cell.rate for (*_, part), cell in data.cells.items() if part in names)
@@ -196,14 +210,17 @@ def _heatmap(figure: Any, data: Data) -> bool:
                 text = f"{100 * cell.rate:.0f}" + ("" if cell.complete else "†")
                 ink = ink_on(mapped(colors, cell.rate / highest if highest else 0.0))
                 inside: dict[str, Any] = {"ha": "center", "va": "center", "in_layout": False}
-                axes.text(x, y, text, **inside, size=7, color=ink)
+                axes.text(x, y, text, **inside, size=curves.SMALL, color=ink)
         axes.imshow(rates, cmap=colors, vmin=0, vmax=highest, aspect="auto")
-        axes.set_xticks(range(len(conditions)), labels, size=7, rotation=turned)
-        axes.set_yticks(range(len(names)), names, size=7)
+        axes.set_xticks(range(len(conditions)), labels, size=curves.SMALL, rotation=turned)
+        axes.set_yticks(range(len(names)), names, size=curves.SMALL)
         axes.tick_params(length=0)
         axes.spines[:].set_visible(False)
-        axes.set_title(fill(data.styles[system].label, 26), size=8, color=INK)
-    figure.suptitle(f"Success in %, {data.simulator}", size=9, color=INK)
+        label = fill(data.styles[system].label, max(10, 100 // wide))
+        axes.set_title(label, size=curves.HEADING, color=INK)
+    figure.suptitle(
+        f"Success by family and condition, %, {data.simulator}", size=curves.TITLE, color=INK
+    )
     return True
 
 
@@ -213,48 +230,75 @@ def _matrix(figure: Any, data: Data) -> bool:
     last = max((parse_condition(one.condition).k for one in pairs), default=0)
     shown = [c.name for c in data.conditions if c.kind.counted and c.k in (0, last)]
     panels = {name: found for name in shown if (found := [p for p in pairs if p.condition == name])}
-    if not panels:
+    # Two systems make a single difference, which the other figures show.
+    most = max(
+        (
+            len({name for one in found for name in (one.system, one.against[0])})
+            for found in panels.values()
+        ),
+        default=0,
+    )
+    if most < 3:
         return False
-    many = max(len({one.system for one in found}) for found in panels.values()) + 1
-    figure.set_size_inches(2.6 + (1.6 + 0.3 * many) * len(panels), 2.8 + 0.3 * many)
+    figure.set_size_inches(curves.WIDTH, 1.6 + 0.5 * most)
     widest = 100 * max(abs(one.pairs.change.value) for one in pairs)
     for axes, (condition, found) in zip(
         figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True
     ):
-        changes = {(one.system, one.against[0]): 100 * one.pairs.change.value for one in found}
-        changes |= {(other, one): -change for (one, other), change in changes.items()}
-        systems = sorted(
-            (one for one in data.systems if any(one in two for two in changes)),
-            key=lambda s: -data.cells[s, condition, ""].rate,
-        )
-        values = np.full((len(systems), len(systems)), np.nan)
-        for y, x in combinations(range(len(systems)), 2):
-            row, column = systems[x], systems[y]
-            differ = (condition, frozenset((row, column))) in data.distinguishable
-            change = changes[column, row]
-            if differ:
-                values[y, x] = change
-            style: dict[str, Any] = (
-                {"weight": "bold", "color": "black"} if differ else {"color": INK}
-            )
-            style |= {"ha": "center", "va": "center", "in_layout": False}
-            axes.text(x, y, f"{round(change) + 0:.0f}".replace("-", "−"), size=7, **style)
-        axes.imshow(values, cmap="RdBu", vmin=-2 * widest, vmax=2 * widest, aspect="auto")
-        labels = [data.styles[system].label for system in systems]
-        axes.set_xticks(range(len(systems)), labels, size=7, rotation=90)
-        axes.set_yticks(range(len(systems)), labels, size=7)
-        axes.tick_params(length=0)
-        axes.spines[:].set_visible(False)
-        axes.set_title(condition, size=9, color=INK)
-    figure.suptitle(f"Row − column, points, {data.simulator}", size=10, color=INK)
-    legend(figure, f"filled and bold: p < {ALPHA} after Holm's correction")
+        _pairs(axes, data, condition, found, widest)
+    figure.suptitle(
+        f"Success of the row's system minus the column's, points, {data.simulator}",
+        size=curves.TITLE,
+        color=INK,
+    )
+    legend(figure, f"colored and bold: p < {ALPHA} after Holm's correction; gray: not significant")
     return True
 
 
+def _pairs(axes: Any, data: Data, condition: str, found: Sequence[Contrast], widest: float) -> None:
+    """Draw the differences of each system to those below it, by their rates."""
+    changes = {(one.system, one.against[0]): 100 * one.pairs.change.value for one in found}
+    changes |= {(other, one): -change for (one, other), change in changes.items()}
+    systems = sorted(
+        (one for one in data.systems if any(one in two for two in changes)),
+        key=lambda s: -data.cells[s, condition, ""].rate,
+    )
+    # The best system is no column, and the last one no row: they would be empty.
+    rows, columns = systems[:-1], systems[1:]
+    values = np.full((len(rows), len(columns)), np.nan)
+    for (y, row), (x, column) in product(enumerate(rows), enumerate(columns)):
+        if x < y:
+            continue
+        differ = (condition, frozenset((row, column))) in data.distinguishable
+        change = changes[row, column]
+        style: dict[str, Any] = {"weight": "bold", "color": "black"} if differ else {"color": INK}
+        style |= {"ha": "center", "va": "center", "in_layout": False, "size": curves.SMALL}
+        axes.text(x, y, f"{round(change) + 0:.0f}".replace("-", "−"), **style)
+        if differ:
+            values[y, x] = change
+        else:
+            axes.add_patch(cell_box(x, y))
+    axes.imshow(values, cmap="RdBu", vmin=-2 * widest, vmax=2 * widest, aspect="auto")
+    labels = [[fill(data.styles[name].label, 20) for name in names] for names in (columns, rows)]
+    turned = 90 if len(columns) > 3 else 0
+    axes.set_xticks(range(len(columns)), labels[0], size=curves.SMALL, rotation=turned)
+    axes.set_yticks(range(len(rows)), labels[1], size=curves.SMALL)
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+    axes.set_title(condition, size=curves.HEADING, color=INK)
+
+
 _DRAWERS = {
-    **{"effects": forests.effects, "success": _success, "families": _families},
-    **{"difficulty": _difficulty, "retention": forests.retention, "heatmap": _heatmap},
-    **{"retrieval": _retrieval, "kinds": _kinds, "interference": forests.interference},
-    **{"by_evidence_kept": forests.by_evidence_kept, "ceiling": forests.ceiling},
-    **{"matrix": _matrix},
+    "interference": forests.interference,
+    "kinds": _kinds,
+    "effects": forests.effects,
+    "success": _success,
+    "families": _families,
+    "difficulty": _difficulty,
+    "retention": forests.retention,
+    "heatmap": _heatmap,
+    "retrieval": _retrieval,
+    "by_evidence_kept": forests.by_evidence_kept,
+    "ceiling": forests.ceiling,
+    "matrix": _matrix,
 }

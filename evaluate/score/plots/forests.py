@@ -16,7 +16,19 @@ from robomme_interference_data.stats.bootstrap import Interval
 from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.viz.figure import GRAY, INK, Hue, tidy
 
-from .curves import draw_points, label_ends, legend, mark, panel_grid, set_axes, short
+from .curves import (
+    HEADING,
+    SMALL,
+    TITLE,
+    WIDTH,
+    draw_points,
+    label_ends,
+    legend,
+    mark,
+    panel_grid,
+    set_axes,
+    short,
+)
 from .data import Data
 from .styles import SeriesStyle
 
@@ -63,13 +75,13 @@ def _forest(
             style = data.styles[one.system]
             draw_points(axes, [point], style, one.system, [one.complete], lying=True)
         tidy(axes)
-        axes.set_title(fill(name, 26), size=9, color=INK)
+        axes.set_title(fill(name, 26), size=HEADING, color=INK)
     grid[0].set_yticks(range(len(rows)), list(rows.values()))
     grid[0].set_ylim(len(rows) - 0.4, -0.6)
-    figure.suptitle(title, size=10, color=INK)
+    figure.suptitle(title, size=TITLE, color=INK)
     hollow = not all(one.complete for group in panels.values() for one in group.values())
     lines = [*notes, "hollow: incomplete cell" * hollow]
-    legend(figure, "\n".join(fill(line, 150) for line in lines if line))
+    legend(figure, "\n".join(filter(None, lines)))
 
 
 def _by_system(
@@ -80,7 +92,7 @@ def _by_system(
     leading = next(group for group in reversed([*groups.values()]) if len(group) == most)
     systems = [one for one in data.systems if any(one in group for group in groups.values())]
     systems.sort(key=lambda s: -leading[s].pairs.change.value if s in leading else math.inf)
-    figure.set_size_inches(10, 1.5 + 0.27 * max(3, len(systems)))
+    figure.set_size_inches(WIDTH, 1.5 + 0.27 * max(3, len(systems)))
     rows = {system: data.styles[system].label for system in systems}
     _forest(figure, data, groups, rows, title, *notes, band=band, wide=len(groups))
 
@@ -148,7 +160,7 @@ def retention(figure: Any, data: Data) -> bool:
         f"Not shown (no lift at k0 with p < {ALPHA}, or rows missing at {last}): "
         f"{', '.join(absent)}"
     )
-    figure.set_size_inches(8, 1.6 + 0.3 * max(2, len(found)))
+    figure.set_size_inches(WIDTH, 1.6 + 0.3 * max(2, len(found)))
     _forest(
         figure,
         data,
@@ -177,7 +189,7 @@ def interference(figure: Any, data: Data) -> bool:
         }
         for system in systems
     }
-    figure.set_size_inches(7.5, 0.9 + (0.5 + 0.34 * len(groups)) * -(-len(systems) // 3))
+    figure.set_size_inches(WIDTH, 0.9 + (0.5 + 0.34 * len(groups)) * -(-len(systems) // 3))
     title = f"Effect of each kind of interference, {data.simulator}"
     _forest(figure, data, panels, {name: name for name in groups}, title, f"points; {_BARS}")
     return True
@@ -214,7 +226,7 @@ def by_evidence_kept(figure: Any, data: Data) -> bool:
     if not systems:
         return False
     wide = min(3, len(systems))
-    figure.set_size_inches(max(6.0, 3.6 * wide), 0.9 + 2.3 * -(-len(systems) // wide))
+    figure.set_size_inches(WIDTH, 1.1 + 2.3 * -(-len(systems) // wide))
     panels = panel_grid(figure, len(systems), wide)
     ends: dict[str, dict[str, float]] = {system: {} for system in systems}
     for axes, system in zip(panels, systems, strict=True):
@@ -229,10 +241,12 @@ def by_evidence_kept(figure: Any, data: Data) -> bool:
             mark(axes.plot(*zip(*(p[:2] for p in points), strict=True), **style.stroke), system)
             draw_points(axes, points, style, system, [True] * len(points))
             ends[system][level] = points[-1][1]
-        axes.set_title(data.styles[system].label, size=9, color=INK)
+        axes.set_title(data.styles[system].label, size=HEADING, color=INK)
     for number, (axes, system) in enumerate(zip(panels, systems, strict=True)):
         set_axes(axes, data, systems, "" if number % wide else "success, %")
-        label_ends(axes, ends[system], _LEVELS, 1.8, 7, system)
+        label_ends(axes, ends[system], _LEVELS, 1.8, SMALL, system)
     note = "Different episodes, not paired. Bars: 95% Wilson intervals; n: see the table."
+    title = f"Success by whether the memory kept the evidence, {data.simulator}"
+    figure.suptitle(title, size=TITLE, color=INK)
     legend(figure, f"By whether all, some or none of the evidence was in the memory. {note}")
     return True

@@ -8,7 +8,7 @@ from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.schema.conditions import NO_HISTORY, parse_condition
 from robomme_interference_data.viz.figure import INK, tidy
 
-from .curves import draw_points, label_ends, legend, mark, shifts, short
+from .curves import LABEL, TITLE, WIDTH, draw_points, label_ends, legend, mark, shifts, short
 from .styles import styles_of
 
 _HIGH = 4.2  # inches
@@ -24,7 +24,7 @@ def action_error(figure: Any, score: Score) -> None:
     systems = list(dict.fromkeys(cell.system for cell in cells))
     styles = styles_of(systems)
     places = {condition: place for place, condition in enumerate(conditions)}
-    figure.set_size_inches(9, _HIGH)
+    figure.set_size_inches(WIDTH, _HIGH)
     axes = figure.subplots()
     ends: dict[str, float] = {}
     for system, shift in shifts(systems, min(0.09, 0.55 / max(1, len(systems)))).items():
@@ -47,13 +47,13 @@ def action_error(figure: Any, score: Score) -> None:
     axes.set_xticks(range(len(conditions)), [short(name) for name in conditions])
     axes.set_xlim(-0.4, len(conditions) - 0.6)
     axes.set_ylim(0, 1.05 * max(_top(cell.error) for cell in cells))
-    axes.set_ylabel("action error, in the actions' units", size=8, color=INK)
-    label_ends(axes, ends, styles, _HIGH - 1, 8)
+    axes.set_ylabel("action error, in the actions' units", size=LABEL, color=INK)
+    label_ends(axes, ends, styles, _HIGH - 1, LABEL)
     notes = ["Mean absolute difference to the recorded actions; bars: 95% bootstrap intervals"]
     if not all(cell.complete for cell in cells):
         notes.append("hollow: incomplete cell")
     legend(figure, "; ".join(notes))
-    axes.set_title("Action error by condition, offline", loc="left", size=10, color=INK)
+    axes.set_title("Action error by condition, offline", loc="left", size=TITLE, color=INK)
 
 
 def _top(error: tuple[float, float, float]) -> float:
