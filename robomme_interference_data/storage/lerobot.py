@@ -262,8 +262,8 @@ def _check_info(info: dict[str, Any], path: object) -> None:
         check(isinstance(shape, list) and len(shape) <= _MAX_SIDES, "features")
         check(all(is_count(side, 1, _MAX_VALUES) for side in shape), "features")
         check(math.prod(shape) <= _MAX_VALUES, "features")
-        described = (feature.get("info", {}), feature.get("video_info", {}))
-        check(all(one is None or isinstance(one, dict) for one in described), "features")
+        for key in ("info", "video_info"):  # LeRobot's newer and older name
+            check(isinstance(feature.get(key), dict | None), "features")
         check(feature["dtype"] != "video" or is_template(info.get("video_path")), "video_path")
 
 

@@ -103,12 +103,13 @@ def _check_size(
     file: pq.ParquetFile, path: Path, columns: list[str] | None, groups: Sequence[int]
 ) -> None:
     """Raise if a read would take too much memory."""
+    # A list or struct is stored as columns of its own, such as `image.bytes`.
     schema = file.metadata.schema
-    every = [schema.column(number) for number in range(file.metadata.num_columns)]
+    stored = [schema.column(number) for number in range(file.metadata.num_columns)]
     prefixes = None if columns is None else tuple(f"{name}." for name in columns)
     chosen = [
         (number, column.length or 0)
-        for number, column in enumerate(every)
+        for number, column in enumerate(stored)
         if prefixes is None or f"{column.path}.".startswith(prefixes)
     ]
     # Batches of no rows read no page, but raise if the metadata of a column is damaged: asking for

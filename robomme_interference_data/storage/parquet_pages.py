@@ -1,7 +1,7 @@
 """Bound what the pages of a parquet file declare, before pyarrow reads them.
 
 pyarrow allocates what the headers of pages declare, regardless of the file's metadata, and
-expands a text that is stored once as often as it occurs: a file of 294 bytes became 8 GB. The
+expands a text that is stored once as often as it occurs: a file of 50 kB became 5 GB. The
 format's `parquet.thrift` describes the headers.
 """
 

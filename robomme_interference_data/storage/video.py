@@ -141,11 +141,10 @@ def _indexed_frames(
                     # The seek went too far (some muxers mark no earlier key frame): read from the
                     # beginning, which is slower and always right.
                     container.seek(0, stream=stream, backward=True)
-                    yield from (
-                        (n, f)
-                        for f in container.decode(stream)
-                        if (n := _number(path, f, tick, fps)) >= start
-                    )
+                    for earlier in container.decode(stream):
+                        number = _number(path, earlier, tick, fps)
+                        if number >= start:
+                            yield number, earlier
                     return
                 first = False
                 if number >= start:
