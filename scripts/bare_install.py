@@ -17,6 +17,7 @@ from pathlib import Path
 
 from support.hub import BUFFER_SET, push_buffer_set
 from support.hub_server import HubServer
+from support.package import HEAVY
 
 from robomme_interference_data import load_buffer
 
@@ -34,10 +35,13 @@ EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
 
 LOAD = """
 import hashlib, sys
+from importlib.util import find_spec
 from robomme_interference_data import load_buffer
 
 buffer = load_buffer(sys.argv[2], sys.argv[3], buffer_set=sys.argv[1], verify=True)
-print(hashlib.sha256(buffer.frames().tobytes()).hexdigest())
+arrays = (buffer.frames("front"), buffer.frames("wrist"), buffer.states)
+print(*[hashlib.sha256(array.tobytes()).hexdigest() for array in arrays])
+print(*[name for name in sys.argv[4:] if find_spec(name)])
 """
 
 
@@ -96,7 +100,7 @@ class BareInstall:
             self.install(extra, "--dry-run")
         self.install("score")
         self.command("score", GOLDEN / "run", "--out", self.folder / "score")
-        expect((self.folder / "score" / "report.html").is_file(), "score writes a report")
+        expect((self.folder / "score" / "report.html").is_file(), "score wrote no report")
         print(f"bare install: works with the {self.resolution} versions")
 
     def install(self, extra: str | None = None, *options: str) -> None:
@@ -116,11 +120,14 @@ class BareInstall:
     def check_loading(self) -> None:
         """Load the same frames as `.venv` does, from a folder and from the Hub."""
         golden = GOLDEN / "buffer_set"
-        frames = load_buffer(QUERY, CONDITION, buffer_set=golden).frames()
-        expected = hashlib.sha256(frames.tobytes()).hexdigest()
+        buffer = load_buffer(QUERY, CONDITION, buffer_set=golden)
+        arrays = (buffer.frames("front"), buffer.frames("wrist"), buffer.states)
+        expected = " ".join(hashlib.sha256(array.tobytes()).hexdigest() for array in arrays)
         for source in (str(golden), BUFFER_SET):
-            loaded = self.run("python", "-I", "-c", LOAD, source, QUERY, CONDITION)
-            expect(loaded.stdout.strip() == expected, f"the frames of {source} are the same")
+            loaded = self.run("python", "-I", "-c", LOAD, source, QUERY, CONDITION, *HEAVY)
+            digests, installed = loaded.stdout.splitlines()
+            expect(digests == expected, f"the frames of {source} differ")
+            expect(not installed, f"the light core brings {installed}")
         self.command("list", BUFFER_SET)
         self.command("fetch", BUFFER_SET, "--to", self.folder / "fetched")
         self.command("list", self.folder / "fetched")

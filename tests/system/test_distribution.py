@@ -1,8 +1,5 @@
-"""What is published of the package: sdist and wheel hold what they should, and work alone."""
+"""What is published of the package: sdist and wheel; `scripts/bare_install.py` uses the latter."""
 
-import hashlib
-import json
-import os
 import shutil
 import subprocess
 import sys
@@ -10,13 +7,9 @@ import tarfile
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
-from support.buffer_sets import GOLDEN, expected_frames, expected_states
-from support.hub import BUFFER_SET, push_buffer_set
-from support.hub_server import HubServer
-from support.package import CONFIG, HEAVY, PACKAGE, ROOT, committable, module_files
-
-from robomme_interference_data import load_buffer_set
+from support.package import PACKAGE, ROOT, committable, module_files
 
 pytestmark = pytest.mark.slow  # test_packaging.py compares the lists of files
 
@@ -75,67 +68,79 @@ def test_the_package_index_would_take_both(distributions: Path) -> None:
     assert (done.returncode, done.stdout.count("PASSED")) == (0, 2), done.stdout
 
 
-@pytest.fixture(scope="module")
-def empty_python(distributions: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The interpreter of an environment with the wheel and what it asks for, as pinned."""
-    folder, uv = tmp_path_factory.mktemp("empty") / "venv", Path(sys.executable).with_name("uv")
-    (wheel,) = distributions.glob("*.whl")
-    # Use uv's cache, which set-up has filled, and pip's configured index (scripts/setup.sh).
-    own = {name: text for name, text in os.environ.items() if name != "XDG_CACHE_HOME"}
-    query = [sys.executable, "-m", "pip", "config", "get", "global.index-url"]
-    index = subprocess.run(query, capture_output=True, text=True, check=False).stdout.strip()
-    if index:
-        own.setdefault("UV_DEFAULT_INDEX", index)
-    subprocess.run([uv, "venv", "--quiet", "--python", sys.executable, folder], check=True)
-    command = [uv, "pip", "install", "--quiet", "--python", folder / "bin" / "python"]
-    command += ["--constraint", ROOT / "requirements.txt", wheel]
-    done = subprocess.run(command, env=own, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        pytest.skip(f"no package index gives what is needed: {done.stderr.strip()[-500:]}")
-    return folder / "bin" / "python"
+USER = """
+from typing import assert_type, override
 
+import numpy as np
+from numpy.typing import NDArray
+from robomme_interference_data import (
+    Buffer, BufferManifest, BufferSet, Chunk, EpisodeId, Query, Session
+)
+from robomme_interference_data import load_buffer, load_buffer_set
+from robomme_interference_data.evaluate import Observation, Policy
+from robomme_interference_data.training import HistoryDataset
 
-LOAD = """
-import hashlib, json
-from importlib.util import find_spec
+buffer = load_buffer("MoveCube/test/0", "k3", buffer_set="buffers")
+assert_type(buffer, Buffer)
+assert_type(buffer.frames("front"), NDArray[np.uint8])
+assert_type(buffer.states, NDArray[np.float32])
+assert_type(buffer.goal, str)
+assert_type(buffer.sessions, tuple[Session, ...])
+for chunk in buffer.stream(64):
+    assert_type(chunk, Chunk)
+    assert_type(chunk.frames, dict[str, NDArray[np.uint8]])
+buffers = load_buffer_set("buffers")
+assert_type(buffers, BufferSet)
+assert_type(buffers.episode_ids, tuple[EpisodeId, ...])
+assert_type(buffers.query("MoveCube/test/0"), Query)
+assert_type(buffers.manifest("MoveCube/test/0", "k3"), BufferManifest)
+assert_type(HistoryDataset("buffers", ["k3"]), HistoryDataset)
+
+class Still(Policy):
+    @override
+    def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
+        assert_type(observation.state, NDArray[np.float32])
+        return np.zeros((1, 8), np.float32)
+"""
+
+MISTAKES = """
 from robomme_interference_data import load_buffer
+from robomme_interference_data.evaluate import RunConfig
 
-where = dict(buffer_set="{buffer_set}", revision="data-1.0.0")
-buffer = load_buffer("MoveCube/test/0", "k3", **where, verify=True)
-arrays = [buffer.frames("front"), buffer.frames("wrist"), buffer.states]
-print(json.dumps({{
-    "arrays": [[a.shape, str(a.dtype), hashlib.sha256(a.tobytes()).hexdigest()] for a in arrays],
-    "installed": [name for name in {heavy!r} if find_spec(name)],
-}}))
+load_buffer("MoveCube/test/0", "k3", bufer_set="buffers")
+load_buffer("MoveCube/test/0", "k3", buffer_set="buffers").frames(1)
+RunConfig(policy=1)
 """
 
 
-def test_the_wheel_alone_loads_a_buffer_from_the_hub(
-    empty_python: Path, hub: HubServer, tmp_path: Path
-) -> None:
-    push_buffer_set(hub, GOLDEN, tmp_path / "work")
-    own = {"HF_ENDPOINT": hub.endpoint, "HF_HUB_CACHE": str(tmp_path / "fresh")}
-    own |= {"HF_HUB_DISABLE_XET": "1", "HF_HUB_OFFLINE": "0"}
-    code = LOAD.format(buffer_set=BUFFER_SET, heavy=HEAVY)
-    command = [empty_python, "-I", "-c", code]
-    done = subprocess.run(
-        command, env=os.environ | own, capture_output=True, text=True, check=False
+def test_type_checkers_see_the_types_of_the_wheel(distributions: Path, tmp_path: Path) -> None:
+    """An editable install would not do: they do not follow its mapping of folders."""
+    uv, python = Path(sys.executable).with_name("uv"), tmp_path / "venv" / "bin" / "python"
+    (wheel,) = distributions.glob("*.whl")
+    subprocess.run(
+        [uv, "venv", "--quiet", "--python", sys.executable, tmp_path / "venv"], check=True
     )
-    assert done.returncode == 0, done.stderr
-    sessions = load_buffer_set(GOLDEN).manifest("MoveCube/test/0", "k3").sessions
-    arrays = [*(expected_frames(sessions, name) for name in ("front", "wrist"))]
-    arrays.append(expected_states(sessions))
-    assert json.loads(done.stdout) == {
-        "arrays": [
-            [[*one.shape], str(one.dtype), hashlib.sha256(one.tobytes()).hexdigest()]
-            for one in arrays
-        ],
-        "installed": [],
-    }
-    assert hub.downloads()
-
-
-def test_the_wheel_alone_has_the_command(empty_python: Path) -> None:
-    command = [empty_python.with_name("robomme-interference"), "--version"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.stdout == f"robomme-interference {CONFIG['project']['version']}\n", done.stderr
+    install = [uv, "pip", "install", "--quiet", "--offline", "--no-deps", "--python", python, wheel]
+    subprocess.run(install, check=True)
+    (site,) = tmp_path.glob("venv/lib/python*/site-packages")
+    (site / "numpy.pth").write_text(str(Path(np.__file__).parents[1]), encoding="utf-8")
+    for name, text in {"user.py": USER, "mistakes.py": MISTAKES}.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    settings = "[mypy]\nstrict = true\n[mypy-torch.*]\nfollow_imports = skip\n"
+    (tmp_path / "mypy.ini").write_text(settings, encoding="utf-8")
+    command = [
+        sys.executable,
+        "-m",
+        "mypy",
+        "--python-executable",
+        python,
+        "user.py",
+        "mistakes.py",
+    ]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    lines = done.stdout.splitlines()
+    assert [line.split(": ")[0] for line in lines if ": error: " in line] == [
+        "mistakes.py:5",
+        "mistakes.py:6",
+        "mistakes.py:7",
+    ], done.stdout + done.stderr
