@@ -74,9 +74,9 @@ from typing import assert_type, override
 import numpy as np
 from numpy.typing import NDArray
 from robomme_interference_data import (
-    Buffer, BufferManifest, BufferSet, Chunk, EpisodeId, Query, Session, load_buffer,
-    load_buffer_set,
+    Buffer, BufferManifest, BufferSet, Chunk, EpisodeId, Query, Session
 )
+from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.evaluate import Observation, Policy
 from robomme_interference_data.training import HistoryDataset
 
