@@ -166,4 +166,4 @@ def test_embeddings_without_units(whole: Path) -> None:
     """A buffer set lists its units; these are datasets that somebody chose."""
     datasets = {"demonstrations": load_buffer_set(whole).datasets["demonstrations"]}
     with pytest.raises(MissingFileError, match="distractors"):
-        BufferSetIndex(datasets, "thumbnail")
+        BufferSetIndex(datasets, "thumbnail", "front")
