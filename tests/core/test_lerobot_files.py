@@ -76,14 +76,23 @@ def test_values_frames_and_locations(root: Path) -> None:
 def test_several_files_statistics_and_tasks_as_pandas_writes_them(v30: Path) -> None:
     edit_columns(v30 / TABLE, **{"stats/state/mean": [[0.0]] * 3})
     whole = pq.read_table(v30 / TABLE)
-    pq.write_table(whole.slice(1), v30 / TABLE)
-    pq.write_table(whole.slice(0, 1), (v30 / TABLE).with_name("file-001.parquet"))
+    pq.write_table(whole.slice(0, 1), v30 / TABLE)
+    pq.write_table(whole.slice(1), (v30 / TABLE).with_name("file-001.parquet"))
     tasks = pa.table({"task_index": [0, 1], "__index_level_0__": ["one", "two"]})
     pq.write_table(tasks, v30 / "meta/tasks.parquet")
     lerobot = opened(v30)
     assert lerobot.table["episode_index"].to_pylist() == [0, 1, 2]
     assert "stats/state/mean" not in lerobot.row(2)  # statistics are never read
     assert set(lerobot.tasks) == {"one", "two"}
+
+
+def test_episodes_out_of_order(v30: Path) -> None:
+    """LeRobot finds an episode by its place in all files."""
+    whole = pq.read_table(v30 / TABLE)
+    pq.write_table(whole.slice(1), v30 / TABLE)
+    pq.write_table(whole.slice(0, 1), (v30 / TABLE).with_name("file-001.parquet"))
+    with pytest.raises(FormatError, match="each once and in order"):
+        _ = opened(v30).table
 
 
 # --- paths ---------------------------------------------------------------------------------------

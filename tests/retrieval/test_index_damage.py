@@ -12,7 +12,7 @@ from support.damage import flipped_bits
 from support.retrieval import change_header, make_index
 
 from robomme_interference_data import load_buffer, load_buffer_set
-from robomme_interference_data.data.embeddings import episode_file
+from robomme_interference_data.data.embeddings import BufferSetIndex, episode_file
 from robomme_interference_data.errors import FormatError, InterferenceError, MissingFileError
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.select import measure
@@ -162,10 +162,8 @@ def test_pool_statistics_are_only_in_the_index_of_units(whole: Path) -> None:
         check(whole)
 
 
-def test_a_buffer_set_without_units(whole: Path) -> None:
-    header = whole / "manifests/manifest.json"
-    values = json.loads(header.read_text())
-    del values["datasets"]["distractors"]
-    header.write_text(json.dumps(values))
+def test_embeddings_without_units(whole: Path) -> None:
+    """A buffer set lists its units; these are datasets that somebody chose."""
+    datasets = {"demonstrations": load_buffer_set(whole).datasets["demonstrations"]}
     with pytest.raises(MissingFileError, match="distractors"):
-        load_buffer(QUERIES[0], "k0", buffer_set=whole).embeddings("thumbnail")
+        BufferSetIndex(datasets, "thumbnail", "front")

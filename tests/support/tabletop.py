@@ -15,8 +15,14 @@ from support.buffer_sets import build, plan_again
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.questions import make_questions, write_questions
-from robomme_interference_data.build_dataset.sources import Frame, Recording, Source, SourceEpisode
-from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.build_dataset.sources import (
+    Frame,
+    Recording,
+    Robot,
+    Source,
+    SourceEpisode,
+)
+from robomme_interference_data.constants import FAMILIES, FPS, STATE, VALUE_NAMES
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.evidence import spans_of_parts
 from robomme_interference_data.simulators.tabletop import SUITE_VERSION
@@ -78,7 +84,8 @@ class Drawn(Source):
         seen = shown(len(parts))
         evidence = spans_of_parts(seen, parts)
         header = (scene.goal,), seed, difficulty_of(seed), "tabletop", True
-        return Recording(*header, self._frames(episode.key, seen), evidence)
+        robot = Robot(FPS, names={STATE: VALUE_NAMES})
+        return Recording(*header, self._frames(episode.key, seen), evidence, robot)
 
     def _frames(self, number: int, seen: Sequence[Sequence[int]]) -> Generator[Frame]:
         for place in range(UNIT):
