@@ -30,7 +30,8 @@ from robomme_interference_data.errors import MissingFileError, counted
 from robomme_interference_data.runtime.executor import WorkersConfig, make_executor
 
 from .config import AllConfig, BuildConfig, NewConfig, PlanConfig
-from .plan import BuildPlan, like, plan_all, plan_alone, plan_more_units, plan_new
+from .plan import BuildPlan, like, plan_all, plan_alone, plan_new
+from .plan_checks import plan_more_units
 from .replan import Replan, replan
 
 if TYPE_CHECKING:

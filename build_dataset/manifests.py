@@ -5,7 +5,7 @@ Rules 5 and 8 of the protocol. `schema/conditions.py` defines the content of a c
 """
 
 import shutil
-from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import batched
 from pathlib import Path
@@ -41,7 +41,6 @@ from robomme_interference_data.errors import (
     MissingFileError,
     SourceError,
 )
-from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, Condition, in_order
 from robomme_interference_data.schema.manifest import (
@@ -54,7 +53,7 @@ from robomme_interference_data.storage.hub import HubFiles
 from robomme_interference_data.storage.parquet import writing
 from robomme_interference_data.storage.staging import staging_dir
 
-from .alike import differences, in_buffers, unequal
+from .manifest_checks import check_executions, check_features, check_needs, check_scenes
 from .replan import Planned
 
 _BATCH = 1024
@@ -129,7 +128,7 @@ def plan_manifests(
                 f"Move it away, and build the {name} in its place.",
                 f"build {name} BUFFER_SET --source KIND:PATH",
             )
-    _check_features(opened)
+    check_features(opened)
     for name in {*UNITS} & opened.keys():
         splits = {record.episode_id.split for record in opened[name].records()}
         if splits != {"train"}:
@@ -145,80 +144,10 @@ def plan_manifests(
                 "Build both with the same `unit_frames` and `unit_stride`.",
             )
     if SHIFTED in opened:
-        _check_scenes(opened[SHIFTED], opened[DEMONSTRATIONS])
+        check_scenes(opened[SHIFTED], opened[DEMONSTRATIONS])
     if EXECUTIONS in opened:
-        _check_executions(opened[EXECUTIONS], opened[DEMONSTRATIONS])
+        check_executions(opened[EXECUTIONS], opened[DEMONSTRATIONS])
     return ManifestPlan(SessionSource(opened, seed), ordered, position_limit)
-
-
-def check_needs(conditions: Iterable[Condition], available: Collection[str]) -> None:
-    """Check that the available datasets are all that conditions need."""
-    for condition in conditions:
-        for name in condition.kind.needs:
-            if name not in available:
-                raise SourceError(
-                    f"{condition} needs the dataset {name}, which the buffer set lacks",
-                    f"Build it first, or leave {condition} out.",
-                    f"build {name} BUFFER_SET --source KIND:PATH",
-                )
-
-
-def _check_features(datasets: Mapping[str, Dataset]) -> None:
-    """Check that sessions of all datasets can follow one another in a buffer."""
-    looks = {name: in_buffers(dataset.features, dataset.fps) for name, dataset in datasets.items()}
-    base = (f"the {DEMONSTRATIONS}", looks[DEMONSTRATIONS])
-    for name, look in looks.items():
-        if found := differences(base, (f"the {name}", look)):
-            raise SourceError(
-                "sessions of the datasets cannot follow one another in a buffer: "
-                + "; ".join(found),
-                "Build all with the same `cameras`, from sources with the same rates and sizes.",
-            )
-
-
-def _check_scenes(shifted: Dataset, base: Dataset) -> None:
-    """Check that the views under shifts show the scenes of all demonstrations."""
-    sources, expected = ([*one.identity.sources] for one in (shifted, base))
-    views, queries = ({r.episode_id for r in one.records()} for one in (shifted, base))
-    problem = f"lacks {min(queries - views)}" if queries - views else ""
-    if other := [source for source in sources if source not in expected]:
-        nearest = next((one for one in expected if one["kind"] == other[0]["kind"]), expected[0])
-        found = unequal(("it", other[0]), (f"the {DEMONSTRATIONS}", nearest))
-        problem = f"is of another source: {'; '.join(found)}"
-    if problem:
-        raise SourceError(
-            f"{shifted.files.describe()} {problem}",
-            "Build it from all query episodes, or remove it.",
-            f"build {SHIFTED}",
-        )
-
-
-def _check_executions(executions: Dataset, base: Dataset) -> None:
-    """Check that every execution follows a demonstration: the same goals, seed and difficulty."""
-
-    def recorded(dataset: Dataset) -> dict[EpisodeId, dict[str, object]]:
-        return {
-            record.episode_id: {
-                "goals": " / ".join(record.goals),
-                "seed": record.seed,
-                "difficulty": record.difficulty,
-                "simulator": record.simulator,
-            }
-            for record in dataset.records()
-        }
-
-    expected = recorded(base)
-    for episode, metadata in recorded(executions).items():
-        if metadata != expected.get(episode):
-            found = [f"the {DEMONSTRATIONS} lack it"]
-            if episode in expected:
-                found = unequal(("it", metadata), (f"the {DEMONSTRATIONS}", expected[episode]))
-            raise SourceError(
-                f"{executions.files.describe()}: {episode} is of another recording: "
-                + "; ".join(found),
-                "Build both from the same recordings.",
-                f"build {EXECUTIONS}",
-            )
 
 
 def planned_buffers(plan: ManifestPlan) -> Iterator[BufferManifest]:

@@ -6,16 +6,14 @@ import re
 from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
-    DATASETS,
     DEMONSTRATIONS,
     DISTRACTORS,
     EXECUTIONS,
     LESSONS,
-    MANIFESTS,
     PAPER_UNIT,
     SHIFTED,
     SPLITS,
@@ -29,15 +27,12 @@ from robomme_interference_data.schema.conditions import datasets_of
 
 from .alike import Look, in_buffers
 from .config import NO_CAMERAS, AllConfig, BuildConfig, NewConfig, PlanConfig
-from .replan import Planned, Replan, replan
+from .plan_checks import check_plans, check_root
+from .replan import Replan, replan
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from robomme_interference_data.data.dataset import Dataset
-    from robomme_interference_data.schema.draw import UnitPool
 
-    from .existing import ExistingDataset
     from .sources import Source, SourceEpisode
 
 
@@ -83,7 +78,7 @@ def plan_all(config: AllConfig, request: PlanConfig) -> tuple[dict[str, BuildPla
         names.append(EXECUTIONS)
     plans = {name: plan_build(name, units if name in UNITS else config) for name in names}
     queries = {episode.id for _, episode in plans[DEMONSTRATIONS].tasks}
-    return plans, _check_plans(queries, plans, config.buffer_set, planned, request)
+    return plans, check_plans(queries, plans, config.buffer_set, planned, request)
 
 
 def plan_new(config: NewConfig, request: PlanConfig) -> "tuple[Dataset, BuildPlan, Replan]":
@@ -92,7 +87,8 @@ def plan_new(config: NewConfig, request: PlanConfig) -> "tuple[Dataset, BuildPla
     from robomme_interference_data.storage.files import LocalFiles
     from robomme_interference_data.storage.hub import locate
 
-    from .manifests import check_needs, in_folder, read_planned
+    from .manifest_checks import check_needs
+    from .manifests import in_folder, read_planned
 
     base = Dataset(locate(config.demonstrations))
     if base.kind != DEMONSTRATIONS:
@@ -113,74 +109,7 @@ def plan_new(config: NewConfig, request: PlanConfig) -> "tuple[Dataset, BuildPla
     units = like(plan_build(DISTRACTORS, _with_cameras_of(base, config)), base)
     queries = {record.episode_id for record in base.records()}
     plans = {DISTRACTORS: units}
-    return base, units, _check_plans(queries, plans, config.buffer_set, planned, request)
-
-
-def plan_more_units(units: BuildPlan, root: "Path") -> Replan | None:
-    """Return how further units would change the buffers that are planned; None if none are."""
-    from .existing import open_existing
-    from .manifests import read_planned
-
-    planned = read_planned(root)
-    if planned is None:
-        return None
-    existing = open_existing(root.resolve() / DISTRACTORS, units)
-    return replan(planned, PlanConfig(), units_change=_adds_episodes(units, existing))
-
-
-def _check_plans(
-    queries: set[EpisodeId],
-    plans: dict[str, BuildPlan],
-    root: "Path",
-    planned: Planned | None,
-    request: PlanConfig,
-) -> Replan:
-    """Check that datasets can be built or extended, and that units suffice; return the plan."""
-    from robomme_interference_data.schema.draw import UnitPool
-
-    from .existing import open_existing
-    from .manifests import check_manifests_folder
-
-    existing = {kind: open_existing(root.resolve() / kind, one) for kind, one in plans.items()}
-    if (base := existing.get(DEMONSTRATIONS)) is not None:
-        queries = queries | base.ids
-    units, built = plans[DISTRACTORS], existing[DISTRACTORS]
-    following = replan(planned, request, queries=queries, units_change=_adds_episodes(units, built))
-    available = {episode.id for _, episode in units.tasks}
-    pool = UnitPool(available if built is None else available | built.ids)
-    for query in {one.family: one for one in sorted(queries)}.values():
-        for condition in following.conditions:
-            condition.sessions(_UnreadSessions(query, pool))
-    check_manifests_folder(root)
-    return following
-
-
-def _adds_episodes(plan: BuildPlan, existing: "ExistingDataset | None") -> bool:
-    """Return whether a dataset lacks episodes that are to be built."""
-    if existing is None:
-        return True
-    known = {*existing.skipped, *map(str, existing.ids)}
-    return any(str(episode.id) not in known for _, episode in plan.tasks)
-
-
-@dataclass(frozen=True)
-class _UnreadSessions:
-    """Sources of a query's sessions, before data is read: drawing checks that units suffice."""
-
-    query: EpisodeId
-    pool: "UnitPool"
-
-    def lesson(self, part: str = "lesson") -> Any:
-        return self.query
-
-    def contradiction(self) -> Any:
-        return self.query
-
-    def units(self, k: int, dataset: str = DISTRACTORS) -> Sequence[Any]:
-        return self.pool.draw(self.query, k)
-
-    def own_units(self, k: int) -> Sequence[Any]:
-        return self.pool.draw_own(self.query, k)
+    return base, units, check_plans(queries, plans, config.buffer_set, planned, request)
 
 
 def plan_alone(kind: str, config: BuildConfig) -> BuildPlan:
@@ -220,7 +149,7 @@ def plan_build(
     from .frame_selection import unmarked_error
     from .sources import open_source
 
-    _check_root(config.buffer_set)
+    check_root(config.buffer_set)
     get_codec(config.codec)
     if not re.fullmatch(r"\d+\.\d+\.\d+", config.version, re.ASCII):
         raise InvalidOptionError.expected("version", config.version, "a version such as 1.0.0")
@@ -266,22 +195,6 @@ def plan_build(
         unit=unit,
         fps=config.fps,
     )
-
-
-def _check_root(root: "Path") -> None:
-    """Check that a folder is absent, empty or, as far as a build has come, a buffer set."""
-    from robomme_interference_data.storage.staging import staging_path
-
-    if root.exists() and not root.is_dir():
-        raise BuildError(f"{root} is a file", "Choose another `buffer_set`.")
-    known = [root / name for name in (*DATASETS, MANIFESTS)]
-    if not root.exists() or any(path.exists() or staging_path(path).exists() for path in known):
-        return
-    if other := sorted(path.name for path in root.iterdir() if not path.name.startswith(".")):
-        raise BuildError(
-            f"{root} holds {other[0]}, and nothing of a buffer set",
-            "Choose a new or empty folder as `buffer_set`.",
-        )
 
 
 def _columns(texts: Sequence[str]) -> dict[str, str]:

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from support import worlds
-from support.buffer_sets import GOLDEN, copy_buffer_set
+from support.buffer_sets import GOLDEN, build, copy_buffer_set, plan_again
 from support.chat_server import ChatServer
 from support.hub import push_buffer_set
 from support.page_scripts import Step, folder_on_path, steps_of, words_of
@@ -23,6 +23,7 @@ from support.recordings import make_episode, rows_of, write_table, write_video
 from support.serve_policy import command as serve_command
 from support.tabletop import copy_tabletop
 
+from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.evaluate.run import evaluation as run_module
 from robomme_interference_data.runtime.executor import Serial
 
@@ -36,10 +37,16 @@ NOT_RUN = {
     ("lerobot-policy.md", "build all my-training"): "hours of simulation",
     ("many-machines.md", "evaluate namespace/name --executor ray"): "a cluster; test_cluster.py",
     ("many-machines.md", "index my-buffers --encoder siglip"): "a cluster and 3.5 GB of weights",
-    ("official-simulator.md", "simulate --simulator robomme"): "RoboMME; test_robomme.py",
-    ("official-simulator.md", "build demonstrations"): "RoboMME; test_robomme.py",
+    (
+        "official-simulator.md",
+        "simulate --simulator robomme",
+    ): "RoboMME; test_robomme_whole.py goes this way with a stand-in",
+    (
+        "official-simulator.md",
+        "build demonstrations",
+    ): "RoboMME; test_robomme_whole.py goes this way with a stand-in",
     ("official-simulator.md", "build distractors"): "RoboMME's recordings; test_source_h5.py",
-    ("official-simulator.md", "evaluate my-buffers --simulator robomme"): "RoboMME",
+    ("official-simulator.md", "evaluate my-buffers --simulator robomme"): "the same",
     ("paper-systems.md", "evaluate "): "released checkpoints and RoboMME; test_systems.py",
     ("paper-systems.md", "index my-buffers --encoder siglip"): "3.5 GB of weights",
     ("publish-results.md", "score theirs/rollouts.jsonl"): "results that others published",
@@ -82,6 +89,15 @@ def trained(folder: Path) -> None:
         copy_tabletop(folder / name)
 
 
+def executed(folder: Path) -> None:
+    """A buffer set with executions."""
+    golden(folder)
+    families = ("VideoRepick", "MoveCube", "PatternLock")
+    source = SampleSource(size=32)
+    build(folder / "my-buffers", "executions", source, families=families, split="test")
+    plan_again(folder / "my-buffers")
+
+
 def nothing(folder: Path) -> None:
     """The page makes what it needs."""
 
@@ -104,6 +120,7 @@ PREPARED: dict[str, Callable[[Path], None]] = {
     "retrieval.md": nothing,
     "train-a-policy.md": trained,
     "vision-language-model.md": asked,
+    "your-own-policy.md": executed,
     "your-own-recordings.md": nothing,
 }
 """The data that a page starts from, where that is not any buffer set `my-buffers`."""
@@ -179,7 +196,7 @@ def _run_command(
     for shown, meant in stand_ins.items():
         text = text.replace(shown, meant)
     words = words_of(Step("command", text))
-    if words[0] == "evaluate" and page not in REAL:
+    if words[0] == "evaluate" and page not in REAL and "--offline" not in words:
         words += ["--simulator", "support.worlds:World"]
     path = folder_on_path(step, ROOT)
     if path is not None:

@@ -1,0 +1,81 @@
+"""Whether the datasets of a buffer set fit each other, and the conditions that are planned."""
+
+from collections.abc import Collection, Iterable, Mapping
+
+from robomme_interference_data.constants import DEMONSTRATIONS, EXECUTIONS, SHIFTED
+from robomme_interference_data.data.dataset import Dataset
+from robomme_interference_data.errors import SourceError
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.schema.conditions import Condition
+
+from .alike import differences, in_buffers, unequal
+
+
+def check_needs(conditions: Iterable[Condition], available: Collection[str]) -> None:
+    """Check that the available datasets are all that conditions need."""
+    for condition in conditions:
+        for name in condition.kind.needs:
+            if name not in available:
+                raise SourceError(
+                    f"{condition} needs the dataset {name}, which the buffer set lacks",
+                    f"Build it first, or leave {condition} out.",
+                    f"build {name} BUFFER_SET --source KIND:PATH",
+                )
+
+
+def check_features(datasets: Mapping[str, Dataset]) -> None:
+    """Check that sessions of all datasets can follow one another in a buffer."""
+    looks = {name: in_buffers(dataset.features, dataset.fps) for name, dataset in datasets.items()}
+    base = (f"the {DEMONSTRATIONS}", looks[DEMONSTRATIONS])
+    for name, look in looks.items():
+        if found := differences(base, (f"the {name}", look)):
+            raise SourceError(
+                "sessions of the datasets cannot follow one another in a buffer: "
+                + "; ".join(found),
+                "Build all with the same `cameras`, from sources with the same rates and sizes.",
+            )
+
+
+def check_scenes(shifted: Dataset, base: Dataset) -> None:
+    """Check that the views under shifts show the scenes of all demonstrations."""
+    sources, expected = ([*one.identity.sources] for one in (shifted, base))
+    views, queries = ({r.episode_id for r in one.records()} for one in (shifted, base))
+    problem = f"lacks {min(queries - views)}" if queries - views else ""
+    if other := [source for source in sources if source not in expected]:
+        nearest = next((one for one in expected if one["kind"] == other[0]["kind"]), expected[0])
+        found = unequal(("it", other[0]), (f"the {DEMONSTRATIONS}", nearest))
+        problem = f"is of another source: {'; '.join(found)}"
+    if problem:
+        raise SourceError(
+            f"{shifted.files.describe()} {problem}",
+            "Build it from all query episodes, or remove it.",
+            f"build {SHIFTED}",
+        )
+
+
+def check_executions(executions: Dataset, base: Dataset) -> None:
+    """Check that every execution follows a demonstration: the same goals, seed and difficulty."""
+
+    def recorded(dataset: Dataset) -> dict[EpisodeId, dict[str, object]]:
+        return {
+            record.episode_id: {
+                "goals": " / ".join(record.goals),
+                "seed": record.seed,
+                "difficulty": record.difficulty,
+                "simulator": record.simulator,
+            }
+            for record in dataset.records()
+        }
+
+    expected = recorded(base)
+    for episode, metadata in recorded(executions).items():
+        if metadata != expected.get(episode):
+            found = [f"the {DEMONSTRATIONS} lack it"]
+            if episode in expected:
+                found = unequal(("it", metadata), (f"the {DEMONSTRATIONS}", expected[episode]))
+            raise SourceError(
+                f"{executions.files.describe()}: {episode} is of another recording: "
+                + "; ".join(found),
+                "Build both from the same recordings.",
+                f"build {EXECUTIONS}",
+            )
