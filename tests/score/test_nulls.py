@@ -61,7 +61,7 @@ def made_up(
     shape = (systems, len(conditions))
     return Outcomes(
         *("made-up", names, tuple(conditions), EPISODES, (0,), status),
-        *(np.full(status.shape, np.nan), steps),
+        *(np.full(status.shape, np.nan), steps, np.full(status.shape, np.nan)),
         *(np.zeros(len(EPISODES), int), np.full(len(EPISODES), np.nan), every),
         *(np.ones(shape, bool), np.zeros(systems, bool)),
     )

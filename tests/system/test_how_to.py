@@ -61,6 +61,8 @@ NOT_RUN = {
     ("vla-eval.md", "evaluate my-buffers --policy vla-eval"): "a server; test_vla_eval.py",
     ("vla-eval.md", "score results/*_aggregate.json"): "vla-eval's results; its own test",
     ("your-own-policy.md", "evaluate my-buffers --policy lerobot"): "a checkpoint",
+    ("your-own-policy.md", "evaluate my-buffers --policy hold"): "executions; test_offline.py",
+    ("your-own-policy.md", "evaluate my-buffers --policy mean"): "executions; test_offline.py",
     ("your-own-policy.md", "score runs/offline"): "rows of that checkpoint; test_offline.py",
     ("your-own-policy.md", "from pathlib import Path"): "starts processes; test_run.py",
     ("publish-buffers.md", "from datasets import load_dataset"): "reads the Hub; test_cards.py",

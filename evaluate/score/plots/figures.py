@@ -279,10 +279,13 @@ def _pairs(axes: Any, data: Data, condition: str, found: Sequence[Contrast], wid
         else:
             axes.add_patch(cell_box(x, y))
     axes.imshow(values, cmap="RdBu", vmin=-2 * widest, vmax=2 * widest, aspect="auto")
-    labels = [[fill(data.styles[name].label, 20) for name in names] for names in (columns, rows)]
-    turned = 90 if len(columns) > 3 else 0
-    axes.set_xticks(range(len(columns)), labels[0], size=curves.SMALL, rotation=turned)
-    axes.set_yticks(range(len(rows)), labels[1], size=curves.SMALL)
+    turned = len(columns) > 3
+    heads = [data.styles[name].label for name in columns]
+    if not turned:
+        heads = [fill(head, 20) for head in heads]
+    names = [fill(data.styles[name].label, 20) for name in rows]
+    axes.set_xticks(range(len(columns)), heads, size=curves.SMALL, rotation=90 if turned else 0)
+    axes.set_yticks(range(len(rows)), names, size=curves.SMALL)
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
     axes.set_title(condition, size=curves.HEADING, color=INK)
