@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from robomme_interference_data.data.fetch import FetchConfig
-from robomme_interference_data.errors import InvalidOptionError, counted
+from robomme_interference_data.errors import InterferenceError, InvalidOptionError, counted
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
 
 from .console import check_output, echo, graceful_interrupt, print_json, print_status
@@ -218,9 +218,13 @@ def _write_page(
     cameras, retrieved = tuple(live), []
     encoders = indexed_encoders(opened.datasets[DISTRACTORS], cameras[0]) if len(buffer) else []
     for name in encoders:
-        rule = Rule.parse("max", published_threshold(name))
-        query = live_embedding(opened, buffer, shift, name, cameras[0])
-        measured = measure(buffer, name, cameras[0], query)
+        try:
+            rule = Rule.parse("max", published_threshold(name))
+            query = live_embedding(opened, buffer, shift, name, cameras[0])
+            measured = measure(buffer, name, cameras[0], query)
+        except InterferenceError as error:  # such as another dataset without these embeddings
+            print_status(f"The page does not show retrieval by {name}: {error.message}")
+            continue
         choice = choose(measured, rule)
         grade = explain(buffer, measured, choice, rule, name, cameras[0]).graded()
         retrieved.append(RetrievedPart(f"{name}/{rule}", choice.frames.tolist(), grade))
