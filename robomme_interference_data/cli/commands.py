@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from robomme_interference_data.data.fetch import FetchConfig
-from robomme_interference_data.errors import InvalidOptionError, counted
+from robomme_interference_data.errors import InterferenceError, InvalidOptionError, counted
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
 
 from .console import check_output, echo, graceful_interrupt, print_json, print_status
@@ -24,6 +24,11 @@ from .options import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import numpy as np
+    from numpy.typing import NDArray
+
     from robomme_interference_data.data.buffer import Buffer
     from robomme_interference_data.data.buffer_set import BufferSet
     from robomme_interference_data.schema.shifts import Shift
@@ -104,23 +109,26 @@ def show(
     html: Annotated[
         Path | None, typer.Option(help="Web page to write, with the videos in it, .html.")
     ] = None,
+    rerun: Annotated[
+        Path | None, typer.Option(help="Recording for the Rerun viewer to write, .rrd.")
+    ] = None,
     camera: Annotated[
         str | None,
-        typer.Option(help="Camera of --out (default: the first) and --html (default: all)."),
+        typer.Option(help="Camera to show; default: the first in --out, all in other files."),
     ] = None,
-    shift: Annotated[str, typer.Option(help=f"{SHIFT_HELP} Needs --out or --html.")] = NO_SHIFT,
+    shift: Annotated[str, typer.Option(help=f"{SHIFT_HELP} For files only.")] = NO_SHIFT,
     as_json: AsJson = False,
 ) -> None:
     """Show the sessions of one buffer as a table; as a film strip (--out) or a web page (--html).
 
-    The page plays the stored videos, and shows what an even sample and retrieval keep. It needs no
-    other file: it takes about 18 KB per frame and camera of 256 × 256 pixels.
+    The web page plays the stored videos, and shows what an even sample and retrieval keep. It needs
+    no other file, and takes up to 18 KB per frame and camera of 256 × 256 pixels.
 
     Examples:
     ```
     robomme-interference show my-buffers VideoRepick/test/7 k3
     robomme-interference show my-buffers VideoRepick/test/7 k7 --out strip.png
-    robomme-interference show my-buffers VideoRepick/test/7 k7 --html page.html
+    robomme-interference show my-buffers VideoRepick/test/7 k7 --html page.html --camera front
     robomme-interference show my-buffers MoveCube/test/0 k1 --shift light:2 --out strip.png
     ```
     """
@@ -129,12 +137,12 @@ def show(
     from robomme_interference_data.schema.codec import to_dict
     from robomme_interference_data.viz.tables import Table
 
-    check_output(out, html)
+    check_output(out, html, rerun)
     scene_shift = parse_shift(shift)
     for name, given in (("shift", scene_shift and shift), ("camera", camera)):
-        if given is not None and out is None and html is None:
+        if given is not None and out is html is rerun is None:
             raise InvalidOptionError(
-                f"--{name} {given} has no effect without --out or --html",
+                f"--{name} {given} has no effect without a file to write",
                 f"Add --out strip.png or --html page.html, or omit --{name}.",
             )
     opened = load_buffer_set(buffer_set)
@@ -146,8 +154,17 @@ def show(
         live = live_frame(opened, buffer, scene_shift, drawn)
         draw_strip(buffer, out, camera=drawn, live=live)
         print_status(f"{out} written")
-    if html is not None:
-        _write_page(opened, buffer, html, camera, scene_shift)
+    if html is not None or rerun is not None:
+        dataset = buffer.query.dataset
+        cameras = (dataset.camera(camera),) if camera or not buffer.cameras else buffer.cameras
+        lives = {name: live_frame(opened, buffer, scene_shift, name) for name in cameras}
+        if html is not None:
+            _write_page(opened, buffer, html, lives, scene_shift)
+        if rerun is not None:
+            from robomme_interference_data.viz.rerun_file import write_recording
+
+            write_recording(buffer, rerun, lives)
+            print_status(f"{rerun} written")
     manifest, evidence = buffer.manifest, buffer.evidence
     if as_json:
         spans = None if evidence is None else [one.to_dict() for one in evidence]
@@ -181,12 +198,16 @@ def show(
 
 
 def _write_page(
-    opened: "BufferSet", buffer: "Buffer", html: Path, camera: str | None, shift: "Shift | None"
+    opened: "BufferSet",
+    buffer: "Buffer",
+    html: Path,
+    live: "Mapping[str, NDArray[np.uint8]]",
+    shift: "Shift | None",
 ) -> None:
     """Write the page of a buffer, with what retrieval chooses by each encoder that has an index."""
     from robomme_interference_data.constants import DISTRACTORS
     from robomme_interference_data.data.embeddings import indexed_encoders
-    from robomme_interference_data.data.views import live_embedding, live_frame
+    from robomme_interference_data.data.views import live_embedding
     from robomme_interference_data.retrieval.encoders import published_threshold
     from robomme_interference_data.retrieval.explain import explain
     from robomme_interference_data.retrieval.select import Rule, choose, measure
@@ -194,19 +215,20 @@ def _write_page(
 
     if html.suffix.lower() not in (".html", ".htm"):
         raise InvalidOptionError.expected("--html", str(html), "a name that ends in .html")
-    dataset = buffer.query.dataset
-    cameras = (dataset.camera(camera),) if camera or not buffer.cameras else buffer.cameras
-    retrieved = []
+    cameras, retrieved = tuple(live), []
     encoders = indexed_encoders(opened.datasets[DISTRACTORS], cameras[0]) if len(buffer) else []
     for name in encoders:
-        rule = Rule.parse("max", published_threshold(name))
-        query = live_embedding(opened, buffer, shift, name, cameras[0])
-        measured = measure(buffer, name, cameras[0], query)
+        try:
+            rule = Rule.parse("max", published_threshold(name))
+            query = live_embedding(opened, buffer, shift, name, cameras[0])
+            measured = measure(buffer, name, cameras[0], query)
+        except InterferenceError as error:  # such as another dataset without these embeddings
+            print_status(f"The page does not show retrieval by {name}: {error.message}")
+            continue
         choice = choose(measured, rule)
         grade = explain(buffer, measured, choice, rule, name, cameras[0]).graded()
         retrieved.append(RetrievedPart(f"{name}/{rule}", choice.frames.tolist(), grade))
     buffer.fetch(cameras)
-    live = {name: live_frame(opened, buffer, shift, name) for name in cameras}
     size = write_page(opened, buffer, html, live, retrieved)
     print_status(f"{html} written, {size / 1e6:,.1f} MB with {counted(len(cameras), 'camera')}")
 

@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -123,6 +124,10 @@ def test_the_command_writes_a_page(own_buffers: Path, tmp_path: Path, run: Run) 
     code, _, err = run("show", root, QUERY, "k3", "--html", out, "--camera", "wrist")
     assert code == 0 and "1 camera" in err and len(out.read_text()) < len(whole)
     assert "<figcaption>front" not in out.read_text()
+    shutil.rmtree(root / "demonstrations" / "index")
+    code, _, err = run("show", root, QUERY, "k3", "--html", out)
+    assert code == 0 and "does not show retrieval by thumbnail" in err
+    assert "thumbnail/max" not in out.read_text()
     assert run("show", root, QUERY, "k3", "--html", tmp_path / "page.png")[0] == 1
     assert run("show", root, QUERY, "k3", "--html", root / "manifests" / "page.html")[0] == 1
     assert not (tmp_path / "page.png").exists()

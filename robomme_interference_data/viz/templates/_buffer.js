@@ -28,12 +28,11 @@ function load(place, file) {
   return ready;
 }
 
-function seek(video, time) {
-  if (Math.abs(video.currentTime - time) < 1e-6) return Promise.resolve();
-  return new Promise((resolve) => {
-    video.addEventListener("seeked", resolve, { once: true });
-    video.currentTime = time;
-  });
+async function seek(video, time) {
+  if (Math.abs(video.currentTime - time) > 1e-6) video.currentTime = time;
+  // An event may belong to an earlier seek.
+  while (video.seeking)
+    await new Promise((resolve) => video.addEventListener("seeked", resolve, { once: true }));
 }
 
 async function show(index) {
