@@ -297,7 +297,7 @@ def test_no_reader_takes_rows_that_the_rules_do_not_give(
         "ceiling": lambda: ceiling(load_buffer_set(root), CeilingConfig(conditions=("k1",))),
         "train": train,
         "grade": lambda: _measured(
-            str(root), "thumbnail", "front", "none", (), ("k1",), quiet=True
+            load_buffer_set(root), "thumbnail", "front", "none", (), ("k1",), quiet=True
         ),
     }
     with pytest.raises(HashMismatchError, match="is not what the rules give"):
