@@ -35,14 +35,11 @@ from robomme_interference_data.errors import (
     counted,
 )
 from robomme_interference_data.ids import parse_numbers
-from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.manifest import FetchRecord
 from robomme_interference_data.schema.settings import setting
 from robomme_interference_data.storage.files import atomic_path, sha256_file, write_json
 from robomme_interference_data.storage.hub import HubFiles
 from robomme_interference_data.storage.staging import staging_dir
-
-from .fetched_copy import read_fetch_record
 
 if TYPE_CHECKING:
     from .buffer_set import BufferSet
@@ -198,6 +195,8 @@ def _earlier_files(to: Path, header: Path) -> tuple[str, ...]:
     """Return the files of an earlier copy in a folder; check that it holds nothing else."""
     if not to.exists() or (to.is_dir() and not any(to.iterdir())):
         return ()
+    from .fetched_copy import read_fetch_record
+
     record = read_fetch_record(to) if to.is_dir() else None
     if record is None:
         raise InvalidOptionError(f"{to} exists, and is no copy of a buffer set", _ANOTHER_FOLDER)
@@ -234,6 +233,8 @@ def _move(staged: Path, to: Path, record: FetchRecord, copied: Collection[str]) 
     The record is there first, so that the next call knows the folder if the process is killed in
     between; the header of the manifests, without which the folder is no buffer set, comes last.
     """
+    from robomme_interference_data.schema.codec import to_dict
+
     if not (to / FETCH_RECORD).is_file():
         write_json(to / FETCH_RECORD, to_dict(record))
     for path in sorted(copied, key=lambda path: (path == MANIFEST_PATH, path)):

@@ -19,7 +19,7 @@ from robomme_interference_data.evaluate.score.tables.model import Fit, fit_withi
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.stats.bootstrap import Floats
 
-PAGE = Path(__file__).parents[2] / "docs" / "explanation" / "statistics.md"
+PAGE = Path(__file__).parents[2] / "docs" / "results" / "simulated-grids.md"
 
 
 def scored(tmp_path: Path, outcomes: dict[tuple[str, str], str], **values: object) -> made.Score:

@@ -1,6 +1,6 @@
 """Sizes of tests and coverage of intervals where nothing differs, in 300 made-up grids a case.
 
-The numbers are those of docs/explanation/statistics.md.
+The numbers are those of docs/results/simulated-grids.md.
 """
 
 import json
@@ -39,7 +39,7 @@ pytestmark = pytest.mark.slow
 GRIDS = 300
 CONDITIONS = ("k0", "k1", "k3", "k7")
 EPISODES = tuple(EpisodeId(family, "test", index) for family in FAMILIES for index in range(50))
-PAGE = Path(__file__).parents[2] / "docs" / "explanation" / "statistics.md"
+PAGE = Path(__file__).parents[2] / "docs" / "results" / "simulated-grids.md"
 
 # Systems, and the share of the variance of an episode's difficulty that systems have in common.
 CASES = {"6 systems": (6, 0.5), "12 systems": (12, 0.5), "12 systems, independent": (12, 0.0)}

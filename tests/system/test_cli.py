@@ -71,7 +71,8 @@ def test_help_of_every_command(path: tuple[str, ...], run: Run) -> None:
     code, out, err = run(*path, "--help")
     assert (code, err) == (0, "")
     assert "Usage: robomme-interference" in out
-    assert max(map(len, out.splitlines())) <= 80
+    # An address is not broken: it is copied.
+    assert max(len(line) for line in out.splitlines() if "://" not in line) <= 80
     assert "robomme-interference " in out.split("Usage:")[1].split("\n", 1)[1], "no example"
     for parameter in ALL[path].params:
         if parameter.name != "help":
