@@ -28,6 +28,9 @@ RENDERER = "robomme_interference_data.simulators.tabletop.renderer"
 ORACLE_EPISODE = "VideoUnmask/test/0"
 """The shortest of RoboMME's episodes."""
 
+TORCH_EXTRAS = ("build", "sim", "retrieval", "vlm", "train")
+"""Extras with PyTorch, whose build for Linux has all of CUDA."""
+
 RENDERER_S, ROBOMME_S, HUB_S = 30, 120, 10
 """Time limits of the checks, in seconds."""
 
@@ -110,6 +113,8 @@ def check_packages(extra: str = "") -> Check:
         versions = ", ".join(f"{one.name} {metadata.version(one.name)}" for one in required)
         return Check(name, True, versions)
     if extra:
+        if extra in TORCH_EXTRAS and util.find_spec("torch") is None:
+            problems.append("brings PyTorch for CUDA, 5 GB; for the CPU: uv, --torch-backend cpu")
         return Check(name, None, ", ".join(problems), f'pip install "{DISTRIBUTION}[{extra}]"')
     fix = f"pip install --force-reinstall {DISTRIBUTION}"
     return Check(name, False, ", ".join(problems), fix)
