@@ -3,6 +3,7 @@
 import logging
 import os
 import socket
+import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 
@@ -59,6 +60,11 @@ def reserve_port() -> Iterator[int]:
     same port, and one of them would get both rollouts. So the reservation is an abstract socket
     (Linux) with the port in its name, which all users and containers that share the port see.
     """
+    if sys.platform != "linux":
+        raise PolicyServerError(
+            "workers start policy servers on Linux only",
+            "Start the server yourself, and give its address: websocket://HOST:PORT",
+        )
     with ExitStack() as stack:
         for port in _PORTS:
             name = stack.enter_context(socket.socket(socket.AF_UNIX))

@@ -5,6 +5,7 @@ task that hangs. Pebble can, but neither retries it, nor ends the processes that
 reports where it hung.
 """
 
+import os
 import platform
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterable, Iterator, Sequence
@@ -13,7 +14,7 @@ from dataclasses import dataclass, fields, replace
 from importlib import metadata
 from typing import Any
 
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import InvalidOptionError, WorkerError
 from robomme_interference_data.lazy import load_extra
 from robomme_interference_data.schema.settings import setting
 
@@ -195,6 +196,11 @@ class Processes(Executor):
     def __post_init__(self) -> None:
         if self.workers < 1:
             raise InvalidOptionError.expected("workers", self.workers, "1 or more")
+        if not hasattr(os, "setpgid"):  # a worker ends with its process group
+            raise WorkerError(
+                "worker processes need Linux or macOS",
+                "Use one of them, such as the Windows Subsystem for Linux.",
+            )
 
     @contextmanager
     def session(self, function: Task) -> Iterator[Session]:

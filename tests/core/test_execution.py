@@ -1,5 +1,6 @@
 """What every executor does, shown by the one in this process."""
 
+import os
 import re
 import sys
 from typing import Any
@@ -11,6 +12,7 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     MissingExtraError,
     SimulatorCrashError,
+    WorkerError,
     WorkerRetiredError,
 )
 from robomme_interference_data.ids import EpisodeId
@@ -155,3 +157,10 @@ def test_a_function_describes_what_must_be_equal_on_all_nodes() -> None:
 
     assert {"python", "robomme-interference-data"} == describe(Noted()).keys()
     assert describe(Described())["the buffer set's revision"] == "abc"
+
+
+def test_worker_processes_on_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(os, "setpgid")
+    with pytest.raises(WorkerError) as caught:
+        make_executor(WorkersConfig())
+    assert caught.value.hint
