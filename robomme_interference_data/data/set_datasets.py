@@ -85,8 +85,9 @@ class SetDatasets(Mapping[str, Dataset]):
     @cached_property
     def _names(self) -> tuple[str, ...]:
         """All that are planned; in a partial copy, those that are there."""
-        buffer_set, names = self._buffer_set, tuple(self._buffer_set.header.datasets)
-        copy = buffer_set.copy
-        if copy is None:
-            return names
-        return tuple(n for n in names if copy.has_dataset(n, buffer_set.dataset_files(n)))
+        buffer_set, copy = self._buffer_set, self._buffer_set.copy
+        return tuple(
+            name
+            for name in buffer_set.header.datasets
+            if copy is None or copy.has_dataset(buffer_set.dataset_files(name))
+        )

@@ -105,6 +105,7 @@ def test_optional_datasets_are_published_and_fetched(
     finish("fetch", UNITS, "--conditions", "k1", "--to", part)
     assert load_buffer_set(part).load(QUERY, "k1", verify=True).condition == "k1"
     assert not list(part.rglob("contradictions/videos"))
+    finish("verify", part)
 
 
 @pytest.mark.slow
@@ -131,6 +132,8 @@ def test_executions_are_published_and_fetched(
     finish("fetch", UNITS, *words, "--to", folders["with"])
     videos = {name: len([*(one / EXECUTIONS).rglob("*.mp4")]) for name, one in folders.items()}
     assert videos == {"whole": 6, "part": 0, "with": 1}
+    finish("verify", folders["part"])
+    finish("verify", folders["with"])
 
 
 @pytest.mark.slow
@@ -157,3 +160,4 @@ def test_views_under_shifts_are_published_and_fetched(
                 expected = live_embedding(original, own, shift, "thumbnail")
                 assert (embedding == expected).all()
     assert list(verify_buffer_set(published)) == []
+    finish("verify", part)
