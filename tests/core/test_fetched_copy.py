@@ -95,6 +95,7 @@ def test_commands_work_on_a_part(part: Path, run: Run, tmp_path: Path) -> None:
     assert "holds 3 of the 15 buffers" in err and "fetch" in err
     assert run("verify", part)[0] == 0
     assert run("show", part, "MoveCube/test/0", "k1", "--out", tmp_path / "strip.png")[0] == 0
+    assert run("show", part, "MoveCube/test/0", "k1", "--html", tmp_path / "page.html")[0] == 0
     assert run("ceiling", part)[0] == run("ceiling", GOLDEN)[0]
     code, _, err = run("show", part, "MoveCube/test/0", "k7")
     assert code == 1 and f"--to {part} --conditions k7" in err
