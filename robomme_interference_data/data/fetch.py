@@ -136,10 +136,12 @@ def plan_fetch(buffer_set: "BufferSet", config: FetchConfig) -> list[Part]:
         if files is buffer_set.files:
             paths |= {MANIFEST_PATH, _ROWS_PATH}
             sums[_ROWS_PATH] = buffer_set.header.rows
-            if QUESTIONS_PATH in sizes and (whole or config.questions):
+            questions = buffer_set.header.questions
+            if config.questions and questions is None:
+                raise MissingFileError(f"{buffer_set.location} has no questions")
+            if questions is not None and (whole or config.questions):
                 paths.add(QUESTIONS_PATH)
-                if buffer_set.header.questions is not None:
-                    sums[QUESTIONS_PATH] = buffer_set.header.questions
+                sums[QUESTIONS_PATH] = questions
         for name, dataset in datasets.items():
             if dataset.files is files:
                 listed = _listed(dataset)

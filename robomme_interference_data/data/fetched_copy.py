@@ -3,7 +3,8 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robomme_interference_data.constants import FETCH_RECORD, INFO_PATH
+from robomme_interference_data.constants import FETCH_RECORD, INFO_PATH, QUESTIONS_PATH
+from robomme_interference_data.errors import MissingFileError
 from robomme_interference_data.schema.manifest import BufferManifest, FetchRecord
 from robomme_interference_data.storage.files import Files, LocalFiles, read_header
 
@@ -46,6 +47,19 @@ class FetchedCopy:
         """The command that adds all that it lacks."""
         return fetch_command(self.root, self.record)
 
+    def not_fetched(self, what: str, options: str = "") -> MissingFileError:
+        """Return the error about what a partial copy lacks.
+
+        Args:
+            what: What it lacks, in the plural.
+            options: Options with which `fetch` adds it; empty for everything.
+        """
+        return MissingFileError(
+            f"{what} are not in {self.root}, a copy of a part of {self.record.location}",
+            "Fetch them too.",
+            f"{self.refetch} {options}".strip(),
+        )
+
     def has_dataset(self, files: Files) -> bool:
         """Whether the metadata of a dataset is here, or on the Hub, from which it is read."""
         return not isinstance(files, LocalFiles) or self.lists(files.root, INFO_PATH)
@@ -76,6 +90,22 @@ class FetchedCopy:
         return all(
             name in buffer_set.datasets and self.holds(buffer_set.datasets[name], index)
             for name, index in episodes
+        )
+
+    def is_whole(self, buffer_set: "BufferSet") -> bool:
+        """Whether all files of all datasets are here, and the questions."""
+        header = buffer_set.header
+        if header.questions is not None and not self.lists(self.root, QUESTIONS_PATH):
+            return False
+        return all(
+            name in buffer_set.datasets and self._is_whole(buffer_set.datasets[name])
+            for name in header.datasets
+        )
+
+    def _is_whole(self, dataset: Dataset) -> bool:
+        files = dataset.files
+        return not isinstance(files, LocalFiles) or all(
+            self.lists(files.root, path) for path in dataset.sums()
         )
 
     def _episodes(self, dataset: Dataset) -> dict[int, frozenset[str]]:

@@ -63,12 +63,13 @@ class SetDatasets(Mapping[str, Dataset]):
             recorded = self._buffer_set.header.datasets[name]
             dataset = Dataset(self._buffer_set.dataset_files(name))
             if dataset.revision != recorded.revision:
-                local = isinstance(self._buffer_set.files, LocalFiles)
                 raise HashMismatchError(
                     f"{dataset.files.describe()} has revision {dataset.revision[:12]}…; the "
                     f"manifests were made for {recorded.revision[:12]}…",
                     self._buffer_set.fix,
-                    f"build manifests {self._buffer_set.location}" if local else None,
+                    f"build manifests {self._buffer_set.location}"
+                    if self._buffer_set.is_own
+                    else None,
                 )
             self._opened[name] = dataset
         return self._opened[name]

@@ -13,9 +13,11 @@ from support import runs, worlds
 from support.buffer_sets import GOLDEN, copy_buffer_set
 from support.hub import BUFFER_SET, push_buffer_set
 from support.hub_server import HubServer
+from support.tabletop import TABLETOP
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.verify import verify_buffer_set
+from robomme_interference_data.data.questions import read_questions
 from robomme_interference_data.errors import (
     FormatError,
     HashMismatchError,
@@ -99,6 +101,37 @@ def test_commands_work_on_a_part(part: Path, run: Run, tmp_path: Path) -> None:
     assert run("ceiling", part)[0] == run("ceiling", GOLDEN)[0]
     code, _, err = run("show", part, "MoveCube/test/0", "k7")
     assert code == 1 and f"--to {part} --conditions k7" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "command"),
+    [
+        ("publish {} --repo-id someone/other --dry-run", "fetch"),
+        ("index {}", "fetch"),
+        ("build manifests {} --conditions before-k1", "new-buffer-set"),
+        ("list {} --conditions before-k1", "new-buffer-set"),
+        ("build questions {}", "new-buffer-set"),
+    ],
+)
+def test_a_part_is_neither_changed_nor_published(
+    part: Path, run: Run, words: str, command: str
+) -> None:
+    before = digests(part)
+    code, _, err = run(*words.format(part).split())
+    assert code == 1 and f"\nRun: robomme-interference {command} " in err
+    assert digests(part) == before
+
+
+def test_questions_that_were_not_fetched(hub: HubServer, run: Run, tmp_path: Path) -> None:
+    push_buffer_set(hub, TABLETOP, tmp_path / "work")
+    words = ("--families", "MoveCube", "--conditions", "k0")
+    assert run("fetch", BUFFER_SET, *words, "--to", tmp_path / "part")[0] == 0
+    part = load_buffer_set(tmp_path / "part")
+    with pytest.raises(MissingFileError) as caught:
+        read_questions(part)
+    assert caught.value.command == f"{part.copy.refetch} --questions"  # type: ignore[union-attr]
+    assert run("fetch", BUFFER_SET, *words, "--questions", "--to", tmp_path / "part")[0] == 0
+    assert {*load_buffer_set(tmp_path / "part").episode_ids} <= {*read_questions(part)}
 
 
 def test_a_run_on_a_part_plays_what_it_holds(

@@ -15,8 +15,10 @@ from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.build_dataset.verify import verify_buffer_set
 from robomme_interference_data.constants import EXECUTIONS, SHIFTED
+from robomme_interference_data.data.loading import open_dataset
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.views import live_embedding, live_frame
+from robomme_interference_data.errors import MissingFileError
 from robomme_interference_data.schema.shifts import SHIFTS
 
 Run = Callable[..., tuple[int, str, str]]
@@ -133,6 +135,9 @@ def test_executions_are_published_and_fetched(
     videos = {name: len([*(one / EXECUTIONS).rglob("*.mp4")]) for name, one in folders.items()}
     assert videos == {"whole": 6, "part": 0, "with": 1}
     finish("verify", folders["part"])
+    with pytest.raises(MissingFileError) as caught:
+        open_dataset(load_buffer_set(folders["part"]), EXECUTIONS)
+    assert caught.value.command is not None and caught.value.command.endswith(" --executions")
     finish("verify", folders["with"])
 
 
