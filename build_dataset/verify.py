@@ -151,13 +151,13 @@ def _buffers(buffer_set: BufferSet, datasets: Mapping[str, Dataset]) -> Iterator
     plan = plan_manifests(files, conditions, header.seed, header.position_limit)
     counts = {"queries": len(plan.demonstrations), "buffers": 0, "sessions": 0}
     stored: dict[str, dict[str, Any]] = {}
-    names = {one.name for one in conditions}
+    left_out = {*header.conditions} - {one.name for one in conditions}
     for manifest in buffer_set.planned_manifests():
-        if manifest.condition in names:
-            stored[str(manifest)] = to_dict(manifest)
-        else:
+        if manifest.condition in left_out:
             counts["buffers"] += 1
             counts["sessions"] += len(manifest.sessions)
+        else:
+            stored[str(manifest)] = to_dict(manifest)
     order = list(stored)
     for number, manifest in enumerate(planned_buffers(plan)):
         name = str(manifest)
