@@ -188,6 +188,7 @@ def questions(buffer_set: _Folder, as_json: AsJson = False) -> None:
     from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.runtime.progress import WorkProgress
 
+    from .manifests import check_is_own
     from .questions import make_questions, write_questions
 
     if not buffer_set.is_dir():
@@ -200,6 +201,7 @@ def questions(buffer_set: _Folder, as_json: AsJson = False) -> None:
         WorkProgress(unit="questions") as progress,
     ):
         opened = load_buffer_set(buffer_set)
+        check_is_own(opened)
         progress.start("Making questions", len(opened.episode_ids))
         made = []
         for one in make_questions(opened):

@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 from robomme_interference_data.errors import counted
+from robomme_interference_data.runtime.progress import duration
 from robomme_interference_data.storage.files import all_files
 
 logger = logging.getLogger(__name__)
@@ -57,10 +58,9 @@ def estimate_text(left: int, seconds: float, megabytes: float, free: float) -> s
     """
     if seconds < _LONG_S and megabytes < _LARGE_MB:
         return None
-    hours = seconds / 3600
-    duration = f"{hours:.1f} h" if hours >= 2 else f"{max(1, round(seconds / 60))} min"
     text = (
-        f"about {duration} and {megabytes:,.0f} MB for the other {counted(left, 'episode')}, "
-        f"judged by the first; twice the space until the dataset is written, {free:,.0f} MB free"
+        f"about {duration(seconds)} and {megabytes:,.0f} MB for the other "
+        f"{counted(left, 'episode')}, judged by the first; twice the space until the "
+        f"dataset is written, {free:,.0f} MB free"
     )
     return f"{text}: too little" if 2 * megabytes > free else text

@@ -30,6 +30,7 @@ from robomme_interference_data.constants import (
     SHIFTED,
     UNITS,
 )
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.data.manifest_table import pending_rows
@@ -101,6 +102,7 @@ def read_planned(root: Path) -> Planned | None:
         return None
     try:
         opened = load_buffer_set(root)
+        check_is_own(opened)
         return Planned(opened.header, frozenset(opened.episode_ids))
     except (FormatError, MissingFileError) as error:
         raise FormatError(
@@ -108,6 +110,17 @@ def read_planned(root: Path) -> Planned | None:
             f"Restore it, or remove {root / MANIFESTS} and plan all conditions anew: which ones "
             "were planned cannot be read.",
         ) from None
+
+
+def check_is_own(buffer_set: BufferSet) -> None:
+    """Check that a buffer set may be changed: a copy of a published one stays as it is."""
+    if buffer_set.copy is not None:
+        raise BuildError(
+            f"{buffer_set.location} is a copy of {buffer_set.copy.record.location}, and a "
+            "published buffer set never changes",
+            "Build one of your own with the same demonstrations:",
+            buffer_set.planning(),
+        )
 
 
 def plan_manifests(

@@ -23,13 +23,14 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
+from robomme_interference_data.data.fetched_copy import FetchedCopy
 from robomme_interference_data.data.manifest_table import pending_rows
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.questions import Question, read_questions
 from robomme_interference_data.errors import FormatError, InterferenceError
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.codec import arrow_schema, to_dict
-from robomme_interference_data.schema.conditions import datasets_of
+from robomme_interference_data.schema.conditions import datasets_of, in_order
 from robomme_interference_data.schema.manifest import BufferManifest
 from robomme_interference_data.storage.arrays import combine
 from robomme_interference_data.storage.encode import CODECS, decode_image
@@ -69,7 +70,7 @@ def verify_buffer_set(
         progress: Shows how many frames are decoded.
     """
     progress = progress or WorkProgress(quiet=True)
-    header, root = buffer_set.header, buffer_set.files.snapshot("*")
+    header, root, copy = buffer_set.header, buffer_set.files.snapshot("*"), buffer_set.copy
     yield from _files(buffer_set, root)
     datasets: dict[str, Dataset] = {}
     for name in buffer_set.datasets:
@@ -87,14 +88,13 @@ def verify_buffer_set(
         progress.start("Verifying", frames)
     for name, dataset in datasets.items():
         units, shown = datasets.get(DISTRACTORS), progress if decode else None
-        copy = buffer_set.copy if dataset.files.snapshot().is_relative_to(root) else None
         yield from caught(name, dataset_violations(name, dataset, header, units, shown, copy))
         yield from index_violations(name, dataset, units, copy)
     if len(datasets) == len(buffer_set.datasets):
         yield from caught(MANIFESTS, _buffers(buffer_set, datasets))
     if decode and {DEMONSTRATIONS, EXECUTIONS} <= datasets.keys():
-        yield from caught(EXECUTIONS, _executions(datasets[EXECUTIONS], datasets[DEMONSTRATIONS]))
-    copy = buffer_set.copy
+        executions, demonstrations = datasets[EXECUTIONS], datasets[DEMONSTRATIONS]
+        yield from caught(EXECUTIONS, _executions(executions, demonstrations, copy))
     if header.questions is not None and (copy is None or copy.lists(root, QUESTIONS_PATH)):
         yield from caught(QUESTIONS_PATH, _table(root, QUESTIONS_PATH, Question))
         yield from caught(QUESTIONS_PATH, _questions(buffer_set, decode=decode))
@@ -136,16 +136,29 @@ def _table(root: Path, path: str, record: type) -> Iterator[Violation]:
 
 
 def _buffers(buffer_set: BufferSet, datasets: Mapping[str, Dataset]) -> Iterator[Violation]:
-    """Plan all buffers again, and compare them with the rows."""
+    """Plan all buffers again, and compare them with the rows.
+
+    Of a partial copy, those are left out that need a dataset which it lacks.
+    """
     header, files = buffer_set.header, {name: one.files for name, one in datasets.items()}
     if header.rule_version != RULE_VERSION:
         what = f"rule version {header.rule_version}; this package can check {RULE_VERSION}"
         yield Violation(HEADER, what)
         return
-    plan = plan_manifests(files, header.conditions, header.seed, header.position_limit)
-    stored = {str(manifest): to_dict(manifest) for manifest in buffer_set.planned_manifests()}
-    order = list(stored)
+    conditions = in_order(header.conditions)
+    if buffer_set.copy is not None:
+        conditions = tuple(one for one in conditions if files.keys() >= {*one.kind.needs})
+    plan = plan_manifests(files, conditions, header.seed, header.position_limit)
     counts = {"queries": len(plan.demonstrations), "buffers": 0, "sessions": 0}
+    stored: dict[str, dict[str, Any]] = {}
+    left_out = {*header.conditions} - {one.name for one in conditions}
+    for manifest in buffer_set.planned_manifests():
+        if manifest.condition in left_out:
+            counts["buffers"] += 1
+            counts["sessions"] += len(manifest.sessions)
+        else:
+            stored[str(manifest)] = to_dict(manifest)
+    order = list(stored)
     for number, manifest in enumerate(planned_buffers(plan)):
         name = str(manifest)
         counts["buffers"] += 1
@@ -162,18 +175,22 @@ def _buffers(buffer_set: BufferSet, datasets: Mapping[str, Dataset]) -> Iterator
     yield from (Violation(name, f"should not be in {MANIFEST_ROWS}") for name in stored)
     if header.counts != counts:
         yield Violation(HEADER, f"counts are {header.counts}; expected {counts}")
-    needed = set(datasets_of(plan.conditions))
+    needed = {*datasets_of(in_order(header.conditions))}
     if not needed <= header.datasets.keys() <= {*DATASETS}:
         yield Violation(HEADER, f"datasets are {sorted(header.datasets)}")
 
 
-def _executions(executions: Dataset, demonstrations: Dataset) -> Iterator[Violation]:
+def _executions(
+    executions: Dataset, demonstrations: Dataset, copy: FetchedCopy | None
+) -> Iterator[Violation]:
     """Check that executions begin with the query frames of demonstrations, bit for bit."""
     codecs = [CODECS.get(one.identity.codec) for one in (executions, demonstrations)]
     if not all(codec and codec.exact for codec in codecs):
         return
     queries = {one.episode_id: one.span_sha256 for one in demonstrations.records()}
     for record in executions.records():
+        if copy is not None and not copy.holds_all(executions, record.episode_index):
+            continue
         [first] = executions.digests(record.episode_index, [(0, 1)])
         query = queries.get(record.episode_id)
         if query is not None and combine(first) != query.query:

@@ -246,6 +246,7 @@ def missing_extras() -> list[str]:
 
 def check_buffer_set(buffer_set: BufferSet, progress: WorkProgress | None = None) -> None:
     """Check hashes, rules and leaks, and that LeRobot, if installed, opens the datasets."""
+    buffer_set.check_is_whole()
     violations = list(verify_buffer_set(buffer_set, progress=progress))
     if violations:
         first = violations[0]

@@ -17,7 +17,7 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.errors import HubError, PublishError
 from robomme_interference_data.storage.files import all_files, sha256_file
-from robomme_interference_data.storage.hub import HubCall
+from robomme_interference_data.storage.hub_call import HubCall
 from robomme_interference_data.storage.staging import replace_folder, staging_dir
 
 if TYPE_CHECKING:

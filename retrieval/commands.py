@@ -113,6 +113,8 @@ def index(
             f"Build one: robomme-interference build all {buffer_set} --source KIND:PATH",
         )
     planned = load_buffer_set(buffer_set) if (folder / MANIFEST_PATH).is_file() else None
+    if planned is not None:
+        planned.check_is_whole()
     image_encoder = make_encoder(config.encoder, device=config.device, batch=config.batch)
     with graceful_interrupt("Finished episodes are kept"), WorkProgress(quiet=as_json) as progress:
         reports = build_index(

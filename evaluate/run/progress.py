@@ -8,7 +8,7 @@ from typing import Any, Self
 
 from robomme_interference_data.errors import visible
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.runtime.progress import WorkProgress, duration
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.schema.rollouts import Rollout, Status
 from robomme_interference_data.viz.tables import Table
@@ -103,9 +103,7 @@ def estimate(rows: Sequence[Rollout], left: int, workers: int) -> str:
         parts[part] += sum(getattr(row, column) or 0.0 for row in rows)
     longest = sorted(parts.items(), key=itemgetter(1), reverse=True)
     shares = [f"{part} {value / total:.0%}" for part, value in longest if value]
-    hours, minutes = seconds / 3600, max(1, round(seconds / 60))
-    time = f"{hours:.1f} h" if hours >= 2 else f"{minutes} min"
-    return f"about {time} left; where the time goes: {', '.join(shares)}"
+    return f"about {duration(seconds)} left; where the time goes: {', '.join(shares)}"
 
 
 def rate_table(rows: Iterable[Rollout]) -> Table:

@@ -10,6 +10,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, redirect_stdout
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -99,8 +100,7 @@ class Tracking(AbstractContextManager["Tracking"]):
         self._rows, self._errors = 0, 0
         self._sums: Counter[str] = Counter()
         self._counts: Counter[str] = Counter()
-        self._tracker: Tracker | None = None
-        self._attempt(lambda: setattr(self, "_tracker", opened()))
+        self._tracker = self._attempt(opened)
 
     def __enter__(self) -> Self:
         return self
@@ -120,8 +120,7 @@ class Tracking(AbstractContextManager["Tracking"]):
         metrics = {name: self._sums[name] / self._counts[name] for name in changed}
         metrics |= {"rollouts": self._rows, "errors": self._errors}
         if self._tracker is not None:
-            tracker = self._tracker
-            self._attempt(lambda: tracker.log(metrics, step=self._rows))
+            self._attempt(partial(self._tracker.log, metrics, step=self._rows))
 
     def _count(self, row: Rollout) -> dict[str, float]:
         values = values_of(row)
@@ -131,14 +130,16 @@ class Tracking(AbstractContextManager["Tracking"]):
         self._counts.update(values.keys())
         return values
 
-    def _attempt(self, call: Callable[[], object]) -> None:
+    def _attempt[Result](self, call: Callable[[], Result]) -> Result | None:
+        """Return what a call returns; after an error None, and nothing is tracked any more."""
         try:
             with redirect_stdout(sys.stderr):  # trackio prints
-                call()
+                return call()
         except Exception as error:
             self._tracker = None
             what = f"{type(error).__name__}: {first_line(error)}"
             logger.warning("tracking with %s stopped: %s. The run continues.", self._name, what)
+            return None
 
 
 def values_of(row: Rollout) -> dict[str, float]:

@@ -21,7 +21,7 @@ from robomme_interference_data.retrieval import commands as retrieving
 from robomme_interference_data.simulators import commands as simulating
 from robomme_interference_data.storage.hub import check_endpoint
 
-from . import commands
+from . import commands, show_commands
 from .console import echo, log_to_stderr, print_status
 from .help import App, Group
 from .hints import PROGRAM, ShownError, option_names, shown_error
@@ -64,8 +64,8 @@ _GROUPS = {
     "Look": (
         ("conditions", commands.list_conditions),
         ("list", commands.list_buffers),
-        ("show", commands.show),
-        ("question", commands.show_question),
+        ("show", show_commands.show),
+        ("question", show_commands.show_question),
         ("simulate", simulating.simulate),
     ),
     "Retrieval": (

@@ -16,7 +16,6 @@ from robomme_interference_data.constants import DATASETS, DEMONSTRATIONS, DISTRA
 from robomme_interference_data.errors import (
     FormatError,
     InvalidOptionError,
-    MissingFileError,
     UnknownNameError,
     counted,
 )
@@ -114,6 +113,11 @@ class BufferSet:
         """Its folder, or its repository with the commit, `namespace/name@…`."""
         return self.files.location
 
+    @property
+    def is_own(self) -> bool:
+        """Whether it may be changed: a folder that is no copy of a published version."""
+        return isinstance(self.files, LocalFiles) and self.copy is None
+
     @cached_property
     def revision(self) -> str:
         """Identity of the content: SHA-256 over its header, which lists all data by hash.
@@ -188,7 +192,9 @@ class BufferSet:
         """
         parsed = _condition(condition, k)
         if self.copy is not None and parsed.name in {*self.header.conditions} - {*self.conditions}:
-            raise self._not_fetched(f"the buffers of {parsed.name}", f"--conditions {parsed.name}")
+            raise self.copy.not_fetched(
+                f"the buffers of {parsed.name}", f"--conditions {parsed.name}"
+            )
         if parsed.name not in self.conditions:
             raise UnknownNameError(
                 f"condition {parsed.name!r} is not in {self.location}",
@@ -199,7 +205,7 @@ class BufferSet:
 
     def planning(self, *conditions: str) -> str:
         """Return the command that plans buffers under these conditions too."""
-        if isinstance(self.files, HubFiles):  # a published version never changes
+        if not self.is_own:
             location = self.header.datasets[DEMONSTRATIONS].location
             command = f"new-buffer-set BUFFER_SET --demonstrations {location} --source KIND:PATH"
             names = [name for name in self.conditions if name not in conditions]
@@ -217,11 +223,22 @@ class BufferSet:
                 f"Download it again: run hf cache rm {cached}, then the same command. If that "
                 "does not help, ask its publisher."
             )
+        if self.copy is not None:
+            return f"Fetch it again: robomme-interference {self.copy.refetch}"
         return "Restore the original files, or build the manifests again."
 
     def holds(self, dataset: Dataset, episode_index: int) -> bool:
         """Whether an episode can be loaded; only a partial copy lacks some."""
         return self.copy is None or self.copy.holds(dataset, episode_index)
+
+    def check_is_whole(self) -> None:
+        """Check that all files of all datasets are here.
+
+        Raises:
+            MissingFileError: This is a copy that lacks some.
+        """
+        if self.copy is not None and not self.copy.is_whole(self):
+            raise self.copy.not_fetched("some files")
 
     def query(self, episode_id: EpisodeId | str) -> Query:
         """Return a query episode: its goal, scene and first live observation, without a buffer.
@@ -248,9 +265,9 @@ class BufferSet:
         if row is None:
             self._check_episode(episode)
             raise FormatError.damaged(self._table.path, f"no row of {episode} under {name}")
-        if not self._is_present[row]:
+        if self.copy is not None and not self._is_present[row]:
             options = f"--families {episode.family} --episodes {episode.index} --conditions {name}"
-            raise self._not_fetched(f"{episode} under {name}", options)
+            raise self.copy.not_fetched(f"{episode} under {name}", options)
         return self._table.record(row)
 
     def manifests(
@@ -386,20 +403,12 @@ class BufferSet:
             source=self._source,
         )
 
-    def _not_fetched(self, what: str, options: str) -> MissingFileError:
-        assert self.copy is not None
-        return MissingFileError(
-            f"{what} are not in {self.location}, a copy of a part of {self.copy.record.location}",
-            "Fetch them too.",
-            f"{self.copy.refetch} {options}",
-        )
-
     def _check_episode(self, episode: EpisodeId) -> None:
         if episode in self._episodes:
             return
         if self.copy is not None and str(episode) in {*self._table.keys["episode_id"]}:
             options = f"--families {episode.family} --episodes {episode.index}"
-            raise self._not_fetched(f"the buffers of {episode}", options)
+            raise self.copy.not_fetched(f"the buffers of {episode}", options)
         if episode.family not in self.families:
             raise UnknownNameError.among("family", episode.family, self.location, self.families)
         raise UnknownNameError.among("episode", str(episode), self.location, self.episode_ids)

@@ -55,7 +55,7 @@ _LEFT_OUT = re.compile(rf"\..*|{PARTS_PATH}|{INDEX_DIR}/.*|({'|'.join(OPTIONAL_D
 """Files of a repository that a whole buffer set may have, and that are not copied with it."""
 
 _STAGED = "copy"
-_ANOTHER_FOLDER = "Give another folder: fetch NAMESPACE/NAME --to FOLDER."
+_ROWS_PATH = f"{MANIFESTS}/{MANIFEST_ROWS}"
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,8 @@ class Part:
         files: The repository.
         folder: Folder for its files inside the local buffer set; empty for the root.
         sizes: Bytes of every file to download, by path.
-        sums: SHA-256 by path of the files whose digest the buffer set records.
+        sums: SHA-256 by path of the files whose digest the buffer set records: all but the header
+            of the manifests, which leads to all digests, and cards.
         missing: Paths of those that are not in the cache yet.
         unlisted: Paths of the repository's files that the buffer set does not list.
     """
@@ -118,9 +119,14 @@ def plan_fetch(buffer_set: "BufferSet", config: FetchConfig) -> list[Part]:
             "Give the buffer set as namespace/name.",
         )
     cameras = config.cameras or buffer_set.cameras
+    # Without a choice of buffers or cameras everything is fetched, also what no buffer needs.
     whole = replace(config, index=None, questions=False, executions=False) == FetchConfig()
     datasets, episodes = _needed(buffer_set, config, whole=whole)
-    others = {n: one.files for n, one in datasets.items() if one.files is not buffer_set.files}
+    others = {
+        name: dataset.files
+        for name, dataset in datasets.items()
+        if dataset.files is not buffer_set.files
+    }
     parts = []
     for folder, files in {"": buffer_set.files, **others}.items():
         assert isinstance(files, HubFiles)  # all datasets of a published buffer set are on the Hub
@@ -128,13 +134,20 @@ def plan_fetch(buffer_set: "BufferSet", config: FetchConfig) -> list[Part]:
         sums: dict[str, str] = {}
         paths = {path for path in sizes if _CARD.fullmatch(path)}
         if files is buffer_set.files:
-            paths |= {MANIFEST_PATH, f"{MANIFESTS}/{MANIFEST_ROWS}"}
-            if QUESTIONS_PATH in sizes and (whole or config.questions):
+            paths |= {MANIFEST_PATH, _ROWS_PATH}
+            sums[_ROWS_PATH] = buffer_set.header.rows
+            questions = buffer_set.header.questions
+            if config.questions and questions is None:
+                raise MissingFileError(f"{buffer_set.location} has no questions")
+            if questions is not None and (whole or config.questions):
                 paths.add(QUESTIONS_PATH)
+                sums[QUESTIONS_PATH] = questions
         for name, dataset in datasets.items():
             if dataset.files is files:
                 listed = _listed(dataset)
                 sums |= listed
+                sums[IDENTITY_PATH] = buffer_set.header.datasets[name].identity
+                sums[SUMS_PATH] = dataset.identity.sums
                 paths |= {IDENTITY_PATH, SUMS_PATH}
                 paths |= {path for path in listed if whole or path.startswith("meta/")}
                 paths |= {*_paths(dataset, episodes[name], cameras, config.index, sizes)}
@@ -158,11 +171,12 @@ def plan_fetch(buffer_set: "BufferSet", config: FetchConfig) -> list[Part]:
 
 
 def fetch(parts: Sequence[Part], to: Path | None = None) -> None:
-    """Download missing files and check each against its digest.
+    """Download missing files; each is checked against the Hub's digest.
 
     If `to` is given, all files are also copied into that folder, or added to an earlier copy of the
-    same buffer set there; otherwise they stay in the Hub client's cache. A copy can be interrupted
-    at any time: it is made beside the folder and moved there at the end, and the same call resumes.
+    same buffer set there, and checked against the buffer set's digests; otherwise they stay in the
+    Hub client's cache. A copy can be interrupted at any time: it is made beside the folder and
+    moved there at the end, and the same call resumes.
 
     Raises:
         InvalidOptionError: `to` holds something else.
@@ -182,8 +196,9 @@ def fetch(parts: Sequence[Part], to: Path | None = None) -> None:
             part.files.fetch(part.sizes)
         return
     to = to.resolve()
-    earlier = _earlier_files(to, parts[0].files.path(MANIFEST_PATH))
-    record = FetchRecord(FORMAT_VERSION, parts[0].files.location, earlier)
+    location = parts[0].files.location
+    earlier = _earlier_files(to, location, parts[0].files.path(MANIFEST_PATH))
+    record = FetchRecord(FORMAT_VERSION, location, earlier)
     with staging_dir(to) as staging:
         for part in parts:
             _copy(part, staging / _STAGED / part.folder, to / part.folder)
@@ -191,38 +206,54 @@ def fetch(parts: Sequence[Part], to: Path | None = None) -> None:
         _move(staging / _STAGED, to, record, copied)
 
 
-def _earlier_files(to: Path, header: Path) -> tuple[str, ...]:
-    """Return the files of an earlier copy in a folder; check that it holds nothing else."""
+def _earlier_files(to: Path, location: str, header: Path) -> tuple[str, ...]:
+    """Return the files of an earlier copy of a buffer set; check that a folder holds nothing else.
+
+    `location` and `header`, the file of its manifests' header, identify the buffer set.
+    """
     if not to.exists() or (to.is_dir() and not any(to.iterdir())):
         return ()
-    from .fetched_copy import read_fetch_record
+    # Not at the top: commands load this module for its settings, and that loads pyarrow.
+    from .fetched_copy import fetch_command, read_fetch_record
 
     record = read_fetch_record(to) if to.is_dir() else None
     if record is None:
-        raise InvalidOptionError(f"{to} exists, and is no copy of a buffer set", _ANOTHER_FOLDER)
-    existing = to / MANIFEST_PATH  # moved last: an interrupted copy has none
-    if existing.is_file() and existing.read_bytes() != header.read_bytes():
-        raise InvalidOptionError(f"{to} is a copy of {record.location}", _ANOTHER_FOLDER)
+        raise InvalidOptionError(
+            f"{to} exists, and is no copy of a buffer set",
+            "Give another folder: fetch NAMESPACE/NAME --to FOLDER.",
+        )
+    existing = to / MANIFEST_PATH
+    if existing.is_file():
+        is_same = existing.read_bytes() == header.read_bytes()
+    else:  # an interrupted copy: the header is moved last
+        is_same = record.location == location
+    if not is_same:
+        raise InvalidOptionError(
+            f"{to} is a copy of {record.location}",
+            "Give another folder, or add to this copy:",
+            fetch_command(to, record),
+        )
     return record.files
 
 
 def _copy(part: Part, staged: Path, to: Path) -> None:
     """Copy what a folder lacks into its staging folder, and check it."""
 
-    def is_there(path: str, sha256: str | None) -> bool:
+    def is_there(path: str) -> bool:
         places = (to / path, staged / path)
-        return any(place.is_file() and sha256_file(place) == sha256 for place in places)
+        return path in part.sums and any(
+            place.is_file() and sha256_file(place) == part.sums[path] for place in places
+        )
 
-    lacking = [path for path in part.sizes if not is_there(path, part.sums.get(path))]
+    lacking = [path for path in part.sizes if not is_there(path)]
     part.files.fetch(lacking)
     for path in lacking:
-        source = part.files.path(path)
-        expected = part.sums.get(path) or sha256_file(source)
         with atomic_path(staged / path) as partial:
-            shutil.copyfile(source, partial)
-            if sha256_file(partial) != expected:
+            shutil.copyfile(part.files.path(path), partial)
+            if path in part.sums and sha256_file(partial) != part.sums[path]:
                 raise HashMismatchError(
-                    f"{path} of {part.files.describe()} does not have the SHA-256 in {SUMS_PATH}",
+                    f"{path} of {part.files.describe()} does not have the SHA-256 that the buffer "
+                    "set records",
                     "Ask its publisher to publish it again.",
                 )
 

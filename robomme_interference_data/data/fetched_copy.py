@@ -3,9 +3,10 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robomme_interference_data.constants import DATASETS, FETCH_RECORD, INFO_PATH
+from robomme_interference_data.constants import FETCH_RECORD, INFO_PATH, QUESTIONS_PATH
+from robomme_interference_data.errors import MissingFileError
 from robomme_interference_data.schema.manifest import BufferManifest, FetchRecord
-from robomme_interference_data.storage.files import LocalFiles, read_header
+from robomme_interference_data.storage.files import Files, LocalFiles, read_header
 
 from .dataset import Dataset
 
@@ -46,34 +47,40 @@ class FetchedCopy:
         """The command that adds all that it lacks."""
         return fetch_command(self.root, self.record)
 
-    def has_dataset(self, name: str, files: object) -> bool:
+    def not_fetched(self, what: str, options: str = "") -> MissingFileError:
+        """Return the error about what a partial copy lacks.
+
+        Args:
+            what: What it lacks, in the plural.
+            options: Options with which `fetch` adds it; empty for everything.
+        """
+        return MissingFileError(
+            f"{what} are not in {self.root}, a copy of a part of {self.record.location}",
+            "Fetch them too.",
+            f"{self.refetch} {options}".strip(),
+        )
+
+    def has_dataset(self, files: Files) -> bool:
         """Whether the metadata of a dataset is here, or on the Hub, from which it is read."""
-        if not isinstance(files, LocalFiles):
-            return True
-        return name in DATASETS and self._path(files.root, INFO_PATH) in self._files
+        return not isinstance(files, LocalFiles) or self.lists(files.root, INFO_PATH)
 
     def lists(self, folder: Path, path: str) -> bool:
-        """Whether the record lists a file of a dataset in `folder`."""
-        return self._path(folder, path) in self._files
+        """Whether the record lists a file in `folder`, if that is in the copy."""
+        if not folder.is_relative_to(self.root):  # of a dataset that is read from the Hub
+            return True
+        return (folder.relative_to(self.root) / path).as_posix() in self._files
 
     def holds(self, dataset: Dataset, episode_index: int) -> bool:
         """Whether an episode's vectors and at least one of its videos are here."""
-        if not isinstance(dataset.files, LocalFiles):
-            return True
-        return episode_index in self._episodes(dataset, dataset.files.root)
+        return episode_index in self._episodes(dataset)
 
     def holds_all(self, dataset: Dataset, episode_index: int) -> bool:
         """Whether an episode's vectors and all of its videos are here."""
-        if not isinstance(dataset.files, LocalFiles):
-            return True
-        held = self._episodes(dataset, dataset.files.root)
-        return held.get(episode_index) == frozenset(dataset.cameras)
+        return self._episodes(dataset).get(episode_index) == frozenset(dataset.cameras)
 
     def cameras(self, dataset: Dataset) -> tuple[str, ...]:
         """Return the cameras whose videos are here for every episode that is."""
-        if not isinstance(dataset.files, LocalFiles):
-            return dataset.cameras
-        held = self._episodes(dataset, dataset.files.root).values()
+        held = self._episodes(dataset).values()
         return tuple(name for name in dataset.cameras if all(name in names for names in held))
 
     def holds_buffer(self, buffer_set: "BufferSet", manifest: BufferManifest) -> bool:
@@ -85,21 +92,40 @@ class FetchedCopy:
             for name, index in episodes
         )
 
-    def _episodes(self, dataset: Dataset, folder: Path) -> dict[int, frozenset[str]]:
+    def is_whole(self, buffer_set: "BufferSet") -> bool:
+        """Whether all files of all datasets are here, and the questions."""
+        header = buffer_set.header
+        if header.questions is not None and not self.lists(self.root, QUESTIONS_PATH):
+            return False
+        return all(
+            name in buffer_set.datasets and self._is_whole(buffer_set.datasets[name])
+            for name in header.datasets
+        )
+
+    def _is_whole(self, dataset: Dataset) -> bool:
+        files = dataset.files
+        return not isinstance(files, LocalFiles) or all(
+            self.lists(files.root, path) for path in dataset.sums()
+        )
+
+    def _episodes(self, dataset: Dataset) -> dict[int, frozenset[str]]:
         """Return the cameras whose videos are here, by the index of each episode that is here."""
-        known = self._cameras.get(dataset.kind)
-        if known is None:
-            known = self._cameras[dataset.kind] = {}
+        if dataset.kind not in self._cameras:
+            files = dataset.files
+            episodes: dict[int, frozenset[str]] = {}
             for index in range(len(dataset)):
                 data, *videos = dataset.files_of(index, dataset.cameras)
+                here = {
+                    path
+                    for path in (data, *videos)
+                    if not isinstance(files, LocalFiles) or self.lists(files.root, path)
+                }
                 cameras = frozenset(
                     camera
                     for camera, video in zip(dataset.cameras, videos, strict=True)
-                    if self.lists(folder, video)
+                    if video in here
                 )
-                if self.lists(folder, data) and (cameras or not dataset.cameras):
-                    known[index] = cameras
-        return known
-
-    def _path(self, folder: Path, path: str) -> str:
-        return (folder.relative_to(self.root) / path).as_posix()
+                if data in here and (cameras or not dataset.cameras):
+                    episodes[index] = cameras
+            self._cameras[dataset.kind] = episodes
+        return self._cameras[dataset.kind]

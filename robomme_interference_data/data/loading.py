@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robomme_interference_data.constants import DATASETS, IDENTITY_PATH, MANIFEST_PATH
+from robomme_interference_data.constants import DATASETS, EXECUTIONS, IDENTITY_PATH, MANIFEST_PATH
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.ids import EpisodeId, whole_number
 from robomme_interference_data.schema.conditions import Condition
@@ -135,12 +135,14 @@ def open_dataset(buffer_set: BufferSet, name: str, more: str = "") -> Dataset:
     """
     if name in buffer_set.datasets:
         return buffer_set.datasets[name]
+    if buffer_set.copy is not None and name in buffer_set.header.datasets:
+        option = "--executions" if name == EXECUTIONS else ""
+        raise buffer_set.copy.not_fetched(f"the {name}", option)
     hint, command = "Ask its publisher to add them.", None
-    files = buffer_set.files
-    if isinstance(files, LocalFiles) and (files.root / name / IDENTITY_PATH).is_file():
+    if buffer_set.is_own and Path(buffer_set.location, name, IDENTITY_PATH).is_file():
         hint = "It is built; plan the buffers again to include it."
         command = f"build manifests {buffer_set.location}"
-    elif isinstance(files, LocalFiles):
+    elif buffer_set.is_own:
         hint = "Build them from the source of its demonstrations, then run build manifests again."
         command = f"build {name} {buffer_set.location} --source KIND:PATH"
     raise MissingFileError(

@@ -12,7 +12,7 @@ from robomme_interference_data.errors import FormatError, MissingFileError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import from_table, to_dict
 from robomme_interference_data.schema.subgoal import Pixel
-from robomme_interference_data.storage.files import LocalFiles, digest_json, sha256_file
+from robomme_interference_data.storage.files import digest_json, sha256_file
 from robomme_interference_data.storage.parquet import open_parquet, read_table
 
 from .buffer_set import BufferSet
@@ -92,12 +92,14 @@ def digest_questions(questions: Iterable[Question]) -> str:
 
 def read_questions(buffer_set: BufferSet) -> dict[EpisodeId, Question]:
     """Read the questions of a buffer set, by query episode."""
-    local = isinstance(buffer_set.files, LocalFiles)
-    hint = "" if local else "Only its publisher can make them again."
-    command = f"build questions {buffer_set.location}" if local else None
+    hint, command = "Only its publisher can make them again.", None
+    if buffer_set.is_own:
+        hint, command = "", f"build questions {buffer_set.location}"
     try:
         path = buffer_set.files.path(QUESTIONS_PATH)
     except MissingFileError:
+        if buffer_set.copy is not None and buffer_set.header.questions is not None:
+            raise buffer_set.copy.not_fetched("the questions", "--questions") from None
         what = f"{buffer_set.location} has no questions ({QUESTIONS_PATH})"
         raise MissingFileError(what, hint, command) from None
     if sha256_file(path) != buffer_set.header.questions:

@@ -63,12 +63,13 @@ class SetDatasets(Mapping[str, Dataset]):
             recorded = self._buffer_set.header.datasets[name]
             dataset = Dataset(self._buffer_set.dataset_files(name))
             if dataset.revision != recorded.revision:
-                local = isinstance(self._buffer_set.files, LocalFiles)
                 raise HashMismatchError(
                     f"{dataset.files.describe()} has revision {dataset.revision[:12]}…; the "
                     f"manifests were made for {recorded.revision[:12]}…",
                     self._buffer_set.fix,
-                    f"build manifests {self._buffer_set.location}" if local else None,
+                    f"build manifests {self._buffer_set.location}"
+                    if self._buffer_set.is_own
+                    else None,
                 )
             self._opened[name] = dataset
         return self._opened[name]
@@ -85,8 +86,9 @@ class SetDatasets(Mapping[str, Dataset]):
     @cached_property
     def _names(self) -> tuple[str, ...]:
         """All that are planned; in a partial copy, those that are there."""
-        buffer_set, names = self._buffer_set, tuple(self._buffer_set.header.datasets)
-        copy = buffer_set.copy
-        if copy is None:
-            return names
-        return tuple(n for n in names if copy.has_dataset(n, buffer_set.dataset_files(n)))
+        buffer_set, copy = self._buffer_set, self._buffer_set.copy
+        return tuple(
+            name
+            for name in buffer_set.header.datasets
+            if copy is None or copy.has_dataset(buffer_set.dataset_files(name))
+        )

@@ -19,6 +19,13 @@ from rich.progress import (
 from rich.text import Text
 
 
+def duration(seconds: float) -> str:
+    """Return a time for people, such as `5 min` or `2.5 h`."""
+    if seconds >= 2 * 3600:
+        return f"{seconds / 3600:.1f} h"
+    return f"{max(1, round(seconds / 60))} min"
+
+
 class _Rate(ProgressColumn):
     def __init__(self, unit: str):
         super().__init__()

@@ -7,6 +7,7 @@ sessions, so that its pictures are the stored pixels.
 import base64
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata, resources
@@ -24,7 +25,7 @@ from robomme_interference_data.storage.encode import png
 from robomme_interference_data.storage.files import write_text
 
 from .figure import ink_on
-from .filmstrip import session_colors
+from .filmstrip import round_step, session_colors
 from .templates import fill
 
 if TYPE_CHECKING:
@@ -33,6 +34,9 @@ if TYPE_CHECKING:
 
 _THUMB = 112
 """Longest side of a picture of the sample, px: twice its size on a phone."""
+
+_TICKS = 7
+"""Most labeled frames of the timeline."""
 
 
 @dataclass(frozen=True)
@@ -87,11 +91,11 @@ def write_page(
                 "part": one,
                 "runs": runs(one.frames),
                 "chosen": counted(len(one.frames), "frame"),
-                "sample": _counted(one, buffer),
+                "by_session": Counter(buffer.session_index[list(one.frames)].tolist()),
             }
             for one in retrieved
         ],
-        "ticks": _ticks(len(buffer)),
+        "ticks": range(0, len(buffer), round_step(len(buffer), _TICKS)),
         "live": {camera: _address(png(image)) for camera, image in live.items()},
         "videos": [_read(path) for path in videos],
         "data": json.dumps(data),
@@ -165,19 +169,6 @@ def _evidence(buffer: "Buffer", retrieved: Sequence[RetrievedPart]) -> list[dict
         }
         for one in buffer.evidence
     ]
-
-
-def _counted(part: RetrievedPart, buffer: "Buffer") -> dict[str, int]:
-    """Return the sessions that retrieved frames belong to, and their number of such frames."""
-    numbers = buffer.session_index[list(part.frames)].tolist()
-    return {str(number): numbers.count(number) for number in sorted({*numbers})}
-
-
-def _ticks(frames: int) -> list[int]:
-    """Return the labeled frames of the timeline: at most 7, at a round distance."""
-    steps = (digit * 10**power for power in range(9) for digit in (1, 2, 5))
-    step = next(one for one in steps if one * 7 > frames)
-    return list(range(0, frames, step))
 
 
 def _small(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -80,6 +80,12 @@ def session_colors(sessions: Sequence[Session]) -> list[str]:
     return [LESSON_COLOR if s.role == "lesson" else by_family[s.family] for s in sessions]
 
 
+def round_step(frames: int, most: int) -> int:
+    """Return the distance of labels on a timeline, such as 50, for at most so many of them."""
+    steps = (digit * 10**power for power in range(9) for digit in (1, 2, 5))
+    return next(step for step in steps if step * most >= frames)
+
+
 def mark_evidence(page: Page, buffer: "Buffer", left: float, scale: float, bottom: float) -> None:
     """Draw a dark line at the bottom of a bar where the buffer's frames show the answer."""
     for one in buffer.evidence or ():
@@ -226,9 +232,7 @@ def _draw_timeline(page: Page, buffer: "Buffer", top: float) -> None:
     page.box(end - scale, bar, scale, _BAR, fill="black", edge="black", line=0.8)
     page.text(end + 0.02, bar - 0.21, "+1 live", _NUMBER, align="left", color=_GRAY)
     page.arrow(end + 0.05, end + 0.37, bar + _BAR / 2)
-    steps = (digit * 10**power for power in range(9) for digit in (1, 2, 5))
-    step = next(n for n in steps if n * 10 >= len(buffer))
-    for index in range(0, len(buffer) + 1, step):
+    for index in range(0, len(buffer) + 1, round_step(len(buffer), 10)):
         x = _MARGIN + (index + 0.5) * scale
         page.tick(x, bar + _BAR, bar + _BAR + 0.04)
         page.text(x, bar + _BAR + 0.06, str(index), _NUMBER, color=_GRAY)

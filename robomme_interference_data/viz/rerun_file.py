@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import InvalidOptionError, MissingExtraError
+from robomme_interference_data.errors import MissingExtraError
 from robomme_interference_data.schema.sampling import even_sample
 from robomme_interference_data.storage.encode import png
 from robomme_interference_data.storage.files import atomic_path
@@ -31,8 +31,6 @@ def write_recording(buffer: "Buffer", out: Path, live: Mapping[str, NDArray[np.u
     Raises:
         MissingExtraError: rerun-sdk is not installed.
     """
-    if out.suffix.lower() != ".rrd":
-        raise InvalidOptionError.expected("--rerun", str(out), "a name that ends in .rrd")
     rerun = _load_rerun()
     name = f"{buffer.episode_id} {buffer.condition}"
     sample = {*even_sample(len(buffer))}

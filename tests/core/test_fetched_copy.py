@@ -13,9 +13,11 @@ from support import runs, worlds
 from support.buffer_sets import GOLDEN, copy_buffer_set
 from support.hub import BUFFER_SET, push_buffer_set
 from support.hub_server import HubServer
+from support.tabletop import TABLETOP
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.verify import verify_buffer_set
+from robomme_interference_data.data.questions import read_questions
 from robomme_interference_data.errors import (
     FormatError,
     HashMismatchError,
@@ -95,9 +97,41 @@ def test_commands_work_on_a_part(part: Path, run: Run, tmp_path: Path) -> None:
     assert "holds 3 of the 15 buffers" in err and "fetch" in err
     assert run("verify", part)[0] == 0
     assert run("show", part, "MoveCube/test/0", "k1", "--out", tmp_path / "strip.png")[0] == 0
+    assert run("show", part, "MoveCube/test/0", "k1", "--html", tmp_path / "page.html")[0] == 0
     assert run("ceiling", part)[0] == run("ceiling", GOLDEN)[0]
     code, _, err = run("show", part, "MoveCube/test/0", "k7")
     assert code == 1 and f"--to {part} --conditions k7" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "command"),
+    [
+        ("publish {} --repo-id someone/other --dry-run", "fetch"),
+        ("index {}", "fetch"),
+        ("build manifests {} --conditions before-k1", "new-buffer-set"),
+        ("list {} --conditions before-k1", "new-buffer-set"),
+        ("build questions {}", "new-buffer-set"),
+    ],
+)
+def test_a_part_is_neither_changed_nor_published(
+    part: Path, run: Run, words: str, command: str
+) -> None:
+    before = digests(part)
+    code, _, err = run(*words.format(part).split())
+    assert code == 1 and f"\nRun: robomme-interference {command} " in err
+    assert digests(part) == before
+
+
+def test_questions_that_were_not_fetched(hub: HubServer, run: Run, tmp_path: Path) -> None:
+    push_buffer_set(hub, TABLETOP, tmp_path / "work")
+    words = ("--families", "MoveCube", "--conditions", "k0")
+    assert run("fetch", BUFFER_SET, *words, "--to", tmp_path / "part")[0] == 0
+    part = load_buffer_set(tmp_path / "part")
+    with pytest.raises(MissingFileError) as caught:
+        read_questions(part)
+    assert caught.value.command == f"{part.copy.refetch} --questions"  # type: ignore[union-attr]
+    assert run("fetch", BUFFER_SET, *words, "--questions", "--to", tmp_path / "part")[0] == 0
+    assert {*load_buffer_set(tmp_path / "part").episode_ids} <= {*read_questions(part)}
 
 
 def test_a_run_on_a_part_plays_what_it_holds(
@@ -179,10 +213,12 @@ def test_a_copy_of_another_buffer_set_is_not_mixed(
     header = tmp_path / "other-work" / "manifests" / "manifest.json"
     write_json(header, json.loads(header.read_text()) | {"seed": 7})
     published.push("datasets/someone/else", tmp_path / "other-work")
-    before = digests(part)
-    code, _, err = run("fetch", "someone/else", *PART, "--to", part)
-    assert code == 1 and BUFFER_SET in err
-    assert digests(part) == before
+    for _ in range(2):
+        before = digests(part)
+        code, _, err = run("fetch", "someone/else", *PART, "--to", part)
+        assert code == 1 and f"fetch {BUFFER_SET}@" in err
+        assert digests(part) == before
+        (part / "manifests" / "manifest.json").unlink(missing_ok=True)  # as after an interruption
 
 
 # --- files that the buffer set does not list ------------------------------------------------------
@@ -237,6 +273,17 @@ def test_a_file_that_differs_from_its_list_is_not_copied(
     hub.push(f"datasets/{BUFFER_SET}", tmp_path / "work")
     code, _, err = run("fetch", BUFFER_SET, "--to", tmp_path / "copy")
     assert code == 1 and "meta/stats.json" in err and not (tmp_path / "copy").exists()
+
+
+def test_rows_that_differ_from_their_header_are_not_copied(
+    hub: HubServer, run: Run, tmp_path: Path
+) -> None:
+    push_buffer_set(hub, GOLDEN, tmp_path / "work")
+    header = tmp_path / "work" / "manifests" / "manifest.json"
+    write_json(header, json.loads(header.read_text()) | {"rows": "0" * 64})
+    hub.push(f"datasets/{BUFFER_SET}", tmp_path / "work")
+    code, _, err = run("fetch", BUFFER_SET, "--to", tmp_path / "copy")
+    assert code == 1 and "manifests/buffers.parquet" in err and not (tmp_path / "copy").exists()
 
 
 # --- the record -----------------------------------------------------------------------------------

@@ -128,6 +128,8 @@ def test_the_command_writes_a_page(own_buffers: Path, tmp_path: Path, run: Run) 
     code, _, err = run("show", root, QUERY, "k3", "--html", out)
     assert code == 0 and "does not show retrieval by thumbnail" in err
     assert "thumbnail/max" not in out.read_text()
-    assert run("show", root, QUERY, "k3", "--html", tmp_path / "page.png")[0] == 1
+    wrong = ("--html", tmp_path / "page.png")
+    assert run("show", root, QUERY, "k3", "--out", tmp_path / "strip.png", *wrong)[0] == 1
+    assert not (tmp_path / "strip.png").exists()
     assert run("show", root, QUERY, "k3", "--html", root / "manifests" / "page.html")[0] == 1
     assert not (tmp_path / "page.png").exists()

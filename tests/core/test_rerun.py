@@ -12,7 +12,7 @@ import pytest
 from support.buffer_sets import GOLDEN, QUERIES
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.errors import InvalidOptionError, MissingExtraError
+from robomme_interference_data.errors import MissingExtraError
 from robomme_interference_data.schema.sampling import even_sample
 from robomme_interference_data.storage.encode import decode_image
 from robomme_interference_data.viz.rerun_file import write_recording
@@ -83,8 +83,9 @@ def test_rerun_reads_the_file(tmp_path: Path) -> None:
 def test_errors_before_anything_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Run
 ) -> None:
-    with pytest.raises(InvalidOptionError):
-        write_recording(BUFFER, tmp_path / "a.png", LIVE)
+    wrong = ("--out", tmp_path / "strip.png", "--rerun", tmp_path / "a.png")
+    code, _, err = run("show", GOLDEN, QUERIES[1], "k3", *wrong)
+    assert code == 1 and ".rrd" in err
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(MissingExtraError) as missing:
         write_recording(BUFFER, tmp_path / "a.rrd", LIVE)

@@ -14,7 +14,12 @@ import pytest
 from huggingface_hub import constants
 from support.hub_server import HubServer
 
-from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, MANIFEST_PATH
+from robomme_interference_data.constants import (
+    DEMONSTRATIONS,
+    DISTRACTORS,
+    MANIFEST_PATH,
+    QUESTIONS_PATH,
+)
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.manifest import ManifestHeader
 from robomme_interference_data.storage.files import read_header, write_json
@@ -69,6 +74,8 @@ def push_buffer_set(
     shutil.copytree(root / DISTRACTORS, work)
     shutil.copytree(root / "manifests", work / "manifests")
     header = read_header(root / MANIFEST_PATH, ManifestHeader)
+    if header.questions is not None:
+        shutil.copyfile(root / QUESTIONS_PATH, work / QUESTIONS_PATH)
     places = {DEMONSTRATIONS: f"{BASE}@{base}", DISTRACTORS: "."}
     datasets = {name: replace(one, location=places[name]) for name, one in header.datasets.items()}
     write_json(work / MANIFEST_PATH, to_dict(replace(header, datasets=datasets)))

@@ -15,8 +15,10 @@ from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.build_dataset.verify import verify_buffer_set
 from robomme_interference_data.constants import EXECUTIONS, SHIFTED
+from robomme_interference_data.data.loading import open_dataset
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.views import live_embedding, live_frame
+from robomme_interference_data.errors import MissingFileError
 from robomme_interference_data.schema.shifts import SHIFTS
 
 Run = Callable[..., tuple[int, str, str]]
@@ -105,6 +107,7 @@ def test_optional_datasets_are_published_and_fetched(
     finish("fetch", UNITS, "--conditions", "k1", "--to", part)
     assert load_buffer_set(part).load(QUERY, "k1", verify=True).condition == "k1"
     assert not list(part.rglob("contradictions/videos"))
+    finish("verify", part)
 
 
 @pytest.mark.slow
@@ -131,6 +134,11 @@ def test_executions_are_published_and_fetched(
     finish("fetch", UNITS, *words, "--to", folders["with"])
     videos = {name: len([*(one / EXECUTIONS).rglob("*.mp4")]) for name, one in folders.items()}
     assert videos == {"whole": 6, "part": 0, "with": 1}
+    finish("verify", folders["part"])
+    with pytest.raises(MissingFileError) as caught:
+        open_dataset(load_buffer_set(folders["part"]), EXECUTIONS)
+    assert caught.value.command is not None and caught.value.command.endswith(" --executions")
+    finish("verify", folders["with"])
 
 
 @pytest.mark.slow
@@ -157,3 +165,4 @@ def test_views_under_shifts_are_published_and_fetched(
                 expected = live_embedding(original, own, shift, "thumbnail")
                 assert (embedding == expected).all()
     assert list(verify_buffer_set(published)) == []
+    finish("verify", part)

@@ -65,12 +65,7 @@ def compare(
     alpha = look_levels(look[1])[look[0] - 1] if look[1] > 1 else ALPHA
     one = read_rows([first], systems[0], lenient)
     other = one if second is None else read_rows([second], systems[1], lenient)
-    offline = {row.simulator == RECORDINGS for rows in (one, other) for row in rows}
-    if len(offline) > 1:
-        raise InvalidOptionError(
-            "the rows are of rollouts and of offline runs",
-            "Compare runs of one kind: a success rate has no counterpart in an action error.",
-        )
+    offline = _are_offline(one, other)
     _check_scenes(one, other)
     sides = [_sides(rows) for rows in (one, other)]
     matched = list(_matched((one, other), sides))
@@ -88,7 +83,7 @@ def compare(
                 bounds = compared.at(1 - alpha)
                 more = {"low": bounds.low, "high": bounds.high}
                 found.append(Contrast(*names, compared, complete, family=family, more=more))
-        if a.repeats(b, one, other) and not conditions and True not in offline:
+        if a.repeats(b, one, other) and not conditions and not offline:
             notes += _noise(a, b, {c: pairs["", (c, c)] for c, _ in both})
     if not found:
         runs = " and ".join(str(path) for path in (first, second) if path)
@@ -106,50 +101,62 @@ def compare(
             notes += _stopped(name, own.values())
     notes += _left_out("a", sides[0].values(), dict(matched), conditions)
     notes += _left_out("b", sides[1].values(), {b: a for a, b in matched}, conditions[::-1])
-    cells = (
-        "simulator system_a=against_system system_b=system family condition_a=against_condition "
-        "condition_b=condition n "
-    )
-    if True in offline:
-        columns = (
-            f"{cells} action_l1_a:number=against_rate action_l1_b:number=rate {ERROR_TEST} complete"
+    title = "Two runs compared" if second else "Two conditions compared"
+    table = comparison_table("compare", found, _spec(title, alpha, offline=offline))
+    note = f"a: {first}; b: {second or first}. {table.note}"
+    if look[1] > 1:
+        note += (
+            f" Look {look[0]} of {look[1]} (alpha spending like O'Brien and Fleming's boundaries): "
+            f"a difference is significant if p holm is below {alpha:.2g}, and intervals have the "
+            f"level {1 - alpha:.4%}."
         )
+    unplanned = [
+        str(path) for rows in (one, other) for path, run in rows.sources.items() if not run
+    ]
+    if unplanned:
+        note += (
+            " Without the record of a run, complete means all episodes that occur: "
+            f"{', '.join(dict.fromkeys(unplanned))}."
+        )
+    table = replace(table, note=note)
+    return RunComparison(table, tuple(notes), (one,) if other is one else (one, other))
+
+
+def _are_offline(one: Rows, other: Rows) -> bool:
+    """Return whether rows are of offline runs; those of both runs must be of one kind."""
+    found = {row.simulator == RECORDINGS for rows in (one, other) for row in rows}
+    if len(found) > 1:
+        raise InvalidOptionError(
+            "the rows are of rollouts and of offline runs",
+            "Compare runs of one kind: a success rate has no counterpart in an action error.",
+        )
+    return True in found
+
+
+def _spec(title: str, alpha: float, *, offline: bool) -> TableSpec:
+    """Return the specification of the table; offline, the action error replaces the rate."""
+    if offline:
+        values = f"action_l1_a:number=against_rate action_l1_b:number=rate {ERROR_TEST}"
         note = (
             "Over the n episodes that count in both; difference is the action error of b minus "
             f"that of a: negative if b is better. {ERROR_NOTE}"
         )
     else:
-        columns = f"{cells} rate_a=against_rate rate_b=rate difference {TEST} complete"
+        values = f"rate_a=against_rate rate_b=rate difference {TEST}"
         note = (
             "Over the n episodes that count in both; difference is b − a, gained and lost are "
             "changes from a to b. {how}"
         )
-    spec = TableSpec(
-        "Two runs compared" if second else "Two conditions compared",
-        columns,
+    return TableSpec(
+        title,
+        "simulator system_a=against_system system_b=system family condition_a=against_condition "
+        f"condition_b=condition n {values} complete",
         note,
-        lambda c: (c.simulator, bool(c.family)),
+        lambda contrast: (contrast.simulator, bool(contrast.family)),
         "the rows of all families, and among those of single families, of a simulator",
         alpha=alpha,
-        power=True not in offline,
+        power=not offline,
     )
-    table = comparison_table("compare", found, spec)
-    looked = (
-        f" Look {look[0]} of {look[1]} (alpha spending like O'Brien and Fleming's boundaries): a "
-        f"difference is significant if p holm is below {alpha:.2g}, and intervals have the level "
-        f"{1 - alpha:.4%}."
-    )
-    unplanned = [
-        str(path) for rows in (one, other) for path, run in rows.sources.items() if not run
-    ]
-    unknown = (
-        f" Without the record of a run, complete means all episodes that occur: "
-        f"{', '.join(dict.fromkeys(unplanned))}."
-    )
-    note = f"a: {first}; b: {second or first}. {table.note}"
-    note += looked * (look[1] > 1) + unknown * bool(unplanned)
-    table = replace(table, note=note)
-    return RunComparison(table, tuple(notes), (one,) if other is one else (one, other))
 
 
 def _check_arguments(first: Path, second: Path | None, conditions: Sequence[str]) -> None:

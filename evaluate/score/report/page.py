@@ -37,13 +37,18 @@ _LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
 """Libraries that numbers and figures depend on."""
 
 _SHOWN_IN = {
-    **{"effects": ("lift", "effects"), "success": ("main", "chance", "paper")},
-    **{"families": ("family", "paper_family"), "heatmap": ("family",)},
-    **{"difficulty": ("difficulty",), "retention": ("lift",)},
-    **{"retrieval": ("effects", "family"), "kinds": ("main",), "interference": ("interference",)},
+    "effects": ("lift", "effects"),
+    "success": ("main", "chance", "paper"),
+    "families": ("family", "paper_family"),
+    "heatmap": ("family",),
+    "difficulty": ("difficulty",),
+    "retention": ("lift",),
+    "retrieval": ("effects", "family"),
+    "kinds": ("main",),
+    "interference": ("interference",),
     "by_evidence_kept": ("by_evidence_kept", "evidence_effects", "evidence_use"),
     "ceiling": ("ceiling",),
-    **{"matrix": ("matrix", "systems", "ranks")},
+    "matrix": ("matrix", "systems", "ranks"),
     "action_error": ("action_error", offline.CHANGES, offline.SYSTEMS),
 }
 """Figure to the tables with its numbers."""
@@ -224,21 +229,18 @@ def _facts(score: Score, command: str | None) -> dict[str, list[str]]:
     rows, settings = score.rows, score.settings
     call = {"command": command} if command else {"call": f"score({settings}, draws={score.draws})"}
     seeds = rows.names("model_seed")
-    facts = {
-        **call,
-        "scored with": versions(),
-        "rows": f"{len(rows):,}",
-        "episodes of a complete cell": _GRIDS[settings.expected] if score.outcomes else "",
-        "recordings of a complete cell": "those in any row or in the plan of a run"
-        if score.recordings
-        else "",
-        "bootstrap": f"{score.draws:,} draws, seeded by the simulator, clustered by episode",
-        "model seeds": ", ".join(map(str, seeds[:20])) if len(seeds) > 1 else "",
-        **{
-            f"revision of the buffer set, {name}": rev
-            for name, rev in sorted(rows.revisions.items())
-        },
-        "note": " ".join(score.notes),
-        "bad rows left out": f"{rows.refused:,}: {'; '.join(rows.refusals)}" * bool(rows.refused),
-    }
-    return {name: [text] for name, text in facts.items() if text}
+    facts = {**call, "scored with": versions(), "rows": f"{len(rows):,}"}
+    if score.outcomes:
+        facts["episodes of a complete cell"] = _GRIDS[settings.expected]
+    if score.recordings is not None:
+        facts["recordings of a complete cell"] = "those in any row or in the plan of a run"
+    facts["bootstrap"] = f"{score.draws:,} draws, seeded by the simulator, clustered by episode"
+    if len(seeds) > 1:
+        facts["model seeds"] = ", ".join(map(str, seeds[:20]))
+    for name, revision in sorted(rows.revisions.items()):
+        facts[f"revision of the buffer set, {name}"] = revision
+    if score.notes:
+        facts["note"] = " ".join(score.notes)
+    if rows.refused:
+        facts["bad rows left out"] = f"{rows.refused:,}: {'; '.join(rows.refusals)}"
+    return {name: [text] for name, text in facts.items()}

@@ -1,5 +1,6 @@
 """Differences in words, and the strongest paired effect of a simulator's rows."""
 
+import math
 from collections.abc import Sequence
 
 from robomme_interference_data.evaluate.score.comparisons import offline
@@ -52,7 +53,7 @@ def shown(one: Contrast, among: Sequence[Contrast], correction: str, counts: str
     number = error_change if offline_row else points
     unit = "in action error" if offline_row else "points"
     text = f"{number(change.value)} {unit} ("
-    if change.low == change.low:
+    if not math.isnan(change.low):
         text += f"{number(change.low)} to {number(change.high)}; "
     text += f"{counts}, " if counts else ""
     text += f"{name} p = {_p(p)}"
