@@ -84,8 +84,7 @@ def verify_buffer_set(
             for path in further_files(folder, ()):
                 yield Violation(f"{name}/{path}", "is not part of the dataset")
     if decode:
-        frames = sum(dataset.identity.counts.frames for dataset in datasets.values())
-        progress.start("Verifying", frames)
+        progress.start("Verifying", sum(_frames(one, copy) for one in datasets.values()))
     for name, dataset in datasets.items():
         units, shown = datasets.get(DISTRACTORS), progress if decode else None
         yield from caught(name, dataset_violations(name, dataset, header, units, shown, copy))
@@ -125,6 +124,14 @@ def _files(buffer_set: BufferSet, root: Path) -> Iterator[Violation]:
     for path in recorded:
         if "/" not in path and not (root / path).is_file():
             yield Violation(path, "is missing")
+
+
+def _frames(dataset: Dataset, copy: FetchedCopy | None) -> int:
+    """Return how many frames of a dataset are decoded."""
+    if copy is None:
+        return dataset.identity.counts.frames
+    held = (one for one in dataset.records() if copy.holds_all(dataset, one.episode_index))
+    return sum(record.length for record in held)
 
 
 def _table(root: Path, path: str, record: type) -> Iterator[Violation]:

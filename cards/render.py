@@ -119,6 +119,7 @@ def card_text(facts: Facts, publication: Publication) -> str:
             for title, value in facts.details.items()
         },
         "limits": facts.limits,
+        "simulated": facts.simulated,
     }
     text = fill(
         "robomme_interference_data.cards",

@@ -74,7 +74,8 @@ def show(
     if out is not None:
         from robomme_interference_data.viz.filmstrip import draw_strip
 
-        drawn = buffer.query.dataset.camera(camera)
+        first = next(iter(opened.cameras), None)  # of a partial copy, one that is there
+        drawn = buffer.query.dataset.camera(camera or first)
         live = live_frame(opened, buffer, scene_shift, drawn)
         draw_strip(buffer, out, camera=drawn, live=live)
         print_status(f"{out} written")

@@ -118,6 +118,8 @@ def plan_fetch(buffer_set: "BufferSet", config: FetchConfig) -> list[Part]:
             f"{buffer_set.location} is a folder on this machine; only a repository can be fetched",
             "Give the buffer set as namespace/name.",
         )
+    for camera in config.cameras:
+        buffer_set.datasets[DEMONSTRATIONS].camera(camera, "cameras")  # raises for an unknown one
     cameras = config.cameras or buffer_set.cameras
     # Without a choice of buffers or cameras everything is fetched, also what no buffer needs.
     whole = replace(config, index=None, questions=False, executions=False) == FetchConfig()

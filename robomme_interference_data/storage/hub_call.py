@@ -117,7 +117,11 @@ class HubCall:
             missing = key == "RemoteEntryNotFoundError"
             return MissingFileError(message, hint) if missing else HubError(message, hint)
         what = f"{self.path} of {repo}" if self.path else repo
-        reason, hint = " ".join(str(error).split()), "Run the same command again to resume."
+        reason = " ".join(str(error).split())
+        if self.revision:
+            hint = "Run the same command again to resume."
+        else:  # publishing, which can also be tried without the Hub
+            hint = "Check the network. To write the files into a folder instead: --to FOLDER"
         if constants.HF_HUB_OFFLINE:
             reason, hint = "HF_HUB_OFFLINE is set", "With a network: unset HF_HUB_OFFLINE"
         elif status in (429, 503):

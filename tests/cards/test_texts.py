@@ -175,7 +175,9 @@ def test_nothing_unknown_is_asserted(
     assert data["rai:dataBiases"].startswith("One robot arm at a table") == tabletop
     assert data["rai:personalSensitiveInformation"].startswith("None") == simulated
     assert ("no people" in data["rai:dataSocialImpact"]) == simulated
-    tags = card_text(facts, OF_BUFFER_SET).split("---\n")[1].splitlines()
+    text = card_text(facts, OF_BUFFER_SET)
+    assert ("The simulator defines the difficulty" in text) == simulated
+    tags = text.split("---\n")[1].splitlines()
     assert ("- RoboMME" in tags) == ("robomme" in (query, unit))
 
 

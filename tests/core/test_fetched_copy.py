@@ -5,6 +5,7 @@ import json
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -84,6 +85,17 @@ def test_what_a_part_lacks_is_an_error_with_the_command(
         buffer_set.load("MoveCube/test/9", "k0")
 
 
+def test_the_default_camera_of_a_part_is_one_that_is_there(
+    published: HubServer, run: Run, tmp_path: Path
+) -> None:
+    options = ("--families", "MoveCube", "--conditions", "k0", "--cameras", "wrist")
+    assert run("fetch", BUFFER_SET, *options, "--to", tmp_path / "part")[0] == 0
+    out = tmp_path / "strip.png"
+    assert run("show", tmp_path / "part", "MoveCube/test/0", "k0", "--out", out)[0] == 0
+    code, _, err = run("fetch", BUFFER_SET, "--cameras", "side")
+    assert code == 1 and "--cameras" in err
+
+
 def test_a_camera_that_was_not_fetched(part: Path) -> None:
     buffer_set = load_buffer_set(part)
     with pytest.raises(MissingFileError) as caught:
@@ -147,7 +159,13 @@ def test_a_run_on_a_part_plays_what_it_holds(
 
 
 def test_a_part_is_verified(part: Path) -> None:
-    assert [*verify_buffer_set(load_buffer_set(part))] == []
+    counted: dict[str, int] = {"done": 0}
+    shown: Any = SimpleNamespace(
+        start=lambda text, frames: counted.update(all=frames),
+        advance=lambda frames: counted.update(done=counted["done"] + frames),
+    )
+    assert [*verify_buffer_set(load_buffer_set(part), progress=shown)] == []
+    assert counted["done"] == counted["all"]
     video = next(path for path in all_files(part) if path.endswith(".mp4"))
     (part / video).unlink()
     assert [one.what for one in verify_buffer_set(load_buffer_set(part)) if video in one.where] == [
