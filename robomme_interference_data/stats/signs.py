@@ -153,10 +153,6 @@ def _vector_tests(whitened: Sequence[Floats], flips: NDArray[np.uint8]) -> list[
 
 @lru_cache(maxsize=2)
 def _flips(key: str, episodes: int, draws: int) -> NDArray[np.uint8]:
-    return flips_of(generator_of(f"{key}, signs"), episodes, draws)
-
-
-def flips_of(generator: np.random.Generator, episodes: int, draws: int) -> NDArray[np.uint8]:
     """Return which episodes each draw flips, `(draws, episodes)` of 0 and 1.
 
     If there are no more than `draws` flips in all, they are all of them except the observed signs,
@@ -165,7 +161,7 @@ def flips_of(generator: np.random.Generator, episodes: int, draws: int) -> NDArr
     if episodes <= _most_enumerated(draws):
         every = np.arange(1, 2**episodes)[:, None]
         return (every >> np.arange(episodes) & 1).astype(np.uint8)
-    return generator.integers(0, 2, (draws, episodes), np.uint8)
+    return generator_of(f"{key}, signs").integers(0, 2, (draws, episodes), np.uint8)
 
 
 def _most_enumerated(draws: int) -> int:

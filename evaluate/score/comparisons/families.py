@@ -16,7 +16,6 @@ from robomme_interference_data.stats.bootstrap import (
     varies_enough,
 )
 from robomme_interference_data.stats.significance import holm
-from robomme_interference_data.stats.signs import flips_of
 from robomme_interference_data.viz.tables import Table
 
 from .contrast import Contrast
@@ -115,7 +114,7 @@ def over_families(
     The test: Σ nᶠ mᶠ² − (Σ nᶠ mᶠ)² / n grows with the differences between families. Its
     distribution without any comes from random signs of the residuals (d − mᶠ) √(nᶠ / (nᶠ − 1)), so
     that families may differ in how often their outcomes flip; the observed value counts as one of
-    the draws. Few episodes take every flip once (see `flips_of`).
+    the draws.
 
     Source: Davison and Hinkley (1997), Bootstrap Methods and their Application, section 3.8 (draws
     of clusters, then within them); Wu (1986), Annals of Statistics 14, 1261–1295 (signs of
@@ -153,11 +152,11 @@ def _over(
         return np.asarray(((sums * sums / sizes).sum(axis=-2) - whole).round(9))
 
     residuals *= np.sqrt(sizes / np.maximum(1, sizes - 1)).repeat(sizes[:, 0], axis=0)
-    signs = 1.0 - 2 * flips_of(generator, len(values), draws)
+    signs = 1.0 - 2 * generator.integers(0, 2, (draws, len(values)), np.uint8)
     ends = [*starts.tolist(), len(values)]
     sums = np.stack([signs[:, a:b] @ residuals[a:b] for a, b in pairwise(ends)], axis=1)
     reached = (variation(sums) >= variation(means * sizes)).sum(axis=0)
-    p = (1 + reached) / (1 + len(signs))
+    p = (1 + reached) / (1 + draws)
 
     alike = means.mean(axis=0)
     without = (means.sum(axis=0) - means) / (count - 1)
