@@ -118,7 +118,7 @@ def vector_sign_flips(parts: Sequence[Floats], key: str, draws: int = DRAWS) -> 
     found = [math.nan] * len(parts)
     many: dict[int, Floats] = {}
     for number, values in enumerate(parts):
-        known = ~np.isnan(values).any(axis=1)
+        known = np.asarray(~np.isnan(values).any(axis=1))
         n = int(known.sum())
         if not n:
             continue
