@@ -141,7 +141,8 @@ class FormatError(InterferenceError, ValueError):
     @classmethod
     def damaged(cls, path: object, what: object) -> Self:
         """Return the error for a damaged file: its path, and what is wrong with it."""
-        return cls(f"{path}: {what}", "The file is damaged: download or build it again.")
+        hint = "The file is damaged: restore it from a copy, or download or build it again."
+        return cls(f"{path}: {what}", hint)
 
 
 class HashMismatchError(InterferenceError, ValueError):

@@ -11,6 +11,7 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.progress import WorkProgress, duration
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.schema.rollouts import Rollout, Status
+from robomme_interference_data.simulators.registry import RECORDINGS
 from robomme_interference_data.viz.tables import Table
 
 from .log import is_done
@@ -24,7 +25,8 @@ class RunProgress:
     """A table of successes above a progress bar, on stderr; use as a context manager.
 
     If stderr is no terminal, it prints a line whenever a family is done under a condition. Once
-    each of the workers has ended two rows or so, it prints what the time left depends on.
+    each of the workers has ended two rows or so, it prints what the time left depends on, if that
+    is a minute or more.
     """
 
     def __init__(self, *, quiet: bool = False, unit: str = "rollouts", workers: int = 1):
@@ -63,8 +65,9 @@ class RunProgress:
         self._bar.advance(1, node=node)
         if row.wall_s is not None and len(self._timed) < 2 * self._workers:
             self._timed.append(row)
-            if len(self._timed) == 2 * self._workers and self._left > len(self._timed):
-                self._console.print(estimate(self._timed, self._left, self._workers))
+            timed = len(self._timed) == 2 * self._workers and self._left > len(self._timed)
+            if timed and (text := estimate(self._timed, self._left, self._workers)):
+                self._console.print(text)
         if not is_done(row):
             error = visible(f"{WorkItem.of(row)} broke: {row.error}")
             self._console.print(error, style="red", markup=False)
@@ -87,9 +90,16 @@ _PARTS = {
 }
 """Where the time of a row goes, by column."""
 
+_OFFLINE_PARTS = _PARTS | {"reset_s": "the recordings", "simulator_s": "the recordings"}
+
+_WORTH_TELLING = 60
+"""Seconds that are left, at least, for an estimate: a shorter run ends before it is read."""
+
 
 def estimate(rows: Sequence[Rollout], left: int, workers: int) -> str:
     """Return how long the remaining rows take, and on what, if they are as the given ones.
+
+    Empty if they take less than a minute. The shares are of the whole time.
 
     Args:
         rows: Rows with times.
@@ -98,11 +108,16 @@ def estimate(rows: Sequence[Rollout], left: int, workers: int) -> str:
     """
     total = sum(row.wall_s or 0.0 for row in rows)
     seconds = total / len(rows) * left / workers
-    parts = dict.fromkeys(_PARTS.values(), 0.0)
-    for column, part in _PARTS.items():
+    if seconds < _WORTH_TELLING:
+        return ""
+    names = _OFFLINE_PARTS if rows[0].simulator == RECORDINGS else _PARTS
+    parts = dict.fromkeys(names.values(), 0.0)
+    for column, part in names.items():
         parts[part] += sum(getattr(row, column) or 0.0 for row in rows)
     longest = sorted(parts.items(), key=itemgetter(1), reverse=True)
-    shares = [f"{part} {value / total:.0%}" for part, value in longest if value]
+    # Such as videos that are written, and checks of the data.
+    longest.append(("the rest", total - sum(parts.values())))
+    shares = [f"{part} {value / total:.0%}" for part, value in longest if value / total >= 0.005]
     return f"about {duration(seconds)} left; where the time goes: {', '.join(shares)}"
 
 

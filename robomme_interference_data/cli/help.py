@@ -68,7 +68,16 @@ class _Layout:
 
 
 class _Command(_Layout, TyperCommand):
-    pass
+    """A command, whose errors of usage are plain."""
+
+    def make_context(self, *args: Any, **settings: Any) -> Any:
+        """Parse the arguments."""
+        try:
+            return super().make_context(*args, **settings)
+        except typer.BadParameter as error:
+            # Typer's newer versions let pydantic check values, which says what it raised.
+            error.message = error.message.removeprefix("Value error, ")
+            raise
 
 
 class Group(_Layout, TyperGroup):

@@ -141,7 +141,7 @@ class Table:
         """
         width = width or max(80, shutil.get_terminal_size().columns)
         sides, heads, rows = self._layout("<", ">")
-        rows = [[_BOLD.sub(r"\1*", cell) for cell in row] for row in rows]
+        rows = [[_COUNT_OF.sub(_NO_BREAK, _BOLD.sub(r"\1*", cell)) for cell in row] for row in rows]
         columns = list(zip(heads, *rows, strict=True))
         widths = [max(map(len, cells)) for cells in columns]
         least = [
@@ -172,7 +172,7 @@ class Table:
             lines = [_aligned([row[column] for column in block], formats) for row in [heads, *rows]]
             parts.append("\n".join([lines[0], rule, *lines[1:]]))
         parts.append(_fill(self.note, width))
-        return visible("\n\n".join(filter(None, parts)))
+        return visible("\n\n".join(filter(None, parts)).replace("\xa0", " "))
 
     def _keys(self, rows: Sequence[Sequence[str]]) -> list[int]:
         """Return the columns that tell rows apart: the first ones of names and numbers that do."""
@@ -190,6 +190,14 @@ class Table:
 
 _BOLD = re.compile(r"\*\*(.+?)\*\*")
 
+_COUNT_OF = re.compile(r"(?<=\d) of (?=\d)")
+"""Inside a count such as `6 of 12`, which is read as one number."""
+
+_NO_BREAK = "\xa0of\xa0"
+
+_WORD = re.compile("[^ \t\n]+")
+"""What is not wrapped, no-break spaces included."""
+
 # Names of commands and options have hyphens, and are copied.
 _wrap = partial(wrap, break_on_hyphens=False)
 _fill = partial(fill, break_on_hyphens=False, break_long_words=False)
@@ -199,7 +207,7 @@ _MAX_WORD = 26
 
 
 def _longest_word(cells: Iterable[str]) -> int:
-    return max((len(word) for cell in cells for word in cell.split()), default=0)
+    return max((len(word) for cell in cells for word in _WORD.findall(cell)), default=0)
 
 
 def _aligned(cells: Sequence[str], formats: Sequence[tuple[str, int]]) -> str:

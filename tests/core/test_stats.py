@@ -149,11 +149,44 @@ def test_sign_flips_of_five_repeats_are_exact_where_one_broke() -> None:
     assert found == pytest.approx((12 / 16, 10 / 16))
 
 
+@pytest.mark.parametrize(
+    ("differences", "p"),
+    [
+        ([], math.nan),
+        ([0.3], 1.0),  # both signs are as far from 0
+        ([0.1, 0.2], 2 / 4),
+        ([0.1, 0.2, -0.3], 1.0),  # the sum is 0
+        ([3.0, 2.0, -1.0], 4 / 8),  # the sum is 4: of 6, 4, 2 and 0 with either sign, two reach it
+        ([0.3, 0.1, 0.4, 0.1, 0.5, 0.9], 2 / 64),
+        ([-1.0] * 13, 2 / 8192),
+    ],
+)
+def test_few_episodes_take_every_flip_once(differences: list[float], p: float) -> None:
+    """Whatever the key; also beside a column of many episodes, and as vectors of one number."""
+    column = np.full((40, 2), 0.5)
+    column[:, 0] = np.nan
+    column[5 : 5 + len(differences), 0] = differences
+    for key in ("one key", "other"):
+        found = sign_flips(column, key)[0]
+        [of_vectors] = vector_sign_flips([column[:, :1]], key)
+        assert [found.p, of_vectors] == pytest.approx([p, p], rel=1e-12, nan_ok=True)
+
+
+def test_the_interval_of_few_episodes_by_hand() -> None:
+    """Of 0 and twelve ones: a part without the 0 has the mean 1, the other one 1 - 1 / its size."""
+    values = np.array([0.0, *[1.0] * 12])
+    [found] = sign_flips(values[:, None], "key")
+    sizes = [size for size in range(1, 13) for _ in range(2 * math.comb(12, size - 1))]
+    assert found.low[0] == -np.inf and len(found.low) == 2**13 - 1
+    assert found.low[1:] == pytest.approx([1 - 1 / size for size in sizes])
+    assert found.p == 4 / 2**13  # no flip, all, and those of the 0 alone
+
+
 def test_random_sign_flips_and_their_interval_by_hand() -> None:
     # Of the draws of four ones, two in sixteen leave one part empty: the sum is as far from 0.
     column = np.array([[1.0, 0.0]] * 4 + [[np.nan, 0.0]] * 2)
     one, nothing = sign_flips(column, "key", 20_000)
-    assert one.value == 1 and one.p == pytest.approx(2 / 16, abs=0.01)
+    assert one.value == 1 and one.p == 2 / 16
     assert math.isnan(one.at().low)  # fewer than ten episodes differ
     assert (nothing.value, nothing.p) == (0, 1)
     # Of a normal sample the interval is Student's, and the p-value that of its test.

@@ -60,6 +60,13 @@ def test_a_table_fits_the_terminal() -> None:
     assert sum(line.startswith("row") for line in many.text(80).splitlines()) == 3
 
 
+def test_a_count_of_a_whole_stays_in_one_line() -> None:
+    columns = " ".join(f"found_{n}" for n in range(12))
+    table = Table.make("t", "", f"name {columns}", [("row", *["16 of 160"] * 12)])
+    text = table.text(80)
+    assert max(map(len, text.splitlines())) <= 80 and text.count("16 of 160") == 12
+
+
 def test_a_note_of_several_tables_is_printed_once() -> None:
     text = tables_text([TABLE, TABLE])
     assert text.count("Rates of systems") == 2 and text.count("How to read it.") == 1

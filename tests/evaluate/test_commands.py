@@ -15,7 +15,7 @@ from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate import commands
 from robomme_interference_data.evaluate.run import evaluation as run_module
 from robomme_interference_data.evaluate.run.plan import WorkItem
-from robomme_interference_data.evaluate.run.progress import RunProgress, rate_table
+from robomme_interference_data.evaluate.run.progress import RunProgress, estimate, rate_table
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS
@@ -178,8 +178,36 @@ def test_an_estimate_is_printed_once_after_two_rows_of_each_worker(
     (line,) = [one for one in capsys.readouterr().err.splitlines() if "left" in one]
     # 59 of 100 s on two workers are 2,950 s.
     assert line == (
-        "about 49 min left; where the time goes: the simulator 70%, the policy 20%, the history 5%"
+        "about 49 min left; where the time goes: "
+        "the simulator 70%, the policy 20%, the history 5%, the rest 5%"
     )
+
+
+@pytest.mark.parametrize(
+    ("simulator", "times", "shares"),
+    [
+        (
+            "recordings",
+            {"reset_s": 8.0, "simulator_s": 2.0, "policy_s": 1.0, "history_s": 0.0},
+            {"the recordings": 10, "the policy": 1, "the rest": 89},
+        ),
+        ("world", {"reset_s": 40.0, "policy_s": 60.0}, {"the policy": 60, "the simulator": 40}),
+    ],
+)
+def test_an_estimate_shares_out_the_whole_time(
+    simulator: str, times: dict[str, float], shares: dict[str, int]
+) -> None:
+    rows = [replace(row(PLAN[0], "success"), simulator=simulator, wall_s=100.0, **times)]
+    _, _, told = estimate(rows, left=10, workers=1).partition("goes: ")
+    found = {
+        part: int(share[:-1]) for part, _, share in (s.rpartition(" ") for s in told.split(", "))
+    }
+    assert found == shares and sum(found.values()) == 100
+
+
+def test_a_run_that_ends_within_seconds_has_no_estimate() -> None:
+    rows = [replace(row(PLAN[0], "success"), wall_s=1.0, policy_s=1.0)]
+    assert estimate(rows, left=59, workers=1) == "" != estimate(rows, left=60, workers=1)
 
 
 def test_errors_are_listed_beside_the_rate() -> None:

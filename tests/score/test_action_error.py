@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from matplotlib.collections import LineCollection
 from support import scoring as made
 from support.scoring import OWN
 from support.scoring import recording as row
@@ -14,12 +15,14 @@ from support.scoring import recording as row
 from robomme_interference_data.errors import FormatError, InvalidOptionError, RunError
 from robomme_interference_data.evaluate.run.plan import Plan
 from robomme_interference_data.evaluate.score.comparisons.compare import compare
+from robomme_interference_data.evaluate.score.plots.figures import draw_error_figure
 from robomme_interference_data.evaluate.score.report.methods import methods
 from robomme_interference_data.evaluate.score.report.page import headlines
 from robomme_interference_data.evaluate.score.rows.export import export
 from robomme_interference_data.evaluate.score.rows.reading import read_rows
 from robomme_interference_data.evaluate.score.writing import write_score
 from robomme_interference_data.schema.rollouts import Rollout
+from robomme_interference_data.viz.figure import open_figure
 
 ERRORS = {  # of the values of actions, in episodes 0, 1, 2
     "no-history": [(0.5, 0.7), (0.4, 0.8), (0.5, 0.5)],  # means 0.6, 0.6, 0.5
@@ -169,6 +172,46 @@ def test_systems_are_compared_with_each_other_and_with_baselines(tmp_path: Path)
     }
 
 
+def headline_of(path: Path, errors: dict[tuple[str, str], float]) -> str:
+    """The headline of six recordings with the given error of each system and condition."""
+    given = [
+        replace(row(condition, n, (error,)), system=system)
+        for (system, condition), error in errors.items()
+        for n in range(6)
+    ]
+    return headlines(made.score(made.write_parquet(path / "rows.parquet", given)))["recordings"]
+
+
+BASELINES = {("hold", "no-history"): 0.1797, ("mean", "no-history"): 0.5723}
+
+
+def test_no_error_is_called_lowest_that_a_baseline_beats(tmp_path: Path) -> None:
+    mine = {("mine", "no-history"): 0.0213, ("mine", "k0"): 0.4875, ("mine", "k3"): 0.5}
+    text = headline_of(tmp_path, {**BASELINES, **mine})
+    first, second, *_ = text.split(". ")
+    assert "lowest" not in text and "0.4875 under k0" in first
+    # Worse than Hold and than itself, and better than Mean.
+    assert "worse" in second and "Hold (0.1797)" in second and "itself" in second
+    assert "(0.0213)" in second and "Mean" not in second
+
+
+def test_the_lowest_error_is_named_and_each_system_that_is_worse_than_a_baseline(
+    tmp_path: Path,
+) -> None:
+    systems = {("good", "no-history"): 0.3, ("good", "k0"): 0.1, ("bad", "k0"): 0.2}
+    text = headline_of(tmp_path, {**BASELINES, **systems})
+    first, second, *rest = text.split(". ")
+    assert "good has the lowest" in first and "0.1000 under k0" in first
+    assert second.startswith("bad is worse") and "Hold (0.1797)" in second
+    assert "worse" not in "".join(rest)
+
+
+def test_a_single_error_is_not_called_lowest(tmp_path: Path) -> None:
+    assert "lowest" not in headline_of(tmp_path, {("mine", "k0"): 0.1})
+    lower_without = headline_of(tmp_path, {("mine", "k1"): 0.3, ("other", "no-history"): 0.2})
+    assert "lowest" not in lower_without and "0.3000 under k1" in lower_without
+
+
 def test_systems_without_a_revision_are_not_compared(tmp_path: Path) -> None:
     lines = [
         f"{system},recordings,OpenDrawer,k0,{n},measured,,20,0.{n + 1}"
@@ -195,6 +238,38 @@ def test_the_report_of_offline_runs_has_no_empty_part(tmp_path: Path) -> None:
     [data] = re.findall('id="episode-data">(.*?)</script>', page)
     first = json.loads(data)["rows"][0]
     assert first[3:6] == ["test/0", "easy", ["0.6000", "0.2000", "0.3000", "0.2000"]]
+
+
+@pytest.mark.parametrize(
+    ("recordings", "errors", "bars"), [(6, ("k0",), 0), (12, ("k0", "k1"), 1), (12, ("k0",), 1)]
+)
+def test_the_figure_names_the_intervals_that_it_draws(
+    tmp_path: Path, recordings: int, errors: tuple[str, ...], bars: int
+) -> None:
+    """Errors under k0 vary, those under k1 do not."""
+    given = [
+        row(condition, n, (n / 100 if condition == "k0" else 0.5,))
+        for condition in errors
+        for n in range(recordings)
+    ]
+    found = made.score(made.write_parquet(tmp_path / "rows.parquet", given))
+    with open_figure() as figure:
+        draw_error_figure(figure, found)
+        note = figure.legends[0].get_title().get_text()
+        [axes] = figure.axes
+        drawn = [one for one in axes.collections if isinstance(one, LineCollection)]
+        segments = sum(len(one.get_segments()) for one in drawn)
+    assert segments == bars
+    assert ("bars" in note) == (bars > 0)
+    assert ("fewer than 10" in note) == (bars < len(errors))
+
+
+def test_errors_that_are_all_zero_have_an_axis(tmp_path: Path) -> None:
+    given = [row("k0", n, (0.0,)) for n in range(3)]
+    found = made.score(made.write_parquet(tmp_path / "rows.parquet", given))
+    with open_figure() as figure:
+        draw_error_figure(figure, found)
+        assert figure.axes[0].get_ylim() == (0, 1)
 
 
 def test_rollouts_beside_them_are_scored_as_before(tmp_path: Path) -> None:
@@ -230,6 +305,28 @@ def test_two_conditions_are_compared(tmp_path: Path) -> None:
     path = made.write_parquet(tmp_path / "rows.parquet", rows())
     [change, _] = compare(path, conditions=("k0", "k1")).table.records()
     assert (change["n"], round(change["difference"], 9), change["complete"]) == (2, 0.1, False)
+
+
+@pytest.mark.parametrize(
+    ("held", "suggested"),
+    [
+        (("no-history", "k0", "k1", "k3"), "--conditions k0,k3"),
+        (("no-history", "k1"), "--conditions no-history,k1"),
+        (("no-history", "k0"), "--conditions no-history,k0"),
+        (("k0",), None),
+    ],
+)
+def test_the_suggested_conditions_are_those_of_the_run(
+    tmp_path: Path, held: tuple[str, ...], suggested: str | None
+) -> None:
+    given = [row(condition, 0, (0.1,)) for condition in held]
+    path = made.write_parquet(tmp_path / "rows.parquet", given)
+    for second in (None, path):
+        with pytest.raises(InvalidOptionError) as error:
+            compare(path, second)
+        command = error.value.command
+        assert command == (suggested and f"compare {path} {suggested}")
+        assert all(name in str(error.value.hint) for name in held)
 
 
 def test_rollouts_are_not_compared_with_recordings(tmp_path: Path) -> None:

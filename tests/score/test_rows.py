@@ -343,9 +343,9 @@ def test_files_that_cannot_be_read(tmp_path: Path, capfd: pytest.CaptureFixture[
         "cut.csv": (b"a,b\n1,\xc3", "position 6"),
         "empty.parquet": (b"", "cannot be read"),
         "b.parquet": (whole[:200] + bytes(100) + whole[300:], "cannot be read"),
-        "a.jsonl": (record.replace(b'"episode"', b"episode", 1), "cannot be read"),
-        "b.jsonl": (record + b"[1]\n", "cannot be read"),
-        "c.jsonl": (record + b"[" * 100_000 + b"\n", "cannot be read"),
+        "a.jsonl": (record.replace(b'"episode"', b"episode", 1), "line 1 "),
+        "b.jsonl": (record + b"[1]\n", f"line {len(made.rows()) + 1} "),
+        "c.jsonl": (record + b"[" * 100_000 + b"\n", f"line {len(made.rows()) + 1} "),
         "rows.txt": (b"", "rows.txt is not a"),
     }
     for name, (data, message) in damaged.items():
@@ -357,6 +357,23 @@ def test_files_that_cannot_be_read(tmp_path: Path, capfd: pytest.CaptureFixture[
     with pytest.raises(FormatError, match="list<"):
         read_rows([nested])
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("number", [1, 3, 40_000])
+@pytest.mark.parametrize("damage", [(b"{", b"{x"), (b'"MoveCube"', b"[]")])
+def test_a_damaged_line_of_a_record_is_numbered_as_in_an_editor(
+    tmp_path: Path, number: int, damage: tuple[bytes, bytes]
+) -> None:
+    """Also where pyarrow reads the file in several blocks."""
+    run = made.write_run(tmp_path / "run", made.rows()[:1])
+    record = run / "rollouts.jsonl"
+    line = record.read_bytes()
+    record.write_bytes(line * (number - 1) + line.replace(*damage, 1) + line * 2)
+    with pytest.raises(FormatError) as raised:
+        read_rows([run])
+    assert f"{record}, line {number} " in raised.value.message
+    assert "row " not in raised.value.message.removeprefix(str(record)).replace("no row of", "")
+    assert "build" not in (raised.value.hint or "")
 
 
 def test_files_of_too_many_rows_are_not_read(

@@ -135,6 +135,10 @@ run_program()
         (["lits"], "No such command 'lits'"),
         (["list", ".", "--bad"], "No such option: --bad"),
         (["build", "demonstrations", "--source", "frames:."], "Missing argument"),
+        (
+            ["score", ".", "--out", "x", "--expected", "all"],
+            "'--expected': 'all' is not one of 'benchmark', 'observed'",
+        ),
         (["list", ".", "--conditions", ""], "has an empty name"),
         (["build", "manifests", ".", "--conditions", "k0,,k1"], "has an empty name"),
         (["build", "all", ".", "--source", "sample", "--cameras", " "], "has an empty name"),

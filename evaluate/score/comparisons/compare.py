@@ -25,7 +25,7 @@ from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.stats.signs import sign_flips
 from robomme_interference_data.viz.tables import Table, percent
 
-from .contrast import Contrast
+from .contrast import START, Contrast
 from .pairs import Pairs, pair, pair_errors
 from .tables import ERROR_NOTE, ERROR_TEST, TEST, TableSpec, comparison_table
 
@@ -61,7 +61,7 @@ def compare(
     `conditions` of the first are compared. `look` is the number of this look at the data and of all
     planned ones; with several, intervals and levels spend 5% over all looks.
     """
-    _check_arguments(first, second, conditions)
+    _check_arguments(first, second, conditions, systems[0], lenient=lenient)
     alpha = look_levels(look[1])[look[0] - 1] if look[1] > 1 else ALPHA
     one = read_rows([first], systems[0], lenient)
     other = one if second is None else read_rows([second], systems[1], lenient)
@@ -159,21 +159,39 @@ def _spec(title: str, alpha: float, *, offline: bool) -> TableSpec:
     )
 
 
-def _check_arguments(first: Path, second: Path | None, conditions: Sequence[str]) -> None:
-    command = f"compare {shlex.quote(str(first))} --conditions k0,k7"
+def _check_arguments(
+    first: Path,
+    second: Path | None,
+    conditions: Sequence[str],
+    system: str | None,
+    *,
+    lenient: bool,
+) -> None:
+    for name in conditions:
+        parse_condition(name)
     if len(conditions) not in (0, 2) or (second is None and len({*conditions}) < 2):
+        hint, command = _two_conditions(first, read_rows([first], system, lenient))
         raise InvalidOptionError(
             f"conditions to compare: {' '.join(conditions) or 'none'}; expected two different "
             "ones, or two runs",
-            "Compare k7 with k0 of one run:",
+            hint,
             command,
         )
-    for name in conditions:
-        parse_condition(name)
     if second is not None and first.exists() and second.exists() and first.samefile(second):
-        raise InvalidOptionError(
-            f"{first} is given twice", "Compare two conditions of it:", command
-        )
+        hint, command = _two_conditions(first, read_rows([first], system, lenient))
+        raise InvalidOptionError(f"{first} is given twice", hint, command)
+
+
+def _two_conditions(path: Path, rows: Rows) -> tuple[str, str | None]:
+    """Return a hint and a command that compare two conditions of a run, if it holds two."""
+    held = sorted(rows.names("condition"), key=lambda name: parse_condition(name).sort_key)
+    names = ", ".join(held) or "no rows"
+    if len(held) < 2:
+        return f"{path} holds {names}: give another run.", None
+    # As in the tables: against k0, or else the first condition.
+    before = START if START in held[:-1] else held[0]
+    command = f"compare {shlex.quote(str(path))} --conditions {before},{held[-1]}"
+    return f"{path} holds {names}. Compare two of them, such as:", command
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,11 +1,14 @@
 """The figure of offline runs: the action error by condition."""
 
 import math
+from collections.abc import Sequence
 from itertools import groupby
 from typing import Any
 
 from robomme_interference_data.evaluate.score.scoring import Score
+from robomme_interference_data.evaluate.score.tables.action_error import ErrorCell
 from robomme_interference_data.schema.conditions import NO_HISTORY, parse_condition
+from robomme_interference_data.stats.bootstrap import MIN_EPISODES
 from robomme_interference_data.viz.figure import INK, tidy
 
 from .curves import LABEL, TITLE, WIDTH, draw_points, label_ends, legend, mark, shifts, short
@@ -46,14 +49,26 @@ def action_error(figure: Any, score: Score) -> None:
     tidy(axes)
     axes.set_xticks(range(len(conditions)), [short(name) for name in conditions])
     axes.set_xlim(-0.4, len(conditions) - 0.6)
-    axes.set_ylim(0, 1.05 * max(_top(cell.error) for cell in cells))
+    highest = max(_top(cell.error) for cell in cells)
+    # Errors that are all 0 give no scale.
+    axes.set_ylim(0, 1.05 * highest if highest else 1)
     axes.set_ylabel("action error, in the actions' units", size=LABEL, color=INK)
     label_ends(axes, ends, styles, _HIGH - 1, LABEL)
-    notes = ["Mean absolute difference to the recorded actions; bars: 95% bootstrap intervals"]
+    notes = ["Mean absolute difference to the recorded actions", _bars(cells)]
     if not all(cell.complete for cell in cells):
         notes.append("hollow: incomplete cell")
     legend(figure, "; ".join(notes))
     axes.set_title("Action error by condition, offline", loc="left", size=TITLE, color=INK)
+
+
+def _bars(cells: Sequence[ErrorCell]) -> str:
+    """Say which intervals are drawn."""
+    without = sum(math.isnan(cell.error.low) for cell in cells)
+    few = f"fewer than {MIN_EPISODES} recordings differ"
+    if without == len(cells):
+        return f"no intervals: {few}"
+    bars = "bars: 95% bootstrap intervals"
+    return f"{bars}, none where {few}" if without else bars
 
 
 def _top(error: tuple[float, float, float]) -> float:

@@ -8,12 +8,13 @@ from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.cells import Cell
 from robomme_interference_data.evaluate.score.tables.equivalence import BEYOND, EQUIVALENT, OPEN
 from robomme_interference_data.evaluate.systems import base_of, display_name, is_reference
-from robomme_interference_data.schema.conditions import NO_HISTORY, parse_condition
+from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.stats.intervals import wilson
 from robomme_interference_data.stats.significance import ALPHA, holm
 from robomme_interference_data.stats.signs import simultaneous
 from robomme_interference_data.viz.tables import percent, points
 
+from .offline import offline_headline
 from .strongest import named, shown
 
 
@@ -25,7 +26,7 @@ def headline(score: Score, simulator: str) -> str:
     of the leader. A reference leads only if there is no other system.
     """
     if score.recordings is not None and simulator == score.recordings.simulator:
-        return _offline(score)
+        return offline_headline(score)
     found = [one for one in score.cells if one.simulator == simulator and not one.part]
     cells = [cell for cell in found if not is_reference(cell.system)] or found
     complete = [cell for cell in cells if cell.complete]
@@ -33,30 +34,6 @@ def headline(score: Score, simulator: str) -> str:
     if not all(cell.complete for cell in found):
         done = sum(cell.complete for cell in found)
         sentences.append(f"{done} of {len(found)} cells are complete.")
-    return " ".join(sentences)
-
-
-def _offline(score: Score) -> str:
-    """Return the main finding of offline runs."""
-    cells = [cell for cell in score.error_cells if not cell.part]
-    complete = [cell for cell in cells if cell.complete]
-    sentences = list[str]()
-    starts = [cell for cell in complete if cell.condition == START] or complete
-    if starts:
-        lowest = min(starts, key=lambda cell: cell.error.value)
-        sentences.append(
-            f"Offline, {display_name(lowest.system)} has the lowest action error, "
-            f"{lowest.error.value:.4f} under {named(lowest.condition)}, over {lowest.n} recordings."
-        )
-    with_history = {cell.system for cell in cells if cell.condition != NO_HISTORY}
-    lone = [cell for cell in complete if cell.system not in with_history]
-    if lone and with_history:
-        listed = ", ".join(f"{display_name(one.system)} {one.error.value:.4f}" for one in lone)
-        sentences.append(f"Without history: {listed}.")
-    if len(complete) < len(cells):
-        sentences.append(f"{len(complete)} of {len(cells)} cells are complete.")
-    if errors := sum(cell.errors for cell in cells):
-        sentences.append(f"Errors, which do not count: {errors}.")
     return " ".join(sentences)
 
 

@@ -162,8 +162,7 @@ def _read_record(path: Path, names: Sequence[str], has_system: bool) -> Part:
         return Part({}, [])
     _check_count(data.count(b"\n"))
     fields = [arrow_schema(Rollout).field(name) for name in {*names, *KEY_COLUMNS}]
-    options = pa_json.ParseOptions(pa.schema(fields), unexpected_field_behavior="ignore")
-    columns = _columns(path, pa_json.read_json(pa.BufferReader(data), parse_options=options))
+    columns = _columns(path, _parse_record(path, data, pa.schema(fields)))
     keys = [*zip(*(columns[name] for name in KEY_COLUMNS), strict=True)]
     last = {key: at for at, key in enumerate(keys)}
     kept = [
@@ -174,6 +173,38 @@ def _read_record(path: Path, names: Sequence[str], has_system: bool) -> Part:
     return Part(
         {name: [columns[name][at] for at in kept] for name in names}, [at + 1 for at in kept]
     )
+
+
+def _parse_record(path: Path, data: bytes, schema: pa.Schema) -> pa.Table:
+    """Parse the lines of a record; name the first damaged one, counted from 1 as editors do."""
+    options = pa_json.ParseOptions(schema, unexpected_field_behavior="ignore")
+
+    def parse(part: bytes) -> pa.Table:
+        return pa_json.read_json(pa.BufferReader(part), parse_options=options)
+
+    try:
+        return parse(data)
+    except pa.ArrowInvalid:
+        # Its number of a row is that in a block of the file: look for the line in halves.
+        lines = data.removesuffix(b"\n").split(b"\n")
+        number = 1
+        while len(lines) > 1:
+            half = len(lines) // 2
+            try:
+                parse(b"\n".join(lines[:half]))
+            except pa.ArrowInvalid:
+                lines = lines[:half]
+            else:
+                number, lines = number + half, lines[half:]
+        try:
+            parse(lines[0])
+        except pa.ArrowInvalid as error:
+            reason = str(error).partition("\n")[0].partition(" in row ")[0]
+            raise FormatError(
+                f"{path}, line {number} (counted from 1) is no row of a rollout: {reason}",
+                "Remove the line, and run the command of the run again: it repeats that rollout.",
+            ) from None
+        raise
 
 
 def _read_vla_eval(path: Path, names: Sequence[str], has_system: bool) -> Part:
