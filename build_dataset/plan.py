@@ -117,6 +117,10 @@ def plan_alone(kind: str, config: BuildConfig) -> BuildPlan:
     from robomme_interference_data.data.dataset import Dataset
     from robomme_interference_data.storage.files import LocalFiles
 
+    if kind not in UNITS and Unit(config.unit_frames, config.unit_stride) != PAPER_UNIT:
+        raise InvalidOptionError(
+            f"`unit_frames` and `unit_stride` have no effect on {kind}", "Leave them out."
+        )
     folder = config.buffer_set / DEMONSTRATIONS
     if kind == DEMONSTRATIONS or not folder.is_dir():
         return plan_build(kind, config)

@@ -98,3 +98,6 @@ def test_only_short_episodes_are_an_error_that_names_the_options(tmp_path: Path)
     config = BuildConfig(("sample",), tmp_path, unit_frames=0)
     with pytest.raises(InvalidOptionError, match="unit_frames 0; expected a positive number"):
         plan_build(DISTRACTORS, config)
+    other = BuildConfig(("sample",), tmp_path, unit_frames=5)
+    with pytest.raises(InvalidOptionError, match="no effect on demonstrations"):
+        plan_alone("demonstrations", other)
