@@ -17,7 +17,7 @@ from robomme_interference_data.build_dataset.manifests import (
     plan_manifests,
     write_manifests,
 )
-from robomme_interference_data.build_dataset.plan import BuildPlan, plan_build
+from robomme_interference_data.build_dataset.plan import BuildPlan, plan_alone, plan_build
 from robomme_interference_data.build_dataset.sources.base import Frame
 from robomme_interference_data.cards.dataset_facts import buffer_set_facts
 from robomme_interference_data.cards.publication import Publication
