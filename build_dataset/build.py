@@ -2,7 +2,7 @@
 
 The output folder is always either absent or complete: everything is made in a hidden folder beside
 it and renamed at the end. An interrupted build resumes from its staged episodes. An existing
-dataset is extended by the episodes that it lacks; the others are neither read nor encoded again.
+dataset is extended by the episodes that it lacks; the others are not encoded again.
 """
 
 import os
