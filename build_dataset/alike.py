@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from robomme_interference_data.constants import ACTION, CAMERA_PREFIX
@@ -46,6 +46,21 @@ def differences(one: tuple[str, Look], other: tuple[str, Look]) -> list[str]:
     facts["robot"] = a.robot_type, b.robot_type
     here = {what: values[0] for what, values in facts.items()}
     return unequal((first, here), (second, {what: values[1] for what, values in facts.items()}))
+
+
+def differ_in_cameras(one: Look, other: Look) -> bool:
+    """Return whether two looks differ in cameras alone, so that a choice of cameras mends it."""
+
+    def without_others(look: Look) -> Look:
+        shared = {
+            name: shape
+            for name, shape in look.features.items()
+            if not name.startswith(CAMERA_PREFIX)
+            or one.features.get(name) == other.features.get(name)
+        }
+        return replace(look, features=shared)
+
+    return not differences(("", without_others(one)), ("", without_others(other)))
 
 
 def unequal(one: tuple[str, Mapping[str, Any]], other: tuple[str, Mapping[str, Any]]) -> list[str]:

@@ -2,7 +2,7 @@
 
 The output folder is always either absent or complete: everything is made in a hidden folder beside
 it and renamed at the end. An interrupted build resumes from its staged episodes. An existing
-dataset is extended by the episodes that it lacks; the others are neither read nor encoded again.
+dataset is extended by the episodes that it lacks; the others are not encoded again.
 """
 
 import os
@@ -29,7 +29,7 @@ from robomme_interference_data.storage.encode import get_codec
 from robomme_interference_data.storage.files import canonical_json, read_json
 from robomme_interference_data.storage.staging import replace_folder, staging_dir
 
-from .alike import Look, differences, in_buffers
+from .alike import Look, differ_in_cameras, differences, in_buffers
 from .estimate import BuildEstimate
 from .existing import ExistingDataset, open_existing
 from .identity import complete_dataset, identity_of
@@ -86,6 +86,7 @@ def _stage(
     progress: WorkProgress,
 ) -> None:
     """Stage episodes, and add each to `stored` or `skipped`."""
+    built = stored[:1]  # of the dataset that is extended; all its episodes are alike
     limit = plan.time_limit_s or max(source.time_limit_s for source in plan.sources)
 
     def folder(one: Task) -> Path:
@@ -96,9 +97,16 @@ def _stage(
         if staged.skipped is not None:
             skipped[str(staged.episode_id)] = staged.skipped
         else:
-            stored.append(staged.stored(folder(one)))
-            _check_alike(stored[0], stored[-1])
-            _check_like(stored[-1], plan)
+            episode = staged.stored(folder(one))
+            try:
+                _check_like(episode, plan)
+                for earlier in built:
+                    _check_alike(earlier, episode)
+            except SourceError:
+                shutil.rmtree(folder(one))  # no later attempt can use it
+                raise
+            stored.append(episode)
+            _check_alike(stored[0], episode)
 
     missing = []
     progress.start("Reading and encoding", len(todo))
@@ -133,7 +141,9 @@ def _check_alike(one: StoredEpisode, other: StoredEpisode) -> None:
     if found := differences((names[0], looks[0]), (names[1], looks[1])):
         raise SourceError(
             f"{names[0]} and {names[1]} cannot be in one dataset: {'; '.join(found)}",
-            "Choose `cameras` that all have, or build the sources into separate buffer sets.",
+            "Choose `cameras` that all have, or build the sources into separate buffer sets."
+            if differ_in_cameras(*looks)
+            else "Leave one of them out, or build them into separate buffer sets.",
         )
 
 
@@ -148,11 +158,13 @@ def _check_like(episode: StoredEpisode, plan: BuildPlan) -> None:
         return
     name = str(episode.record.episode_id)
     look = in_buffers(episode.features, episode.fps)
+    shared = {one: look.features[one] for one in plan.like.features if one in look.features}
     if found := differences(("the demonstrations", plan.like), (name, look)):
         raise SourceError(
             f"{name} cannot be in a buffer with the demonstrations: {'; '.join(found)}",
-            "Choose recordings with the rate, cameras and sizes of the demonstrations, or their "
-            "`cameras`.",
+            "Choose recordings that are alike, or build a separate buffer set of them."
+            if differences(("", plan.like), ("", replace(look, features=shared)))
+            else "Choose the `cameras` of the demonstrations.",
         )
 
 
@@ -168,8 +180,7 @@ def _failure(failures: Sequence[Outcome], total: int) -> InterferenceError:
     more = f"\n  … and {len(failures) - 10} more" if len(failures) > 10 else ""
     return BuildError(
         f"{len(failures)} of {total} episodes failed:\n" + "\n".join(lines) + more,
-        "The others are kept. Correct these or leave them out (`families`, `episodes`), then run "
-        "the same command again.",
+        "The others are kept. Correct these, and run the same command again, or leave them out.",
     )
 
 
@@ -187,9 +198,9 @@ def _write(
         reasons = "; ".join(f"{name}: {why}" for name, why in list(skipped.items())[:5])
         raise SourceError(
             f"no episode yields {plan.kind}: {len(skipped)} unusable ({reasons})",
-            "Check `families`, `split` and `episodes` against the sources."
-            + " `unit_frames` and `unit_stride` allow units of shorter episodes."
-            * (plan.kind in UNITS),
+            "`unit_frames` and `unit_stride` allow units of shorter episodes."
+            if plan.kind in UNITS
+            else "Choose other episodes or sources.",
         )
     ordered = sorted(stored, key=lambda one: one.record.episode_id)
     # Actions are stored only if all episodes have them: buffers do not hold them.

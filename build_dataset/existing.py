@@ -6,19 +6,20 @@ from pathlib import Path
 
 from robomme_interference_data.constants import ACTION, IDENTITY_PATH, REPORT_PATH, STATE, UNITS
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.errors import BuildError
+from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.files import LocalFiles, read_header
 from robomme_interference_data.storage.lerobot import LeRobotFiles
 
-from .alike import unequal
+from .alike import same_rate, unequal
 from .identity import BuildReport
 from .image_stats import Statistics, before_scaling, episode_statistics
 from .lerobot_writer import StoredEpisode
 from .plan import BuildPlan
 from .sources.base import Robot
 from .sources.columns import recorded_robot
+from .sources.simulator import SimulatorSource
 
 _ADVICE = "Choose another `buffer_set`, or remove the folder first."
 
@@ -67,12 +68,47 @@ def open_existing(out: Path, plan: BuildPlan) -> ExistingDataset | None:
         if "suite_version" in before and before != source.provenance:
             found = unequal(("it", before), ("this source", source.provenance))
             raise BuildError(f"{out} exists, of another source: {'; '.join(found)}", _ADVICE)
+    if plan.fps is not None and not same_rate(plan.fps, dataset.fps):
+        raise InvalidOptionError(
+            f"fps {plan.fps:g}; {out} has {dataset.fps:g} frames per second",
+            "Leave out `fps`, or choose another `buffer_set`.",
+            option="fps",
+        )
+    _check_recordings(out, dataset, plan)
     statistics = episode_statistics(LeRobotFiles(dataset.files, statistics=True).table)
     vectors = {name: name for name in (STATE, ACTION) if name in dataset.features}
     robot = recorded_robot(dataset.lerobot, vectors)
     episodes = map(partial(_stored, dataset, robot), dataset.records(), statistics)
     report = read_header(out / REPORT_PATH, BuildReport)
     return ExistingDataset(dataset, tuple(episodes), report.reasons)
+
+
+def _check_recordings(out: Path, dataset: Dataset, plan: BuildPlan) -> None:
+    """Check that recordings are those that the dataset was built from: one of each source.
+
+    Simulators, and repositories at a recorded commit, are the same by what is recorded of them.
+    """
+    known = {record.episode_id: record for record in dataset.records()}
+    for number, source in enumerate(plan.sources):
+        again = [one for owner, one in plan.tasks if owner == number and one.id in known]
+        if not again or isinstance(source, SimulatorSource):
+            continue
+        if "revision" in source.provenance and source.provenance in dataset.identity.sources:
+            continue
+        recording, record = source.read(again[0], plan.cameras), known[again[0].id]
+        recording.frames.close()
+        given = dataset.fps if plan.fps is None else plan.fps
+        rate = given if recording.robot.fps is None else recording.robot.fps
+        names = ("goals", "seed", "difficulty")
+        stored = {name: getattr(record, name) for name in names}
+        facts = {name: getattr(recording, name) for name in names}
+        if not same_rate(rate, dataset.fps):
+            stored["frames per second"] = dataset.fps
+            facts["frames per second"] = rate
+        if found := unequal((str(out), stored), ("this source", facts)):
+            raise SourceError(
+                f"{record.episode_id} exists with another recording: {'; '.join(found)}", _ADVICE
+            )
 
 
 def _stored(

@@ -21,7 +21,7 @@ from robomme_interference_data.constants import (
     Unit,
 )
 from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError, counted
-from robomme_interference_data.ids import EpisodeId, parse_numbers
+from robomme_interference_data.ids import EpisodeId, format_numbers, parse_numbers
 from robomme_interference_data.runtime.executor import make_executor
 from robomme_interference_data.schema.conditions import datasets_of
 
@@ -117,6 +117,10 @@ def plan_alone(kind: str, config: BuildConfig) -> BuildPlan:
     from robomme_interference_data.data.dataset import Dataset
     from robomme_interference_data.storage.files import LocalFiles
 
+    if kind not in UNITS and Unit(config.unit_frames, config.unit_stride) != PAPER_UNIT:
+        raise InvalidOptionError(
+            f"`unit_frames` and `unit_stride` have no effect on {kind}", "Leave them out."
+        )
     folder = config.buffer_set / DEMONSTRATIONS
     if kind == DEMONSTRATIONS or not folder.is_dir():
         return plan_build(kind, config)
@@ -147,7 +151,7 @@ def plan_build(
     from robomme_interference_data.storage.encode import get_codec
 
     from .frame_selection import unmarked_error
-    from .sources import open_source
+    from .sources import open_source, takes
 
     check_root(config.buffer_set)
     get_codec(config.codec)
@@ -164,6 +168,12 @@ def plan_build(
     numbers = None if config.episodes is None else parse_numbers(config.episodes)
     columns = _columns(config.columns)
     unit = Unit(config.unit_frames, config.unit_stride)
+    for name in ("columns", "families_file"):
+        if getattr(config, name) and not any(takes(text, name) for text in config.source):
+            raise InvalidOptionError(
+                f"`{name}` has no effect on {', '.join(config.source)}",
+                "Only the source lerobot takes it: leave it out.",
+            )
     sources = tuple(
         open_source(
             text,
@@ -248,12 +258,15 @@ def list_episodes(
         if one.id == other.id:
             raise SourceError(
                 f"{one.id} is recorded twice (in source {first + 1} and source {second + 1})",
-                "Leave one out with `families`, `split` or `episodes`, or give fewer sources.",
+                "Give only one of these sources, or name the episode differently in one of them.",
             )
     if not chosen:
+        asked = [split, *sorted(families)]
+        if chosen_indices is not None:
+            asked.append(f"episodes {format_numbers(sorted(chosen_indices))}")
+        wanted = ", ".join(filter(None, asked)) or "a query episode"
         raise SourceError(
-            f"no episode of {counted(len(listed), 'recorded episode')} matches `families`, `split` "
-            "and `episodes`",
+            f"no episode of {counted(len(listed), 'recorded episode')} is: {wanted}",
             "Choose others.",
         )
     return tuple(chosen)

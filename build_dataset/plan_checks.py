@@ -1,9 +1,7 @@
 """Checks before a build: its folder, units that suffice, planned buffers that would change."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from robomme_interference_data.constants import DATASETS, DEMONSTRATIONS, DISTRACTORS, MANIFESTS
 from robomme_interference_data.errors import BuildError
@@ -13,8 +11,6 @@ from .config import PlanConfig
 from .replan import Planned, Replan, replan
 
 if TYPE_CHECKING:
-    from robomme_interference_data.schema.draw import UnitPool
-
     from .existing import ExistingDataset
     from .plan import BuildPlan
 
@@ -55,7 +51,7 @@ def check_plans(
     request: PlanConfig,
 ) -> Replan:
     """Check that datasets can be built or extended, and that units suffice; return the plan."""
-    from robomme_interference_data.schema.draw import UnitPool
+    from robomme_interference_data.schema.draw import UnitPool, check_units
 
     from .existing import open_existing
     from .manifests import check_manifests_folder
@@ -67,9 +63,7 @@ def check_plans(
     following = replan(planned, request, queries=queries, units_change=_adds_episodes(units, built))
     available = {episode.id for _, episode in units.tasks}
     pool = UnitPool(available if built is None else available | built.ids)
-    for query in {one.family: one for one in sorted(queries)}.values():
-        for condition in following.conditions:
-            condition.sessions(_UnreadSessions(query, pool))
+    check_units(pool, queries, following.conditions)
     check_manifests_folder(root)
     return following
 
@@ -80,23 +74,3 @@ def _adds_episodes(plan: "BuildPlan", existing: "ExistingDataset | None") -> boo
         return True
     known = {*existing.skipped, *map(str, existing.ids)}
     return any(str(episode.id) not in known for _, episode in plan.tasks)
-
-
-@dataclass(frozen=True)
-class _UnreadSessions:
-    """Sources of a query's sessions, before data is read: drawing checks that units suffice."""
-
-    query: EpisodeId
-    pool: "UnitPool"
-
-    def lesson(self, part: str = "lesson") -> Any:
-        return self.query
-
-    def contradiction(self) -> Any:
-        return self.query
-
-    def units(self, k: int, dataset: str = DISTRACTORS) -> Sequence[Any]:
-        return self.pool.draw(self.query, k)
-
-    def own_units(self, k: int) -> Sequence[Any]:
-        return self.pool.draw_own(self.query, k)

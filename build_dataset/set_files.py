@@ -6,6 +6,7 @@ from pathlib import Path
 
 from robomme_interference_data.constants import (
     DATASET_FOLDERS,
+    DATASETS,
     INDEX_DIR,
     INFO_PATH,
     MANIFESTS,
@@ -13,6 +14,7 @@ from robomme_interference_data.constants import (
     QUESTIONS_PATH,
 )
 from robomme_interference_data.storage.files import all_files
+from robomme_interference_data.storage.staging import staging_path
 
 _BESIDE = (
     rf"(README|LICENSE)[^/]*|croissant\.json|{PARTS_PATH}"
@@ -24,18 +26,27 @@ _IN_DATASET = re.compile(rf"({'|'.join((*DATASET_FOLDERS, INDEX_DIR))})/.*|{_BES
 _IN_SET = re.compile(rf"{MANIFESTS}/.*|{QUESTIONS_PATH}|{_BESIDE}")
 
 
+def unfinished_builds(root: Path) -> list[str]:
+    """Return the names of a buffer set's folders whose build has begun and not ended."""
+    return [name for name in (*DATASETS, MANIFESTS) if staging_path(root / name).is_dir()]
+
+
 def further_files(root: Path, datasets: Collection[str]) -> Iterator[str]:
     """Yield the paths of the files of a folder that belong to no dataset or buffer set.
 
-    Files in the folders of datasets and manifests count as theirs here, and are checked with them.
+    Files in the folders of datasets and manifests count as theirs here, and are checked with them;
+    those of unfinished builds are left out.
 
     Args:
         root: Folder of a buffer set, or of a single dataset.
         datasets: Names of the buffer set's datasets; empty for a single dataset.
     """
     has_dataset = (root / INFO_PATH).is_file()  # a published buffer set has its units at the root
+    staging = {staging_path(root / name).name for name in unfinished_builds(root)}
     for path in all_files(root):
         folder, _, inner = path.partition("/")
+        if folder in staging:
+            continue
         if folder in datasets:
             patterns, inside = [_IN_DATASET], inner
         else:

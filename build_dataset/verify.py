@@ -1,5 +1,6 @@
 """Recompute every hash and every rule of a buffer set, and list each violation."""
 
+import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from importlib.util import find_spec
@@ -36,6 +37,7 @@ from robomme_interference_data.storage.arrays import combine
 from robomme_interference_data.storage.encode import CODECS, decode_image
 from robomme_interference_data.storage.files import LocalFiles, all_files, sha256_file
 from robomme_interference_data.storage.parquet import open_parquet
+from robomme_interference_data.storage.staging import staging_path
 
 from .dataset_checks import (
     HEADER,
@@ -47,7 +49,7 @@ from .dataset_checks import (
 )
 from .manifests import plan_manifests, planned_buffers
 from .questions import Marks, planned_questions
-from .set_files import further_files
+from .set_files import further_files, unfinished_builds
 
 _ROWS = f"{MANIFESTS}/{MANIFEST_ROWS}"
 
@@ -118,6 +120,10 @@ def _files(buffer_set: BufferSet, root: Path) -> Iterator[Violation]:
         yield Violation(rows, f"does not have the SHA-256 of {MANIFEST_HEADER}")
     else:
         yield from caught(MANIFESTS, _table(root, rows, BufferManifest))
+    for name in unfinished_builds(root):
+        folder = staging_path(root / name)
+        what = f"is an unfinished build of the {name}: resume it with the command that began it, or"
+        yield Violation(folder.name, f"{what} remove it with rm -r {shlex.quote(str(folder))}")
     for path in further_files(root, buffer_set.header.datasets):
         yield Violation(path, "is not part of the buffer set")
     recorded = buffer_set.copy.record.files if buffer_set.copy is not None else ()

@@ -144,12 +144,18 @@ def _spans(text: str) -> list[range]:
     spans, count = [], 0
     for part in text.split(","):
         match = _SPAN.fullmatch(part.strip())
-        if match is None or int(match[2] or match[1]) < int(match[1]):
+        where = "" if part == text else f" in {text!r}"
+        if match is None:
             raise InvalidOptionError(
-                f"{text!r} is not a list of episode numbers: {part.strip()!r}",
+                f"{part.strip()!r}{where} is not an episode number or a range of them",
                 "Expected numbers and ranges separated by commas, such as 0-49 or 0,3,10-12.",
             )
-        spans.append(range(int(match[1]), int(match[2] or match[1]) + 1))
+        first, last = int(match[1]), int(match[2] or match[1])
+        if last < first:
+            raise InvalidOptionError(
+                f"the range {part.strip()}{where} ends before it begins", f"Write {last}-{first}."
+            )
+        spans.append(range(first, last + 1))
         count += len(spans[-1])
         if count > _MOST_NUMBERS:
             raise InvalidOptionError(

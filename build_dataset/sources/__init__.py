@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import InvalidOptionError, nearest
 from robomme_interference_data.runtime.specs import (
     OWN,
     Kind,
@@ -15,7 +15,16 @@ from robomme_interference_data.simulators.registry import SIMULATORS, simulator_
 
 from .base import Frame, Recording, Robot, Source, SourceEpisode
 
-__all__ = ["SOURCES", "Frame", "Recording", "Robot", "Source", "SourceEpisode", "open_source"]
+__all__ = [
+    "SOURCES",
+    "Frame",
+    "Recording",
+    "Robot",
+    "Source",
+    "SourceEpisode",
+    "open_source",
+    "takes",
+]
 
 _LOCATION = "(?P<location>.+)"
 
@@ -66,15 +75,20 @@ def open_source(specification: str, *, shifted: bool = False, **options: Any) ->
     return source
 
 
+def takes(specification: str, option: str) -> bool:
+    """Return whether a source takes one of the options of `open_source`."""
+    return option in signature_of(SOURCES.factory(_parse(specification))).parameters
+
+
 def _parse(specification: str) -> Spec:
     """Parse the text of a source; a simulator of the user is one like the embedded one."""
     module = specification.partition(":")[0]
     if module in SOURCES.kinds or not OWN.fullmatch(specification):
         return SOURCES.parse(specification)
     try:
-        import_factory("source", specification)
+        import_factory(f"source {specification!r}", specification)
     except InvalidOptionError as error:  # the module, or the name of a kind, is misspelled
-        raise InvalidOptionError(
-            error.message, f"{error.hint} Other sources: {SOURCES.forms}."
-        ) from error
+        meant = nearest(module, SOURCES.kinds, more="")
+        hint = f"{meant} {error.hint} Other sources: {SOURCES.forms}.".lstrip()
+        raise InvalidOptionError(error.message, hint) from error
     return Spec("tabletop", given={"name": specification})

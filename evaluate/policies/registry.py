@@ -171,7 +171,7 @@ def _factory(text: str, worker: int) -> tuple[Factory, dict[str, Any]]:
     """Return what makes a policy, and the arguments that its text gives."""
     spec = POLICIES.parse(text)
     if spec.kind == "python":
-        factory = import_factory("policy", spec.target)
+        factory = import_factory(f"policy {str(spec)!r}", spec.target)
         takes_worker = "worker" in signature_of(factory).parameters
         return factory, {"worker": worker} if takes_worker else {}
     if starts_server(text):

@@ -109,7 +109,7 @@ def fetch(
     check_output(None if to is None else to.resolve().parent)  # `to` may be an earlier copy
     with graceful_interrupt("What was fetched is kept"):
         opened = load_buffer_set(buffer_set)
-        parts = plan_fetch(opened, config)
+        parts = plan_fetch(opened, config, to)
         repositories = [
             {
                 "repository": part.files.describe(),

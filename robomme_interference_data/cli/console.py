@@ -108,7 +108,8 @@ def graceful_interrupt(kept: str, place: Path | None = None) -> Iterator[None]:
         print_kept("resume with")
         raise typer.Exit(143 if isinstance(interrupt, _Terminated) else 130) from None
     except OSError as error:
-        if error.errno is not None:  # such as a full disk
+        # Such as a full disk; the same command cannot mend a file where a folder must be.
+        if error.errno is not None and not isinstance(error, FileExistsError | NotADirectoryError):
             print_kept("once this is fixed, resume with")
         raise
     finally:

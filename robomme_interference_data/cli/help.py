@@ -35,6 +35,13 @@ class _Layout:
         """Return the names of a group's commands by title."""
         return {"Commands": list(getattr(self, "commands", ()))}
 
+    def collect_usage_pieces(self: Any, ctx: Any) -> list[str]:
+        """Return the words of the usage, which errors of usage show too."""
+        params = self.get_params(ctx)
+        names = [_argument(one) for one in params if one.param_type_name == "argument"]
+        command = ["COMMAND [ARGS]..."] if hasattr(self, "commands") else []
+        return ["[OPTIONS]", *names, *command]
+
     def format_help(self: Any, ctx: Any, formatter: Any) -> None:
         """Write the help."""
         arguments: _Rows = []
@@ -45,9 +52,7 @@ class _Layout:
             text = with_addresses(text)
             group = getattr(param, "rich_help_panel", None) or "Options"
             if param.param_type_name == "argument":
-                name = param.metavar or param.name.upper()
-                name = (name if param.required else f"[{name}]") + "..." * (param.nargs != 1)
-                arguments.append((name, text.removesuffix("[required]").rstrip()))
+                arguments.append((_argument(param), text.removesuffix("[required]").rstrip()))
             elif param.name in ("as_json", "help"):
                 last.append((name, text))
             else:
@@ -55,8 +60,7 @@ class _Layout:
         groups.setdefault("Options" if len(groups) == 1 else "Other options", []).extend(last)
 
         commands = getattr(self, "commands", {})
-        usage = [name for name, _ in arguments] + ["COMMAND [ARGS]..."] * bool(commands)
-        formatter.write_usage(ctx.command_path, " ".join(["[OPTIONS]", *usage]))
+        self.format_usage(ctx, formatter)
         description, heading, examples = inspect.cleandoc(self.help).partition("\nExample")
         _write_prose(formatter, description)
         for title, rows in [("Arguments", arguments), *groups.items()]:
@@ -82,6 +86,12 @@ class _Command(_Layout, TyperCommand):
 
 class Group(_Layout, TyperGroup):
     """A group of commands."""
+
+
+def _argument(param: Any) -> str:
+    """Return the name of an argument as users see it."""
+    name = param.metavar or param.name.upper()
+    return (name if param.required else f"[{name}]") + ("..." if param.nargs != 1 else "")
 
 
 def _write_section(formatter: Any, title: str, rows: _Rows) -> None:

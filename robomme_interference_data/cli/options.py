@@ -5,6 +5,7 @@ A list is an option that is repeated, or has values separated by commas.
 
 import dataclasses
 import inspect
+from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import wraps
 from pathlib import Path
@@ -20,14 +21,20 @@ def split_commas(values: Sequence[str] | None) -> list[str] | None:
     """Return the values of a list option.
 
     Raises:
-        typer.BadParameter: One is empty: `--conditions ""` is a mistake, such as an unset variable.
+        typer.BadParameter: One is empty: `--conditions ""` is a mistake, such as an unset variable;
+            or one is given twice.
     """
     if values is None:
         return None
     parts = [part.strip() for text in values for part in text.split(",")]
     if not all(parts):
         given = ",".join(values)
-        raise typer.BadParameter(f"{given!r} has an empty name. Leave out the option for all.")
+        raise typer.BadParameter(
+            f"{given!r} has an empty name. Leave out the option for its default."
+        )
+    for part, times in Counter(parts).items():
+        if times > 1:
+            raise typer.BadParameter(f"{part!r} is given {times} times. Give it once.")
     return parts
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import DATASETS, DEMONSTRATIONS, DISTRACTORS, MANIFEST_PATH
 from robomme_interference_data.errors import (
+    BuildError,
     FormatError,
     InvalidOptionError,
     UnknownNameError,
@@ -22,6 +23,7 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.ids import EpisodeId, whole_number
 from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_pandas
 from robomme_interference_data.schema.conditions import Condition, datasets_of, parse_condition
+from robomme_interference_data.schema.draw import UnitPool, check_units
 from robomme_interference_data.schema.manifest import BufferManifest, ManifestHeader
 from robomme_interference_data.storage.files import LocalFiles, digest_json, read_header
 from robomme_interference_data.storage.hub import HubFiles
@@ -196,12 +198,27 @@ class BufferSet:
                 f"the buffers of {parsed.name}", f"--conditions {parsed.name}"
             )
         if parsed.name not in self.conditions:
-            raise UnknownNameError(
-                f"condition {parsed.name!r} is not in {self.location}",
-                f"Planned there: {' '.join(self.conditions)}.",
-                self.planning(parsed.name),
-            )
+            what = f"condition {parsed.name!r} is not in {self.location}"
+            there = f"Planned there: {' '.join(self.conditions)}."
+            if (lacking := self._lacking(parsed)) is None:
+                raise UnknownNameError(what, there, self.planning(parsed.name))
+            raise UnknownNameError(what, f"{there} {lacking}")
         return parsed
+
+    def _lacking(self, condition: Condition) -> str | None:
+        """Return what its folder lacks for buffers under a condition; None if nothing."""
+        if not self.is_own or isinstance(self.files, HubFiles):
+            return None
+        names = [name for name in condition.kind.needs if not (self.files.root / name).is_dir()]
+        if names:
+            return f"For {condition}, build the {' and '.join(names)} first."
+        # Without the check of its revision: the next plan draws from the units that are there now.
+        units = Dataset(self.dataset_files(DISTRACTORS)).records()
+        try:
+            check_units(UnitPool(one.episode_id for one in units), self.episode_ids, [condition])
+        except BuildError as error:
+            return f"For {condition}, {error.message}."
+        return None
 
     def planning(self, *conditions: str) -> str:
         """Return the command that plans buffers under these conditions too."""

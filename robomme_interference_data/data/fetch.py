@@ -107,17 +107,20 @@ class Part:
     unlisted: tuple[str, ...]
 
 
-def plan_fetch(buffer_set: "BufferSet", config: FetchConfig) -> list[Part]:
+def plan_fetch(buffer_set: "BufferSet", config: FetchConfig, to: Path | None = None) -> list[Part]:
     """Return the files to download from each repository; only listings and metadata are read.
 
     A repository may hold anything, but only files that the buffer set lists are fetched: those of
-    its datasets, by their lists of digests, its manifests, and its card.
+    its datasets, by their lists of digests, its manifests, and its card. `to` is checked first.
     """
     if not isinstance(buffer_set.files, HubFiles):
         raise InvalidOptionError(
             f"{buffer_set.location} is a folder on this machine; only a repository can be fetched",
             "Give the buffer set as namespace/name.",
         )
+    if to is not None:
+        header = buffer_set.files.path(MANIFEST_PATH)
+        _earlier_files(to.resolve(), buffer_set.location, header)
     for camera in config.cameras:
         buffer_set.datasets[DEMONSTRATIONS].camera(camera, "cameras")  # raises for an unknown one
     cameras = config.cameras or buffer_set.cameras

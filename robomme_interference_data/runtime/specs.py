@@ -137,11 +137,11 @@ class Registry:
 
 
 def import_factory(what: str, target: str) -> Factory:
-    """Import a function or class by `module:name`; messages call its result `what`."""
+    """Import a function or class by `module:name`; messages begin with `what`, which is made."""
     module, _, name = target.partition(":")
     if module == "__main__":
         raise InvalidOptionError(
-            f"{what} {target!r}: worker processes run another program, which has no such function",
+            f"{what}: worker processes run another program, which has no such function",
             "Put the function into a module, a .py file beside the script or on PYTHONPATH, and "
             "write MODULE:FUNCTION.",
         )
@@ -149,8 +149,8 @@ def import_factory(what: str, target: str) -> Factory:
         loaded = import_module(module)
     except Exception as error:
         raise InvalidOptionError(
-            f"{what} {target!r}: importing {module} failed: {type(error).__name__}: {error}",
-            "Install it, or set PYTHONPATH to the folder that contains it.",
+            f"{what}: importing {module} failed: {type(error).__name__}: {error}",
+            f"Install {module}, or set PYTHONPATH to the folder that contains it.",
         ) from error
     factory: Any = getattr(loaded, name, None)
     if not callable(factory):

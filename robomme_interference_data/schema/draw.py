@@ -23,13 +23,17 @@ Rule version 1, for a query of family F and index i:
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cache, partial
 from itertools import islice
+from typing import Any
 
-from robomme_interference_data.constants import FAMILIES, RULE_VERSION
+from robomme_interference_data.constants import DISTRACTORS, FAMILIES, RULE_VERSION
 from robomme_interference_data.errors import BuildError, InvalidOptionError
 from robomme_interference_data.ids import EpisodeId
+
+from .conditions import Condition
 
 
 class UnitPool:
@@ -57,8 +61,9 @@ class UnitPool:
         if k > count:
             raise BuildError(
                 f"{query} needs {k} distractor units of other families; the pool has "
-                f"{count} ({', '.join(others) or 'no family'})",
-                "Build distractors from more episodes or families, or plan a smaller k.",
+                f"{count} ({', '.join(others) or 'no family'}), {k - count} too few",
+                "Build distractors from more episodes or families, or choose `conditions` with a "
+                "smaller k.",
             )
         return list(islice(self._units(query, others), k))
 
@@ -70,8 +75,10 @@ class UnitPool:
         units = [one for one in self._families.get(query.family, []) if one != query]
         if k > len(units):
             raise BuildError(
-                f"{query} needs {k} units of its own family; the pool has {len(units)} others",
-                f"Build distractors from more episodes of {query.family}, or plan a smaller k.",
+                f"{query} needs {k} units of its own family; the pool has {len(units)} "
+                f"others, {k - len(units)} too few",
+                f"Build distractors from more episodes of {query.family}, or choose `conditions` "
+                "with a smaller k.",
             )
         first = 7 * query.index + self._offset("own", query.split, query.family)
         return [units[(first + number) % len(units)] for number in range(k)]
@@ -121,6 +128,40 @@ class UnitPool:
 
     def _offset(self, *parts: str) -> int:
         return int.from_bytes(self._hash(*parts)[:8])
+
+
+def check_units(
+    pool: UnitPool, queries: Iterable[EpisodeId], conditions: Iterable[Condition]
+) -> None:
+    """Check that a pool has the units of all buffers.
+
+    Raises:
+        BuildError: It has too few; the message says how many.
+    """
+    chosen = list(conditions)
+    for query in {one.family: one for one in sorted(queries)}.values():
+        for condition in chosen:
+            condition.sessions(_UnreadSessions(query, pool))
+
+
+@dataclass(frozen=True)
+class _UnreadSessions:
+    """Sources of a query's sessions, before data is read: drawing checks that units suffice."""
+
+    query: EpisodeId
+    pool: UnitPool
+
+    def lesson(self, part: str = "lesson") -> Any:
+        return self.query
+
+    def contradiction(self) -> Any:
+        return self.query
+
+    def units(self, k: int, dataset: str = DISTRACTORS) -> Sequence[Any]:
+        return self.pool.draw(self.query, k)
+
+    def own_units(self, k: int) -> Sequence[Any]:
+        return self.pool.draw_own(self.query, k)
 
 
 def _hash(seed: int, *parts: str) -> bytes:

@@ -78,7 +78,9 @@ def find_simulator(name: str) -> Callable[..., Simulator]:
     if name not in known and ":" not in name:
         raise UnknownNameError.none("simulator", name, SIMULATORS)
     factory = known.get(name, name)
-    return import_factory("simulator", factory) if isinstance(factory, str) else factory
+    return (
+        import_factory(f"simulator {factory!r}", factory) if isinstance(factory, str) else factory
+    )
 
 
 def simulator_class(name: str) -> type[Simulator]:

@@ -209,15 +209,16 @@ def test_what_cannot_follow_the_demonstrations_is_refused_before_it_is_built(
     slow = MadeUpSource({"B/train/0": (260, None)}, robot=Robot(10))
     two = MadeUpSource({"B/train/1": (260, None)}, robot=Robot(15), cameras=("front", "top"))
     clauses = {
-        "frames per second: 15 in the demonstrations, 10 in B/train/0": slow,
-        "camera top: missing in the demonstrations, 24×16 pixels in B/train/1": two,
+        "frames per second: 15 in the demonstrations, 10 in B/train/0": (slow, False),
+        "camera top: missing in the demonstrations, 24×16 pixels in B/train/1": (two, True),
     }
-    for clause, source in clauses.items():
+    for clause, (source, cameras_help) in clauses.items():
         plan = like(BuildPlan("distractors", (source,), list_episodes((source,))), base)
         with pytest.raises(SourceError) as caught:
             build_dataset(plan, out, Serial(), WorkProgress(quiet=True))
         assert clause in caught.value.message
-        assert not out.exists()
+        assert ("`cameras`" in str(caught.value.hint)) == cameras_help
+        assert not out.exists() and not staging_path(out).exists()
 
 
 TABLETOP = {"kind": "tabletop", "suite_version": 1}
@@ -255,9 +256,43 @@ def test_dataset_with_other_settings_is_unchanged(
 def test_episodes_of_other_cameras_mix_in_those_that_all_have(tmp_path: Path) -> None:
     one = MadeUpSource({"A/train/0": (260, None)})
     both = MadeUpSource({"B/train/0": (260, None)}, cameras=("front", "wrist"))
-    with pytest.raises(SourceError, match="cannot be in one dataset"):
+    with pytest.raises(SourceError, match="cannot be in one dataset") as caught:
         build(tmp_path / "out", one, both)
+    assert "`cameras`" in str(caught.value.hint)
     assert build(tmp_path / "out", one, both, cameras=("front",)).episodes == 2
+
+
+def test_what_cannot_follow_an_existing_dataset_leaves_nothing(tmp_path: Path) -> None:
+    slow = MadeUpSource({"B/train/0": (260, None)}, robot=Robot(5))
+    with pytest.raises(SourceError) as caught:  # one of both fits: it is kept
+        build(tmp_path / "both", MadeUpSource({"A/train/0": (260, None)}), slow)
+    assert "cameras" not in str(caught.value.hint)
+    assert staging_path(tmp_path / "both").is_dir()
+    build(tmp_path / "out", MadeUpSource({"A/train/0": (260, None)}))
+    with pytest.raises(SourceError):
+        build(tmp_path / "out", slow)
+    assert not staging_path(tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("robot", "options", "error"),
+    [
+        (Robot(10), {"fps": 10.0}, None),
+        (Robot(10), {"fps": 5.0}, InvalidOptionError),
+        (Robot(5), {}, SourceError),
+        (Robot(None), {}, None),
+    ],
+)
+def test_what_is_built_again_must_be_the_same(
+    robot: Robot, options: dict[str, Any], error: type[InterferenceError] | None, tmp_path: Path
+) -> None:
+    build(tmp_path / "out", MadeUpSource({"A/train/0": (260, None)}))
+    again = MadeUpSource({"A/train/0": (260, None)}, robot=robot)
+    if error is None:
+        assert build(tmp_path / "out", again, **options).added == 0
+    else:
+        with pytest.raises(error):
+            build(tmp_path / "out", again, **options)
 
 
 def test_unknown_files_and_concurrent_builds(tmp_path: Path) -> None:
@@ -315,8 +350,9 @@ def test_filters() -> None:
     ):
         with pytest.raises(error):
             listed(source, **filters)
-    with pytest.raises(SourceError, match=r"recorded twice \(in source 1 and source 2\)"):
+    with pytest.raises(SourceError, match=r"recorded twice \(in source 1 and source 2\)") as caught:
         listed(source, source)
+    assert "`" not in str(caught.value.hint)  # a filter would leave out both
 
 
 def config(tmp_path: Path, *source: str, **changes: Any) -> AllConfig:
@@ -370,6 +406,8 @@ def test_what_goes_with_demonstrations_has_their_episodes_and_cameras(
         ({"version": "one"}, {}, InvalidOptionError),
         ({"fps": 0.0}, {}, InvalidOptionError),
         ({"columns": ("front=a", "front=b")}, {}, InvalidOptionError),
+        ({"columns": ("front=a",)}, {}, InvalidOptionError),
+        ({"families_file": Path("no.csv")}, {}, InvalidOptionError),
         ({}, {"conditions": ("k0", "k0")}, InvalidOptionError),
         ({}, {"conditions": ("x3",)}, InvalidIdError),
         ({}, {"position_limit": "many"}, InvalidOptionError),

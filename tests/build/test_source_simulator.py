@@ -160,7 +160,7 @@ def test_a_simulator_of_ones_own_is_a_source(name: str) -> None:
         (f"{OWN}Blind", SimulatorError, "was to draw top; it drew no camera"),
         (f"{OWN}nothing", UnknownNameError, "'nothing' is not in module"),
         ("__main__:make", InvalidOptionError, "worker processes run another program"),
-        ("no_such_module:make", UnknownNameError, "MODULE:NAME of a simulator of your own"),
+        ("no_such_module:make", InvalidOptionError, "MODULE:NAME of a simulator of your own"),
         ("frames:make", SourceError, "frames.parquet"),
     ],
 )

@@ -128,6 +128,7 @@ def test_actions_marks_and_a_camera_may_be_missing(tmp_path: Path, layout: str) 
         ("lamp:Lamp", "PYTHONPATH"),
         ("support.nowhere:Lamp", "PYTHONPATH"),
         ("frame:recordings", "frames:FOLDER"),
+        ("frame:recordings", "Did you mean 'frames'?"),
     ],
 )
 def test_unknown_source(text: str, expected: str) -> None:

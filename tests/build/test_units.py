@@ -17,7 +17,7 @@ from robomme_interference_data.build_dataset.manifests import (
     plan_manifests,
     write_manifests,
 )
-from robomme_interference_data.build_dataset.plan import BuildPlan, plan_build
+from robomme_interference_data.build_dataset.plan import BuildPlan, plan_alone, plan_build
 from robomme_interference_data.build_dataset.sources.base import Frame
 from robomme_interference_data.cards.dataset_facts import buffer_set_facts
 from robomme_interference_data.cards.publication import Publication
@@ -98,3 +98,6 @@ def test_only_short_episodes_are_an_error_that_names_the_options(tmp_path: Path)
     config = BuildConfig(("sample",), tmp_path, unit_frames=0)
     with pytest.raises(InvalidOptionError, match="unit_frames 0; expected a positive number"):
         plan_build(DISTRACTORS, config)
+    other = BuildConfig(("sample",), tmp_path, unit_frames=5)
+    with pytest.raises(InvalidOptionError, match="no effect on demonstrations"):
+        plan_alone("demonstrations", other)

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import shutil
 from collections.abc import Callable
 from contextlib import suppress
@@ -38,6 +39,7 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.storage.encode import decode_image, png
 from robomme_interference_data.storage.files import LocalFiles
+from robomme_interference_data.storage.staging import staging_path
 
 EPISODES = "distractors/meta/episodes/chunk-000/file-000.parquet"
 RECORDS = "distractors/meta/interference.parquet"
@@ -130,6 +132,17 @@ def test_unlisted_file(own_buffers: Path, path: str, message: str) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text("?")
     expect(own_buffers, f"{path}: .*{message}")
+
+
+def test_an_unfinished_build_is_one_violation(own_buffers: Path) -> None:
+    folder = staging_path(own_buffers / "distractors")
+    for number in range(3):
+        (folder / "episodes" / str(number)).mkdir(parents=True)
+        (folder / "episodes" / str(number) / "record.json").write_text("{}")
+    checks = verify_buffer_set(load_buffer_set(own_buffers), decode=False)
+    [found] = checks
+    assert found.where == ".distractors.building"
+    assert shlex.split(found.what)[-3:] == ["rm", "-r", str(folder)]
 
 
 def test_links_that_lead_nowhere(own_buffers: Path) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from support.buffer_sets import CONDITIONS, GOLDEN, QUERIES
+from support.buffer_sets import CONDITIONS, GOLDEN, QUERIES, UNITS
 from support.damage import HEADER, ROWS, edit, renew_header
 from support.lerobot_layouts import edit_columns, edit_info
 
@@ -134,6 +134,26 @@ def test_conditions_that_cannot_be_loaded(
     with pytest.raises(error) as caught:
         load_buffer("MoveCube/test/0", buffer_set=GOLDEN, **given)
     assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("condition", "missing"),
+    [
+        ("before-k7", None),
+        ("k40", f"{40 - (UNITS - 1)} too few"),  # one is of the query's family
+        ("same-k2", "1 too few"),
+        ("stale-k0", "contradictions"),
+    ],
+)
+def test_a_condition_is_suggested_only_where_it_can_be_planned(
+    condition: str, missing: str | None, own_buffers: Path
+) -> None:
+    with pytest.raises(UnknownNameError) as caught:
+        load_buffer_set(own_buffers).planned(condition)
+    if missing is None:
+        assert caught.value.command == f"build manifests {own_buffers} --conditions {condition}"
+    else:
+        assert caught.value.command is None and missing in str(caught.value.hint)
 
 
 @pytest.mark.parametrize(

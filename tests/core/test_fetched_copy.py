@@ -217,6 +217,7 @@ def test_a_folder_that_is_no_copy_is_not_written_to(
         before = digests(folder) if folder.is_dir() else None
         code, _, err = run("fetch", BUFFER_SET, "--to", folder)
         assert code == 1 and InvalidOptionError.__name__ not in err
+        assert "to fetch" not in err  # the folder is checked before anything is planned
         if before is not None:
             assert digests(folder) == before
     code, _, _ = run("fetch", BUFFER_SET, "--to", own_buffers / "demonstrations" / "copy")

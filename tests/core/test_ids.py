@@ -88,9 +88,10 @@ def test_numbers(text: str, numbers: tuple[int, ...]) -> None:
 
 @pytest.mark.parametrize("text", ["", "a", "3-1", "1-", "-1", "1,,2", "1 2", "1.5", "1-2-3"])
 def test_what_is_no_list_of_numbers(text: str) -> None:
-    with pytest.raises(InvalidOptionError, match="not a list of episode numbers"):
+    with pytest.raises(InvalidOptionError) as caught:
         parse_numbers(text)
-    with pytest.raises(InvalidOptionError, match="not a list of episode numbers"):
+    assert str(caught.value).count(repr(text)) <= 1
+    with pytest.raises(InvalidOptionError):
         count_numbers(text)
 
 

@@ -183,7 +183,7 @@ def test_recall_needs_evidence(tiny_buffers: Path, monkeypatch: pytest.MonkeyPat
     plan = plan_work(buffer_set.episode_ids, conditions=("k0",))
     with pytest.raises(InvalidOptionError, match=r"MoveCube/test/0|VideoRepick/test/0") as raised:
         check_plan(settings, name_system("recall-window"), buffer_set, plan, plan.items())
-    assert "docs/reference/sources.md" in (raised.value.hint or "")
+    assert "reference/sources" in (raised.value.hint or "")
 
 
 # --- names -------------------------------------------------------------------------------------

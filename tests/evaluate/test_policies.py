@@ -162,6 +162,7 @@ def test_the_part_of_a_policy_that_can_change_a_result() -> None:
     ("text", "error", "words"),
     [
         ("python:no_such_module:make", InvalidOptionError, "PYTHONPATH"),
+        ("python:no_such_module:make", InvalidOptionError, "policy 'python:no_such_module:make'"),
         (f"{OWN}stil", UnknownNameError, "Did you mean 'still'"),
         (f"{OWN}NUMBER", UnknownNameError, "function 'NUMBER'"),
         ("python:broken_policy:make", InvalidOptionError, "No module named 'not_installed_here'"),

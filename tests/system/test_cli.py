@@ -139,8 +139,10 @@ run_program()
             ["score", ".", "--out", "x", "--expected", "all"],
             "'--expected': 'all' is not one of 'benchmark', 'observed'",
         ),
+        (["build", "demonstrations"], "demonstrations [OPTIONS] BUFFER_SET\n"),
         (["list", ".", "--conditions", ""], "has an empty name"),
         (["build", "manifests", ".", "--conditions", "k0,,k1"], "has an empty name"),
+        (["list", ".", "--conditions", "k0,k1", "--conditions", "k0"], "'k0' is given 2 times"),
         (["build", "all", ".", "--source", "sample", "--cameras", " "], "has an empty name"),
     ],
 )
@@ -313,6 +315,7 @@ def test_output_folder_that_cannot_be_created(run: Run, tmp_path: Path) -> None:
     code, printed, err = run("build", "demonstrations", out, "--source", "sample")
     assert (code, printed) == (1, "")
     assert f"Error: {out.parent}" in err and "Not a directory" in err
+    assert "resume" not in err  # the same command would fail again
     assert "Traceback" not in err
 
 
