@@ -121,7 +121,10 @@ class HubCall:
         if self.revision:
             hint = "Run the same command again to resume."
         else:  # publishing, which can also be tried without the Hub
-            hint = "Check the network. To write the files into a folder instead: --to FOLDER"
+            hint = (
+                "Check the network, then run the same command again. To write the files into a "
+                "folder instead: --to FOLDER"
+            )
         if constants.HF_HUB_OFFLINE:
             reason, hint = "HF_HUB_OFFLINE is set", "With a network: unset HF_HUB_OFFLINE"
         elif status in (429, 503):

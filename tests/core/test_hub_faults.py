@@ -121,7 +121,7 @@ def test_a_cache_that_cannot_be_written(
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "file" / "cache"))
     code, _, err = run(*command)
     assert code == 1 and f"Error: {tmp_path / 'file'}" in err and "Not a directory" in err
-    assert "resume with:\nrobomme-interference fetch" in err and "must be a folder" in err
+    assert "must be a folder" in err
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
     assert run(*command)[0] == 0
     assert whole()

@@ -42,17 +42,21 @@ codec = lazy("vla_eval.protocol.image_codec")
 messages = lazy("vla_eval.protocol.messages")
 
 _CHILD = """
-import json, resource, sys, time
+import json, sys, time
 from pathlib import Path
 from support.runs import run_one
+
+def peak_mb():
+    # Not ru_maxrss: a child starts with the peak of the process that forked it.
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) >> 10
 
 for name in sys.argv[3:]:
     began = time.monotonic()
     options = (f"response_s={sys.argv[2]}", "connect_s=2", "checkpoint=a")
     done = run_one(Path(name), policy=sys.argv[1], policy_options=options)
     [row] = done.rows
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
-    print(json.dumps([name, row.status, row.error, time.monotonic() - began, peak]), flush=True)
+    print(json.dumps([name, row.status, row.error, time.monotonic() - began, peak_mb()]), flush=True)
 """
 
 

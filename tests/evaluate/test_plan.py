@@ -48,7 +48,7 @@ def test_the_order_of_input_does_not_matter(known: list[EpisodeId], names: list[
         ({"split": "val", "families": ["MoveCube"]}, UnknownNameError, "MoveCube/val are none"),
         ({"families": ["MoveCub"]}, UnknownNameError, "Did you mean 'MoveCube'?"),
         ({"split": "train"}, InvalidOptionError, "no train episode"),
-        ({"episodes": "3-1"}, InvalidOptionError, "not a list of episode numbers"),
+        ({"episodes": "3-1"}, InvalidOptionError, "the range 3-1 ends before it begins"),
         ({"conditions": ["k0", "k64"]}, InvalidIdError, "'k64' is not a condition"),
         ({"conditions": ["k0", "k0"]}, InvalidOptionError, "each once"),
         ({"shard": "9/8"}, InvalidOptionError, "shard '9/8'"),

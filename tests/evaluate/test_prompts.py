@@ -326,7 +326,7 @@ def test_invalid_files_are_errors(
     with pytest.raises(FormatError) as raised:
         load(str(path))
     assert words in raised.value.message and str(path) in raised.value.message
-    assert "docs/reference/prompts.md" in str(raised.value.hint)
+    assert "/reference/prompts.html" in str(raised.value.hint)
 
 
 def test_special_tokens_of_models_are_no_placeholders() -> None:

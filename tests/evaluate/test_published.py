@@ -160,7 +160,7 @@ def test_another_prompt_or_option_may_not_carry_the_name(
         given = settings(system, server.url, client / PUBLISHED[system].file)
         with pytest.raises(InvalidOptionError, match=message) as raised:
             run_one(client / "run", **given | changes)
-        assert "paper-systems.md" in str(raised.value.hint)
+        assert "/paper-systems.html" in str(raised.value.hint)
         assert not (client / "run").exists()
 
 

@@ -122,10 +122,13 @@ def test_only_a_privileged_policy_gets_the_evidence() -> None:
 class Chooses:
     """A retrieval step that always selects these frames."""
 
-    name, camera = "chooses", "front"
+    camera = "front"
 
     def __init__(self, *frames: int):
         self.chosen = np.array(frames)
+
+    def label(self, buffer: Buffer) -> str:
+        return "chooses"
 
     def select(self, buffer: Buffer, image: np.ndarray) -> Any:
         return self.chosen

@@ -306,7 +306,8 @@ def test_a_buffer_set_without_executions(tiny_buffers: Path, tmp_path: Path) -> 
 def test_manifests_planned_before_the_executions(executed_buffers: Path, tmp_path: Path) -> None:
     root = copy_buffer_set(tmp_path / "buffers", executed_buffers)
     shutil.copytree(GOLDEN / MANIFESTS, root / MANIFESTS, dirs_exist_ok=True)
-    with pytest.raises(MissingFileError, match="build manifests"):
+    with pytest.raises(MissingFileError) as caught:
         HistoryDataset(root, ["k0"], store=tmp_path)
+    assert str(caught.value.command).startswith("build manifests")
     plan_again(root)
     assert len(HistoryDataset(root, ["k0"], store=tmp_path, quiet=True)) == 3 * LIVE
