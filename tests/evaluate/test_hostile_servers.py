@@ -56,7 +56,8 @@ for name in sys.argv[3:]:
     options = (f"response_s={sys.argv[2]}", "connect_s=2", "checkpoint=a")
     done = run_one(Path(name), policy=sys.argv[1], policy_options=options)
     [row] = done.rows
-    print(json.dumps([name, row.status, row.error, time.monotonic() - began, peak_mb()]), flush=True)
+    took = time.monotonic() - began
+    print(json.dumps([name, row.status, row.error, took, peak_mb()]), flush=True)
 """
 
 

@@ -68,7 +68,7 @@ def _changed(value: Any, place: Place, kind: pa.DataType | None = None) -> Any:
         value[place[0]] = _changed(value[place[0]], place[1:])
         return value
     if value is None:
-        return _OF_NONE.get(kind, "x")
+        return [] if kind is not None and pa.types.is_list(kind) else _OF_NONE.get(kind, "x")
     return _OTHER[type(value)](value)
 
 

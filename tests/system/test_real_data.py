@@ -1,8 +1,8 @@
 """Real RoboMME recordings, all the way: every pixel and number against h5py and the raw videos."""
 
-import shutil
 import subprocess
 import sys
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -72,7 +72,7 @@ def write_lessons(lessons: Path, folder: Path, starts: dict[str, int]) -> None:
         assert values["exec_start_idx"] == start
         video = folder / f"videos/front/{family}/test/0.mkv"
         video.parent.mkdir(parents=True)
-        shutil.copy(lessons / f"{family}_test_0_front.mkv", video)
+        copy_at_rate(lessons / f"{family}_test_0_front.mkv", video, 10)
         rows += [
             {
                 "episode_id": f"{family}/test/0",
@@ -85,6 +85,19 @@ def write_lessons(lessons: Path, folder: Path, starts: dict[str, int]) -> None:
             for step, state in enumerate(values["state"])
         ]
     pq.write_table(pa.Table.from_pylist(rows), folder / "frames.parquet")
+
+
+def copy_at_rate(source: Path, target: Path, fps: int) -> None:
+    """Copy a video's frames as they are, at the rate of RoboMME: the files have another one."""
+    with av.open(str(source)) as old, av.open(str(target), "w") as new:
+        stream = new.add_stream_from_template(old.streams.video[0], opaque=True)
+        for number, packet in enumerate(old.demux(video=0)):
+            if packet.size:
+                packet.stream = stream
+                packet.time_base = Fraction(1, 1000)
+                packet.pts = packet.dts = number * 1000 // fps
+                packet.duration = 1000 // fps
+                new.mux(packet)
 
 
 def video_frames(path: Path) -> NDArray[np.uint8]:
