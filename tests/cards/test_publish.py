@@ -136,6 +136,7 @@ def test_private_repositories(hub: HubServer, login: Login) -> None:
         load_buffer_set(UNITS)
 
 
+@pytest.mark.slow
 def test_questions_are_parts_of_a_buffer_set(hub: HubServer, tmp_path: Path, run: Run) -> None:
     publish(TABLETOP)
     assert files(hub, UNITS)["questions.parquet"] == (TABLETOP / "questions.parquet").read_bytes()

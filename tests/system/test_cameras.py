@@ -23,6 +23,9 @@ CAMERAS = ("hand", "top")
 WATCHER = "python:support.own_policies:Watcher"
 
 
+pytestmark = pytest.mark.slow
+
+
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A buffer set of a robot whose cameras are `hand` and `top`, with an index of `hand`."""

@@ -195,6 +195,7 @@ def test_packages_without_metadata(monkeypatch: pytest.MonkeyPatch) -> None:
     assert row.ok is False and "not-installed-at-all" in row.detail
 
 
+@pytest.mark.slow
 def test_an_unusable_endpoint_is_a_failed_check(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HF_ENDPOINT", "hub")
     code, out, err = run("doctor", "--json")
@@ -208,6 +209,7 @@ def test_an_unusable_endpoint_is_a_failed_check(run: Any, monkeypatch: pytest.Mo
 PROGRAM = "from robomme_interference_data.cli import run_program; run_program()"
 
 
+@pytest.mark.slow
 def test_a_broken_library_is_reported(tmp_path: Path) -> None:
     (tmp_path / "pyarrow.py").write_text("raise ImportError('libarrow.so is missing')")
     command = [sys.executable, "-c", PROGRAM, "doctor", "--json"]

@@ -101,7 +101,7 @@ main()
 @pytest.mark.parametrize(
     ("step", "number"),
     [
-        ("copying", 1),
+        pytest.param("copying", 1, marks=pytest.mark.slow),
         pytest.param("copying", 2, marks=pytest.mark.slow),
         pytest.param("copying", 30, marks=pytest.mark.slow),
         pytest.param("copying", 74, marks=pytest.mark.slow),

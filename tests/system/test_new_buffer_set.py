@@ -93,6 +93,7 @@ def test_a_buffer_set_for_demonstrations_in_a_folder(mine: str, tmp_path: Path, 
     assert code == 1 and "exists, and is not a copy of" in err
 
 
+@pytest.mark.slow
 def test_retrieval_on_published_demonstrations(
     hub: HubServer, mine: str, tmp_path: Path, run: Any
 ) -> None:
@@ -120,6 +121,7 @@ def test_retrieval_on_published_demonstrations(
     assert results[0][:2] == results[1][:2] and results[0][0] == 0
 
 
+@pytest.mark.slow
 def test_published_demonstrations_without_an_index(
     hub: HubServer, mine: str, tmp_path: Path, run: Any, offline: Any
 ) -> None:

@@ -173,6 +173,7 @@ for command in (
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("platform", ABSENT)
 def test_the_light_core_needs_nothing_of_one_platform(platform: str, tmp_path: Path) -> None:
     code = ELSEWHERE.format(absent=ABSENT[platform], names=core_modules())

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -88,16 +87,15 @@ def write_lessons(lessons: Path, folder: Path, starts: dict[str, int]) -> None:
 
 
 def copy_at_rate(source: Path, target: Path, fps: int) -> None:
-    """Copy a video's frames as they are, at the rate of RoboMME: the files have another one."""
-    with av.open(str(source)) as old, av.open(str(target), "w") as new:
-        stream = new.add_stream_from_template(old.streams.video[0], opaque=True)
-        for number, packet in enumerate(old.demux(video=0)):
-            if packet.size:
-                packet.stream = stream
-                packet.time_base = Fraction(1, 1000)
-                packet.pts = packet.dts = number * 1000 // fps
-                packet.duration = 1000 // fps
-                new.mux(packet)
+    """Store a video's frames, bit for bit, at the rate of RoboMME: the file has another one."""
+    with av.open(str(target), "w") as new:
+        stream = new.add_stream("ffv1", rate=fps)
+        stream.pix_fmt = "bgr0"
+        frames = video_frames(source)
+        stream.height, stream.width = frames.shape[1:3]
+        for frame in frames:
+            new.mux(stream.encode(av.VideoFrame.from_ndarray(frame, "rgb24")))
+        new.mux(stream.encode())
 
 
 def video_frames(path: Path) -> NDArray[np.uint8]:
