@@ -128,6 +128,7 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory, tiny_buffers: Path) -> di
     return {name: rest for name, *rest in map(json.loads, done.stdout.splitlines())}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_hostile_answer_is_an_error_row(outcomes: dict[str, Any], name: str) -> None:
     status, error, seconds, peak = outcomes[name]
