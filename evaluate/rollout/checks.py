@@ -124,6 +124,8 @@ def _check_cameras(config: RunConfig, demonstrations: Dataset, policy: Policy) -
         ("the live views of the recordings", used if config.offline else set()),
     ):
         for camera in sorted(lacking - {*demonstrations.cameras}):
+            if not demonstrations.cameras:
+                demonstrations.camera(camera)  # raises: stored without images
             raise UnknownNameError(
                 f"the policy {config.policy} reads the camera {camera!r}, which is not in {where}",
                 f"Its cameras: {', '.join(demonstrations.cameras) or 'none'}. Set another policy.",

@@ -72,7 +72,7 @@ def test_a_buffer_set_of_short_units(tmp_path: Path) -> None:
         plan_manifests(in_folder(tmp_path), conditions)
     with pytest.raises(BuildError, match="exists with units of 8 frames at stride 1, not of 12 "):
         build(tmp_path, RAW_DISTRACTORS, TRAIN)
-    (tmp_path / RAW_DISTRACTORS).rename(tmp_path / "other")
+    (tmp_path / RAW_DISTRACTORS).rename(tmp_path.with_name("other"))
     build(tmp_path, RAW_DISTRACTORS, TRAIN)
     list(write_manifests(plan_manifests(in_folder(tmp_path), conditions), tmp_path))
     opened = load_buffer_set(tmp_path)
