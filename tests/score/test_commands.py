@@ -253,7 +253,7 @@ def test_rows_of_a_stranger_cannot_take_all_memory(tmp_path: Path, command: list
         env=os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=180,
         check=False,
     )
     assert done.returncode == 1

@@ -99,7 +99,7 @@ def test_a_node_and_the_driver_are_killed_and_no_row_is_lost(
     first = driver(out, cluster.address)
     runs.wait_for_rows(out, 1, first)
     first.kill()
-    first.communicate(timeout=60)
+    first.communicate(timeout=180)
     before = read_record(out)
     assert 1 <= len(before) < ROLLOUTS
     second = driver(out, cluster.address)
@@ -120,7 +120,7 @@ def test_ctrl_c_gives_all_workers_back(cluster: Any, tmp_path: Path) -> None:
     runs.wait_for_rows(tmp_path / "run", 1, running)
     assert workers_of(cluster)
     running.send_signal(signal.SIGINT)
-    _, err = running.communicate(timeout=60)
+    _, err = running.communicate(timeout=180)
     assert running.returncode == 130 and "resume with:" in err
     wait_until_no_worker_is_left(cluster)
     assert 1 <= len(read_record(tmp_path / "run")) < ROLLOUTS

@@ -70,7 +70,7 @@ def test_the_command_may_be_killed_or_stopped_at_any_moment(
             running.kill()
         else:
             os.killpg(running.pid, number)
-        _, err = running.communicate(timeout=60)
+        _, err = running.communicate(timeout=180)
         wait_until_gone(workers)  # they end with their parent
         header, rows = json.loads((out / "run.json").read_text()), read_record(out)
         # `read_record` refuses a second row of a finished rollout: none is lost, none is double.
@@ -180,7 +180,7 @@ def test_servers_that_workers_start_end_with_the_command(
     pids = [int(line) for line in (tmp_path / "pids").read_text().split()]
     assert len(pids) == 2  # one beside each worker
     os.killpg(running.pid, sent)
-    running.communicate(timeout=60)
+    running.communicate(timeout=180)
     wait_until_gone(pids)
     numbers = {path.stem.rpartition("-")[2] for path in (tmp_path / "run" / "servers").iterdir()}
     assert {"0"} <= numbers <= {"0", "1"}

@@ -135,7 +135,7 @@ def test_no_process_outlives_the_command(tmp_path: Path, sent: signal.Signals) -
     started = [one.pid for one in psutil.Process(running.pid).children(recursive=True)]
     assert len(started) >= 8  # two workers, two policies, and a guard beside each
     os.kill(running.pid, sent)
-    _, err = running.communicate(timeout=60)
+    _, err = running.communicate(timeout=180)
     wait_until_gone(started)
     if sent == signal.SIGINT:
         assert running.returncode == 130 and "Traceback" not in err

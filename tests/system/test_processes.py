@@ -191,7 +191,7 @@ def test_workers_close_what_they_hold_and_print_to_stderr(tmp_path: Path) -> Non
         "    print([outcome.value for outcome in Processes(1).run(Held(), [1])])\n",
     )
     done = subprocess.run(
-        command, env=environment, capture_output=True, text=True, timeout=60, check=True
+        command, env=environment, capture_output=True, text=True, timeout=180, check=True
     )
     assert done.stdout == "[1]\n"
     assert done.stderr.split() == ["printed", "1", "echoed", "closed"]
@@ -212,7 +212,7 @@ def test_a_script_that_workers_cannot_import_gets_one_error(
         env=environment,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=180,
         check=False,
     )
     assert done.returncode == 1

@@ -99,7 +99,7 @@ def test_nor_by_the_workers_of_a_script(planted: Path) -> None:
         env=environment(),
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=180,
         check=True,
     )
     assert done.stdout == "7\n"
