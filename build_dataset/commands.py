@@ -352,7 +352,7 @@ def verify(
     from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.runtime.progress import WorkProgress
 
-    from .verify import verify_buffer_set
+    from .verify.buffer_set import verify_buffer_set
 
     progress = WorkProgress()
     checks = verify_buffer_set(load_buffer_set(buffer_set), decode=decode, progress=progress)
@@ -381,7 +381,7 @@ def audit(buffer_set: BufferSetFolder, as_json: AsJson = False) -> None:
     from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.viz.tables import tables_text
 
-    from .audit import audit_buffer_set
+    from .verify.audit import audit_buffer_set
 
     report = audit_buffer_set(load_buffer_set(buffer_set))
     if as_json:

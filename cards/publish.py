@@ -8,8 +8,8 @@ from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path, PurePosixPath
 
-from robomme_interference_data.build_dataset.audit import audit_buffer_set
-from robomme_interference_data.build_dataset.verify import verify_buffer_set
+from robomme_interference_data.build_dataset.verify.audit import audit_buffer_set
+from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,

@@ -14,6 +14,7 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import InterferenceError, InvalidOptionError, UnknownNameError
+from robomme_interference_data.evaluate.language.subgoal_writer import ORACLE
 from robomme_interference_data.evaluate.policies.policy import BATCH_METHODS, Policy
 from robomme_interference_data.evaluate.policies.registry import BUILTINS, POLICIES, policy_options
 from robomme_interference_data.evaluate.run.config import (
@@ -23,7 +24,6 @@ from robomme_interference_data.evaluate.run.config import (
     with_retrieval,
 )
 from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
-from robomme_interference_data.evaluate.subgoals.writer import ORACLE
 from robomme_interference_data.evaluate.systems import (
     System,
     base_of,

@@ -15,6 +15,13 @@ from robomme_interference_data.errors import (
     PolicyServerError,
     SimulatorCrashError,
 )
+from robomme_interference_data.evaluate.language.subgoal_writer import ORACLE
+from robomme_interference_data.evaluate.language.subgoal_writers import (
+    describe_subgoals,
+    pin_subgoals,
+    subgoals_identity,
+    with_published,
+)
 from robomme_interference_data.evaluate.policies.answers import Answers, read_answers
 from robomme_interference_data.evaluate.policies.identity import (
     check_memory_kind,
@@ -33,13 +40,6 @@ from robomme_interference_data.evaluate.policies.sockets import Address
 from robomme_interference_data.evaluate.run.config import RunConfig, check_unused
 from robomme_interference_data.evaluate.run.kind import Run, RunKind
 from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
-from robomme_interference_data.evaluate.subgoals.registry import (
-    describe_subgoals,
-    pin_subgoals,
-    subgoals_identity,
-    with_published,
-)
-from robomme_interference_data.evaluate.subgoals.writer import ORACLE
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.runtime.executor import Session
 from robomme_interference_data.simulators.base import Simulator

@@ -15,12 +15,12 @@ from robomme_interference_data.constants import ACTION_CHUNK, MAX_STEPS
 from robomme_interference_data.data.buffer import Buffer, Chunk
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import InvalidOptionError, PolicyError, RunError
+from robomme_interference_data.evaluate.language.subgoal_writer import History, SubgoalWriter
 from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.history import HistoryReader
 from robomme_interference_data.evaluate.run.kind import Run, history_columns, model_columns
 from robomme_interference_data.evaluate.run.plan import WorkItem
-from robomme_interference_data.evaluate.subgoals.writer import History, SubgoalWriter
 from robomme_interference_data.evaluate.systems import check_history, name_system
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.evidence import among

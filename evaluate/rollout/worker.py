@@ -16,6 +16,8 @@ from robomme_interference_data.errors import (
     WorkerRetiredError,
     first_line,
 )
+from robomme_interference_data.evaluate.language.subgoal_writer import ORACLE, SubgoalWriter
+from robomme_interference_data.evaluate.language.subgoal_writers import make_writer
 from robomme_interference_data.evaluate.policies.answers import Answers
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import make_policy
@@ -23,8 +25,6 @@ from robomme_interference_data.evaluate.policies.sockets import Address
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.kind import Job, Run, RunTask
 from robomme_interference_data.evaluate.run.plan import WorkItem
-from robomme_interference_data.evaluate.subgoals.registry import make_writer
-from robomme_interference_data.evaluate.subgoals.writer import ORACLE, SubgoalWriter
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker

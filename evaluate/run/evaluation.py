@@ -170,7 +170,7 @@ def plan_run(kind: RunKind[Any]) -> tuple[Plan, tuple[WorkItem, ...]]:
 
 def _kind(config: RunConfig | AskConfig, buffer_set: BufferSet) -> RunKind[Any]:
     if isinstance(config, AskConfig):
-        from robomme_interference_data.evaluate.questions.kind import Questions
+        from robomme_interference_data.evaluate.language.question_run import Questions
 
         return Questions(config, buffer_set)
     from robomme_interference_data.evaluate.rollout.kind import Offline, Rollouts

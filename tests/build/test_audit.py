@@ -12,7 +12,7 @@ from support.damage import HEADER, ROWS, edit, put, renew_header
 from support.made_up import record, write_metadata
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.build_dataset.audit import Audit, Leak, audit_buffer_set
+from robomme_interference_data.build_dataset.verify.audit import Audit, Leak, audit_buffer_set
 from robomme_interference_data.errors import FormatError
 
 

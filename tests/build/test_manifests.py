@@ -15,7 +15,7 @@ from robomme_interference_data.build_dataset.manifests import (
     planned_buffers,
     write_manifests,
 )
-from robomme_interference_data.build_dataset.verify import verify_buffer_set
+from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
 from robomme_interference_data.errors import (
     BuildError,
     FormatError,

@@ -19,9 +19,9 @@ from support.publishing import LESSONS, UNITS, files, plain_cards, plan, plan_ag
 from support.tabletop import TABLETOP, copy_tabletop
 
 from robomme_interference_data import load_buffer, load_buffer_set
-from robomme_interference_data.build_dataset.audit import Audit, Leak
 from robomme_interference_data.build_dataset.questions import write_questions
-from robomme_interference_data.build_dataset.verify import verify_buffer_set
+from robomme_interference_data.build_dataset.verify.audit import Audit, Leak
+from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
 from robomme_interference_data.cards import publish as publish_module
 from robomme_interference_data.cards import results
 from robomme_interference_data.cards.publish import check_buffer_set

@@ -15,7 +15,7 @@ from support.machine import full_disk
 from support.publishing import content_of, plain_cards
 
 from robomme_interference_data import load_buffer, load_buffer_set
-from robomme_interference_data.build_dataset.verify import verify_buffer_set
+from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
 from robomme_interference_data.cards.publication import (
     Publication,
     PublishConfig,

@@ -17,7 +17,7 @@ from support.hub_server import HubServer
 from support.tabletop import TABLETOP
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.build_dataset.verify import verify_buffer_set
+from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
 from robomme_interference_data.data.questions import read_questions
 from robomme_interference_data.errors import (
     FormatError,

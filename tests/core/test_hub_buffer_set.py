@@ -15,8 +15,8 @@ from support.hub_server import HubServer
 from support.retrieval import make_index
 
 from robomme_interference_data import load_buffer, load_buffer_set
-from robomme_interference_data.build_dataset.audit import audit_buffer_set
-from robomme_interference_data.build_dataset.verify import verify_buffer_set
+from robomme_interference_data.build_dataset.verify.audit import audit_buffer_set
+from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
 from robomme_interference_data.constants import MANIFEST_PATH
 from robomme_interference_data.errors import (
     FormatError,

@@ -17,7 +17,7 @@ from support.hub_server import HubServer
 from support.machine import full_disk
 
 from robomme_interference_data import Buffer, load_buffer, load_buffer_set
-from robomme_interference_data.build_dataset.verify import verify_buffer_set
+from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
 from robomme_interference_data.errors import HashMismatchError, InterferenceError
 
 Run = Callable[..., tuple[int, str, str]]

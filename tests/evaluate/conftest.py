@@ -35,7 +35,7 @@ def fast_retries(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let clients of models retry without waiting, unless the server sends a delay."""
     import openai
 
-    from robomme_interference_data.evaluate.models import openai as endpoint
+    from robomme_interference_data.evaluate.language import openai as endpoint
 
     monkeypatch.setattr(openai._base_client, "INITIAL_RETRY_DELAY", 0.001)
     monkeypatch.setattr(endpoint, "_PAUSE_S", 0.001)

@@ -11,12 +11,12 @@ from support.asking import ask
 from support.lazy import lazy
 
 from robomme_interference_data.errors import InvalidOptionError, ModelError
-from robomme_interference_data.evaluate.models.model import Message, Video
-from robomme_interference_data.evaluate.models.registry import MODELS, model_identity
+from robomme_interference_data.evaluate.language.model import Message, Video
+from robomme_interference_data.evaluate.language.models import MODELS, model_identity
 from robomme_interference_data.storage import weights
 
 _, tiny_models = lazy("transformers"), lazy("support.vision_language")
-loaded = lazy("robomme_interference_data.evaluate.models.transformers")
+loaded = lazy("robomme_interference_data.evaluate.language.transformers")
 
 NOISE = np.random.default_rng(0).integers(0, 256, (6, 32, 24, 3), dtype=np.uint8)
 

@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 
 from robomme_interference_data.data.questions import LETTERS, Question
 from robomme_interference_data.errors import FormatError, InvalidOptionError, UnknownNameError
-from robomme_interference_data.evaluate.models.model import Video
-from robomme_interference_data.evaluate.models.prompts import as_text
-from robomme_interference_data.evaluate.questions import prompt as questions
-from robomme_interference_data.evaluate.questions.prompt import QuestionPrompt, read_letter
-from robomme_interference_data.evaluate.subgoals import prompt as subgoals
-from robomme_interference_data.evaluate.subgoals.prompt import Prompt, merge_near
+from robomme_interference_data.evaluate.language import question_prompt as questions
+from robomme_interference_data.evaluate.language import subgoal_prompt as subgoals
+from robomme_interference_data.evaluate.language.model import Video
+from robomme_interference_data.evaluate.language.prompt_files import as_text
+from robomme_interference_data.evaluate.language.question_prompt import QuestionPrompt, read_letter
+from robomme_interference_data.evaluate.language.subgoal_prompt import Prompt, merge_near
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.subgoal import Subgoal
 

@@ -23,9 +23,13 @@ from support.runs import EPISODE, config, header, run_one
 from support.worlds import buffer_set_here, query_of
 
 from robomme_interference_data.errors import FormatError, InvalidOptionError
-from robomme_interference_data.evaluate.subgoals import published
-from robomme_interference_data.evaluate.subgoals.published import FOLDER, PUBLISHED, read_client
-from robomme_interference_data.evaluate.subgoals.registry import with_published
+from robomme_interference_data.evaluate.language import published_prompts as published
+from robomme_interference_data.evaluate.language.published_prompts import (
+    FOLDER,
+    PUBLISHED,
+    read_client,
+)
+from robomme_interference_data.evaluate.language.subgoal_writers import with_published
 
 pytestmark = pytest.mark.usefixtures("world", "fast_retries")
 
@@ -42,7 +46,9 @@ def client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         for name, one in PUBLISHED.items()
     }
     monkeypatch.setattr(published, "PUBLISHED", known)
-    monkeypatch.setattr("robomme_interference_data.evaluate.subgoals.registry.PUBLISHED", known)
+    monkeypatch.setattr(
+        "robomme_interference_data.evaluate.language.subgoal_writers.PUBLISHED", known
+    )
     return tmp_path
 
 

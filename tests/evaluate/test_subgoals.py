@@ -22,7 +22,11 @@ from robomme_interference_data.errors import (
     ModelError,
     RunError,
 )
-from robomme_interference_data.evaluate.models.model import ChatModel, Message, Part, Reply, Video
+from robomme_interference_data.evaluate.language.model import ChatModel, Message, Part, Reply, Video
+from robomme_interference_data.evaluate.language.model_writer import ModelWriter
+from robomme_interference_data.evaluate.language.subgoal_prompt import load_prompt
+from robomme_interference_data.evaluate.language.subgoal_writer import History, OracleWriter
+from robomme_interference_data.evaluate.language.subgoal_writers import make_writer
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.rollout.checks import (
@@ -31,10 +35,6 @@ from robomme_interference_data.evaluate.rollout.checks import (
     default_system,
 )
 from robomme_interference_data.evaluate.run.history import HistoryReader
-from robomme_interference_data.evaluate.subgoals.model_writer import ModelWriter
-from robomme_interference_data.evaluate.subgoals.prompt import load_prompt
-from robomme_interference_data.evaluate.subgoals.registry import make_writer
-from robomme_interference_data.evaluate.subgoals.writer import History, OracleWriter
 from robomme_interference_data.runtime.executor import Executor, Processes, Serial
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Observation

@@ -12,7 +12,7 @@ from support.retrieval import make_index
 from support.shifted import add_shifted
 
 from robomme_interference_data import EpisodeId, load_buffer_set
-from robomme_interference_data.build_dataset.verify import verify_buffer_set
+from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
 from robomme_interference_data.constants import SHIFTED
 from robomme_interference_data.errors import SourceError
 

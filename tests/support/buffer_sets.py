@@ -20,7 +20,7 @@ from robomme_interference_data.build_dataset.manifests import (
 from robomme_interference_data.build_dataset.plan import BuildPlan, list_episodes
 from robomme_interference_data.build_dataset.sources import Frame, Source
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
-from robomme_interference_data.build_dataset.verify import verify_buffer_set
+from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
 from robomme_interference_data.constants import SUMS_PATH
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.ids import EpisodeId

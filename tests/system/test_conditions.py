@@ -13,7 +13,7 @@ from support.shifted import add_shifted
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
-from robomme_interference_data.build_dataset.verify import verify_buffer_set
+from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
 from robomme_interference_data.constants import EXECUTIONS, SHIFTED
 from robomme_interference_data.data.loading import open_dataset
 from robomme_interference_data.data.query import Query

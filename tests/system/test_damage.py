@@ -25,7 +25,7 @@ from support.tabletop import copy_tabletop
 from support.worlds import BUFFER_SET
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.build_dataset.verify import verify_buffer_set
+from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
 from robomme_interference_data.errors import HashMismatchError, InterferenceError
 from robomme_interference_data.evaluate.ceiling import ceiling
 from robomme_interference_data.evaluate.run.config import CeilingConfig

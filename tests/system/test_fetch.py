@@ -15,7 +15,7 @@ from support.hub_http import Request
 from support.hub_server import HubServer
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.build_dataset.verify import verify_buffer_set
+from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
 
 Run = Callable[..., tuple[int, str, str]]
 FETCH = "from robomme_interference_data.cli.main import main; main()"

@@ -15,7 +15,7 @@ from support.retrieval import make_index
 from support.tabletop import TABLETOP, copy_tabletop
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.build_dataset.verify import verify_buffer_set
+from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
 from robomme_interference_data.errors import InterferenceError
 
 UNREAD = {

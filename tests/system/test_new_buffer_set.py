@@ -17,7 +17,7 @@ from support.recordings import make_episode, rows_of, write_images, write_table
 from support.tabletop import copy_tabletop
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.build_dataset.verify import verify_buffer_set
+from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
 
 FAMILIES = ("MyDrawer", "MyCup")
 

@@ -20,7 +20,7 @@ from robomme_interference_data.build_dataset.manifests import (
 )
 from robomme_interference_data.build_dataset.plan import BuildPlan, list_episodes
 from robomme_interference_data.build_dataset.sources import open_source
-from robomme_interference_data.build_dataset.verify import verify_buffer_set
+from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
 from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.runtime.progress import WorkProgress
 

@@ -10,15 +10,15 @@ import numpy as np
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.questions import Question
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.evaluate.models.model import Reply, Video
-from robomme_interference_data.evaluate.models.prompts import as_text
-from robomme_interference_data.evaluate.models.registry import MODELS
 from robomme_interference_data.evaluate.run.config import AskConfig
-from robomme_interference_data.evaluate.subgoals.writer import History
 from robomme_interference_data.simulators.registry import recorded_scene
 from robomme_interference_data.storage.encode import decode_image
 
-from .prompt import load_prompt, read_letter
+from .model import Reply, Video
+from .models import MODELS
+from .prompt_files import as_text
+from .question_prompt import load_prompt, read_letter
+from .subgoal_writer import History
 
 CONTROLS = ("none", "blank", "text")
 """What a model does not see: nothing; the content of the history frames; all images."""

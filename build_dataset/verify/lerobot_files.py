@@ -9,6 +9,12 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from robomme_interference_data.build_dataset.image_stats import (
+    QUANTILES,
+    STATISTICS,
+    Statistics,
+    episode_statistics,
+)
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     EPISODES_DIR,
@@ -24,8 +30,6 @@ from robomme_interference_data.schema.codec import arrow_schema
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.files import read_json
 from robomme_interference_data.storage.lerobot import LeRobotFiles
-
-from .image_stats import QUANTILES, STATISTICS, Statistics, episode_statistics
 
 _TOLERANCE_S = 1e-4
 """LeRobot's own tolerance of timestamps, in seconds."""

@@ -13,7 +13,7 @@ from typing import Any
 from robomme_interference_data.constants import POSITION_LIMIT
 from robomme_interference_data.errors import FormatError, InvalidOptionError
 
-from .prompt import Prompt, load_prompt
+from .subgoal_prompt import Prompt, load_prompt
 
 CLIENT = "RoboMME/robomme_policy_learning@3507f80ddc47a6c6363d4af9a51afaa1a3992944"
 """The released client."""

@@ -5,8 +5,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from robomme_interference_data.data.questions import Question
-from robomme_interference_data.evaluate.models.model import Message, Part
-from robomme_interference_data.evaluate.models.prompts import fill, read_prompt
+
+from .model import Message, Part
+from .prompt_files import fill, read_prompt
 
 PROMPTS = ("choice",)
 """The prompts of the package."""
@@ -71,4 +72,4 @@ def read_letter(text: str, letters: str) -> str | None:
 
 def load_prompt(name: str) -> tuple[QuestionPrompt, str]:
     """Read a prompt: `choice`, or a TOML file by its path; and the SHA-256 of its file."""
-    return read_prompt(QuestionPrompt, __package__, PROMPTS, name, "docs/reference/prompts.md")
+    return read_prompt(QuestionPrompt, PROMPTS, name, "docs/reference/prompts.md")

@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evaluate.models.model import ChatModel, Message, Part, Reply
-from robomme_interference_data.evaluate.models.prompts import as_text
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.schema.sampling import spread
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Observation, Simulator
 
-from .prompt import Answer, Prompt, merge_near
-from .writer import History, SubgoalWriter, Turn
+from .model import ChatModel, Message, Part, Reply
+from .prompt_files import as_text
+from .subgoal_prompt import Answer, Prompt, merge_near
+from .subgoal_writer import History, SubgoalWriter, Turn
 
 
 class ModelWriter(SubgoalWriter):

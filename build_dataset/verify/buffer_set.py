@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.build_dataset.manifests import plan_manifests, planned_buffers
+from robomme_interference_data.build_dataset.questions import Marks, planned_questions
 from robomme_interference_data.constants import (
     DATASETS,
     DEMONSTRATIONS,
@@ -39,16 +41,7 @@ from robomme_interference_data.storage.files import LocalFiles, all_files, sha25
 from robomme_interference_data.storage.parquet import open_parquet
 from robomme_interference_data.storage.staging import staging_path
 
-from .dataset_checks import (
-    HEADER,
-    UNLISTED,
-    Violation,
-    caught,
-    dataset_violations,
-    index_violations,
-)
-from .manifests import plan_manifests, planned_buffers
-from .questions import Marks, planned_questions
+from .dataset import HEADER, UNLISTED, Violation, caught, dataset_violations, index_violations
 from .set_files import further_files, unfinished_builds
 
 _ROWS = f"{MANIFESTS}/{MANIFEST_ROWS}"
@@ -231,7 +224,7 @@ def _questions(buffer_set: BufferSet, *, decode: bool) -> Iterator[Violation]:
 
 
 def _is_picture(stored: NDArray[np.uint8], query: Query, marks: Marks) -> bool:
-    from .question_pictures import is_picture
+    from robomme_interference_data.build_dataset.question_pictures import is_picture
 
     return is_picture(stored, query.frame(), marks)
 

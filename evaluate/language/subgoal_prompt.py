@@ -8,10 +8,11 @@ from functools import cached_property
 from typing import Any
 
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evaluate.models.model import Part
-from robomme_interference_data.evaluate.models.prompts import check_places, fill, read_prompt
 from robomme_interference_data.schema.subgoal import Pixel, Subgoal, read_points, write_points
 from robomme_interference_data.storage.files import digest_json
+
+from .model import Part
+from .prompt_files import check_places, fill, read_prompt
 
 PROMPTS = ("simple", "grounded", "memer")
 """The prompts of this package, for policies as those of SimpleSG, GroundSG and MemER."""
@@ -217,4 +218,4 @@ def merge_near(frames: Sequence[int], distance: int) -> list[int]:
 
 def load_prompt(name: str) -> Prompt:
     """Read one of `PROMPTS`, or a TOML file."""
-    return read_prompt(Prompt, __package__, PROMPTS, name, "docs/reference/prompts.md")[0]
+    return read_prompt(Prompt, PROMPTS, name, "docs/reference/prompts.md")[0]

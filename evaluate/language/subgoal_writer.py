@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.data.buffer import Buffer
-from robomme_interference_data.evaluate.models.model import Video
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.evaluate.run.history import HistoryReader
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Observation, Simulator
+
+from .model import Video
 
 ORACLE = "oracle"
 """Name of the writer that reads the simulator."""

@@ -69,16 +69,14 @@ def as_text(parts: Sequence[Part]) -> str:
     return "".join(texts)
 
 
-def read_prompt[T](
-    record: type[T], package: str, names: Sequence[str], name: str, page: str
-) -> tuple[T, str]:
+def read_prompt[T](record: type[T], names: Sequence[str], name: str, page: str) -> tuple[T, str]:
     """Read a prompt of the package by name, or a TOML file; return it with its SHA-256.
 
     `record` is its dataclass, of text and integers, `page` the documentation for messages.
     """
     path: Any = Path(name)
     if name in names:
-        path = resources.files(package) / "prompts" / f"{name}.toml"
+        path = resources.files(__package__) / "prompts" / f"{name}.toml"
     elif not path.is_file():
         raise UnknownNameError(
             f"there is no prompt or file {name!r}",

@@ -7,14 +7,14 @@ from dataclasses import replace
 from typing import Any
 
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evaluate.models.registry import MODELS, model_identity
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.runtime.specs import bind_options
 
 from .model_writer import ModelWriter
-from .prompt import DEFAULT_PROMPT
-from .published import PUBLISHED, load_published
-from .writer import ORACLE, OracleWriter, SubgoalWriter
+from .models import MODELS, model_identity
+from .published_prompts import PUBLISHED, load_published
+from .subgoal_prompt import DEFAULT_PROMPT
+from .subgoal_writer import ORACLE, OracleWriter, SubgoalWriter
 
 _WRITER_OPTIONS = [
     one.name

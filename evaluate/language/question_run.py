@@ -12,7 +12,6 @@ from robomme_interference_data.errors import (
     UnknownNameError,
     nearest,
 )
-from robomme_interference_data.evaluate.models.registry import MODELS, model_identity
 from robomme_interference_data.evaluate.run.config import (
     AskConfig,
     check_unused,
@@ -26,8 +25,9 @@ from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.sampling import MEMORIES, Memory
 from robomme_interference_data.simulators.registry import recorded_scene
 
+from .models import MODELS, model_identity
+from .question_task import AskTask
 from .responders import CONTROLS, OWN, ModelResponder
-from .task import AskTask
 
 
 class Questions(RunKind[AskConfig]):

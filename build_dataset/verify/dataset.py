@@ -10,6 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.build_dataset.identity import (
+    BuildReport,
+    identity_of,
+    listed_files,
+    report_of,
+)
+from robomme_interference_data.build_dataset.image_stats import (
+    ImageStats,
+    Statistics,
+    episode_statistics,
+)
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     DISTRACTORS,
@@ -47,9 +58,7 @@ from robomme_interference_data.storage.files import (
 from robomme_interference_data.storage.lerobot import LeRobotFiles
 from robomme_interference_data.storage.video import open_video
 
-from .identity import BuildReport, identity_of, listed_files, report_of
-from .image_stats import ImageStats, Statistics, episode_statistics
-from .lerobot_checks import lerobot_violations
+from .lerobot_files import lerobot_violations
 
 UNLISTED = "is not listed"
 HEADER = f"{MANIFESTS}/{MANIFEST_HEADER}"

@@ -15,7 +15,6 @@ from robomme_interference_data.evaluate.run.kind import (
     history_columns,
     model_columns,
 )
-from robomme_interference_data.evaluate.subgoals.writer import History
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.evidence import known_parts
@@ -23,6 +22,7 @@ from robomme_interference_data.schema.rollouts import Rollout, Status
 from robomme_interference_data.schema.sampling import Memory
 
 from .responders import OWN, ModelResponder, Prompted
+from .subgoal_writer import History
 
 
 class AskTask(RunTask[AskConfig]):
