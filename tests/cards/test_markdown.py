@@ -25,6 +25,7 @@ def inline(tokens: Any) -> list[Any]:
     return [child for token in tokens if token.type == "inline" for child in token.children]
 
 
+@pytest.mark.slow
 @given(st.one_of(st.text(max_size=60), NASTY))
 def test_escaped_text_is_shown_as_it_is(text: str) -> None:
     expected = one_line(text)

@@ -52,6 +52,7 @@ def writes(hub: HubServer) -> list[str]:
     return [one for one in hub.requests if not one.startswith(("GET", "HEAD"))]
 
 
+@pytest.mark.slow
 def test_a_dry_run_needs_the_light_core_only(
     hub: HubServer, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -127,6 +128,7 @@ def test_a_published_buffer_set_is_the_one_on_disk(hub: HubServer, tmp_path: Pat
     assert (writes(hub), hub.received) == ([], 0)
 
 
+@pytest.mark.slow
 def test_private_repositories(hub: HubServer, login: Login) -> None:
     publish(GOLDEN, private=True)
     assert all(one.private for one in hub.repositories.values())
@@ -219,6 +221,7 @@ def test_an_older_version_is_not_published_after_a_newer_one(
     assert path not in files(hub, UNITS) and path in files(hub, UNITS, "data-2.0.0")
 
 
+@pytest.mark.slow
 def test_demonstrations_count_their_own_versions(
     hub: HubServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -392,6 +395,7 @@ def test_the_command_into_a_folder(hub: HubServer, run: Run, tmp_path: Path) -> 
     assert (code, "inside" in err, contents(root)) == (1, True, before)
 
 
+@pytest.mark.slow
 def test_a_buffer_set_that_fails_a_check_is_not_published(
     hub: HubServer, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -418,6 +422,7 @@ def ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "run"
 
 
+@pytest.mark.slow
 def test_results(hub: HubServer, ended: Path, run: Run, tmp_path: Path) -> None:
     repo = "someone/results"
     asked = ("publish-results", ended, "--repo-id", repo, "--expected", "observed")
@@ -443,6 +448,7 @@ def test_results(hub: HubServer, ended: Path, run: Run, tmp_path: Path) -> None:
     assert code == 0 and "results" in out, err
 
 
+@pytest.mark.slow
 def test_other_rows_are_another_version(
     hub: HubServer, ended: Path, run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

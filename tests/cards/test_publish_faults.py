@@ -31,6 +31,8 @@ import pytest
 from support.buffer_sets import GOLDEN
 from support.publishing import plain_cards, publish
 
+pytestmark = pytest.mark.slow
+
 with pytest.MonkeyPatch.context() as patch:
     plain_cards(patch)
     publish(GOLDEN)

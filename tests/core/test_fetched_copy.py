@@ -103,6 +103,7 @@ def test_a_camera_that_was_not_fetched(part: Path) -> None:
     assert caught.value.command == buffer_set.copy.refetch  # type: ignore[union-attr]
 
 
+@pytest.mark.slow
 def test_commands_work_on_a_part(part: Path, run: Run, tmp_path: Path) -> None:
     code, out, err = run("list", part, "--json")
     assert code == 0 and [row["condition"] for row in json.loads(out)] == ["no-history", "k0", "k1"]
@@ -115,6 +116,7 @@ def test_commands_work_on_a_part(part: Path, run: Run, tmp_path: Path) -> None:
     assert code == 1 and f"--to {part} --conditions k7" in err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "command"),
     [
@@ -243,6 +245,7 @@ def test_a_copy_of_another_buffer_set_is_not_mixed(
 # --- files that the buffer set does not list ------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_only_listed_files_are_fetched(hub: HubServer, run: Run, tmp_path: Path) -> None:
     push_buffer_set(hub, GOLDEN, tmp_path / "work")
     planted = ("multiprocessing.py", "meta/more.py", "manifests/x.py", "data/x.py", "sub/x.py")
@@ -270,6 +273,7 @@ def relist(work: Path, path: str, sha256: str) -> None:
     write_json(work / "manifests" / "manifest.json", header)
 
 
+@pytest.mark.slow
 def test_a_list_cannot_name_files_outside_the_dataset(
     hub: HubServer, run: Run, tmp_path: Path
 ) -> None:
@@ -315,6 +319,7 @@ def test_the_record_of_a_copy(part: Path) -> None:
     assert record["files"] == sorted({*all_files(part)} - {RECORD})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [{"files": 7}, {"format_version": 2}, {"more": 1}])
 def test_a_damaged_record(part: Path, change: dict[str, Any]) -> None:
     write_json(part / RECORD, json.loads((part / RECORD).read_text()) | change)

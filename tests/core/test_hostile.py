@@ -81,6 +81,7 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return dict(map(json.loads, done.stdout.splitlines()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BOMBS)
 def test_a_bomb_raises_before_it_is_decoded(outcomes: dict[str, str], name: str) -> None:
     assert BOMBS[name].message in outcomes[name]
@@ -155,6 +156,7 @@ def test_a_sound_file_is_read_and_a_truncated_one_raises_one_error(
             target(root, data[: len(data) * share // 8])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TARGETS)
 def test_a_damaged_file_ends_in_an_error_or_a_sound_value(
     tmp_path_factory: pytest.TempPathFactory, name: str

@@ -20,6 +20,8 @@ from robomme_interference_data import Buffer, load_buffer, load_buffer_set
 from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
 from robomme_interference_data.errors import HashMismatchError, InterferenceError
 
+pytestmark = pytest.mark.slow
+
 Run = Callable[..., tuple[int, str, str]]
 QUERY, VERSION = "MoveCube/test/0", "data-1.0.0"
 ROWS, VIDEO = r"/manifests/buffers\.parquet", r"/observation.images.front/.*\.mp4"

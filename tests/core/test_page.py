@@ -49,6 +49,7 @@ def test_the_page_is_the_same_twice_and_holds_the_stored_files(tmp_path: Path) -
     assert last["offsets"] == [offset, offset]
 
 
+@pytest.mark.slow
 def test_videos_play_in_chromium_frame_by_frame(tmp_path: Path) -> None:
     out = tmp_path / "page.html"
     buffer = page_of(out, retrieved=[RetrievedPart("made/max", range(60, 70), "purity 0.0%")])

@@ -133,6 +133,7 @@ def test_the_run_of_questions_identifies_the_rollouts(tmp_path: Path, right: Pat
         act_out(tmp_path / "acted", other)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

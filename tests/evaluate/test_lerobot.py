@@ -52,6 +52,7 @@ def window(before: Any, numbers: list[int]) -> dict[str, Any]:
 # --- actions -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_act_acts_as_in_lerobots_loop(act: Path, tmp_path: Path) -> None:
     policy = made(act)
     assert (policy.wants_history, policy.every_frame, policy.privileged) == (False, False, False)

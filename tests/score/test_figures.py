@@ -117,6 +117,7 @@ def test_the_retention_figure_names_whom_it_leaves_out(tmp_path: Path, figure: A
 # --- many systems ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_twelve_systems_are_named_at_their_values_without_dodge(full: Score, figure: Any) -> None:
     shown = Data(full, "robomme")
     everyone = {shown.styles[system].label for system in shown.systems}

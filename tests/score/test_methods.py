@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import pytest
 from support import scoring as made
 from support.scoring import BASE, OWN
 
@@ -19,6 +20,7 @@ def cited(found: Score) -> set[str]:
     return names
 
 
+@pytest.mark.slow
 def test_methods_are_those_of_the_rows(full: Score) -> None:
     text, _ = methods(full)
     assert text.startswith(

@@ -80,6 +80,7 @@ def episodes(found: Score, folder: Path) -> list[list[Any]]:
     return list(json.loads(data)["rows"])
 
 
+@pytest.mark.slow
 def test_the_report_works_in_a_browser(report: Path, small: Score) -> None:
     with open_page() as page:
 

@@ -35,6 +35,7 @@ def percent(
     return f"{100 * sum(chosen) / len(chosen):.1f}" if chosen else ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "first", ["system", "policy", "further conditions", "under shifts", "carried out"]
 )

@@ -19,6 +19,8 @@ from robomme_interference_data.simulators.tabletop.episodes import (
 from robomme_interference_data.simulators.tabletop.families import draw_episode, other_answer
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("family", families("MoveCube", "VideoUnmaskSwap"))
 def test_goal_and_first_view_are_the_querys(tabletop: TabletopSimulator, family: str) -> None:

@@ -50,6 +50,7 @@ print(*sorted(name for name in gymnasium.registry if name.startswith("tabletop/"
     assert done.stdout.split() == sorted(f"tabletop/{family}-v1" for family in FAMILIES)
 
 
+@pytest.mark.slow
 def test_an_episode_is_the_simulators(tabletop: Any) -> None:
     env = make(render_mode="rgb_array")
     seen, info = env.reset(seed=SEED)

@@ -20,6 +20,8 @@ from robomme_interference_data.simulators.tabletop.families.move_cube import Mov
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def env(blind: TabletopSimulator) -> TabletopEnv:

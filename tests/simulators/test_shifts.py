@@ -94,6 +94,7 @@ def test_the_scene_stays_under_a_shift_while_it_is_played(
         assert np.array_equal(states, played[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", families("VideoPlaceOrder"))
 def test_clutter_is_out_of_the_way(blind: TabletopSimulator, family: str) -> None:
     """No part of the hand, and no body on the table, reaches a position of clutter."""

@@ -21,6 +21,8 @@ pytest.importorskip("mani_skill", reason="needs the extra sim")
 
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
 
+pytestmark = pytest.mark.slow
+
 
 def follow(
     simulator: TabletopSimulator,

@@ -110,6 +110,7 @@ def started(server: BuildServer, out: Path) -> int:
     return pid
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_is_replaced(
     server: BuildServer, undisturbed: tuple[dict[str, bytes], float], tmp_path: Path
 ) -> None:

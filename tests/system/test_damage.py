@@ -32,6 +32,8 @@ from robomme_interference_data.evaluate.run.config import CeilingConfig
 from robomme_interference_data.retrieval.commands import _measured
 from robomme_interference_data.storage.files import read_json, sha256_file, write_json
 
+pytestmark = pytest.mark.slow
+
 MANIFEST, ROWS = "manifests/manifest.json", "manifests/buffers.parquet"
 CONDITIONS = ("no-history", "k1")
 POLICY = "python:support.own_policies:Hashing"

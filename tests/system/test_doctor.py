@@ -131,6 +131,7 @@ def test_renderer_check_survives_its_driver(
     assert (row.fix is None) is (ok is True)
 
 
+@pytest.mark.slow
 def test_robommes_interpreter_is_asked(
     robomme_python: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

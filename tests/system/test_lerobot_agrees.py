@@ -17,6 +17,7 @@ def lerobot() -> Any:
     return pytest.importorskip("lerobot.datasets")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("codec", CODECS.values(), ids=list(CODECS))
 def test_codecs_are_those_that_lerobot_would_use(lerobot: Any, codec: Codec) -> None:
     from lerobot.configs.video import RGBEncoderConfig
@@ -73,6 +74,7 @@ def write(root: Path, stored: str) -> None:
     made.finalize()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stored", ["image", "av1-lossless", "lerobot-default"])
 def test_a_dataset_of_lerobots_is_read_as_lerobot_does(
     lerobot: Any, tmp_path: Path, stored: str

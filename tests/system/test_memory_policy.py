@@ -83,6 +83,7 @@ def test_it_learns_to_answer_and_writes_rows(program: Any, tmp_path: Path) -> No
     assert {row.retrieval_model for row in rows} == {"thumbnail/max/adaptive"}
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_ends_like_another(
     program: Any, executed_buffers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -200,6 +201,7 @@ def test_wrong_options_are_one_line(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_what_a_run_must_not_do(program: Any, tmp_path: Path) -> None:
     options = ("--conditions", "k0", "--families", "MoveCube", "--steps", 9, *SMALL)
     with pytest.raises(SystemExit, match="loss is nan"):

@@ -42,6 +42,7 @@ def mine(tmp_path: Path) -> str:
     return f"frames:{tmp_path / 'mine'}"
 
 
+@pytest.mark.slow
 def test_a_buffer_set_for_published_demonstrations(
     hub: HubServer, mine: str, tmp_path: Path, run: Any
 ) -> None:

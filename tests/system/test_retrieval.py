@@ -16,6 +16,8 @@ from robomme_interference_data.retrieval.segment import typical_cosine
 from robomme_interference_data.retrieval.select import Rule, choose
 from robomme_interference_data.runtime.executor import Processes, Serial
 
+pytestmark = pytest.mark.slow
+
 Features = dict[str, NDArray[np.float32]]
 
 

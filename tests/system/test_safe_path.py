@@ -13,6 +13,8 @@ from support.buffer_sets import GOLDEN
 
 from robomme_interference_data.runtime import safe_path
 
+pytestmark = pytest.mark.slow
+
 TESTS = Path(__file__).parent.parent
 PROGRAM = Path(sys.executable).parent / "robomme-interference"
 EVALUATE = (

@@ -59,6 +59,7 @@ def make(buffers: Path, tmp_path_factory: pytest.TempPathFactory) -> Make:
 # --- what an item holds ------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("memory", ["framesamp:8", "window:5", "full"])
 @pytest.mark.parametrize("condition", ["no-history", "k0", "k3"])
 @pytest.mark.parametrize("moment", [0, 3, LIVE - 1])
@@ -141,6 +142,7 @@ def test_views_under_shifts(make: Make, buffers: Path) -> None:
     np.testing.assert_array_equal(item["observation.images.front"], view.transpose(2, 0, 1) >> 2)
 
 
+@pytest.mark.slow
 def test_questions_as_tensors(tmp_path: Path) -> None:
     options: dict[str, Any] = {"chunk": 0, "questions": True, "store": tmp_path, "quiet": True}
     data = HistoryDataset(TABLETOP, ["k0"], image_size=8, **options)
@@ -187,6 +189,7 @@ def test_a_batch_is_the_collated_items(memory: str, make: Make) -> None:
         data[[0, 3 * LIVE]]
 
 
+@pytest.mark.slow
 def test_a_batch_of_questions_and_shifts(make: Make, tmp_path: Path) -> None:
     options: dict[str, Any] = {"chunk": 0, "questions": True, "store": tmp_path, "quiet": True}
     asked = HistoryDataset(TABLETOP, ["k0"], image_size=8, **options)

@@ -23,6 +23,8 @@ from robomme_interference_data.retrieval.selector import Selector
 from robomme_interference_data.simulators.recordings import Recordings
 from robomme_interference_data.training import HistoryDataset, Memory, resize
 
+pytestmark = pytest.mark.slow
+
 EPISODE = EpisodeId("MoveCube", "test", 0)
 CAMERAS = ("front", "wrist")
 
