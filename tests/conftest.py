@@ -59,8 +59,17 @@ for _profile, _examples in (("few", 30), ("all", 100)):
     )
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option that writes the golden messages anew."""
+    help_text = "write tests/golden/messages.json: what errors say in the tests that run"
+    parser.addoption("--write-messages", action="store_true", help=help_text)
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Take all of hypothesis' examples only where slow tests run, too."""
+    from support import messages
+
+    messages.configure(config)
     hypothesis.settings.load_profile("few" if config.option.markexpr else "all")
 
 
@@ -70,7 +79,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_unconfigure() -> None:
-    """Remove the caches."""
+    """Write the golden messages if that was asked for; remove the caches."""
+    from support import messages
+
+    messages.write_messages()
     shutil.rmtree(_SCRATCH, ignore_errors=True)
 
 
