@@ -19,6 +19,8 @@ from robomme_interference_data.cards import publish as publish_module
 from robomme_interference_data.cards.publish import open_with_lerobot
 from robomme_interference_data.errors import HubError, PublishError
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(autouse=True)
 def _somebody(login: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -30,8 +32,6 @@ PUBLISH = """
 import pytest
 from support.buffer_sets import GOLDEN
 from support.publishing import plain_cards, publish
-
-pytestmark = pytest.mark.slow
 
 with pytest.MonkeyPatch.context() as patch:
     plain_cards(patch)
