@@ -16,7 +16,7 @@ from robomme_interference_data.retrieval.grade import ALL
 from robomme_interference_data.retrieval.selector import StoredSelector
 from robomme_interference_data.schema.conditions import NO_HISTORY, in_order
 from robomme_interference_data.schema.evidence import known_parts
-from robomme_interference_data.schema.sampling import Memory, check_memory, evidence_kept
+from robomme_interference_data.schema.sampling import Memory, evidence_kept
 from robomme_interference_data.schema.shifts import NO_SHIFT, parse_shift
 from robomme_interference_data.simulators.registry import recorded_scene
 from robomme_interference_data.viz.tables import Table
@@ -50,7 +50,7 @@ class Ceiling:
 
 def ceiling(buffer_set: BufferSet, config: CeilingConfig) -> list[Ceiling]:
     """Return the ceiling of a memory on a buffer set, by family and for all, and by condition."""
-    check_memory(config.memory, "ceiling")
+    memory = Memory.parse(config.memory)
     if config.frames < 1:
         raise InvalidOptionError.expected("frames", config.frames, "1 or more")
     check_retrieval(config)
@@ -70,7 +70,7 @@ def ceiling(buffer_set: BufferSet, config: CeilingConfig) -> list[Ceiling]:
     cells: dict[tuple[str, str], list[_Kept]] = {}
     for buffer in (one for name in names for one in buffer_set.buffers(condition=name)):
         if (given := _given(buffer_set, buffer, config)) is not None:
-            kept = _kept(buffer, config.memory, given, config.frames)
+            kept = _kept(buffer, memory, given, config.frames)
             for family in (buffer.episode_id.family, ALL):
                 cells.setdefault((family, buffer.condition), []).append(kept)
     return [
@@ -97,14 +97,14 @@ def queries_with_evidence(buffer_set: BufferSet) -> list[Query]:
     return known
 
 
-def _kept(buffer: Buffer, memory: str, given: Sequence[int], frames: int) -> _Kept:
+def _kept(buffer: Buffer, memory: Memory, given: Sequence[int], frames: int) -> _Kept:
     """Return what a memory keeps at the first step, given frames of a buffer.
 
     A part of the answer is known from that many kept `frames` on.
     """
     if buffer.evidence is None:
         return None, None
-    kept = Memory(memory).kept(given)
+    kept = memory.kept(given)
     success = chance(buffer.query, known_parts(buffer.evidence, kept, frames))
     return evidence_kept(buffer.evidence, kept), success
 

@@ -30,12 +30,13 @@ def ceiling(buffer_set: BufferSetFolder, config: CeilingConfig, as_json: AsJson 
     Examples:
     ```
     robomme-interference ceiling my-buffers --memory window
-    robomme-interference ceiling my-buffers --memory framesamp --frames 2
+    robomme-interference ceiling my-buffers --memory framesamp:64 --frames 2
     robomme-interference ceiling my-buffers --retrieval thumbnail --shift light:2
     ```
     """
     from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.schema.codec import to_dict
+    from robomme_interference_data.schema.sampling import Memory
 
     from . import ceiling as module
 
@@ -44,7 +45,7 @@ def ceiling(buffer_set: BufferSetFolder, config: CeilingConfig, as_json: AsJson 
     if as_json:
         print_json([to_dict(cell) for cell in cells])
         return
-    title = f"Ceiling on {opened.name}, memory {config.memory}"
+    title = f"Ceiling on {opened.name}, memory {Memory.parse(config.memory)}"
     if config.frames > 1:
         title += f", {config.frames} frames of a part"
     if config.retrieval is not None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from robomme_interference_data.constants import MAX_STEPS, POSITION_LIMIT
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError
 from robomme_interference_data.schema.conditions import NO_HISTORY
+from robomme_interference_data.schema.sampling import Memory
 
 _FREE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
@@ -30,7 +31,7 @@ class System:
             `grounded_subgoal`, or None without a model.
         retrieval: Whether a retrieval step selects what the memory gets.
         step: Changes of that step from the paper's, in the name of a control, such as `joined`.
-        sampling: Rule of `sampling.MEMORIES` by which it keeps frames; None if unknown, or if it
+        sampling: Spelling of the `Memory` by which it keeps frames; None if unknown, or if it
             keeps none.
         position_limit: Maximum history and live frames together in memory; None: no limit.
         paper: Whether the paper reports it.
@@ -142,15 +143,26 @@ _CONTROLS = (
     System("mean", "Mean", "none", with_history=False, reference=True),
 )
 
+_SIZE = re.compile(r"(?:(?<=-framesamp)|(?<=-window))[0-9]+")
+"""The size of a memory in the name of a control, as in `replay-window8`; see `Memory.label`."""
+
 SYSTEMS: dict[str, System] = {system.name: system for system in (*PAPER_SYSTEMS, *_CONTROLS)}
 """Name to system: the paper's, then the built-in policies. The order is that of tables."""
 
 
 def known_system(name: str) -> System | None:
-    """Return a system of the table, or a control with a changed retrieval step; else None.
+    """Return a system of the table, or a control with another memory or retrieval step; else None.
 
-    The change follows the control's name, as in `retrieval-replay-window-joined`.
+    The change follows the control's name, as in `retrieval-replay-window8-joined`.
     """
+    size = _SIZE.search(name)
+    if size is not None:
+        usual = known_system(_SIZE.sub("", name, count=1))
+        if usual is None or usual.sampling is None or usual.paper:
+            return None
+        display = f"{usual.display} ({size.group()} frames)"
+        sampling = f"{usual.sampling}:{size.group()}"
+        return replace(usual, name=name, display=display, sampling=sampling)
     for control in _CONTROLS:
         step = name.removeprefix(f"{control.name}-")
         if control.retrieval and step != name:
@@ -179,6 +191,9 @@ def base_of(name: str) -> str | None:
     known = known_system(name)
     if known is None or not known.retrieval:
         return None
+    if _SIZE.search(name) and known.sampling is not None:
+        usual, memory = base_of(_SIZE.sub("", name, count=1)), Memory.parse(known.sampling)
+        return usual and usual.replace(memory.rule, memory.label)
     plain = name.removeprefix("retrieval-")
     base = next((one for one in SYSTEMS if plain.startswith(one)), f"perceptual-{plain}")
     # An option of the policy, which it has without retrieval too.

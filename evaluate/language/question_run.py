@@ -22,7 +22,7 @@ from robomme_interference_data.evaluate.run.kind import Run, RunKind
 from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
 from robomme_interference_data.evaluate.systems import known_system, name_system
 from robomme_interference_data.schema.conditions import NO_HISTORY
-from robomme_interference_data.schema.sampling import MEMORIES, Memory
+from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.simulators.registry import recorded_scene
 
 from .models import MODELS, model_identity
@@ -37,6 +37,8 @@ class Questions(RunKind[AskConfig]):
         """Check the settings, and identify the model."""
         config = self.config
         _check_settings(config)
+        self.memory = Memory.parse(config.memory)
+        self.config = config = dataclasses.replace(config, memory=str(self.memory))
         self._questions = read_questions(self.buffer_set)
         self.metadata, self._images = {"model": config.model}, None
         if config.model not in OWN:
@@ -63,16 +65,16 @@ class Questions(RunKind[AskConfig]):
                         "Ask a model, or guess.",
                     )
         # How many frames a retrieval step selects is unknown before.
-        if self._images is None or (config.retrieval is not None and config.sampling == "full"):
+        if self._images is None or (config.retrieval is not None and self.memory.rule == "full"):
             return
         for item in items:
             history = self.buffer_set.manifest(item.episode, item.condition).history_frames
-            kept = len(Memory(config.sampling, config.frames).earlier(history))
+            kept = len(self.memory.earlier(history))
             if kept + 1 > self._images:
                 raise InvalidOptionError(
                     f"{item.episode}, {item.condition}: {kept} history frames and the picture; "
                     f"the model takes {self._images} images at most",
-                    f'Set model_options=("images={kept + 1}",), or fewer `frames`.',
+                    f'Set model_options=("images={kept + 1}",), or a smaller `memory`.',
                 )
 
     def task(self, run: Run[AskConfig]) -> AskTask:
@@ -86,8 +88,7 @@ class Questions(RunKind[AskConfig]):
             model = model_identity(config.model, config.model_options, model["model"])
             model["prompt_sha256"] = self.metadata["prompt_sha256"]
         return {
-            "frames": config.frames,
-            "sampling": config.sampling,
+            "memory": str(self.memory),
             "control": config.control,
             "model": model,
             "questions": digest_questions(self._questions.values()),
@@ -96,15 +97,12 @@ class Questions(RunKind[AskConfig]):
 
 def _check_settings(config: AskConfig) -> None:
     """Check the settings by themselves and against each other."""
-    for name, known in (("sampling", MEMORIES), ("control", CONTROLS)):
-        if getattr(config, name) not in known:
-            raise InvalidOptionError.one_of(name, getattr(config, name), known)
-    if config.frames < 2:
-        raise InvalidOptionError.expected("frames", config.frames, "2 or more")
+    if config.control not in CONTROLS:
+        raise InvalidOptionError.one_of("control", config.control, CONTROLS)
     if config.model in OWN:
         unused = ["model_options", "control", "prompt"]
         if config.model == "guess":
-            unused += ["frames", "sampling", "retrieval"]
+            unused += ["memory", "retrieval"]
         check_unused(config, unused, config.model, "Leave it out, or ask a model.")
     elif ":" not in config.model:
         raise UnknownNameError(
@@ -120,8 +118,10 @@ def _name(config: AskConfig) -> str:
     """Return the label of the rows: a name of the table only for the responder that it names."""
     default = None
     if config.model in OWN:
-        memory = (config.sampling,) if config.model == "recall" else ()
-        default = with_retrieval("-".join(("questions", config.model, *memory)), config)
+        default = f"questions-{config.model}"
+        if config.model == "recall":
+            default += f"-{Memory.parse(config.memory).label}"
+        default = with_retrieval(default, config)
     name = config.system or default
     if name is None:
         raise InvalidOptionError(

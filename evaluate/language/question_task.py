@@ -59,7 +59,7 @@ class AskTask(RunTask[AskConfig]):
         given: Sequence[int] = range(len(buffer))
         if self.selector is not None and len(buffer):
             given = self.selector.select(buffer, query.frame(self.selector.camera)).tolist()
-        memory = Memory(config.sampling, config.frames)
+        memory = Memory.parse(config.memory)
         kept = memory.kept(given)
         known = None if buffer.evidence is None else known_parts(buffer.evidence, kept)
         history = History(buffer, kept, self.history)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import ACTION_CHUNK
 from robomme_interference_data.errors import PolicyError
 from robomme_interference_data.schema.evidence import known_parts
-from robomme_interference_data.schema.sampling import Memory, check_memory
+from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Observation, Simulator
 
@@ -36,7 +36,7 @@ class ReplayPolicy(Policy):
     memory.
 
     Args:
-        memory: `full`, `framesamp` or `window`.
+        memory: `full`, `framesamp:N` or `window:N`; see `Memory.parse`.
         extrapolate: Continue the last motion for as many steps as history frames follow the last
             kept one. Such rows are those of another system.
     """
@@ -45,8 +45,7 @@ class ReplayPolicy(Policy):
     history_cameras = ("front",)
 
     def __init__(self, memory: str = "full", *, extrapolate: bool = False):
-        check_memory(memory, "replay")
-        self.memory, self._extrapolate = memory, extrapolate
+        self.memory, self._extrapolate = Memory.parse(memory), extrapolate
 
     def reset(self, info: RolloutInfo) -> None:
         """Clear the memory."""
@@ -70,11 +69,11 @@ class ReplayPolicy(Policy):
 
     def metadata(self) -> dict[str, Any]:
         """Return name and memory rule."""
-        return {"policy": "replay", "memory": self.memory}
+        return {"policy": "replay", "memory": str(self.memory)}
 
     def _start_plan(self, observation: Observation) -> NDArray[np.float32]:
         live = sum(len(states) for states in self._states)
-        kept = np.array(Memory(self.memory).earlier(live), np.int64)
+        kept = np.array(self.memory.earlier(live), np.int64)
         if not len(kept):
             return follow(observation.state, kept, observation.state[None][:0])
         views = np.concatenate(self._views)[kept]
@@ -204,13 +203,12 @@ class Recall(Privileged):
     from the episode's seed, and the simulator's script carries it out. It reads no images.
 
     Args:
-        memory: `full`, `framesamp` or `window`.
+        memory: `full`, `framesamp:N` or `window:N`; see `Memory.parse`.
     """
 
     def __init__(self, memory: str = "full"):
         super().__init__("recall")
-        check_memory(memory, self.name)
-        self.memory = memory
+        self.memory = Memory.parse(memory)
 
     def reset(self, info: RolloutInfo) -> None:
         """Determine which parts of the answer the memory keeps."""
@@ -220,7 +218,7 @@ class Recall(Privileged):
                 "recall needs to know which frames show the answer, which is unknown here",
                 "Build the buffer set from a source with evidence: see docs/reference/sources.md.",
             )
-        self._known = known_parts(info.evidence, Memory(self.memory).earlier(info.history_frames))
+        self._known = known_parts(info.evidence, self.memory.earlier(info.history_frames))
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the script's next action, `(1, 8) float32`; see `Privileged.act`."""
@@ -228,7 +226,7 @@ class Recall(Privileged):
 
     def metadata(self) -> dict[str, Any]:
         """Return name and memory rule."""
-        return {"policy": self.name, "memory": self.memory}
+        return {"policy": self.name, "memory": str(self.memory)}
 
 
 class Noop(Policy):

@@ -15,6 +15,7 @@ from robomme_interference_data.runtime.specs import (
     import_factory,
     signature_of,
 )
+from robomme_interference_data.schema.sampling import Memory
 
 from .policy import Policy
 
@@ -38,11 +39,15 @@ def _valid_addresses(target: str) -> bool:
     return len({*servers}) == len(servers) and all(0 < port < 65536 for _, port in servers)
 
 
+def _memory(target: str) -> str:
+    return str(Memory.parse(target))
+
+
 def _builtin(kind: str, factory: str, memory: bool = False, **given: str) -> Kind:
     factory = f"{__package__}.builtin:{factory}"
     if memory:
-        form = f"{kind}, {kind}:framesamp or {kind}:window"
-        return Kind(form, factory, r"(?P<memory>[a-z]+)", default="full")
+        form = f"{kind}, {kind}:framesamp:N or {kind}:window:N"
+        return Kind(form, factory, r"(?P<memory>.+)", default="full", spelled=_memory)
     return Kind(kind, factory, given=given)
 
 

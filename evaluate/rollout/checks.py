@@ -34,6 +34,7 @@ from robomme_interference_data.evaluate.systems import (
 from robomme_interference_data.retrieval.select import Rule
 from robomme_interference_data.runtime.executor import is_share
 from robomme_interference_data.schema.conditions import NO_HISTORY
+from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.simulators.base import ACTION_SIZE
 from robomme_interference_data.simulators.registry import (
     RECORDINGS,
@@ -68,7 +69,9 @@ def default_system(config: RunConfig) -> str:
             "Set `system`, such as perceptual-framesamp-modul, or a name of your own: see "
             "docs/how-to/paper-systems.md.",
         )
-    name = "-".join(filter(None, (spec.kind, spec.target, config.subgoals)))
+    remembers = spec.kind in ("replay", "recall")
+    target = Memory.parse(spec.target).label if remembers else spec.target
+    name = "-".join(filter(None, (spec.kind, target, config.subgoals)))
     if spec.kind in ("replay", "follow-subgoals"):
         options = policy_options(config.policy, config.policy_options)
         name += "-extrapolate" if options.get("extrapolate") else ""

@@ -128,7 +128,7 @@ def run_rollout(
         vars(error)["progress"] = {"steps": live.steps, **_model_columns(writer)}
         raise
     sampling = name_system(run.system).sampling
-    memory = Memory(sampling) if sampling else None
+    memory = Memory.parse(sampling) if sampling else None
     times: dict[str, Any] = {name: round(value, 4) for name, value in clock.items()}
     return run.row(
         item,

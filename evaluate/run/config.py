@@ -6,10 +6,11 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from robomme_interference_data.constants import DEMONSTRATIONS, SAMPLE_FRAMES, SPLITS
+from robomme_interference_data.constants import DEMONSTRATIONS, SPLITS
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.runtime.executor import WorkersConfig
 from robomme_interference_data.schema.conditions import NO_HISTORY
+from robomme_interference_data.schema.sampling import MEMORY_FORM
 from robomme_interference_data.schema.settings import setting
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP
 
@@ -182,11 +183,8 @@ class AskConfig(WorkConfig):
         name="-", metavar="BUFFER_SET", help="Folder of the buffer set, with its questions."
     )
     out: Path = setting(help="Folder of the run; an existing run resumes.")
-    frames: int = setting(
-        SAMPLE_FRAMES, group=_MODEL, metavar="N", help="Frames in memory, with the current one."
-    )
-    sampling: str = setting(
-        "framesamp", group=_MODEL, help="Which frames are kept: full, framesamp or window."
+    memory: str = setting(
+        "framesamp:32", group=_MODEL, help=f"Frames in memory, with the current one: {MEMORY_FORM}."
     )
     control: str = setting(
         "none", group=_MODEL, help="blank: history frames are gray; text: no images at all."
@@ -211,7 +209,7 @@ class AskConfig(WorkConfig):
 class CeilingConfig(RetrievalConfig):
     """The settings of a ceiling: which memory, and which buffers."""
 
-    memory: str = setting("framesamp", help="full, framesamp or window.")
+    memory: str = setting("framesamp:32", help=f"{MEMORY_FORM}.")
     frames: int = setting(1, help="Kept frames of a part of the answer that make it known.")
     conditions: tuple[str, ...] = setting((), help="Conditions; default: all of the buffer set.")
     shift: str = setting(NO_SHIFT, help=SHIFT_HELP)

@@ -43,6 +43,7 @@ class Kind:
         extra: The extra that has its libraries.
         no_effect: Options, and keys of metadata, that change no result.
         valid: Further check of the target.
+        spelled: The one spelling of a target that has several; it may reject the target.
         on_hub: Whether the target is a folder, or a model on the Hub that `pin` pins.
     """
 
@@ -54,6 +55,7 @@ class Kind:
     extra: str = ""
     no_effect: tuple[str, ...] = ()
     valid: Callable[[str], bool] = lambda target: True
+    spelled: Callable[[str], str] = lambda target: target
     on_hub: bool = False
 
 
@@ -93,6 +95,8 @@ class Registry:
         match = re.fullmatch(kind.target, target, re.DOTALL)
         if match is None or bool(colon) > bool(target) or not kind.valid(target):
             raise InvalidOptionError.expected(self._what, text, kind.form)
+        if kind.spelled(target) != target:
+            return self.parse(f"{name}:{kind.spelled(target)}")
         return Spec(name, target, {**kind.given, **match.groupdict()})
 
     @property

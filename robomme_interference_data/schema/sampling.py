@@ -28,10 +28,10 @@ def even_sample(history_frames: int, frames: int = SAMPLE_FRAMES) -> list[int]:
     return [j * history_frames // (frames - 1) for j in range(frames)]
 
 
-MEMORIES: dict[str, Callable[..., Sequence[int]]] = {
-    "full": lambda live, frames=SAMPLE_FRAMES: range(live),
-    "framesamp": lambda live, frames=SAMPLE_FRAMES: even_sample(live, frames)[:-1],
-    "window": lambda live, frames=SAMPLE_FRAMES: range(max(0, live - frames + 1), live),
+MEMORIES: dict[str, Callable[[int, int], Sequence[int]]] = {
+    "full": lambda live, frames: range(live),
+    "framesamp": lambda live, frames: even_sample(live, frames)[:-1],
+    "window": lambda live, frames: range(max(0, live - frames + 1), live),
 }
 """By name, functions from the index of the live observation to the earlier frames in memory.
 
@@ -39,16 +39,13 @@ The second argument is the size of the memory, with the live observation. `full`
 `framesamp` those of `even_sample`, `window` the last ones.
 """
 
-
-def check_memory(name: str, of: str) -> None:
-    """Check the name of a memory rule; `of` is the option's owner, for the message."""
-    if name not in MEMORIES:
-        raise UnknownNameError.among("memory", name, of, MEMORIES)
+MEMORY_FORM = "full, framesamp:N or window:N (N: 32)"
+"""The spelling of a memory, for help and messages."""
 
 
 @dataclass(frozen=True)
 class Memory:
-    """A memory rule and its size.
+    """A memory rule and its size; `str()` is its one spelling: `full`, `framesamp:32`.
 
     Attributes:
         rule: One of `MEMORIES`.
@@ -60,18 +57,18 @@ class Memory:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Read `full`, `framesamp` or `window`, with the size after a colon: `framesamp:32`.
+        """Read `full`, `framesamp:32` or `window:32`; the size is 32 if it is left out.
 
         Raises:
             UnknownNameError: There is no such rule.
             InvalidOptionError: The size is not a whole number from 2.
         """
         rule, colon, frames = text.partition(":")
-        check_memory(rule, "the memory rules")
+        if rule not in MEMORIES:
+            raise UnknownNameError.among("memory", rule, "the memory rules", MEMORIES)
         sized = rule != "full" and frames.isascii() and frames.isdigit() and int(frames) > 1
         if colon and not sized:
-            expected = f"{', '.join(MEMORIES)}, or framesamp:N or window:N with N from 2"
-            raise InvalidOptionError.expected("memory", text, expected)
+            raise InvalidOptionError.expected("memory", text, f"{MEMORY_FORM}, N from 2")
         return cls(rule, int(frames)) if colon else cls(rule)
 
     def earlier(self, live: int) -> Sequence[int]:
@@ -85,6 +82,12 @@ class Memory:
     def kept(self, given: Sequence[int]) -> list[int]:
         """Return which of the frames of a history are in memory at the first live observation."""
         return [given[place] for place in self.earlier(len(given))]
+
+    @property
+    def label(self) -> str:
+        """The name in labels of rows: the rule, and a size other than 32, as in `window8`."""
+        usual = self.rule == "full" or self.frames == SAMPLE_FRAMES
+        return self.rule if usual else f"{self.rule}{self.frames}"
 
     def __str__(self) -> str:
         return self.rule if self.rule == "full" else f"{self.rule}:{self.frames}"

@@ -32,7 +32,7 @@ def world(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def right(tmp_path: Path) -> Path:
     """A run whose answers are all right."""
-    return ask(tmp_path / "right", sampling="full", conditions=("k0", "k1"), **FEW).folder
+    return ask(tmp_path / "right", memory="full", conditions=("k0", "k1"), **FEW).folder
 
 
 def act_out(out: Path, answers: Path, **changes: Any) -> RunResult:
@@ -128,8 +128,8 @@ def test_the_run_of_questions_identifies_the_rollouts(tmp_path: Path, right: Pat
     assert str(tmp_path) not in json.dumps(identity)
     moved = right.rename(tmp_path / "moved")
     act_out(tmp_path / "acted", moved)  # resumes
-    other = ask(tmp_path / "other", sampling="window", **FEW).folder
-    with pytest.raises(InterferenceError, match=r"another run.*policy_metadata.answers.sampling"):
+    other = ask(tmp_path / "other", memory="window", **FEW).folder
+    with pytest.raises(InterferenceError, match=r"another run.*policy_metadata.answers.memory"):
         act_out(tmp_path / "acted", other)
 
 

@@ -41,11 +41,11 @@ def seen(shade: int, joint: float, opening: float = 0.04) -> Observation:
 
 
 def test_the_frames_that_a_memory_keeps() -> None:
-    assert list(MEMORIES["full"](5)) == [0, 1, 2, 3, 4]
-    assert list(MEMORIES["window"](100)) == list(range(69, 100))  # 32 with the live one
-    assert list(MEMORIES["framesamp"](30)) == list(range(30))
+    assert list(Memory("full").earlier(5)) == [0, 1, 2, 3, 4]
+    assert list(Memory("window").earlier(100)) == list(range(69, 100))  # 32 with the live one
+    assert list(Memory("framesamp").earlier(30)) == list(range(30))
     # numpy truncates linspace(0, 310, 32) to 0, 10, …, 310; the last one is the live frame.
-    assert list(MEMORIES["framesamp"](310)) == list(range(0, 310, 10))
+    assert list(Memory("framesamp").earlier(310)) == list(range(0, 310, 10))
     assert Memory("window", 3).kept([5, 6, 8, 9]) == [8, 9]  # two, and the live one
     with pytest.raises(UnknownNameError, match="Did you mean 'window'"):
         ReplayPolicy("windw")
@@ -53,7 +53,7 @@ def test_the_frames_that_a_memory_keeps() -> None:
 
 @given(st.sampled_from(sorted(MEMORIES)), st.integers(0, 5000))
 def test_a_memory_keeps_existing_frames_in_order(name: str, live: int) -> None:
-    kept = list(MEMORIES[name](live))
+    kept = list(Memory(name).earlier(live))
     assert kept == sorted(set(kept)) and set(kept) <= set(range(live))
     assert len(kept) == min(live, 31) or name == "full"
 
@@ -188,8 +188,8 @@ class Recorder:
     ("memory", "known"),
     [
         ("full", {1: "from the left", 0: "takes peg 2"}),
-        ("framesamp", {1: "from the left"}),  # every tenth frame of 310
-        ("window", {}),  # from 279 on
+        ("framesamp:32", {1: "from the left"}),  # every tenth frame of 310
+        ("window:32", {}),  # from 279 on
     ],
 )
 def test_recall_knows_the_evidence_that_its_memory_keeps(

@@ -35,7 +35,7 @@ IDENTITY = {
     },
     AskConfig: {
         *("model", "model_options", "prompt"),  # in model_identity, and the prompt's digest
-        *("frames", "sampling", "control", "buffer_set"),
+        *("memory", "control", "buffer_set"),
     },
 }
 FREE = {
@@ -131,13 +131,16 @@ def test_another_run_of_questions_is_an_error_that_names_the_difference(tmp_path
     prompt = tmp_path / "mine.toml"
     prompt.write_text('system = "s"\nquestion = "<history><picture>{goal}{question}{options}"\n')
     with ChatServer(look) as server:
-        usual = behind(server, frames=3, families=("MoveCube",), episodes="0")
+        usual = behind(server, memory="framesamp:3", families=("MoveCube",), episodes="0")
         ask(tmp_path / "run", **usual)
         for changes, message in (
-            ({"frames": 5}, "frames is 3 there, 5 here"),
+            ({"memory": "window:3"}, "memory is 'framesamp:3' there, 'window:3' here"),
             ({"control": "blank"}, "control is 'none' there, 'blank' here"),
             ({"model_options": ("max_tokens=9",)}, "max_tokens is 256 there, 9 here"),
-            ({"model": "guess", "frames": 32}, "model.model is 'tiny' there, 'guess' here"),
+            (
+                {"model": "guess", "memory": "framesamp:32"},
+                "model.model is 'tiny' there, 'guess' here",
+            ),
             ({"prompt": str(prompt)}, "model.prompt_sha256 is"),
         ):
             with pytest.raises(RunError, match=message):

@@ -44,7 +44,7 @@ def test_a_policy_is_parsed() -> None:
     [
         ("websockets://a:1", UnknownNameError, "Did you mean 'websocket'?"),
         ("lamp:Lamp", UnknownNameError, "write python:lamp:Lamp"),
-        ("zzz", UnknownNameError, "expected replay, replay:framesamp or replay:window, recall,"),
+        ("zzz", UnknownNameError, "replay, replay:framesamp:N or replay:window:N, recall,"),
         *(
             (text, InvalidOptionError, f"policy '{text}'; expected {text.partition(':')[0]}")
             for text in (
@@ -139,6 +139,8 @@ def test_options_that_do_not_fit(text: str, options: list[str], words: str) -> N
 def test_the_part_of_a_policy_that_can_change_a_result() -> None:
     # The default memory may be left out.
     assert [POLICIES.pin(text) for text in ("replay", "replay:full")] == ["replay:full"] * 2
+    assert POLICIES.pin("recall:window") == POLICIES.pin("recall:window:32") == "recall:window:32"
+    assert make_policy("replay:framesamp:8").metadata()["memory"] == "framesamp:8"
     metadata = {"policy": "websocket", "server": "a:1", "server_metadata": {"model": "m"}}
     assert policy_identity("websocket://a:1,b:2", ("response_s=5", "checkpoint=7"), metadata) == {
         "policy": "websocket",

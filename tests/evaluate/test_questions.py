@@ -38,7 +38,7 @@ SOME = {"families": ("VideoRepick", "MoveCube", "PatternLock")}
 
 
 def test_recall_of_everything_is_always_right(tmp_path: Path) -> None:
-    result = ask(tmp_path / "run", sampling="full", conditions=("k0", "k1"))
+    result = ask(tmp_path / "run", memory="full", conditions=("k0", "k1"))
     assert len(result.rows) == 2 * len(QUERIES)
     for row in result.rows:
         assert (row.success, row.answer) == (True, right_letter(row.episode_id))
@@ -53,7 +53,7 @@ def test_recall_of_everything_is_always_right(tmp_path: Path) -> None:
 
 def test_recall_of_nothing_draws_as_a_guess_does(tmp_path: Path) -> None:
     """With the last frame of a lesson, or without history, all options remain."""
-    kept = {"sampling": "window", "frames": 2}
+    kept = {"memory": "window:2"}
     recalled = ask(tmp_path / "recall", conditions=("no-history", "k0"), **kept)
     guessed = ask(tmp_path / "guess", model="guess", conditions=("no-history", "k0"))
     assert [row.answer for row in recalled.rows] == [row.answer for row in guessed.rows]
@@ -65,7 +65,7 @@ def test_recall_of_nothing_draws_as_a_guess_does(tmp_path: Path) -> None:
 
 def test_recall_of_a_part_draws_from_the_remaining_options(tmp_path: Path) -> None:
     # Of the lesson's frames the last 37: of a path's first target, frames 0 and 1, none is left.
-    rows = ask(tmp_path / "run", sampling="window", frames=38).rows
+    rows = ask(tmp_path / "run", memory="window:38").rows
     for row in rows:
         scene, answer = scene_of(row.episode_id)
         parts = scene.parts(answer)
@@ -101,9 +101,9 @@ def test_guesses_are_right_by_chance() -> None:
     ("settings", "kept"),
     [
         # The live observation has index 40 under k0, and 40 + 32 = 72 under k1.
-        ({"frames": 5}, [0, 10, 20, 30]),  # linspace(0, 40, 5), without the last
-        ({"frames": 3, "sampling": "window", "conditions": ("k1",)}, [70, 71]),
-        ({"sampling": "full"}, [*range(40)]),
+        ({"memory": "framesamp:5"}, [0, 10, 20, 30]),  # linspace(0, 40, 5), without the last
+        ({"memory": "window:3", "conditions": ("k1",)}, [70, 71]),
+        ({"memory": "full"}, [*range(40)]),
         ({"conditions": ("no-history",)}, []),
     ],
 )
@@ -127,19 +127,19 @@ def test_exactly_the_kept_frames_are_sent(
 
 def test_more_frames_than_the_model_takes_are_an_error(tmp_path: Path) -> None:
     with ChatServer(lambda seen: "B") as server:
-        for settings in ({"frames": 6}, {"sampling": "full"}):
+        for settings in ({"memory": "framesamp:6"}, {"memory": "full"}):
             options = behind(server, model_options=("images=5",), **settings)
             with pytest.raises(InvalidOptionError, match="the model takes 5 images at most"):
                 ask(tmp_path / "run", **ONE, **options)
         assert not (tmp_path / "run").exists()
-        for changes in ({"frames": 5}, {"frames": 9, "control": "text"}):
+        for changes in ({"memory": "framesamp:5"}, {"memory": "framesamp:9", "control": "text"}):
             options = behind(server, model_options=("images=5",), **changes)
-            assert ask(tmp_path / str(changes["frames"]), **ONE, **options).counts["error"] == 0
+            assert ask(tmp_path / changes["memory"], **ONE, **options).counts["error"] == 0
 
 
 def test_a_model_that_looks_is_right_where_evidence_was_kept(tmp_path: Path) -> None:
     with ChatServer(look) as server:
-        settings = behind(server, conditions=("no-history", "k0", "k1"), frames=4)
+        settings = behind(server, conditions=("no-history", "k0", "k1"), memory="framesamp:4")
         rows = ask(tmp_path / "run", **SOME, **settings).rows
     for row in rows:
         assert row.success == bool(row.evidence_kept)
@@ -152,7 +152,9 @@ def test_a_model_that_looks_is_right_where_evidence_was_kept(tmp_path: Path) -> 
 
 def test_controls_hide_the_past_or_all_images(tmp_path: Path) -> None:
     with ChatServer(look) as server:
-        rows = ask(tmp_path / "blank", **behind(server, control="blank", frames=4), **SOME).rows
+        rows = ask(
+            tmp_path / "blank", **behind(server, control="blank", memory="framesamp:4"), **SOME
+        ).rows
         assert {(row.status, row.model_faults) for row in rows} == {("fail", 1)}
         for seen in server.seen:
             *history, picture = seen.images
@@ -172,7 +174,7 @@ def test_a_retrieval_step(tmp_path: Path) -> None:
     found = {}
     with ChatServer(look) as server:
         for rule in ("oracle", "last"):
-            settings = {"retrieval": "thumbnail", "retrieval_rule": rule, "sampling": "full"}
+            settings = {"retrieval": "thumbnail", "retrieval_rule": rule, "memory": "full"}
             settings |= {"buffer_set": buffer_set, "conditions": ("k1",), "families": ("MoveCube",)}
             rows = ask(tmp_path / rule, **behind(server, **settings)).rows
             found[rule] = {(row.success, row.lesson_frames) for row in rows}
@@ -187,7 +189,7 @@ def test_a_retrieval_step(tmp_path: Path) -> None:
 
 def test_prompts_and_answers_are_written(tmp_path: Path) -> None:
     with ChatServer(lambda seen: "Half of a character: \ud800. The answer is A.") as server:
-        ask(tmp_path / "run", **behind(server, frames=5), families=("MoveCube",))
+        ask(tmp_path / "run", **behind(server, memory="framesamp:5"), families=("MoveCube",))
     files = sorted((tmp_path / "run" / "answers").iterdir())
     assert [path.name for path in files] == ["MoveCube_test_0_k0.jsonl", "MoveCube_test_2_k0.jsonl"]
     [line] = map(json.loads, files[0].read_text().splitlines())
@@ -208,7 +210,9 @@ def test_a_damaged_picture_breaks_only_its_question(tmp_path: Path) -> None:
     ]
     write_questions(damaged, root)
     with ChatServer(look) as server:
-        rows = ask(tmp_path / "run", buffer_set=root, **behind(server, frames=3, **FOUR)).rows
+        rows = ask(
+            tmp_path / "run", buffer_set=root, **behind(server, memory="framesamp:3", **FOUR)
+        ).rows
     broken, *others = rows
     assert broken.episode_id == MOVE and "MoveCube/test/0: an image is damaged" in str(broken.error)
     assert [row.status for row in others] == ["success"] * 3
@@ -220,10 +224,10 @@ def test_a_damaged_picture_breaks_only_its_question(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"frames": 1}, "frames 1"),
+        ({"memory": "window:1"}, "window:1"),
         ({"control": "blnk"}, "control 'blnk' is none of none, blank, text"),
         ({"control": "blank"}, "`control` has no effect on recall"),
-        ({"model": "guess", "frames": 8}, "`frames` has no effect on guess"),
+        ({"model": "guess", "memory": "window"}, "`memory` has no effect on guess"),
         ({"model": "recal"}, "there is no model 'recal'; expected recall, guess, openai:URL"),
         ({"model": "openai:http://h/v1#m", "system": "m", "prompt": "x"}, "no prompt or file 'x'"),
         ({"retrieval": "thumbnail", "conditions": ("no-history",)}, "nothing to retrieve from"),
@@ -248,7 +252,7 @@ def test_a_model_answers_questions_whose_options_recall_does_not_know(tmp_path: 
     with pytest.raises(InvalidOptionError, match="recall does not know"):
         ask(tmp_path / "recall", buffer_set=root)
     with ChatServer(lambda seen: "B") as server:
-        rows = ask(tmp_path / "run", buffer_set=root, **behind(server, frames=3)).rows
+        rows = ask(tmp_path / "run", buffer_set=root, **behind(server, memory="framesamp:3")).rows
     assert [(row.status, row.chance) for row in rows] == [("success", 0.5)] * 3
     assert len(ask(tmp_path / "guess", buffer_set=root, model="guess").rows) == 3
 

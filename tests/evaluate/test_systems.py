@@ -9,6 +9,7 @@ from robomme_interference_data.evaluate.systems import (
     check_history,
     display_name,
     is_reference,
+    known_system,
     name_system,
 )
 
@@ -27,6 +28,7 @@ def test_conditions_of_a_system(name: str) -> None:
 def test_the_base_of_a_retrieval_system() -> None:
     assert base_of("retrieval-framesamp-modul") == "perceptual-framesamp-modul"
     assert base_of("retrieval-replay-window") == "replay-window"
+    assert base_of("retrieval-replay-window8-extrapolate") == "replay-window8-extrapolate"
     for step in ("", "-joined"):
         assert base_of(f"retrieval-replay-full-extrapolate{step}") == "replay-full-extrapolate"
     assert base_of("replay-window") is base_of("my-memory") is None
@@ -42,6 +44,12 @@ def test_a_control_behind_another_retrieval_step(step: str) -> None:
     assert is_reference(system.name) and not is_reference(f"retrieval-replay-window-{step}")
     assert base_of(system.name) == "recall-framesamp"
     assert display_name(system.name) == system.display
+
+
+def test_a_control_with_a_memory_of_another_size() -> None:
+    system = name_system("retrieval-recall-framesamp8-joined")
+    assert (system.sampling, system.step, system.reference) == ("framesamp:8", "joined", True)
+    assert known_system("perceptual-framesamp8-modul") is known_system("framesamp8") is None
 
 
 def test_position_limits_name_the_conditions() -> None:

@@ -20,6 +20,7 @@ from robomme_interference_data.stats.intervals import newcombe_paired, wilson
     [
         ("replay-framesamp", "recall-framesamp"),
         ("replay-full", "recall-full"),
+        ("replay-framesamp8", "recall-framesamp8"),
         ("retrieval-replay-window-joined", "retrieval-recall-window-joined"),
         ("retrieval-replay-full-extrapolate-joined", "retrieval-recall-full-joined"),
         ("retrieval-framesamp-modul", "retrieval-recall-framesamp"),

@@ -10,6 +10,7 @@ from robomme_interference_data.evaluate.score.comparisons.pairs import pair
 from robomme_interference_data.evaluate.score.comparisons.tables import tested
 from robomme_interference_data.evaluate.score.outcomes import Outcomes, Statuses, counting, rate_of
 from robomme_interference_data.evaluate.systems import is_reference, known_system
+from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.stats.strata import mantel_haenszel
 from robomme_interference_data.viz.tables import Table
 
@@ -23,7 +24,10 @@ def ceiling_of(system: str) -> str | None:
     if known is None or known.sampling is None or known.reference:
         return None
     step = known.step.removeprefix("extrapolate").removeprefix("-")  # not of the memory
-    return f"{'retrieval-' * known.retrieval}recall-{known.sampling}{'-' * bool(step)}{step}"
+    name = f"recall-{Memory.parse(known.sampling).label}"
+    if known.retrieval:
+        name = f"retrieval-{name}"
+    return f"{name}-{step}" if step else name
 
 
 def control_of(outcomes: Outcomes, system: str) -> str | None:
