@@ -13,7 +13,7 @@ from robomme_interference_data.constants import PARTS_PATH
 from robomme_interference_data.errors import FormatError, MissingFileError, PublishError, counted
 from robomme_interference_data.storage.files import indented_json, read_json
 from robomme_interference_data.storage.hub import HubFiles
-from robomme_interference_data.viz.tables import Table
+from robomme_interference_data.viz.tables import Columns, Table
 
 from .publication import Publication, Version, versions_of
 from .render import README, is_card
@@ -98,10 +98,18 @@ class RepoPlan:
 
 def plan_table(plans: Iterable[RepoPlan]) -> Table:
     """Return plans as a table, one row per repository."""
-    columns = "repository version files:count bytes:count sent:count sent_bytes:count state"
+    columns: Columns = {
+        "repository": "text",
+        "version": "text",
+        "files": "count",
+        "bytes": "count",
+        "sent": "count",
+        "sent_bytes": "count",
+        "state": "text",
+    }
     names = ("repo_id", "version", "files", "bytes", "sent_files", "sent_bytes")
     rows = [(*map(plan.to_dict().get, names), plan.status) for plan in plans]
-    return Table.make("publish", "Repositories", columns, rows)
+    return Table("publish", "Repositories", columns, rows)
 
 
 class Publisher:

@@ -113,7 +113,7 @@ def card_text(facts: Facts, publication: Publication) -> str:
         "frames": facts.examples,
         "split_name": facts.tables[0].split,
         "columns": column_table(facts.tables[0].record),
-        "provenance": Table.make("provenance", "Provenance", "what value", rows),
+        "provenance": Table("provenance", "Provenance", {"what": "text", "value": "text"}, rows),
         "details": {
             title: json.dumps(value, indent=2, sort_keys=True, ensure_ascii=False)
             for title, value in facts.details.items()

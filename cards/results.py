@@ -25,7 +25,7 @@ from robomme_interference_data.schema.rollouts import TIMING_COLUMNS, Rollout, S
 from robomme_interference_data.simulators.registry import RECORDINGS
 from robomme_interference_data.storage.files import digest_json, sha256_file
 from robomme_interference_data.viz.figure import open_figure, save_figure
-from robomme_interference_data.viz.tables import Table
+from robomme_interference_data.viz.tables import Columns, Table
 
 from .facts import CardTable, Facts, Rows, origin_limit
 from .markdown import Raw, code, escape
@@ -222,13 +222,28 @@ def _cells(found: Score) -> Table:
     """Return the main table without the columns that the grid shows."""
     rows = [
         (
-            *(cell.simulator, display_name(cell.system), cell.condition, cell.n, cell.expected),
-            *(len(cell.missing), cell.errors, cell.complete),
+            cell.simulator,
+            display_name(cell.system),
+            cell.condition,
+            cell.n,
+            cell.expected,
+            len(cell.missing),
+            cell.errors,
+            cell.complete,
         )
         for cell in _whole(found)
     ]
-    columns = "simulator system condition n:count expected:count missing:count errors:count"
-    return Table.make("cells", "Cells", f"{columns} complete:flag", rows)
+    columns: Columns = {
+        "simulator": "text",
+        "system": "text",
+        "condition": "text",
+        "n": "count",
+        "expected": "count",
+        "missing": "count",
+        "errors": "count",
+        "complete": "flag",
+    }
+    return Table("cells", "Cells", columns, rows)
 
 
 # --- the repository ------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from robomme_interference_data.schema.codec import arrow_schema, descriptions
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS
 from robomme_interference_data.schema.manifest import BufferManifest
 from robomme_interference_data.schema.records import EpisodeRecord
-from robomme_interference_data.viz.tables import Table
+from robomme_interference_data.viz.tables import Columns, Table
 
 from .markdown import code, escape
 
@@ -26,7 +26,7 @@ _WORDS = {
     pa.bool_(): "true or false",
     pa.binary(): "bytes",
 }
-_DIFFICULTIES = "easy:count medium:count hard:count other:count"
+_DIFFICULTIES: Columns = {"easy": "count", "medium": "count", "hard": "count", "other": "count"}
 
 
 def count_table(records: Iterable[EpisodeRecord]) -> Table:
@@ -35,8 +35,10 @@ def count_table(records: Iterable[EpisodeRecord]) -> Table:
         (escape(name), len(found), *_difficulties(found), sum(one.length for one in found))
         for name, found in _by_family(records).items()
     ]
-    columns = f"family episodes:count {_DIFFICULTIES} frames:count"
-    return Table.make("counts", "Episodes", columns, [*rows, _total(rows)])
+    columns: Columns = {"family": "text", "episodes": "count"}
+    columns |= _DIFFICULTIES
+    columns["frames"] = "count"
+    return Table("counts", "Episodes", columns, [*rows, _total(rows)])
 
 
 def unit_table(queries: Iterable[EpisodeRecord], units: Iterable[EpisodeRecord]) -> Table:
@@ -46,8 +48,10 @@ def unit_table(queries: Iterable[EpisodeRecord], units: Iterable[EpisodeRecord])
     for name in sorted({*groups, *pool}, key=family_order):
         found = groups.get(name, [])
         rows.append((escape(name), len(found), *_difficulties(found), pool[name]))
-    columns = f"family queries:count {_DIFFICULTIES} units:count"
-    return Table.make("counts", "Queries and units", columns, [*rows, _total(rows)])
+    columns: Columns = {"family": "text", "queries": "count"}
+    columns |= _DIFFICULTIES
+    columns["units"] = "count"
+    return Table("counts", "Queries and units", columns, [*rows, _total(rows)])
 
 
 def goal_table(records: Iterable[EpisodeRecord]) -> Table:
@@ -56,7 +60,7 @@ def goal_table(records: Iterable[EpisodeRecord]) -> Table:
     rows = [
         (escape(one.episode_id), escape(one.difficulty or ""), escape(one.goal)) for one in first
     ]
-    return Table.make("goals", "Goals", "episode difficulty goal", rows)
+    return Table("goals", "Goals", {"episode": "text", "difficulty": "text", "goal": "text"}, rows)
 
 
 def condition_table(conditions: Iterable[str], manifests: Iterable[BufferManifest]) -> Table:
@@ -75,8 +79,17 @@ def condition_table(conditions: Iterable[str], manifests: Iterable[BufferManifes
                 mean(one.lesson_share for one in found) if found else None,
             )
         )
-    columns = "condition origin buffers:count sessions:count min:count median:count max:count"
-    return Table.make("conditions", "Conditions", f"{columns} lesson_share:rate", rows)
+    columns: Columns = {
+        "condition": "text",
+        "origin": "text",
+        "buffers": "count",
+        "sessions": "count",
+        "min": "count",
+        "median": "count",
+        "max": "count",
+        "lesson_share": "rate",
+    }
+    return Table("conditions", "Conditions", columns, rows)
 
 
 def _by_family(records: Iterable[EpisodeRecord]) -> dict[str, list[EpisodeRecord]]:
@@ -147,7 +160,7 @@ def column_table(record: type) -> Table:
         rows.append((code(column.name), column.words, escape(column.meaning)))
         for part in column.parts:
             rows.append((code(f"{column.name}.{part.name}"), part.words, escape(part.meaning)))
-    return Table.make("columns", "Columns", "column type meaning", rows)
+    return Table("columns", "Columns", {"column": "text", "type": "text", "meaning": "text"}, rows)
 
 
 def _record_in(hint: Any) -> Any:

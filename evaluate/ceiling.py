@@ -138,11 +138,17 @@ def _mean(values: Iterable[float | None]) -> float | None:
 
 def ceiling_table(cells: Sequence[Ceiling], title: str) -> Table:
     """Return the table for the terminal."""
-    return Table.make(
+    return Table(
         "ceiling",
         title,
-        "family condition queries:count evidence_kept:rate expected_success:rate",
-        ((c.family, c.condition, c.queries, c.evidence_kept, c.success) for c in cells),
+        {
+            "family": "text",
+            "condition": "text",
+            "queries": "count",
+            "evidence_kept": "rate",
+            "expected_success": "rate",
+        },
+        [(c.family, c.condition, c.queries, c.evidence_kept, c.success) for c in cells],
         "evidence kept: mean share of the lesson's evidence spans of which the memory keeps a "
         "frame at the first step, empty without a lesson; expected success: of the ideal observer "
         "(recall), which knows these parts of the answer and draws one of the answers that agree. "

@@ -144,14 +144,22 @@ def by_group(groups: Sequence[Hashable], values: Sequence[Hashable]) -> int:
 
 def shortcut_table(found: Sequence[Shortcut], title: str) -> Table:
     """Return the table for the terminal."""
-    return Table.make(
+    return Table(
         "shortcuts",
         title,
-        "family part queries:count most_frequent:count length:count goal:count live_view:count",
-        (
+        {
+            "family": "text",
+            "part": "text",
+            "queries": "count",
+            "most_frequent": "count",
+            "length": "count",
+            "goal": "count",
+            "live_view": "count",
+        },
+        [
             (one.family, one.part, one.queries, one.most_frequent, one.length, one.goal, one.view)
             for one in found
-        ),
+        ],
         "right guesses of each part of the answer (count: of how many there are) without the "
         "lesson's frames: always the most frequent value; the value of the other episode nearest "
         "in lesson length; the most frequent among episodes with the same goal; the value of the "

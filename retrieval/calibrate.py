@@ -16,7 +16,7 @@ import numpy as np
 
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.schema.conditions import in_order
-from robomme_interference_data.viz.tables import Table
+from robomme_interference_data.viz.tables import Columns, Table
 
 from .grade import ALL, grade
 from .select import Rule, Similarities
@@ -92,18 +92,25 @@ class Calibration:
                 "Fitted without one family, graded on it: thresholds from "
                 f"{min(fitted):.3f} to {max(fitted):.3f}"
             )
-            columns = "left_out threshold:ratio purity:rate coverage:rate"
+            left_out: Columns = {
+                "left_out": "text",
+                "threshold": "ratio",
+                "purity": "rate",
+                "coverage": "rate",
+            }
             rows = [(t.family, t.threshold, t.purity, t.coverage) for t in self.held_out]
-            parts.append(Table.make("held_out", head, columns, rows).text())
+            parts.append(Table("held_out", head, left_out, rows).text())
         conditions = dict.fromkeys(one.condition for one in self.sweep)
-        names = [f"{part}_{name}:rate" for part in ("purity", "coverage") for name in conditions]
+        columns: Columns = {"threshold": "text"}
+        for part in ("purity", "coverage"):
+            columns |= {f"{part}_{name}": "rate" for name in conditions}
         swept = []
         for threshold, group in groupby(self.sweep, key=lambda trial: trial.threshold):
             trials = list(group)
             shares = (*(t.purity for t in trials), *(t.coverage for t in trials))
             swept.append((f"{threshold:.2f}", *shares))
         head = "Other thresholds, all families"
-        parts.append(Table.make("sweep", head, " ".join(["threshold", *names]), swept).text())
+        parts.append(Table("sweep", head, columns, swept).text())
         return "\n\n".join(parts)
 
 

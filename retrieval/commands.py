@@ -227,7 +227,6 @@ def retrieval_score(
     from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.schema.codec import to_dict
     from robomme_interference_data.storage.files import write_text
-    from robomme_interference_data.viz.tables import Table
 
     from . import charts, encoders, grade, select
 
@@ -244,8 +243,8 @@ def retrieval_score(
     if len(parsed) == 1:
         title += f", rule {parsed[0]}"
     if out is not None:
-        write_text(out / "cells.csv", Table.of(grade.Cell, cells, "cells", title).csv())
-        write_text(out / "rows.csv", Table.of(grade.Grade, grades, "rows", title).csv())
+        write_text(out / "cells.csv", _csv(grade.Cell, cells))
+        write_text(out / "rows.csv", _csv(grade.Grade, grades))
         charts.draw_cells(cells, title, out / "retrieval.png")
         print_status(f"{out / 'cells.csv'}, rows.csv and retrieval.png written")
     if as_json:
@@ -253,6 +252,15 @@ def retrieval_score(
         print_json(about | {"cells": [to_dict(cell) for cell in cells]})
     else:
         echo(f"{grade.cell_table(cells, title).text()}\n\n{grade.verdict(cells)}.")
+
+
+def _csv(record: type, records: Sequence[Any]) -> str:
+    """Return records of one type as CSV."""
+    from robomme_interference_data.schema.codec import to_dict
+    from robomme_interference_data.viz.tables import Table, record_columns
+
+    rows = [tuple(to_dict(one).values()) for one in records]
+    return Table("records", "", record_columns(record), rows).csv()
 
 
 def calibrate(

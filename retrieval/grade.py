@@ -17,7 +17,7 @@ from robomme_interference_data.schema.conditions import in_order
 from robomme_interference_data.schema.sampling import evidence_kept
 from robomme_interference_data.stats.bootstrap import bootstrap
 from robomme_interference_data.stats.intervals import wilson
-from robomme_interference_data.viz.tables import Table, percent
+from robomme_interference_data.viz.tables import Columns, Table, percent
 
 from .select import Rule, Similarities, choose
 
@@ -199,11 +199,20 @@ def verdict(cells: Sequence[Cell]) -> str:
 def cell_table(cells: Sequence[Cell], title: str) -> Table:
     """Return a table by condition: of one rule by family, or of several rules."""
     several = len({cell.rule for cell in cells}) > 1
-    columns = (
-        f"{'rule' if several else 'family'} condition queries:count hit purity coverage "
-        "evidence_kept false_sessions:ratio cuts_found false_cuts:count pass:flag"
-    )
-    rows = (
+    columns: Columns = {
+        "rule" if several else "family": "text",
+        "condition": "text",
+        "queries": "count",
+        "hit": "text",
+        "purity": "text",
+        "coverage": "text",
+        "evidence_kept": "text",
+        "false_sessions": "ratio",
+        "cuts_found": "text",
+        "false_cuts": "count",
+        "pass": "flag",
+    }
+    rows = [
         (
             cell.rule if several else cell.family,
             cell.condition,
@@ -216,8 +225,8 @@ def cell_table(cells: Sequence[Cell], title: str) -> Table:
         )
         for cell in cells
         if not several or cell.family == ALL
-    )
-    return Table.make("retrieval", title, columns, rows, _NOTE)
+    ]
+    return Table("retrieval", title, columns, rows, _NOTE)
 
 
 def _share(cell: Cell, name: str) -> str | None:

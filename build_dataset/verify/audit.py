@@ -19,7 +19,7 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import KINDS, Kind, parse_condition
 from robomme_interference_data.schema.manifest import BufferManifest, SessionEntry
 from robomme_interference_data.schema.records import EpisodeRecord
-from robomme_interference_data.viz.tables import Table
+from robomme_interference_data.viz.tables import Columns, Table
 
 
 @dataclass(frozen=True)
@@ -49,22 +49,27 @@ class Audit:
 
     def tables(self) -> tuple[Table, Table]:
         """Return the uses of a unit by condition, and the families at each position."""
-        counts = "units:count min:count mean:ratio max:count"
-        rows = ((name, *_usage(uses.values())) for name, uses in self.uses.items())
-        uses = Table.make("uses", "Uses of a unit", f"condition {counts} unused:count", rows)
+        counts: Columns = {"units": "count", "min": "count", "mean": "ratio", "max": "count"}
+        rows = [(name, *_usage(uses.values())) for name, uses in self.uses.items()]
+        columns: Columns = {"condition": "text"}
+        columns |= counts
+        columns["unused"] = "count"
+        uses = Table("uses", "Uses of a unit", columns, rows)
         positions = self.positions.get(self.fullest, {})
         families: dict[str, list[int]] = {}
         for unit, count in sorted(self.uses[self.fullest].items()):
             families.setdefault(unit.family, []).append(count)
-        numbered = " ".join(f"{position}:count" for position in sorted(positions))
-        mix = (
+        columns = {"family": "text"}
+        columns |= counts
+        columns |= {str(position): "count" for position in sorted(positions)}
+        mix = [
             (family, *_usage(used)[:4], *(positions[one][family] for one in sorted(positions)))
             for family, used in families.items()
-        )
-        return uses, Table.make(
+        ]
+        return uses, Table(
             "families",
             f"Families of the units under {self.fullest}",
-            f"family {counts} {numbered}",
+            columns,
             mix,
             "Columns 1, 2, …: buffers with the family at that position among their units.",
         )

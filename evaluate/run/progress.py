@@ -132,11 +132,11 @@ def error_table(rows: Iterable[Rollout]) -> Table:
     for row in rows:
         cells.setdefault((row.family, row.condition), []).append(row)
     conditions, lines = _lines(cells, [])
-    return Table.make(
+    return Table(
         "errors",
         "Mean absolute action error by family and condition",
-        " ".join(["family", *conditions]),
-        ((name, *map(_action_error, line)) for name, line in lines),
+        dict.fromkeys(["family", *conditions], "text"),
+        [(name, *map(_action_error, line)) for name, line in lines],
     )
 
 
@@ -158,11 +158,11 @@ def _count(rows: Iterable[Rollout]) -> dict[Cell, Counter[str]]:
 
 def _table(ended: Mapping[Cell, Counter[str]]) -> Table:
     conditions, lines = _lines(ended, Counter())
-    return Table.make(
+    return Table(
         "rates",
         "Successes by family and condition",
-        " ".join(["family", *conditions]),
-        ((name, *map(_rate, line)) for name, line in lines),
+        dict.fromkeys(["family", *conditions], "text"),
+        [(name, *map(_rate, line)) for name, line in lines],
     )
 
 

@@ -35,7 +35,6 @@ class Settings:
         against: Published rates to compare with.
         expected: Episodes of a complete cell.
         margin: Margin of equivalence tests, in points; None for none.
-        model: Whether a logistic model is fitted too, with statsmodels.
         lenient: Whether bad rows are left out.
     """
 
@@ -60,11 +59,6 @@ class Settings:
         metavar="POINTS",
         help="Test whether differences are within this many points: k against k0, and a system "
         "with retrieval against the one without.",
-        group="Statistics",
-    )
-    model: bool = setting(
-        False,
-        help="Also fit a logistic model within episodes (needs the extra model).",
         group="Statistics",
     )
     lenient: bool = setting(False, help="Leave out bad rows and count them.", group="Rows")

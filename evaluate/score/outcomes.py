@@ -43,7 +43,6 @@ class Outcomes:
     model_seeds: tuple[int, ...]  # ascending
     status: Statuses  # index into STATUSES, −1 without a rollout, (S, C, E, M) int8
     evidence: NDArray[np.float64]  # share of the evidence kept, NaN if unknown, (S, C, E, M)
-    steps: NDArray[np.float64]  # executed, NaN if unknown, (S, C, E, M)
     action_l1: NDArray[np.float64]  # action error offline, NaN if not measured, (S, C, E, M)
     difficulty: NDArray[np.int64]  # index into DIFFICULTIES, −1 if unknown, (E,)
     chance: NDArray[np.float64]  # success of guessing, NaN unless a question, (E,)
@@ -139,13 +138,6 @@ def mean_errors(action_l1: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(np.where(known, action_l1, 0).sum(-1) / known.sum(-1))
 
 
-def steps_to_success(status: Statuses, steps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean steps of an episode's successes, the last axis, NaN where there are none."""
-    won = (status == _SUCCESS) & ~np.isnan(steps)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.where(won, steps, 0).sum(-1) / won.sum(-1))
-
-
 class Rate(NamedTuple):
     """A success rate."""
 
@@ -231,10 +223,9 @@ def _outcomes(
     )
     shape = tuple(map(len, axes))
     status = np.full(shape, -1, np.int8)
-    evidence, steps, action_l1 = (np.full(shape, np.nan) for _ in range(3))
+    evidence, action_l1 = (np.full(shape, np.nan) for _ in range(2))
     status[at] = [STATUSES.index(row.status) for row in rows]
     evidence[at] = np.array([row.evidence_kept for row in rows], float)  # None becomes NaN
-    steps[at] = np.array([row.steps for row in rows], float)
     action_l1[at] = np.array([row.action_l1 for row in rows], float)
     difficulty, chance = np.full(len(episodes), -1), np.full(len(episodes), np.nan)
     for row, place in zip(rows, at[2].tolist(), strict=True):
@@ -252,7 +243,6 @@ def _outcomes(
         model_seeds,
         status,
         evidence,
-        steps,
         action_l1,
         difficulty,
         chance,

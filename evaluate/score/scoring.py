@@ -15,7 +15,7 @@ from .comparisons.tables import SPECS, comparison_table
 from .config import Against, Expected, Settings
 from .outcomes import Outcomes, offline_outcomes, outcomes_of
 from .rows.reading import Rows, read_rows
-from .tables import action_error, cells, chance, equivalence, evidence_kept, model, paper, steps
+from .tables import action_error, cells, chance, equivalence, evidence_kept, paper
 
 TABLES = (
     "main",
@@ -34,8 +34,6 @@ TABLES = (
     "evidence_use",
     "ceiling",
     "decay",
-    "model",
-    "steps",
     "noise",
     "families",
     "family_effects",
@@ -129,15 +127,12 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         *evidence_kept.evidence_tables(every),
         slopes.decay_table(every, draws),
         effects.noise_table(every),
-        steps.steps_table(every, draws),
         cells.coverage_table([*found, *error_cells]),
         action_error.error_table(error_cells),
     ]
     if settings.margin is not None:
         margin = settings.margin
         tables.append(equivalence.equivalence_table(compared, found, published, margin))
-    if settings.model:
-        tables.append(model.model_table(every))
     if published:
         # The paper's rates are over the benchmark's grid.
         whole = cells.cells_of(outcomes_of(rows, Expected.BENCHMARK).values())

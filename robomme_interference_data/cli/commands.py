@@ -42,11 +42,18 @@ def list_buffers(
     values = attrgetter(
         "episode_id", "condition", "difficulty", "lesson_frames", "history_frames", "lesson_share"
     )
-    table = Table.make(
+    table = Table(
         "buffers",
         f"Buffers of {opened.location}",
-        "episode condition difficulty lesson_frames:count history_frames:count lesson_share:rate",
-        map(values, manifests),
+        {
+            "episode": "text",
+            "condition": "text",
+            "difficulty": "text",
+            "lesson_frames": "count",
+            "history_frames": "count",
+            "lesson_share": "rate",
+        },
+        list(map(values, manifests)),
         "lesson share: of an even 32-frame sample of the history",
     )
     episodes = len({manifest.episode_id for manifest in manifests})
@@ -67,11 +74,11 @@ def list_conditions(as_json: AsJson = False) -> None:
     from robomme_interference_data.schema.conditions import KINDS
     from robomme_interference_data.viz.tables import Table
 
-    table = Table.make(
+    table = Table(
         "conditions",
         "Conditions",
-        "condition sessions asks needs",
-        ((kind.pattern, kind.holds, kind.asks, " ".join(kind.needs)) for kind in KINDS.values()),
+        {"condition": "text", "sessions": "text", "asks": "text", "needs": "text"},
+        [(kind.pattern, kind.holds, kind.asks, " ".join(kind.needs)) for kind in KINDS.values()],
         f"n: 0 to {MAX_K}. units: distractor units of other families, the same for every kind. "
         "needs: datasets in addition to demonstrations and distractors.",
     )

@@ -96,25 +96,25 @@ def show(
         spans = None if evidence is None else [one.to_dict() for one in evidence]
         print_json(to_dict(manifest) | {"evidence": spans})
         return
-    table = Table.make(
+    table = Table(
         "sessions",
         f"{manifest}: {manifest.goal}",
-        "session:count role family episode frames",
-        (
+        {"session": "count", "role": "text", "family": "text", "episode": "text", "frames": "text"},
+        [
             (number, one.role, one.family, str(one.source), f"{one.start} to {one.stop - 1}")
             for number, one in enumerate(buffer.sessions)
-        ),
+        ],
     )
     echo(table.text())
     if evidence:
-        answers = Table.make(
+        answers = Table(
             "evidence",
             "Frames of the buffer that show the answer",
-            "part:count text session frames",
-            (
+            {"part": "count", "text": "text", "session": "text", "frames": "text"},
+            [
                 (one.span.part, one.span.text, one.session.role, f"{one.start} to {one.stop - 1}")
                 for one in evidence
-            ),
+            ],
         )
         echo(f"\n{answers.text()}")
     echo(

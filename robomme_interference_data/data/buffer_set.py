@@ -83,15 +83,17 @@ class BufferSet:
 
     def _repr_html_(self) -> str:
         """Return the table of its buffers by family, for notebooks."""
-        from robomme_interference_data.viz.tables import Table
+        from robomme_interference_data.viz.tables import Columns, Table
 
         counts = Counter(zip(self._present["family"], self._present["condition"], strict=True))
-        return Table.make(
+        columns: Columns = {"family": "text"}
+        columns |= dict.fromkeys(self.conditions, "count")
+        return Table(
             "buffers",
             f"{self.name}: {counted(len(self), 'buffer')} of "
             f"{counted(len(self.episode_ids), 'query episode')}",
-            " ".join(["family", *(f"{name}:count" for name in self.conditions)]),
-            ((one, *(counts[one, name] for name in self.conditions)) for one in self.families),
+            columns,
+            [(one, *(counts[one, name] for name in self.conditions)) for one in self.families],
             f"Buffers by family and condition. Cameras: {', '.join(self.cameras)}.",
         ).html()
 

@@ -5,34 +5,25 @@ import io
 import math
 import re
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from html import escape
 from itertools import zip_longest
 from textwrap import fill, wrap
-from typing import Any, Literal, Self, cast
+from typing import Any, Literal
 
 import pyarrow as pa
 
 from robomme_interference_data.errors import visible
-from robomme_interference_data.schema.codec import arrow_schema, to_dict
+from robomme_interference_data.schema.codec import arrow_schema
 
-Kind = Literal["text", "count", "rate", "points", "ratio", "number", "p", "flag"]
+Format = Literal["text", "count", "rate", "points", "ratio", "number", "p", "flag"]
+"""How the values of a column are shown. `rate` and `points` are fractions: CSV has six decimals of
+them, everything else percent and percentage points."""
 
-
-@dataclass(frozen=True)
-class Column:
-    """A column.
-
-    Attributes:
-        name: Its name.
-        kind: How values are shown. `rate` and `points` are fractions: CSV has six decimals of
-            them, everything else percent and percentage points.
-    """
-
-    name: str
-    kind: Kind = "text"
+Columns = dict[str, Format]
+"""Name of a column to its format, in the order of the table."""
 
 
 @dataclass(frozen=True)
@@ -42,60 +33,46 @@ class Table:
     Attributes:
         name: Name of its files.
         title: Its subject, in a line.
-        columns: The columns.
-        rows: Tuples of values.
+        columns: Name of each column to its format, in order.
+        rows: The values of each row, in the order of the columns.
         note: How to read it, in a sentence or two.
     """
 
     name: str
     title: str
-    columns: tuple[Column, ...]
-    rows: tuple[tuple[Any, ...], ...]
+    columns: Mapping[str, Format]
+    rows: Sequence[Sequence[Any]]
     note: str = ""
-
-    @classmethod
-    def make(
-        cls, name: str, title: str, columns: str, rows: Iterable[tuple[Any, ...]], note: str = ""
-    ) -> Self:
-        """Return a table with columns such as `system n:count rate:rate`."""
-        named = (column.partition(":") for column in columns.split())
-        parsed = tuple(Column(name, cast(Kind, kind or "text")) for name, _, kind in named)
-        return cls(name, title, parsed, tuple(rows), note)
-
-    @classmethod
-    def of(cls, record: type, rows: Iterable[Any], name: str, title: str) -> Self:
-        """Return records of one type as a table with the columns of their Arrow schema."""
-        kinds: dict[Any, Kind] = {pa.int64(): "count", pa.float64(): "ratio", pa.bool_(): "flag"}
-        schema = arrow_schema(record)
-        columns = tuple(Column(field.name, kinds.get(field.type, "text")) for field in schema)
-        plain = map(to_dict, rows)
-        return cls(name, title, columns, tuple(tuple(map(r.get, schema.names)) for r in plain))
 
     def records(self) -> list[dict[str, Any]]:
         """Return the rows by column name, NaN as None, for JSON."""
-        names = [column.name for column in self.columns]
-        return [dict(zip(names, map(_known, row), strict=True)) for row in self.rows]
+        return [dict(zip(self.columns, map(_known, row), strict=True)) for row in self.rows]
 
     def csv(self) -> str:
         """Return the table as CSV."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
-        writer.writerow([column.name for column in self.columns])
+        writer.writerow(self.columns)
         for row in self.rows:
-            writer.writerow([_plain(v, c.kind) for v, c in zip(row, self.columns, strict=True)])
+            pairs = zip(row, self.columns.values(), strict=True)
+            writer.writerow([_plain(value, format_) for value, format_ in pairs])
         return out.getvalue()
 
     def _layout(self, left: str, right: str) -> tuple[list[str], list[str], list[list[str]]]:
         """Return the mark of each column's side, the heads, and the rows as text."""
-        sides = [left if one.kind in ("text", "flag") else right for one in self.columns]
-        heads = [one.name.replace("_", " ") for one in self.columns]
+        sides = [left if one in ("text", "flag") else right for one in self.columns.values()]
+        heads = [name.replace("_", " ") for name in self.columns]
         return sides, heads, [self.cells(row) for row in self.rows]
 
     def cells(self, row: Sequence[Any]) -> list[str]:
         """Return a row as text; p-values of a row that is not complete are marked with †."""
-        early = any(c.name == "complete" and not v for v, c in zip(row, self.columns, strict=True))
-        cells = [(_shown(v, c.kind), c.kind) for v, c in zip(row, self.columns, strict=True)]
-        return [f"{cell}†" if early and cell and kind == "p" else cell for cell, kind in cells]
+        values = dict(zip(self.columns, row, strict=True))
+        early = not values.get("complete", True)
+        texts = []
+        for name, format_ in self.columns.items():
+            text = _shown(values[name], format_)
+            texts.append(f"{text}†" if early and text and format_ == "p" else text)
+        return texts
 
     def markdown(self) -> str:
         """Return the table as Markdown, under its title."""
@@ -146,9 +123,9 @@ class Table:
         widths = [max(map(len, cells)) for cells in columns]
         least = [
             min(_MAX_WORD, _longest_word(cells))
-            if column.kind == "text"
+            if format_ == "text"
             else max(_longest_word(cells[:1]), *map(len, cells[1:]), 0)
-            for cells, column in zip(columns, self.columns, strict=True)
+            for cells, format_ in zip(columns, self.columns.values(), strict=True)
         ]
         while sum(widths) + 2 * (len(widths) - 1) > width and widths != least:
             wrappable = (i for i, size in enumerate(widths) if size > least[i])
@@ -178,8 +155,8 @@ class Table:
         """Return the columns that tell rows apart: the first ones of names and numbers that do."""
         keys: list[int] = []
         apart = 1
-        for place, column in enumerate(self.columns):
-            if column.kind not in ("text", "count") or apart == len(rows):
+        for place, format_ in enumerate(self.columns.values()):
+            if format_ not in ("text", "count") or apart == len(rows):
                 break
             found = len({tuple(row[key] for key in (*keys, place)) for row in rows})
             if found > apart:
@@ -217,6 +194,12 @@ def _aligned(cells: Sequence[str], formats: Sequence[tuple[str, int]]) -> str:
         "  ".join(f"{c:{s}{w}}" for c, (s, w) in zip(line, formats, strict=True)).rstrip()
         for line in zip_longest(*wrapped, fillvalue="")
     )
+
+
+def record_columns(record: type) -> Columns:
+    """Return the columns of a record: those of its Arrow schema, numbers as ratios."""
+    formats: dict[Any, Format] = {pa.int64(): "count", pa.float64(): "ratio", pa.bool_(): "flag"}
+    return {field.name: formats.get(field.type, "text") for field in arrow_schema(record)}
 
 
 def tables_text(tables: Sequence[Table]) -> str:
@@ -267,19 +250,19 @@ def _known(value: Any) -> Any:
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
-def _plain(value: Any, kind: Kind) -> str:
+def _plain(value: Any, format_: Format) -> str:
     value = _known(value)
     if value is None:
         return ""
-    if kind == "flag":
+    if format_ == "flag":
         return "yes" if value else "no"
-    if kind in ("rate", "points", "ratio", "number"):
+    if format_ in ("rate", "points", "ratio", "number"):
         text = f"{value:.6f}"
         return "0.000000" if text == "-0.000000" else text
-    return f"{value:.6g}" if kind == "p" else str(value)
+    return f"{value:.6g}" if format_ == "p" else str(value)
 
 
-def _shown(value: Any, kind: Kind) -> str:
+def _shown(value: Any, format_: Format) -> str:
     value = _known(value)
     if value is None:
         return ""
@@ -291,4 +274,4 @@ def _shown(value: Any, kind: Kind) -> str:
         "p": p_text,
         "count": lambda v: f"{v:,}",
     }
-    return shapes.get(kind, lambda v: _plain(v, kind))(value)
+    return shapes.get(format_, lambda v: _plain(v, format_))(value)

@@ -39,7 +39,7 @@ def test_escaped_text_is_shown_as_it_is(text: str) -> None:
 @given(st.one_of(st.text(max_size=60), NASTY))
 def test_texts_in_tables_stay_in_their_cells(text: str) -> None:
     rows = [(escape(text), code(text), "last")]
-    read = READER.parse(table(Table.make("t", "T", "a b c", rows)))
+    read = READER.parse(table(Table("t", "T", {"a": "text", "b": "text", "c": "text"}, rows)))
     cells = [token for token in read if token.type == "td_open"]
     assert len(cells) == 3
     content = [token.children for token in read if token.type == "inline"][3:]

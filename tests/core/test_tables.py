@@ -2,12 +2,20 @@
 
 import math
 
-from robomme_interference_data.viz.tables import Table, tables_text
+from robomme_interference_data.viz.tables import Columns, Table, tables_text
 
-TABLE = Table.make(
+TABLE = Table(
     "rates",
     "Rates of systems",
-    "system n:count rate:rate change:points kept:ratio p:p complete:flag",
+    {
+        "system": "text",
+        "n": "count",
+        "rate": "rate",
+        "change": "points",
+        "kept": "ratio",
+        "p": "p",
+        "complete": "flag",
+    },
     [
         ("a|b", 1234, 0.4489, -0.0304, 0.666, 0.0004, True),
         ("c", None, math.nan, -0.0000001, -0.001, 1.0, False),
@@ -51,9 +59,11 @@ def test_csv_has_fractions_and_json_no_nan() -> None:
 
 def test_a_table_fits_the_terminal() -> None:
     """Texts wrap; columns that do not fit continue below, beside the key columns."""
-    words = Table.make("t", "Title " * 30, "name text", [("a", "word " * 40)], "note " * 30)
-    numbers = " ".join(f"column_{n}:count" for n in range(20))
-    many = Table.make("t", "", f"name {numbers}", [("row", *range(20))])
+    words = Table(
+        "t", "Title " * 30, {"name": "text", "text": "text"}, [("a", "word " * 40)], "note " * 30
+    )
+    numbers: Columns = {f"column_{n}": "count" for n in range(20)}
+    many = Table("t", "", {"name": "text"} | numbers, [("row", *range(20))])
     for table in (words, many):
         assert max(map(len, table.text(80).splitlines())) <= 80
     assert words.text(80).count("word") == 40
@@ -61,8 +71,8 @@ def test_a_table_fits_the_terminal() -> None:
 
 
 def test_a_count_of_a_whole_stays_in_one_line() -> None:
-    columns = " ".join(f"found_{n}" for n in range(12))
-    table = Table.make("t", "", f"name {columns}", [("row", *["16 of 160"] * 12)])
+    columns: Columns = {f"found_{n}": "text" for n in range(12)}
+    table = Table("t", "", {"name": "text"} | columns, [("row", *["16 of 160"] * 12)])
     text = table.text(80)
     assert max(map(len, text.splitlines())) <= 80 and text.count("16 of 160") == 12
 
@@ -75,13 +85,14 @@ def test_a_note_of_several_tables_is_printed_once() -> None:
 
 def test_columns_that_continue_below_repeat_what_tells_rows_apart() -> None:
     """The system is the same in all rows, and the family follows from the other keys."""
-    columns = " ".join(f"a_long_column_{n}:count" for n in range(9))
+    columns: Columns = dict.fromkeys(("system", "family", "condition", "cell"), "text")
+    columns |= {f"a_long_column_{n}": "count" for n in range(9)}
     rows = [
         ("mine", family, condition, f"{family}/{condition}", *range(9))
         for family in ("MoveCube", "InsertPeg")
         for condition in ("k0", "k7")
     ]
-    table = Table.make("t", "Title", f"system family condition cell {columns}", rows)
+    table = Table("t", "Title", columns, rows)
     blocks = [block.splitlines() for block in table.text(80).split("\n\n")[1:]]
     assert len(blocks) > 1 and max(len(line) for block in blocks for line in block) <= 80
     assert blocks[0][0].split()[:4] == ["system", "family", "condition", "cell"]
@@ -95,11 +106,16 @@ def test_keys_leave_room_for_a_column() -> None:
     rows = [
         (*(letter * 26 for letter in letters), 1, 2) for letters in ("abc", "abd", "aec", "fbc")
     ]
-    text = Table.make("t", "", "first second third one:count two:count", rows).text(80)
+    text = Table(
+        "t",
+        "",
+        {"first": "text", "second": "text", "third": "text", "one": "count", "two": "count"},
+        rows,
+    ).text(80)
     assert max(map(len, text.splitlines())) <= 80 and "first" in text and "two" in text
 
 
 def test_bold_is_a_star_in_text_and_bold_elsewhere() -> None:
-    table = Table.make("t", "", "system k0", [("mine", "**45.0%** [40.0, 50.0]")])
+    table = Table("t", "", {"system": "text", "k0": "text"}, [("mine", "**45.0%** [40.0, 50.0]")])
     assert "45.0%* [40.0, 50.0]" in table.text() and "**" not in table.text()
     assert "**45.0%**" in table.markdown() and "\\textbf{45.0\\%}" in table.latex()

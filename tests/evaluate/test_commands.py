@@ -216,7 +216,7 @@ def test_errors_are_listed_beside_the_rate() -> None:
     rows = [row(item, end) for item, end in zip(items, ends, strict=False)]
     other = WorkItem("no-history", EpisodeId("MoveCube", "test", 0))
     table = rate_table([*rows, row(other, "error")])
-    assert [column.name for column in table.columns] == ["family", "no-history", "k0"]
+    assert [*table.columns] == ["family", "no-history", "k0"]
     assert table.rows == (
         ("VideoRepick", "", "3/5 60%, 1 broke"),
         ("MoveCube", "1 broke", ""),

@@ -58,7 +58,13 @@ def test_methods_of_part_of_a_grid_with_repeats(tmp_path: Path) -> None:
 
 def test_tables_as_latex() -> None:
     rows = [("a_b & 5%", 0.4489, -0.03, "**1.0%**†"), ("π", None, float("nan"), "–")]
-    table = Table.make("t", "Title", "system rate:rate low:points best", rows, "A note.")
+    table = Table(
+        "t",
+        "Title",
+        {"system": "text", "rate": "rate", "low": "points", "best": "text"},
+        rows,
+        "A note.",
+    )
     assert table.latex() == (
         "% Title\n\\begin{tabular}{lrrl}\n\\toprule\nsystem & rate & low & best \\\\\n\\midrule\n"
         "a\\_b \\& 5\\% & 44.9\\% & $-$3.0 & \\textbf{1.0\\%}\\textdagger{} \\\\\n"

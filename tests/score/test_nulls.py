@@ -26,7 +26,6 @@ from robomme_interference_data.evaluate.score.outcomes import Outcomes
 from robomme_interference_data.evaluate.score.plots import figures
 from robomme_interference_data.evaluate.score.tables.equivalence import tost
 from robomme_interference_data.evaluate.score.tables.evidence_kept import evidence_tables
-from robomme_interference_data.evaluate.score.tables.steps import steps_table
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.stats.bootstrap import generator_of
@@ -54,14 +53,12 @@ def made_up(
     own = generator.normal(size=(systems, len(conditions), len(EPISODES)))
     hard = math.sqrt(shared) * common + math.sqrt(1 - shared) * own
     status = (hard > -0.524401).astype(np.int8)[..., None]  # the normal quantile of 30%
-    # Lognormal steps to success, of which an episode's part is shared.
-    steps = np.exp(5 + 0.5 * generator.normal(size=status.shape) + 0.5 * common[..., None])
     every = np.ones(len(EPISODES), bool)
     names = tuple(f"system-{number:02}" for number in range(systems))
     shape = (systems, len(conditions))
     return Outcomes(
         *("made-up", names, tuple(conditions), EPISODES, (0,), status),
-        *(np.full(status.shape, np.nan), steps, np.full(status.shape, np.nan)),
+        *(np.full(status.shape, np.nan), np.full(status.shape, np.nan)),
         *(np.zeros(len(EPISODES), int), np.full(len(EPISODES), np.nan), every),
         *(np.ones(shape, bool), np.zeros(systems, bool)),
     )
@@ -95,7 +92,6 @@ def simulated(case: str) -> dict[str, float]:
         rows = decay_table([outcomes], 2000).records()
         counts["decay"].append(found_any(rows))
         counts["decay, fit"].append(found_any(rows, "p_fit_holm"))
-        counts["steps"].append(found_any(steps_table([outcomes], 2000).records()))
         ranks = [row for row in rank_table([outcomes]).records() if row["condition"] == "k0"]
         counts["ranks"].append(
             all((r["rank_low"], r["rank_high"]) == (1, len(ranks)) for r in ranks)
@@ -123,9 +119,9 @@ def test_no_table_of_systems_finds_more_than_5_percent(case: str) -> None:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_no_table_of_trends_or_steps_finds_more_than_5_percent(case: str) -> None:
+def test_no_table_of_trends_finds_more_than_5_percent(case: str) -> None:
     found = simulated(case)
-    names = ("decay", "decay, fit", "interaction, fit", "steps")
+    names = ("decay", "decay, fit", "interaction, fit")
     line = " | ".join([case, *(f"{100 * found[name]:.1f}%" for name in names)])
     assert f"| {line} |" in PAGE.read_text(encoding="utf-8")
     assert max(found[name] for name in names) <= 0.05 + bound(0.05)
@@ -225,7 +221,6 @@ def test_no_table_of_the_command_finds_too_much(
                 made.row(outcomes.systems[s], conditions[c], "MoveCube", at.index, letter),
                 family=at.family,
                 seed=e,
-                steps=min(1300, int(outcomes.steps[s, c, e, 0])),
                 evidence_kept=kept[s][c][e][0],
             )
             for s, c, e, _ in np.ndindex(outcomes.status.shape)
@@ -238,6 +233,6 @@ def test_no_table_of_the_command_finds_too_much(
             for column in [one for one in (table or [{}])[0] if one.endswith("_holm")]:
                 counts[f"{name}, {column}"] += found_any(table, column)
     assert {"lift, p_holm", "matrix, p_holm", "families, p_families_holm"} <= counts.keys()
-    assert {"decay, p_fit_holm", "evidence_effects, p_holm", "steps, p_holm"} <= counts.keys()
+    assert {"decay, p_fit_holm", "evidence_effects, p_holm"} <= counts.keys()
     most = FILES * (0.05 + bound(0.05, FILES))
     assert {name: count for name, count in counts.items() if count > most} == {}

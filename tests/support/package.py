@@ -10,7 +10,7 @@ PACKAGE = "robomme_interference_data"
 MAPPING: dict[str, str] = CONFIG["tool"]["setuptools"]["package-dir"]
 
 HEAVY = ("torch", "lerobot", "h5py", "matplotlib", "datasets", "pandas", "mani_skill", "sapien")
-HEAVY += ("ray", "transformers", "scipy", "statsmodels", "jinja2", "gymnasium", "cv2")
+HEAVY += ("ray", "transformers", "scipy", "jinja2", "gymnasium", "cv2")
 """Libraries that the light install does without."""
 
 

@@ -110,10 +110,19 @@ def noise_table(every: Iterable[Outcomes]) -> Table:
                 flips = int((one != other)[repeated].sum())
                 cell = (outcomes.simulator, outcomes.systems[s], outcomes.conditions[c])
                 rows.append((*cell, pairs, flips, flips / pairs, *wilson(flips, pairs)))
-    return Table.make(
+    return Table(
         "noise",
         "Flips between repeats",
-        "simulator system condition pairs:count flips:count rate:rate low:rate high:rate",
+        {
+            "simulator": "text",
+            "system": "text",
+            "condition": "text",
+            "pairs": "count",
+            "flips": "count",
+            "rate": "rate",
+            "low": "rate",
+            "high": "rate",
+        },
         rows,
         "Repeats differ only in the model seed; in each episode the two lowest that count are "
         "compared. Between conditions, a share of flips (flips in the tables of effects) that does "

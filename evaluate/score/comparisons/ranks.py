@@ -107,10 +107,18 @@ def rank_table(every: Iterable[Outcomes]) -> Table:
             for name, rate in rates.items():
                 rank = 1 + sum(other > rate for other in rates.values())
                 rows.append((outcomes.simulator, condition, name, rate, rank, *bounds[name]))
-    return Table.make(
+    return Table(
         "ranks",
         "Ranks of systems",
-        "simulator condition system rate:rate rank:count rank_low:count rank_high:count",
+        {
+            "simulator": "text",
+            "condition": "text",
+            "system": "text",
+            "rate": "rate",
+            "rank": "count",
+            "rank_low": "count",
+            "rank_high": "count",
+        },
         rows,
         "Complete cells only; rank 1 is the highest rate, and equal rates share a rank. rank low "
         "to rank high: the ranks that the system can have, from the significant differences of the "

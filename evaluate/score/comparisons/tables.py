@@ -6,13 +6,13 @@ from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from operator import attrgetter
-from typing import Any
+from typing import Any, cast
 
 from robomme_interference_data.evaluate.score import power
 from robomme_interference_data.stats.intervals import cohens_h
 from robomme_interference_data.stats.significance import ALPHA, holm
 from robomme_interference_data.stats.signs import simultaneous
-from robomme_interference_data.viz.tables import Table
+from robomme_interference_data.viz.tables import Columns, Format, Table
 
 from .contrast import Contrast
 
@@ -197,7 +197,15 @@ def comparison_table(
         pairs = [one.pairs for one in found if not one.family]
         tests = max((one.more.get("tests", groups[spec.group(one)]) for one in found), default=1)
         note += power.note(((one.pairs, one.gained, one.lost) for one in pairs), tests)
-    return Table.make(name, spec.title, " ".join(column for column, _ in columns), rows, note)
+    return Table(
+        name, spec.title, columns_of(" ".join(column for column, _ in columns)), rows, note
+    )
+
+
+def columns_of(text: str) -> Columns:
+    """Return columns such as `system n:count rate:rate`."""
+    named = (column.partition(":") for column in text.split())
+    return {name: cast(Format, format_ or "text") for name, _, format_ in named}
 
 
 def _column(text: str) -> tuple[str, str]:
@@ -222,7 +230,7 @@ def tested(name: str, title: str, columns: str, rows: Iterable[Sequence[Any]], n
                 row.insert(place, p)
     if not all(row[-1] for row in found):
         note += " p†: provisional, because a cell is incomplete."
-    return Table.make(name, title, columns, map(tuple, found), note)
+    return Table(name, title, columns_of(columns), list(map(tuple, found)), note)
 
 
 def corrected(p_values: Sequence[float], groups: Sequence[Hashable]) -> list[float]:

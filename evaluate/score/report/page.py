@@ -28,6 +28,7 @@ from robomme_interference_data.evaluate.systems import SYSTEMS, display_name
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import in_order, parse_condition
 from robomme_interference_data.storage.files import sha256_file, write_text
+from robomme_interference_data.viz.tables import Table
 from robomme_interference_data.viz.templates import fill
 
 from .headline import headline
@@ -77,6 +78,7 @@ def write_report(
         "titles": FIGURES,
         "shown_in": _SHOWN_IN,
         "number": _number,
+        "numbers": _numbers,
         "conditions": conditions,
         "episodes": _episodes(score, conditions, out.parent),
         "sources": {str(path): _source(path, run) for path, run in score.rows.sources.items()},
@@ -95,6 +97,11 @@ def _number(text: str) -> str:
     """Return the sort key of a cell of a grid; empty without a rate."""
     found = re.match(r"\**([0-9.]+)", text)
     return found[1] if found else ""
+
+
+def _numbers(table: Table) -> list[str]:
+    """Return the columns of numbers, which are aligned to the right."""
+    return [name for name, shape in table.columns.items() if shape not in ("text", "flag")]
 
 
 def _leader(score: Score) -> str:

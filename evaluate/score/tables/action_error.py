@@ -67,11 +67,21 @@ def error_cells(outcomes: Outcomes, draws: int) -> list[ErrorCell]:
 
 def error_table(cells: Sequence[ErrorCell]) -> Table:
     """Return a row for each cell."""
-    return Table.make(
+    return Table(
         "action_error",
         "Action error offline",
-        "system condition family n:count action_l1:number low:number high:number errors:count "
-        "missing:count complete:flag",
+        {
+            "system": "text",
+            "condition": "text",
+            "family": "text",
+            "n": "count",
+            "action_l1": "number",
+            "low": "number",
+            "high": "number",
+            "errors": "count",
+            "missing": "count",
+            "complete": "flag",
+        },
         [
             (
                 cell.system,
@@ -96,10 +106,10 @@ def error_grid(outcomes: Outcomes, cells: Sequence[ErrorCell]) -> Table:
         (display_name(system), *(_shown(at.get((system, c))) for c in outcomes.conditions))
         for system in outcomes.systems
     ]
-    return Table.make(
+    return Table(
         outcomes.simulator,
         f"Action error by system and condition, {outcomes.simulator}",
-        " ".join(["system", *outcomes.conditions]),
+        dict.fromkeys(["system", *outcomes.conditions], "text"),
         rows,
         f"{_NOTE} {NOT_EXPECTED}: no rows.",
     )

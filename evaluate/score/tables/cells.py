@@ -11,6 +11,7 @@ import numpy as np
 
 from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.evaluate.score.comparisons.ranks import all_pairs, tied_with_best
+from robomme_interference_data.evaluate.score.comparisons.tables import columns_of
 from robomme_interference_data.evaluate.score.outcomes import (
     STATUSES,
     Flags,
@@ -201,13 +202,16 @@ def rate_table(cells: Sequence[Cell], name: str) -> Table:
             fixed = () if parts else (*cell.fixed, cell.if_errors_fail)
             more = (cell.complete, len(cell.missing), cell.rank, cell.best)
             rows.append((*key, cell.n, cell.rate, *bounds, *fixed, *cell.counts[:4], *more))
-    return Table.make(
+    return Table(
         name,
         f"Success by {name if parts else 'system and condition'}",
-        f"simulator system condition {name if parts else ''} n:count rate:rate low:rate high:rate "
-        f"{'' if parts else 'fixed_low:rate fixed_high:rate if_errors_fail:rate '}"
-        "successes:count fails:count timeouts:count errors:count complete:flag missing:count "
-        "rank:count best:flag",
+        columns_of(
+            f"simulator system condition {name if parts else ''} n:count rate:rate low:rate "
+            "high:rate "
+            f"{'' if parts else 'fixed_low:rate fixed_high:rate if_errors_fail:rate '}"
+            "successes:count fails:count timeouts:count errors:count complete:flag missing:count "
+            "rank:count best:flag"
+        ),
         rows,
         _NOTE + _BEST + (_FIXED + _ERRORS) * (not parts),
     )
@@ -248,7 +252,9 @@ def main_grids(cells: Sequence[Cell]) -> list[Table]:
         notes.append(f"Errors: {errors}." if errors else "No errors.")
         note = " ".join(notes)
         title = f"Success by system and condition, {simulator}"
-        grids.append(Table.make(simulator, title, " ".join(["system", *conditions]), rows, note))
+        grids.append(
+            Table(simulator, title, dict.fromkeys(["system", *conditions], "text"), rows, note)
+        )
     return grids
 
 
@@ -266,7 +272,7 @@ def _shown(cell: Cell | None, with_n: bool) -> str:
 
 def coverage_table(cells: Iterable[Coverage]) -> Table:
     """Return which episodes each cell of a family lacks, and which have errors."""
-    rows = (
+    rows = [
         (
             *(cell.simulator, cell.system, cell.condition, cell.part, cell.expected, cell.n),
             *(cell.errors, cell.complete),
@@ -274,12 +280,23 @@ def coverage_table(cells: Iterable[Coverage]) -> Table:
         )
         for cell in cells
         if cell.part_of == "family"
-    )
-    return Table.make(
+    ]
+    return Table(
         "coverage",
         "Which episodes count",
-        "simulator system condition family expected:count n:count errors:count complete:flag "
-        "missing_episodes error_episodes other_episodes",
+        {
+            "simulator": "text",
+            "system": "text",
+            "condition": "text",
+            "family": "text",
+            "expected": "count",
+            "n": "count",
+            "errors": "count",
+            "complete": "flag",
+            "missing_episodes": "text",
+            "error_episodes": "text",
+            "other_episodes": "text",
+        },
         rows,
         "Episodes by split and index. An episode counts if one of its rollouts is not an error. "
         "With repeats, one that does not count with every model seed of the condition is missing.",

@@ -69,10 +69,19 @@ def _rates(cells: _Cells) -> Table:
         for name, status in levels.items()
         if (rate := rate_of(status)).n
     ]
-    return Table.make(
+    return Table(
         "by_evidence_kept",
         "Success by the evidence that the memory kept",
-        "simulator system condition kept n:count rate:rate low:rate high:rate",
+        {
+            "simulator": "text",
+            "system": "text",
+            "condition": "text",
+            "kept": "text",
+            "n": "count",
+            "rate": "rate",
+            "low": "rate",
+            "high": "rate",
+        },
         rows,
         "kept: whether all, some or none of the lesson's evidence spans have a frame in the memory "
         "at the first step. Rates over the n episodes for which that is known, with 95% Wilson "
@@ -153,11 +162,24 @@ def _use(cells: _Cells) -> Table:
         if pairs.n:
             execution = (1 - bound for bound in (reached.value, *reversed(reached.interval)))
             rows.append((*cell, control, same, pairs.n, 1 - pairs.first, *execution, *pairs.change))
-    return Table.make(
+    return Table(
         "evidence_use",
         "Failures although all evidence was kept",
-        "simulator system condition control control_condition n:count failures:rate execution:rate "
-        "execution_low:rate execution_high:rate use:points use_low:points use_high:points",
+        {
+            "simulator": "text",
+            "system": "text",
+            "condition": "text",
+            "control": "text",
+            "control_condition": "text",
+            "n": "count",
+            "failures": "rate",
+            "execution": "rate",
+            "execution_low": "rate",
+            "execution_high": "rate",
+            "use": "points",
+            "use_low": "points",
+            "use_high": "points",
+        },
         rows,
         "Over the n episodes whose evidence was all kept and that count on both sides. failures: "
         "of the system. control: a system that knows the answer, so that its failures on the same "

@@ -10,6 +10,7 @@ from typing import Any
 
 from robomme_interference_data.evaluate.score.comparisons.pairs import compare_unpaired
 from robomme_interference_data.evaluate.score.comparisons.ranks import tied_with_best
+from robomme_interference_data.evaluate.score.comparisons.tables import columns_of
 from robomme_interference_data.evaluate.score.rows.values import RELEASED_SIMULATOR
 from robomme_interference_data.evaluate.systems import base_of, display_name
 from robomme_interference_data.stats.intervals import newcombe, wilson
@@ -140,7 +141,9 @@ def paper_table(cells: Sequence[Cell], *, by_part: bool = False) -> Table:
     if not by_part:
         columns = f"system condition {_SIDES} published_best:flag {_CHANGE}"
         note = " ".join([_NOTE, *not_compared(cells)])
-        return Table.make("paper", "Comparison with the published rates", columns, rows, note)
+        return Table(
+            "paper", "Comparison with the published rates", columns_of(columns), rows, note
+        )
     ours = {name for cell in cells for name in (cell.system, base_of(cell.system))}
     others: dict[str, list[str]] = {}
     for system, condition in differing():
@@ -150,7 +153,7 @@ def paper_table(cells: Sequence[Cell], *, by_part: bool = False) -> Table:
     note = _FAMILIES_NOTE + f" They do not for: {listed}." * bool(others)
     columns = f"system condition family {_SIDES} {_CHANGE}"
     title = "Comparison with the published rates by family"
-    return Table.make("paper_family", title, columns, rows, note)
+    return Table("paper_family", title, columns_of(columns), rows, note)
 
 
 def not_compared(cells: Sequence[Cell]) -> list[str]:
