@@ -222,8 +222,14 @@ def _cells(found: Score) -> Table:
     """Return the main table without the columns that the grid shows."""
     rows = [
         (
-            *(cell.simulator, display_name(cell.system), cell.condition, cell.n, cell.expected),
-            *(len(cell.missing), cell.errors, cell.complete),
+            cell.simulator,
+            display_name(cell.system),
+            cell.condition,
+            cell.n,
+            cell.expected,
+            len(cell.missing),
+            cell.errors,
+            cell.complete,
         )
         for cell in _whole(found)
     ]

@@ -26,9 +26,7 @@ from support.tabletop import TABLETOP, copy_tabletop
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.image_stats import QUANTILES
 from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
-from robomme_interference_data.build_dataset.verify.lerobot_files import (
-    differing_statistics,
-)
+from robomme_interference_data.build_dataset.verify.lerobot_files import differing_statistics
 from robomme_interference_data.constants import QUESTIONS_PATH
 from robomme_interference_data.data.dataset import Dataset, revision_of
 from robomme_interference_data.data.questions import read_questions
