@@ -67,15 +67,17 @@ def demonstrations_facts(dataset: Dataset) -> Facts:
     query, lesson = Query(dataset, records[0]), dataset.session("lesson", records[0])
     manifest = query.manifest(parse_condition("k0"), (lesson,), exact=records[0].exact)
     frames, skipped = sum(record.length for record in records), _skipped([dataset])
-    more = (
-        f"{skipped:,} recorded episodes yielded no demonstration, or were not used: {REPORT_PATH} "
-        "lists them with the reason."
-    )
+    limits = []
+    if skipped:
+        limits.append(
+            f"{skipped:,} recorded episodes yielded no demonstration, or were not used: "
+            f"{REPORT_PATH} lists them with the reason."
+        )
     return _facts(
         {"": dataset},
         records,
         Buffer(manifest, query, {dataset.kind: dataset}),
-        [more] * bool(skipped),
+        limits,
         {
             "cameras": dataset.cameras,
             "fps": Raw(f"{dataset.fps:g}"),
@@ -108,18 +110,22 @@ def buffer_set_facts(buffer_set: BufferSet) -> Facts:
     manifests = tuple(buffer_set.manifests())
     if not (manifests and queries):
         raise FormatError.damaged(buffer_set.location, "no buffers")
-    first = [one for one in manifests if one.episode_id == queries[0].episode_id]
-    shown = max(first, key=lambda one: (one.condition == "k3", len(one.sessions)))
+    # The film strip shows k3 where there is one: seven units would be too small to see.
+    first = [manifest for manifest in manifests if manifest.episode_id == queries[0].episode_id]
+    shown = max(first, key=lambda manifest: (manifest.condition == "k3", len(manifest.sessions)))
     same_family = count_same_family(manifests)
-    more = (
-        f"{same_family:,} buffers hold distractors of the query's own family, which the paper's "
-        "protocol excludes: results are not comparable with those of the benchmark."
-    )
     unit = datasets[DISTRACTORS].unit if DISTRACTORS in datasets else PAPER_UNIT
-    other_unit = (
-        f"Distractor units have {unit}, not the paper's {PAPER_UNIT}: results are not comparable "
-        "with those of the benchmark."
-    )
+    limits = []
+    if same_family:
+        limits.append(
+            f"{same_family:,} buffers hold distractors of the query's own family, which the "
+            "paper's protocol excludes: results are not comparable with those of the benchmark."
+        )
+    if unit != PAPER_UNIT:
+        limits.append(
+            f"Distractor units have {unit}, not the paper's {PAPER_UNIT}: results are not "
+            "comparable with those of the benchmark."
+        )
     split_name, questions = one_split(queries), _questions(buffer_set)
     tables = [CardTable("buffers", BufferManifest, _BUFFERS, header.rows, split_name)]
     if DISTRACTORS in records:
@@ -130,7 +136,7 @@ def buffer_set_facts(buffer_set: BufferSet) -> Facts:
         datasets,
         queries,
         buffer_set.load(shown.episode_id, shown.condition, cameras=()),  # fetches no video
-        [more] * bool(same_family) + [other_unit] * (unit != PAPER_UNIT),
+        limits,
         {
             "unit": unit,
             "cameras": buffer_set.cameras,
@@ -148,7 +154,7 @@ def buffer_set_facts(buffer_set: BufferSet) -> Facts:
             "other_conditions": _beyond_paper(buffer_set.conditions),
             "same_family": same_family,
             "skipped": _skipped(datasets[name] for name in records),
-            "inexact": sum(not one.exact for one in manifests),
+            "inexact": sum(not manifest.exact for manifest in manifests),
         },
         kind="buffer_set",
         title="RoboMME-Interference buffers",
@@ -162,7 +168,7 @@ def buffer_set_facts(buffer_set: BufferSet) -> Facts:
         provenance=[
             ("revision of the buffer set", code(buffer_set.revision)),
             (f"SHA-256 of `{_BUFFERS}`", code(header.rows)),
-            *(row for name, one in datasets.items() for row in dataset_rows(one, name)),
+            *(row for name, dataset in datasets.items() for row in dataset_rows(dataset, name)),
             ("version of the draw", code(header.rule_version)),
         ],
         base_kind=DEMONSTRATIONS,
@@ -184,8 +190,8 @@ def _facts(
     `shown` is the buffer whose film strip the card shows, drawn once and only when needed.
     """
     camera = shown.query.dataset.camera()
-    sessions = ", ".join(f"{one.role} {one.source}" for one in shown.sessions) or "no session"
-    simulators = {one.simulator for dataset in datasets.values() for one in dataset.records()}
+    sessions = ", ".join(f"{session.role} {session.source}" for session in shown.sessions)
+    simulators = {record.simulator for dataset in datasets.values() for record in dataset.records()}
     named = sorted(filter(None, simulators))
     sources = {name: list(dataset.identity.sources) for name, dataset in datasets.items()}
 
@@ -202,8 +208,8 @@ def _facts(
         pictures=pictures,
         values={
             "strip": STRIP,
-            "caption": f"{shown.episode_id} under {shown.condition}: {sessions}. Goal: "
-            f"{shown.goal}",
+            "caption": f"{shown.episode_id} under {shown.condition}: "
+            f"{sessions or 'no session'}. Goal: {shown.goal}",
             "shown": shown,
             "camera": camera,
             "first": queries[0].episode_id,
@@ -212,10 +218,16 @@ def _facts(
             "same_family": 0,
             **values,
         },
-        repositories={k: v for one in datasets.values() for k, v in repositories_of(one).items()},
+        repositories={
+            repo_id: commit
+            for dataset in datasets.values()
+            for repo_id, commit in repositories_of(dataset).items()
+        },
         source_kinds=source_kinds_of(datasets.values()),
         details={
-            f"Sources of the {name or DEMONSTRATIONS}": one for name, one in sources.items() if one
+            f"Sources of the {name or DEMONSTRATIONS}": recorded
+            for name, recorded in sources.items()
+            if recorded
         },
         **fields,
     )
@@ -231,15 +243,15 @@ def count_same_family(manifests: Iterable[BufferManifest]) -> int:
     """Return how many buffers have a distractor of the query's own family."""
     return sum(
         any(
-            session.role == "distractor" and session.source.family == one.episode_id.family
-            for session in one.sessions
+            session.role == "distractor" and session.source.family == manifest.episode_id.family
+            for session in manifest.sessions
         )
-        for one in manifests
+        for manifest in manifests
     )
 
 
 def _records(dataset: Dataset) -> tuple[EpisodeRecord, ...]:
-    return tuple(sorted(dataset.records(), key=lambda one: one.episode_id.sort_key))
+    return tuple(sorted(dataset.records(), key=lambda record: record.episode_id.sort_key))
 
 
 def _families(records: Iterable[EpisodeRecord]) -> tuple[str, ...]:
@@ -265,12 +277,14 @@ def _questions(buffer_set: BufferSet) -> str | None:
 
 def _skipped(datasets: Iterable[Dataset]) -> int:
     """Return how many recorded episodes yielded nothing."""
-    reports = (read_json(one.files.path(REPORT_PATH)).get("skipped") for one in datasets)
+    reports = (read_json(dataset.files.path(REPORT_PATH)).get("skipped") for dataset in datasets)
     return sum(len(skipped) for skipped in reports if isinstance(skipped, list))
 
 
 def _beyond_paper(conditions: Iterable[str]) -> list[tuple[list[str], str]]:
     """Return the conditions beyond the paper's, grouped by kind, with what the kind holds."""
-    named = {one: parse_condition(one).kind for one in conditions if one not in DEFAULT_CONDITIONS}
-    kinds = dict.fromkeys(named.values())
-    return [([f"`{one}`" for one in named if named[one] == kind], kind.holds) for kind in kinds]
+    names: dict[Any, list[str]] = {}
+    for condition in conditions:
+        if condition not in DEFAULT_CONDITIONS:
+            names.setdefault(parse_condition(condition).kind, []).append(f"`{condition}`")
+    return [(of_kind, kind.holds) for kind, of_kind in names.items()]

@@ -91,10 +91,11 @@ def card_text(facts: Facts, publication: Publication) -> str:
     """Return the README of a card, without drawing pictures; see `card_files`."""
     publication = publication.made_for(facts.base)
     base = code(publication.base) if publication.base else "none"
+    base_rows = [(f"published {facts.base_kind}", base)] if facts.base_kind else []
     rows = (
         ("repository", code(publication.repo_id)),
         ("version", code(publication.tag)),
-        *([(f"published {facts.base_kind}", base)] if facts.base_kind else []),
+        *base_rows,
         *facts.provenance,
         (
             "made with",
@@ -139,15 +140,18 @@ def front_matter(facts: Facts, publication: Publication) -> str:
     base = [publication.base.split("@")[0]] if publication.base else []
     made_from = sorted({*facts.repositories, *base})
     configs: list[dict[str, Any]] = [
-        {"config_name": one.name, "data_files": [{"split": one.split, "path": one.path}]}
-        for one in facts.tables
+        {"config_name": table.name, "data_files": [{"split": table.split, "path": table.path}]}
+        for table in facts.tables
     ]
     configs[0]["default"] = True
+    tags = [*facts.tags, *_TAGS]
+    if "robomme" in facts.simulators:
+        tags.append("RoboMME")
     data = DatasetCardData(
         pretty_name=f"{facts.title}: {publication.name}",
         license=publication.license,
         task_categories=["robotics"],
-        tags=[*facts.tags, *_TAGS, *["RoboMME"] * ("robomme" in facts.simulators)],
+        tags=tags,
         size_categories=[size_category(facts.examples)],
         source_datasets=made_from or ["original"],
         configs=configs,

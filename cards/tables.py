@@ -32,8 +32,13 @@ _DIFFICULTIES: Columns = {"easy": "count", "medium": "count", "hard": "count", "
 def count_table(records: Iterable[EpisodeRecord]) -> Table:
     """Return the number of episodes by family and difficulty, and of their frames."""
     rows = [
-        (escape(name), len(found), *_difficulties(found), sum(one.length for one in found))
-        for name, found in _by_family(records).items()
+        (
+            escape(name),
+            len(of_family),
+            *_difficulties(of_family),
+            sum(record.length for record in of_family),
+        )
+        for name, of_family in _by_family(records).items()
     ]
     columns: Columns = {"family": "text", "episodes": "count"}
     columns |= _DIFFICULTIES
@@ -43,11 +48,11 @@ def count_table(records: Iterable[EpisodeRecord]) -> Table:
 
 def unit_table(queries: Iterable[EpisodeRecord], units: Iterable[EpisodeRecord]) -> Table:
     """Return the number of queries by family and difficulty, and of units by family."""
-    groups, pool = _by_family(queries), Counter(one.episode_id.family for one in units)
+    groups, pool = _by_family(queries), Counter(unit.episode_id.family for unit in units)
     rows = []
     for name in sorted({*groups, *pool}, key=family_order):
-        found = groups.get(name, [])
-        rows.append((escape(name), len(found), *_difficulties(found), pool[name]))
+        of_family = groups.get(name, [])
+        rows.append((escape(name), len(of_family), *_difficulties(of_family), pool[name]))
     columns: Columns = {"family": "text", "queries": "count"}
     columns |= _DIFFICULTIES
     columns["units"] = "count"
@@ -56,9 +61,10 @@ def unit_table(queries: Iterable[EpisodeRecord], units: Iterable[EpisodeRecord])
 
 def goal_table(records: Iterable[EpisodeRecord]) -> Table:
     """Return the goal of the first episode of each family."""
-    first = [found[0] for found in _by_family(records).values()]
+    first = [of_family[0] for of_family in _by_family(records).values()]
     rows = [
-        (escape(one.episode_id), escape(one.difficulty or ""), escape(one.goal)) for one in first
+        (escape(record.episode_id), escape(record.difficulty or ""), escape(record.goal))
+        for record in first
     ]
     return Table("goals", "Goals", {"episode": "text", "difficulty": "text", "goal": "text"}, rows)
 
@@ -66,17 +72,21 @@ def goal_table(records: Iterable[EpisodeRecord]) -> Table:
 def condition_table(conditions: Iterable[str], manifests: Iterable[BufferManifest]) -> Table:
     """Return the contents of the buffers of each condition."""
     groups: dict[str, list[BufferManifest]] = {name: [] for name in conditions}
-    for one in manifests:
-        groups.setdefault(one.condition, []).append(one)
+    for manifest in manifests:
+        groups.setdefault(manifest.condition, []).append(manifest)
     rows = []
-    for name, found in groups.items():
-        frames = [one.history_frames for one in found] or [0]
+    for name, of_condition in groups.items():
+        frames = [manifest.history_frames for manifest in of_condition] or [0]
         rows.append(
             (
-                *(escape(name), "paper" if name in DEFAULT_CONDITIONS else "extension"),
-                *(len(found), max((len(one.sessions) for one in found), default=0)),
-                *(min(frames), round(median(frames)), max(frames)),
-                mean(one.lesson_share for one in found) if found else None,
+                escape(name),
+                "paper" if name in DEFAULT_CONDITIONS else "extension",
+                len(of_condition),
+                max((len(manifest.sessions) for manifest in of_condition), default=0),
+                min(frames),
+                round(median(frames)),
+                max(frames),
+                mean(manifest.lesson_share for manifest in of_condition) if of_condition else None,
             )
         )
     columns: Columns = {
@@ -135,22 +145,22 @@ class CardColumn:
     @property
     def words(self) -> str:
         """The type in words."""
-        one = _WORDS.get(self.item, "record")
-        return f"list of {one}s".replace("texts", "text") if self.repeated else one
+        item = _WORDS.get(self.item, "record")
+        return f"list of {item}s".replace("texts", "text") if self.repeated else item
 
 
 def columns_of(record: Any) -> tuple[CardColumn, ...]:
     """Return the columns of a dataclass, without maps, whose keys differ between files."""
     texts, hints = descriptions(record), get_type_hints(record)
-    found = []
+    columns = []
     for field in arrow_schema(record):
         inner = _record_in(hints.get(field.name))
         if pa.types.is_struct(field.type) and inner is None:
             continue  # a map
         parts = columns_of(inner) if inner else ()
         meaning = texts[field.name].replace("`", "")
-        found.append(CardColumn(field.name, field.type, meaning, parts))
-    return tuple(found)
+        columns.append(CardColumn(field.name, field.type, meaning, parts))
+    return tuple(columns)
 
 
 def column_table(record: type) -> Table:

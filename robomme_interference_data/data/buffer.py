@@ -362,9 +362,10 @@ class Buffer:
             return
         recorded = dataset.record(index).digests(*span)
         differing = [name for name in digests if recorded and digests[name] != recorded.get(name)]
+        columns = f": {', '.join(differing)}" if differing else ""
         raise HashMismatchError.damaged(
             f"{self.manifest}: {what} ({name} episode {index}, frames {span[0]} to {span[1] - 1}) "
-            f"does not have the recorded SHA-256{': ' * bool(differing)}{', '.join(differing)}"
+            f"does not have the recorded SHA-256{columns}"
         )
 
     def _chosen(self, indices: Sequence[int] | None) -> NDArray[np.int64]:

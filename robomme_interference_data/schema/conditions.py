@@ -116,7 +116,7 @@ _KINDS = (
     ),
     Kind(
         "held",
-        lambda p, k: (p.lesson(), *[p.lesson("last")] * k),
+        lambda p, k: (p.lesson(), *(p.lesson("last") for _ in range(k))),
         "lesson, its last frame for n × 32 frames",
         "delay and dilution without content",
     ),

@@ -44,7 +44,12 @@ KEY_COLUMNS = (
 """Columns that identify a rollout: no two rows of a run agree in all of them."""
 
 TIMING_COLUMNS = (
-    *("reset_s", "history_s", "policy_s", "simulator_s", "model_s", "wall_s"),
+    "reset_s",
+    "history_s",
+    "policy_s",
+    "simulator_s",
+    "model_s",
+    "wall_s",
     "finished_at",
 )
 """The only columns that differ between repetitions of a run."""

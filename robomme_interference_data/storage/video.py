@@ -26,8 +26,22 @@ _MP4 = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide")
 """The first box of an MP4 or QuickTime file."""
 
 _DECODERS = (
-    *("libdav1d", "libaom-av1", "av1", "h264", "hevc", "vp8", "vp9", "mpeg4", "mjpeg"),
-    *("ffv1", "png", "rawvideo", "huffyuv", "ffvhuff", "utvideo", "qtrle"),
+    "libdav1d",
+    "libaom-av1",
+    "av1",
+    "h264",
+    "hevc",
+    "vp8",
+    "vp9",
+    "mpeg4",
+    "mjpeg",
+    "ffv1",
+    "png",
+    "rawvideo",
+    "huffyuv",
+    "ffvhuff",
+    "utvideo",
+    "qtrle",
 )
 """FFmpeg's decoders that are used: those of LeRobot's codecs, and lossless ones."""
 

@@ -26,14 +26,15 @@ def needed_datasets(
 ) -> dict[str, Dataset]:
     """Return the datasets whose frames items can have, by name."""
     parsed = [parse_condition(name) for name in conditions]
-    found = {
-        name: open_dataset(buffer_set, name, _NO_ACTIONS * (name == EXECUTIONS))
-        for name in (*datasets_of(parsed), *[EXECUTIONS] * actions, *[SHIFTED] * shifts)
-    }
+    datasets = {name: open_dataset(buffer_set, name) for name in datasets_of(parsed)}
+    if actions:
+        datasets[EXECUTIONS] = open_dataset(buffer_set, EXECUTIONS, _NO_ACTIONS)
+    if shifts:
+        datasets[SHIFTED] = open_dataset(buffer_set, SHIFTED)
     if planned:
         for condition in parsed:
             buffer_set.planned(condition)
-    return found
+    return datasets
 
 
 def check_size(buffer_set: BufferSet, cameras: Sequence[str], size: int | None) -> int | None:

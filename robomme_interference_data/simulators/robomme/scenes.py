@@ -286,8 +286,15 @@ class RouteStick(OfficialScene):
 _SCENES: dict[str, type[OfficialScene]] = {
     each.__name__: each
     for each in (
-        *(VideoRepick, VideoPlaceOrder, VideoPlaceButton, VideoUnmask, VideoUnmaskSwap),
-        *(MoveCube, InsertPeg, PatternLock, RouteStick),
+        VideoRepick,
+        VideoPlaceOrder,
+        VideoPlaceButton,
+        VideoUnmask,
+        VideoUnmaskSwap,
+        MoveCube,
+        InsertPeg,
+        PatternLock,
+        RouteStick,
     )
 }
 

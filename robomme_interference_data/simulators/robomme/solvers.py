@@ -168,6 +168,7 @@ def _planner(env: Any, *, stick: bool) -> Any:
     """Return RoboMME's planner, which tries again where a screw motion fails."""
     module = importlib.import_module("robomme.robomme_env.utils.planner_fail_safe")
     arm = "Stick" if stick else "Arm"
+    own_options = {"joint_vel_limits": 0.3} if stick else {}
     planner = getattr(module, f"FailAwarePanda{arm}MotionPlanningSolver")(
         env,
         debug=False,
@@ -175,18 +176,19 @@ def _planner(env: Any, *, stick: bool) -> Any:
         base_pose=env.unwrapped.agent.robot.pose,
         visualize_target_grasp_pose=False,
         print_env_info=False,
-        **({"joint_vel_limits": 0.3} if stick else {}),
+        **own_options,
     )
     straight, search = planner.move_to_pose_with_screw, planner.move_to_pose_with_RRTStar
 
     def move(*args: Any, **named: Any) -> Any:
-        for plan in [straight] * _TRIES + [search] * _TRIES:
-            try:
-                result = plan(*args, **named)
-            except module.ScrewPlanFailure:
-                continue
-            if not (isinstance(result, int) and result == -1):
-                return result
+        for plan in (straight, search):
+            for _ in range(_TRIES):
+                try:
+                    result = plan(*args, **named)
+                except module.ScrewPlanFailure:
+                    continue
+                if not (isinstance(result, int) and result == -1):
+                    return result
         raise NoPlanError(f"no motion found in {2 * _TRIES} attempts")
 
     planner.move_to_pose_with_screw = move

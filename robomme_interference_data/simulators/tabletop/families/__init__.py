@@ -18,8 +18,15 @@ from .video_repick import VideoRepick
 from .video_unmask import VideoUnmask, VideoUnmaskSwap
 
 _CLASSES: tuple[type[Family], ...] = (
-    *(VideoRepick, VideoPlaceOrder, VideoPlaceButton, VideoUnmask, VideoUnmaskSwap),
-    *(MoveCube, InsertPeg, PatternLock, RouteStick),
+    VideoRepick,
+    VideoPlaceOrder,
+    VideoPlaceButton,
+    VideoUnmask,
+    VideoUnmaskSwap,
+    MoveCube,
+    InsertPeg,
+    PatternLock,
+    RouteStick,
 )
 _FAMILIES = {each.__name__: each for each in _CLASSES}
 

@@ -96,7 +96,7 @@ class MoveCube(MoveScene, Family):
         left = np.array([math.sin(self.turn), -math.cos(self.turn), 0.0])
         reach = HANDLE - 0.018 - grip - CUBE / 2  # from the grip to the cube's middle
         hold = (BESIDE * left) + (0, 0, at[2] + 0.003)
-        behind = start * (1, 1, 0) + hold + (reach - 0.025) * self.way
+        behind = np.array((start[0], start[1], 0.0)) + hold + (reach - 0.025) * self.way
         yield from arm.move((behind[0], behind[1], 0.12), self.turn)
         yield from arm.move(behind, speed=SLOW)
         yield from arm.move(end + hold + (reach + 0.003) * self.way, speed=SLOW)
