@@ -14,12 +14,14 @@ from robomme_interference_data.evaluate.systems import System
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.storage.files import indented_json
 
+from .capabilities import Role
 from .policy import Policy
 from .registry import (
     POLICIES,
     check_workers,
     make_policy,
-    one_memory,
+    one_client,
+    policy_kind,
     policy_options,
     server_addresses,
     starts_server,
@@ -36,7 +38,7 @@ MOST_METADATA = 1 << 16
 def lock_servers(text: str, out: Path) -> Iterator[None]:
     """Keep other runs from a policy's servers in the block; `out` is this run's folder."""
     with ExitStack() as stack:
-        for host, port in server_addresses(text) if one_memory(text) else ():
+        for host, port in server_addresses(text) if one_client(text) else ():
             stack.enter_context(lock_server(host, port, f"the run in {out.resolve()}"))
         yield
 
@@ -48,7 +50,7 @@ def describe_policy(
 
     All servers are asked for metadata; of one that workers start, the metadata is empty.
     """
-    if one_memory(text):
+    if one_client(text):
         check_workers(text, workers)
     if starts_server(text):
         with closing(make_policy(text, options)) as policy:
@@ -62,13 +64,13 @@ def describe_policy(
     policy, metadata = policies[0], dict(every[0])
     if server_addresses(text):
         # Of a vla-eval server this is known only after its hello.
-        if getattr(policy, "one_memory", False):
+        if getattr(policy, "one_client", False):
             check_workers(text, workers)
         check_metadata(every, policy_options(text, options)["checkpoint"])
         metadata["server"] = ", ".join(one["server"] for one in every)
     if policy.privileged:
         metadata["privileged"] = True
-        if text.partition(":")[0] == "python":
+        if policy_kind(text).role is Role.OWN:
             logger.warning(
                 "The policy %s is privileged: it gets the simulator under every condition, also "
                 "under %s; run.json records this.",

@@ -9,116 +9,54 @@ from typing import Any, get_type_hints
 from robomme_interference_data.errors import InterferenceError, InvalidOptionError, PolicyError
 from robomme_interference_data.runtime.specs import (
     Factory,
-    Kind,
     Registry,
     bind_options,
     import_factory,
     signature_of,
 )
-from robomme_interference_data.schema.sampling import Memory
 
+from .capabilities import PolicyKind, Role
+from .kinds import KINDS, addresses
 from .policy import Policy
 
-BUILTINS = ("replay", "recall", "oracle", "guess", "follow-subgoals", "noop", "hold", "mean")
-"""Policies without learned weights."""
-
-_SERVER = r"(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):[0-9]{1,5}"
+POLICIES = Registry("policy", KINDS)
+"""The kinds of policies."""
 
 
-def _addresses(target: str) -> tuple[tuple[str, int], ...]:
-    """Return host and port of each server of `//…` or `ws://HOST:PORT,…`; empty for a command."""
-    scheme, slashes, servers = target.partition("//")
-    if scheme not in ("", "ws:") or not slashes:
-        return ()
-    pairs = (one.rpartition(":") for one in servers.split(","))
-    return tuple((host.strip("[]"), int(port)) for host, _, port in pairs)
+def policy_kind(text: str) -> PolicyKind:
+    """Return what the kind of a policy declares."""
+    return POLICIES.kinds[POLICIES.parse(text).kind]
 
 
-def _valid_addresses(target: str) -> bool:
-    servers = _addresses(target)
-    return len({*servers}) == len(servers) and all(0 < port < 65536 for _, port in servers)
-
-
-def _memory(target: str) -> str:
-    return str(Memory.parse(target))
-
-
-def _builtin(kind: str, factory: str, memory: bool = False, **given: str) -> Kind:
-    factory = f"{__package__}.builtin:{factory}"
-    if memory:
-        form = f"{kind}, {kind}:framesamp:N or {kind}:window:N"
-        return Kind(form, factory, r"(?P<memory>.+)", default="full", spelled=_memory)
-    return Kind(kind, factory, given=given)
-
-
-POLICIES = Registry(
-    "policy",
-    {
-        "replay": _builtin("replay", "ReplayPolicy", memory=True),
-        "recall": _builtin("recall", "Recall", memory=True),
-        "oracle": _builtin("oracle", "Privileged", name="oracle"),
-        "guess": _builtin("guess", "Privileged", name="guess"),
-        "follow-subgoals": _builtin("follow-subgoals", "FollowSubgoals"),
-        "noop": _builtin("noop", "Noop"),
-        "hold": Kind("hold", f"{__package__}.baselines:Hold"),
-        "mean": Kind("mean", f"{__package__}.baselines:Mean"),
-        "answers": Kind(
-            "answers:folder of a run of questions, or answers:file.csv",
-            f"{__package__}.answers:ActOutAnswers",
-            r"(?P<path>.+)",
-            no_effect=("path",),
-        ),
-        "websocket": Kind(
-            "websocket://host:port, with commas between several servers, each once, or websocket "
-            'with serve="COMMAND with {port}"',
-            f"{__package__}.websocket:WebsocketPolicy",
-            rf"//{_SERVER}(?:,{_SERVER})*|(?!//).*\{{port\}}.*",
-            extra="evaluate",
-            no_effect=("server", "connect_s", "response_s"),
-            valid=_valid_addresses,
-        ),
-        "vla-eval": Kind(
-            "vla-eval:ws://host:port, with commas between several servers, each once",
-            "robomme_interference_data.evaluate.vla_eval.policy:VlaEvalPolicy",
-            rf"ws://{_SERVER}(?:,{_SERVER})*",
-            extra="vla-eval",
-            no_effect=("server", "connect_s", "response_s"),
-            valid=_valid_addresses,
-        ),
-        "lerobot": Kind(
-            "lerobot:namespace/name[@revision] or lerobot:folder",
-            f"{__package__}.lerobot:LeRobotPolicy",
-            r"(?P<path>.+)",
-            extra="build",
-            no_effect=("source", "device"),
-            on_hub=True,
-        ),
-        "python": Kind("python:module:factory", "", r"[A-Za-z_][\w.]*:[A-Za-z_]\w*"),
-    },
-)
+def policy_memory(text: str) -> str | None:
+    """Return the memory of a policy, such as `framesamp:32`; None if its text has none."""
+    return POLICIES.parse(text).given.get("memory")
 
 
 def server_addresses(text: str) -> tuple[tuple[str, int], ...]:
     """Return host and port of each server that a policy names, in order."""
     spec = POLICIES.parse(text)
-    return _addresses(spec.target) if spec.kind in ("websocket", "vla-eval") else ()
+    return addresses(spec.target) if POLICIES.kinds[spec.kind].server is not None else ()
 
 
 def starts_server(text: str) -> bool:
     """Whether each worker starts a server, with the command in the policy's text."""
-    return POLICIES.parse(text).kind == "websocket" and not server_addresses(text)
+    return policy_kind(text).server is not None and not server_addresses(text)
 
 
-def one_memory(text: str) -> bool:
+def one_client(text: str) -> bool:
     """Whether each server of a policy is known to hold the memory of one rollout."""
-    return POLICIES.parse(text).kind == "websocket"
+    server = policy_kind(text).server
+    return server is not None and server.one_client
 
 
 def check_workers(text: str, workers: int) -> None:
     """Refuse more workers than servers that hold the memory of one rollout each."""
     servers = server_addresses(text)
     if 0 < len(servers) < workers:
-        own = ", or let each worker start its own (serve)" if one_memory(text) else ""
+        server = policy_kind(text).server
+        startable = server is not None and server.starter is not None
+        own = ", or let each worker start its own (serve)" if startable else ""
         raise InvalidOptionError(
             f"{workers} workers need {workers} policy servers, as each holds one memory; {text} "
             f"names {len(servers)}",
@@ -152,14 +90,20 @@ def policy_options(text: str, options: Sequence[str] = ()) -> dict[str, Any]:
 
 def with_server(text: str, serve: str | None) -> str:
     """Return a policy's text, with the command with which each worker starts its server."""
+    startable = [
+        name
+        for name, kind in POLICIES.kinds.items()
+        if kind.server is not None and kind.server.starter is not None
+    ]
     if serve is None:
+        # The command has a setting of its own, with checks: it is no part of the text.
         if starts_server(text):
-            raise InvalidOptionError.expected("policy", text, POLICIES.kinds["websocket"].form)
+            raise InvalidOptionError.expected("policy", text, policy_kind(text).form)
         return text
-    if text != "websocket":
+    if text not in startable:
         raise InvalidOptionError(
             f"serve starts the server of a policy, but {text} has no server to start",
-            'Set policy="websocket" with it, or leave it out.',
+            f'Set policy="{startable[0]}" with it, or leave it out.',
         )
     try:
         words = shlex.split(serve)
@@ -169,20 +113,21 @@ def with_server(text: str, serve: str | None) -> str:
         raise InvalidOptionError.expected(
             "serve", serve, "a command with {port}, the port that the server must listen at"
         )
-    return f"websocket:{serve}"
+    return f"{text}:{serve}"
 
 
 def _factory(text: str, worker: int) -> tuple[Factory, dict[str, Any]]:
     """Return what makes a policy, and the arguments that its text gives."""
     spec = POLICIES.parse(text)
-    if spec.kind == "python":
+    kind = POLICIES.kinds[spec.kind]
+    if kind.role is Role.OWN:
         factory = import_factory(f"policy {str(spec)!r}", spec.target)
         takes_worker = "worker" in signature_of(factory).parameters
         return factory, {"worker": worker} if takes_worker else {}
-    if starts_server(text):
-        return POLICIES.factory(spec, "ServedPolicy"), {"command": spec.target}
+    if kind.server is not None and starts_server(text):
+        return POLICIES.factory(spec, kind.server.starter), {"command": spec.target}
     if servers := server_addresses(text):
-        if one_memory(text):
+        if one_client(text):
             check_workers(text, worker + 1)
         host, port = servers[worker % len(servers)]
         return POLICIES.factory(spec), {"host": host, "port": port}

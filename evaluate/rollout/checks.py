@@ -4,19 +4,19 @@ import math
 import re
 from collections.abc import Sequence
 
-from robomme_interference_data.constants import (
-    ACTION,
-    ACTION_CHUNK,
-    DEMONSTRATIONS,
-    EXECUTIONS,
-    STATE,
-)
+from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, EXECUTIONS, STATE
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import InterferenceError, InvalidOptionError, UnknownNameError
 from robomme_interference_data.evaluate.language.subgoal_writer import ORACLE
+from robomme_interference_data.evaluate.policies.capabilities import PolicyKind, Role
 from robomme_interference_data.evaluate.policies.policy import BATCH_METHODS, Policy
-from robomme_interference_data.evaluate.policies.registry import BUILTINS, POLICIES, policy_options
+from robomme_interference_data.evaluate.policies.registry import (
+    POLICIES,
+    policy_kind,
+    policy_memory,
+    policy_options,
+)
 from robomme_interference_data.evaluate.run.config import (
     RunConfig,
     check_unused,
@@ -35,22 +35,14 @@ from robomme_interference_data.retrieval.select import Rule
 from robomme_interference_data.runtime.executor import is_share
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.sampling import Memory
-from robomme_interference_data.simulators.base import ACTION_SIZE
 from robomme_interference_data.simulators.registry import (
     RECORDINGS,
     SIMULATORS,
     check_shift,
-    find_simulator,
     simulator_class,
 )
 
 from .worker import used_cameras
-
-PANDA_POLICIES = ("replay", "noop", "websocket", "vla-eval", "lerobot")
-"""Kinds of policies that read and control RoboMME's robot: 7 joints, then the gripper."""
-
-READS_SUBGOALS = ("websocket", "python", "follow-subgoals")
-"""Kinds of policies that may read subgoals."""
 
 
 def default_system(config: RunConfig) -> str:
@@ -59,29 +51,36 @@ def default_system(config: RunConfig) -> str:
     Such as `replay-window-extrapolate`, `follow-subgoals-oracle` with the simulator's subgoals, or
     `retrieval-replay-window-joined`.
     """
-    spec = POLICIES.parse(config.policy)
-    # Folders, revisions and served models have the same names for different checkpoints.
-    named = ("websocket", "vla-eval", "lerobot", "answers")
-    learned = config.policy if spec.kind in named else config.subgoals
-    if learned not in (None, ORACLE):
+    spec, kind = POLICIES.parse(config.policy), policy_kind(config.policy)
+    unidentified = config.subgoals if kind.identified else config.policy
+    if unidentified not in (None, ORACLE):
         raise InvalidOptionError(
-            f"the rows of {learned} need a name: its text does not identify it",
+            f"the rows of {unidentified} need a name: its text does not identify it",
             "Set `system`, such as perceptual-framesamp-modul, or a name of your own: see "
             "docs/how-to/paper-systems.md.",
         )
-    remembers = spec.kind in ("replay", "recall")
-    target = Memory.parse(spec.target).label if remembers else spec.target
-    name = "-".join(filter(None, (spec.kind, target, config.subgoals)))
-    if spec.kind in ("replay", "follow-subgoals"):
-        options = policy_options(config.policy, config.policy_options)
-        name += "-extrapolate" if options.get("extrapolate") else ""
-        name += "" if options.get("points", True) else "-simple"
-    if spec.kind == "hold":
-        chunk = policy_options(config.policy, config.policy_options)["chunk"]
-        name += "" if chunk == ACTION_CHUNK else f"-chunk{chunk}"
-    if spec.kind == "python":
-        name = re.sub(r"[^A-Za-z0-9._-]+", "-", name.partition("-")[2]).strip("-")
+    memory = policy_memory(config.policy)
+    parts = [spec.target if memory is None else Memory.parse(memory).label]
+    if kind.role is not Role.OWN:
+        parts.insert(0, spec.kind)
+    if config.subgoals is not None:
+        parts.append(config.subgoals)
+    parts += _option_labels(config, kind)
+    name = re.sub(r"[^A-Za-z0-9._-]+", "-", "-".join(filter(None, parts))).strip("-")
     return with_retrieval(name, config)
+
+
+def _option_labels(config: RunConfig, kind: PolicyKind) -> list[str]:
+    """Return what options that make another system add to the label of rows."""
+    if not kind.option_labels:
+        return []
+    usual = policy_options(config.policy)
+    options = policy_options(config.policy, config.policy_options)
+    return [
+        label.format(options[name])
+        for name, label in kind.option_labels.items()
+        if options[name] != usual[name]
+    ]
 
 
 def check_system(config: RunConfig, system: str) -> None:
@@ -92,23 +91,22 @@ def check_system(config: RunConfig, system: str) -> None:
 
 def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> None:
     """Check the settings against each other, the buffer set and the policy."""
-    if config.simulator == RECORDINGS and not config.offline:
+    simulator, kind = simulator_class(config.simulator), policy_kind(config.policy)
+    if simulator.plays_back and not config.offline:
         raise InvalidOptionError(
-            "recordings are no simulator to choose", "Set `offline` for an offline evaluation."
+            f"{config.simulator} are no simulator to choose",
+            "Set `offline` for an offline evaluation.",
         )
-    find_simulator(config.simulator)
     check_shift(config.simulator, config.shift)
-    _check_policies(config, policy)
-    kind = POLICIES.parse(config.policy).kind
-    scripts = simulator_class(config.simulator).policies
-    needed = {"answers": {"answer"}, "python": {*scripts}}.get(kind, {kind})
-    if policy.privileged and not needed & {*scripts}:
+    _check_policies(config, kind, policy)
+    scripts = [name for name in simulator.policies if kind.script in (None, name)]
+    if policy.privileged and not scripts:
         raise InvalidOptionError(
             f"the policy {config.policy} needs a script of the simulator, and {config.simulator} "
             "has none for it",
             _script_hint(config, kind),
         )
-    if kind == "answers":
+    if kind.acts_out_answers:
         check_unused(config, ["retrieval"], config.policy, "Set it for the questions instead.")
     _check_cameras(config, buffer_set.datasets[DEMONSTRATIONS], policy)
     _check_robot(config, buffer_set, kind)
@@ -142,30 +140,30 @@ def _check_cameras(config: RunConfig, demonstrations: Dataset, policy: Policy) -
         )
 
 
-def _script_hint(config: RunConfig, kind: str) -> str:
+def _script_hint(config: RunConfig, kind: PolicyKind) -> str:
     if config.offline:
         return "Leave out `offline`, or set another policy."
-    if kind in simulator_class(RECORDINGS).policies:
+    if kind.script in simulator_class(RECORDINGS).policies:
         return "Set `offline`: it repeats recorded actions."
     return "Set another simulator, such as tabletop, or another policy."
 
 
-def _check_robot(config: RunConfig, buffer_set: BufferSet, kind: str) -> None:
-    """Reject a policy for RoboMME's robot on another one."""
+def _check_robot(config: RunConfig, buffer_set: BufferSet, kind: PolicyKind) -> None:
+    """Reject a policy for RoboMME's robot on a robot of another size."""
     (state,) = buffer_set.datasets[DEMONSTRATIONS].features[STATE]
     action = simulator_class(config.simulator).action_size
     if config.offline and EXECUTIONS in buffer_set.datasets:
         (action,) = buffer_set.datasets[EXECUTIONS].features[ACTION]
-    if kind in PANDA_POLICIES and (state, action) != (ACTION_SIZE, ACTION_SIZE):
+    if kind.action_size is not None and {state, action} != {kind.action_size}:
         raise InvalidOptionError(
-            f"the policy {config.policy} reads {ACTION_SIZE} state values and returns "
-            f"{ACTION_SIZE} action values, 7 joints and a gripper; this robot has {state} and "
+            f"the policy {config.policy} reads {kind.action_size} state values and returns "
+            f"{kind.action_size} action values, 7 joints and a gripper; this robot has {state} and "
             f"{action}",
             'Set a policy for this robot, such as "python:module:factory".',
         )
 
 
-def _check_policies(config: RunConfig, policy: Policy) -> None:
+def _check_policies(config: RunConfig, kind: PolicyKind, policy: Policy) -> None:
     """Check the settings of shared policies, and that the policy can be shared."""
     if config.policies is None:
         own = "policies that are not shared"
@@ -185,7 +183,7 @@ def _check_policies(config: RunConfig, policy: Policy) -> None:
             raise InvalidOptionError.expected(name, getattr(config, name), expected)
     missing = [f"{one}()" for one in BATCH_METHODS if not callable(getattr(policy, one, None))]
     fault = None
-    if POLICIES.parse(config.policy).kind == "websocket":
+    if kind.server is not None and kind.server.one_client:
         fault = "its server holds one memory"
     elif policy.privileged:
         fault = "it needs the simulator, which runs in the worker"
@@ -200,17 +198,18 @@ def _check_policies(config: RunConfig, policy: Policy) -> None:
 
 def _check_name(config: RunConfig, system: System) -> None:
     """Reject the name of a published system or control for a run of another one."""
-    kind, retrieval = POLICIES.parse(config.policy).kind, config.retrieval is not None
+    kind, retrieval = policy_kind(config.policy), config.retrieval is not None
     fault = None
     if not system.paper:
         if known_system(system.name) is not None and (
-            kind not in BUILTINS or default_system(config) != system.name
+            kind.role not in (Role.CONTROL, Role.REFERENCE) or default_system(config) != system.name
         ):
             fault = f"the policy {config.policy} is not the control {system.name}"
             fault += " with a retrieval step in front" if retrieval else ""
-    elif kind not in ("websocket", "python"):
+    elif not kind.published:
         fault = f"the policy {config.policy} is not the paper's system {system.name}"
-    elif (system.subgoals is None) is (config.subgoals is not None) and kind == "websocket":
+    # Code of the user may write the subgoals itself.
+    elif (system.subgoals is None) is (config.subgoals is not None) and kind.role is not Role.OWN:
         needs = "no subgoals" if system.subgoals is None else "subgoals of a model (`subgoals`)"
         fault = f"system {system.name} acts on {needs}, and `subgoals` is {config.subgoals}"
     elif config.subgoals == ORACLE:
@@ -237,10 +236,11 @@ def _check_subgoals(config: RunConfig) -> None:
             )
     if config.subgoals is None:
         return
-    if POLICIES.parse(config.policy).kind not in READS_SUBGOALS:
+    if not policy_kind(config.policy).reads_subgoals:
+        able = [name for name, kind in POLICIES.kinds.items() if kind.reads_subgoals]
         raise InvalidOptionError(
             f"the policy {config.policy} reads no subgoals",
-            f"Set `policy` to {', '.join(READS_SUBGOALS)}, or leave out `subgoals`.",
+            f"Set `policy` to {', '.join(able)}, or leave out `subgoals`.",
         )
 
 
@@ -248,11 +248,11 @@ def check_plan(
     config: RunConfig, system: System, buffer_set: BufferSet, plan: Plan, items: Sequence[WorkItem]
 ) -> None:
     """Check every rollout of a plan."""
-    needs_evidence = POLICIES.parse(config.policy).kind == "recall"
-    families = {one.family for one in simulator_class(config.simulator).episodes()}
+    kind, simulator = policy_kind(config.policy), simulator_class(config.simulator)
+    families = {episode.family for episode in simulator.episodes()}
     for episode in dict.fromkeys(item.episode for item in items):
         record = buffer_set.query(episode).record
-        if needs_evidence and record.evidence is None:
+        if kind.needs_evidence and record.evidence is None:
             raise InvalidOptionError(
                 f"{config.policy} needs to know which frames show the answer, which is unknown "
                 f"for {episode}",
@@ -260,9 +260,7 @@ def check_plan(
                 "docs/reference/sources.md.",
             )
         recorded = record.simulator
-        # A simulator of the user may play any episode, and so may a recording.
-        own = ":" in config.simulator or config.offline
-        if recorded not in (None, config.simulator) and not own:
+        if simulator.own_episodes and recorded not in (None, config.simulator):
             raise InvalidOptionError(
                 f"{episode} was recorded on {recorded!r}, the run is on {config.simulator!r}",
                 f'Set simulator="{recorded}", or give a buffer set of {config.simulator}.'

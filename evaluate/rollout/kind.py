@@ -33,6 +33,7 @@ from robomme_interference_data.evaluate.policies.identity import (
 )
 from robomme_interference_data.evaluate.policies.registry import (
     POLICIES,
+    policy_kind,
     policy_options,
     with_server,
 )
@@ -92,9 +93,8 @@ class Rollouts(RunKind[RunConfig]):
     def check(self, plan: Plan, items: Sequence[WorkItem]) -> None:
         """Check every rollout."""
         check_plan(self.config, self._system, self.buffer_set, plan, items)
-        spec = POLICIES.parse(self.config.policy)
-        if spec.kind == "answers":
-            path = Path(spec.target)
+        if policy_kind(self.config.policy).acts_out_answers:
+            path = Path(POLICIES.parse(self.config.policy).target)
             self._answers = read_answers(self.config, path, self.buffer_set, items)
 
     @contextmanager
@@ -127,9 +127,10 @@ class Rollouts(RunKind[RunConfig]):
                 check_memory_kind(keeps, self._policy_metadata["server"], self._system)
             self.metadata = self._policy_metadata | self._subgoal_metadata
         if todo:
-            # A class of the user is tried out on the first episode.
-            own = ":" in config.simulator and simulator_class(config.simulator) is not Simulator
-            opening = Opening("simulator", todo[0].episode if own else None)
+            simulator = simulator_class(config.simulator)
+            # Of a function that declares no class nothing is known, not even how it begins.
+            tried = simulator.try_out and simulator is not Simulator
+            opening = Opening("simulator", todo[0].episode if tried else None)
             _opened(session, opening, config.simulator_timeout_s)
             check_servers_memory(config.policy, config.policy_options, self._system)
 

@@ -15,6 +15,7 @@ from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.evaluate.policies.registry import policy_kind
 from robomme_interference_data.runtime.executor import Session, Worker
 from robomme_interference_data.schema.rollouts import Rollout, Status, success_of
 from robomme_interference_data.schema.sampling import (
@@ -95,7 +96,7 @@ def package_versions(config: RunConfig | AskConfig) -> dict[str, str]:
     """
     names = ["robomme-interference-data", "numpy", "av", "torch"]
     if isinstance(config, RunConfig):
-        names += {config.policy.partition(":")[0]} & {"lerobot", "vla-eval"}
+        names += policy_kind(config.policy).packages
     if config.retrieval is not None:
         names.append("transformers")
     if isinstance(config, RunConfig):

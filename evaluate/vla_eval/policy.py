@@ -41,7 +41,7 @@ _PARTS: Mapping[str, Mapping[str, DimSpec]] = {
 _ASKED = ("send_wrist_image", "send_state", "send_video_history")
 """What a server may ask for."""
 
-_ONE_MEMORY = ("MmeVlaModelServer",)
+_ONE_CLIENT = ("MmeVlaModelServer",)
 """Servers that keep one history for all connections."""
 
 
@@ -62,7 +62,7 @@ class VlaEvalPolicy(ObservingPolicy):
         response_s: Maximum seconds from a message to the end of its answer.
 
     Attributes:
-        one_memory: Whether the server is known to hold one memory for all its connections.
+        one_client: Whether the server is known to hold one memory for all its connections.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class VlaEvalPolicy(ObservingPolicy):
         self.cameras = ("front", "wrist") if wrist else ("front",)
         self.history_cameras = self.cameras if history else ()
         self.wants_history = bool(history)
-        self.one_memory = self.wants_history and hello["model_server"] in _ONE_MEMORY
+        self.one_client = self.wants_history and hello["model_server"] in _ONE_CLIENT
 
     def reset(self, info: RolloutInfo) -> None:
         """Start an episode, connecting first, or again if the connection was lost."""

@@ -71,13 +71,13 @@ class Spec:
         return f"{self.kind}:{self.target}" if self.target else self.kind
 
 
-class Registry:
+class Registry[K: Kind]:
     """Kinds by name; messages call them `what`, such as `policy`.
 
     `also` is the form of texts that the caller parses itself, for messages.
     """
 
-    def __init__(self, what: str, kinds: Mapping[str, Kind], also: str = ""):
+    def __init__(self, what: str, kinds: Mapping[str, K], also: str = ""):
         self._what, self.kinds, self._also = what, kinds, also
 
     def parse(self, text: str) -> Spec:

@@ -137,6 +137,10 @@ class Simulator(ABC):
         policies: Its built-in policies: those of `act`, and `follow-subgoals` if it has
             `follow_subgoal`.
         shifts: Whether it supports shifts of the live scene.
+        own_episodes: Whether it plays only episodes that were recorded on it.
+        plays_back: Whether it plays back recorded executions: for offline evaluation only.
+        try_out: Whether `evaluate` begins an episode before the run, so that a mistake in a new
+            simulator is an error of the run, and not of every rollout.
         suite_version: Version of its episodes; None if they have none.
         packages: Distributions of this environment that it uses.
         episode_s: Seconds that recording one episode may take.
@@ -153,6 +157,9 @@ class Simulator(ABC):
     settings: ClassVar[tuple[str, ...]] = ()
     policies: ClassVar[tuple[str, ...]] = BUILT_IN
     shifts: ClassVar[bool] = False
+    own_episodes: ClassVar[bool] = False
+    plays_back: ClassVar[bool] = False
+    try_out: ClassVar[bool] = True
     suite_version: ClassVar[int | None] = None
     packages: ClassVar[tuple[str, ...]] = ()
     episode_s: ClassVar[float] = 300.0

@@ -33,6 +33,8 @@ class Recordings(Simulator):
     about = "recordings, played back"
     settings = ("cameras", "buffer_set")
     policies = ("hold", "mean")
+    plays_back = True
+    try_out = False
 
     def __init__(self, buffer_set: str, cameras: Sequence[str] = ()):
         self._buffer_set = load_buffer_set(buffer_set, threads=1)

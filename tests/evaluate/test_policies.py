@@ -1,5 +1,7 @@
 """Policies from text: parsing, errors before any episode, options, and user-defined policies."""
 
+import ast
+import dataclasses
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,15 +17,21 @@ from robomme_interference_data.errors import (
     PolicyError,
     UnknownNameError,
 )
+from robomme_interference_data.evaluate.policies.capabilities import PolicyKind, Role
 from robomme_interference_data.evaluate.policies.identity import policy_identity
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import (
     POLICIES,
     make_policy,
+    policy_kind,
+    policy_memory,
     policy_options,
     server_addresses,
 )
-from robomme_interference_data.runtime.specs import Spec, bind_options
+from robomme_interference_data.runtime.specs import Kind, Spec, bind_options
+from robomme_interference_data.simulators.base import Simulator
+from robomme_interference_data.simulators.recordings import Recordings
+from robomme_interference_data.simulators.registry import SIMULATORS, simulator_class
 
 OWN = "python:support.own_policies:"
 STILL = f"{OWN}Still"
@@ -155,6 +163,53 @@ def test_the_part_of_a_policy_that_can_change_a_result() -> None:
     }
     objects = policy_identity("python:support.own_policies:with_object", (), {})
     assert objects["policy_options"] == {"name": "x"}  # values that JSON lacks are left out
+
+
+# --- what kinds declare ------------------------------------------------------------------------
+
+
+def test_a_forgotten_capability_is_an_error() -> None:
+    capabilities = {one.name for one in dataclasses.fields(PolicyKind)}
+    capabilities -= {one.name for one in dataclasses.fields(Kind)}
+    declared = vars(POLICIES.kinds["noop"])
+    assert PolicyKind(**declared) == POLICIES.kinds["noop"]
+    for name in capabilities:
+        with pytest.raises(TypeError, match=name):
+            PolicyKind(**{key: value for key, value in declared.items() if key != name})
+
+
+def test_kinds_declare_what_their_policies_are() -> None:
+    for name, kind in POLICIES.kinds.items():
+        if kind.role not in (Role.CONTROL, Role.REFERENCE):
+            continue
+        policy = make_policy(name)
+        scripts = {*Simulator.policies, *Recordings.policies}
+        assert policy.privileged == (kind.script is not None)
+        assert kind.script is None or kind.script in scripts
+        assert {*kind.option_labels} <= {*policy_options(name)}
+        memory = policy_memory(name)
+        assert policy.metadata().get("memory") == memory
+        assert memory == ("full" if name in ("replay", "recall") else None)
+    assert policy_memory("replay:framesamp") == "framesamp:32"
+    assert policy_memory(STILL) is None
+    assert policy_kind(STILL) is POLICIES.kinds["python"]
+
+
+@pytest.mark.parametrize("name", SIMULATORS)
+def test_simulators_of_the_package_declare_which_episodes_they_play(name: str) -> None:
+    assert {"own_episodes", "try_out"} <= {*vars(simulator_class(name))}
+
+
+def test_no_check_compares_the_name_of_a_kind() -> None:
+    folder = Path(evaluate.__file__).parent
+    names = {*POLICIES.kinds, *SIMULATORS}
+    for path in (
+        one for room in ("policies", "rollout", "run") for one in folder.glob(f"{room}/*.py")
+    ):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Compare):
+                texts = {one.value for one in ast.walk(node) if isinstance(one, ast.Constant)}
+                assert not texts & names, f"{path}:{node.lineno}"
 
 
 # --- user-defined policies ---------------------------------------------------------------------

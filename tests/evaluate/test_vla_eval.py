@@ -34,7 +34,7 @@ def test_a_server_that_asks_for_everything() -> None:
     server = servers.Noting(servers.ALL, answer=lambda obs: obs["states"])
     with servers.connected(server) as policy:
         assert policy.cameras == policy.history_cameras == ("front", "wrist")
-        assert policy.wants_history and not policy.every_frame and not policy.one_memory
+        assert policy.wants_history and not policy.every_frame and not policy.one_client
         first, second = servers.play(policy, history=5, live=2)
         np.testing.assert_array_equal(first, np.full((1, 8), 5))
         np.testing.assert_array_equal(second, np.full((1, 8), 6))
@@ -198,7 +198,7 @@ def test_a_fault_of_the_server_is_an_error_row_that_is_repeated(tmp_path: Path) 
 
 
 @pytest.mark.usefixtures("world")
-def test_a_server_with_one_memory_has_one_worker(tmp_path: Path) -> None:
+def test_a_server_with_one_client_has_one_worker(tmp_path: Path) -> None:
     settings: dict[str, Any] = {"policy_options": NAMED, "conditions": ("no-history",)}
     for shared in (False, True):
         with servers.running(servers.MmeVlaModelServer(use_history=not shared)) as port:

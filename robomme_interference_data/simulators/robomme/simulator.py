@@ -74,6 +74,8 @@ class RoboMMESimulator(Simulator):
     about = "the official simulator, RoboMME"
     remote = True
     settings = ("cameras", "python", "subgoals", "answer_s")
+    own_episodes = True
+    try_out = False
     episode_s = 1800.0
 
     def __init__(

@@ -52,6 +52,8 @@ class TabletopSimulator(Simulator):
     )
     settings = ("cameras", "shift")
     shifts = True
+    own_episodes = True
+    try_out = False
     suite_version = SUITE_VERSION
     packages = ("mani-skill", "sapien")
 

@@ -1,0 +1,261 @@
+"""The kinds of policies, and what each declares of itself.
+
+A new kind is a file with its policy, and an entry here. Checks read what it declares, never its
+name. What only the policy's object knows, because it depends on weights or on a server (`cameras`,
+`wants_history`, whether it can batch), are attributes and methods of `Policy`.
+"""
+
+from robomme_interference_data.schema.sampling import Memory
+from robomme_interference_data.simulators.base import ACTION_SIZE
+
+from .capabilities import PolicyKind, Role, Server
+
+_HERE = __package__
+
+_SERVER = r"(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):[0-9]{1,5}"
+
+_SERVER_OPTIONS = ("server", "connect_s", "response_s")
+"""Options, and metadata, of a server that change no result."""
+
+
+def addresses(target: str) -> tuple[tuple[str, int], ...]:
+    """Return host and port of each server of `//…` or `ws://HOST:PORT,…`; empty for a command."""
+    scheme, slashes, servers = target.partition("//")
+    if scheme not in ("", "ws:") or not slashes:
+        return ()
+    pairs = (server.rpartition(":") for server in servers.split(","))
+    return tuple((host.strip("[]"), int(port)) for host, _, port in pairs)
+
+
+def _valid_addresses(target: str) -> bool:
+    servers = addresses(target)
+    return len({*servers}) == len(servers) and all(0 < port < 65536 for _, port in servers)
+
+
+def _memory(target: str) -> str:
+    return str(Memory.parse(target))
+
+
+KINDS: dict[str, PolicyKind] = {
+    "replay": PolicyKind(
+        form="replay, replay:framesamp:N or replay:window:N",
+        factory=f"{_HERE}.builtin:ReplayPolicy",
+        target="(?P<memory>.+)",
+        default="full",
+        spelled=_memory,
+        role=Role.CONTROL,
+        identified=True,
+        published=False,
+        option_labels={"extrapolate": "extrapolate"},
+        action_size=ACTION_SIZE,
+        reads_subgoals=False,
+        script=None,
+        needs_evidence=False,
+        acts_out_answers=False,
+        server=None,
+        packages=(),
+    ),
+    "recall": PolicyKind(
+        form="recall, recall:framesamp:N or recall:window:N",
+        factory=f"{_HERE}.builtin:Recall",
+        target="(?P<memory>.+)",
+        default="full",
+        spelled=_memory,
+        role=Role.REFERENCE,
+        identified=True,
+        published=False,
+        option_labels={},
+        action_size=None,
+        reads_subgoals=False,
+        script="recall",
+        needs_evidence=True,
+        acts_out_answers=False,
+        server=None,
+        packages=(),
+    ),
+    "oracle": PolicyKind(
+        form="oracle",
+        factory=f"{_HERE}.builtin:Privileged",
+        given={"name": "oracle"},
+        role=Role.REFERENCE,
+        identified=True,
+        published=False,
+        option_labels={},
+        action_size=None,
+        reads_subgoals=False,
+        script="oracle",
+        needs_evidence=False,
+        acts_out_answers=False,
+        server=None,
+        packages=(),
+    ),
+    "guess": PolicyKind(
+        form="guess",
+        factory=f"{_HERE}.builtin:Privileged",
+        given={"name": "guess"},
+        role=Role.REFERENCE,
+        identified=True,
+        published=False,
+        option_labels={},
+        action_size=None,
+        reads_subgoals=False,
+        script="guess",
+        needs_evidence=False,
+        acts_out_answers=False,
+        server=None,
+        packages=(),
+    ),
+    "follow-subgoals": PolicyKind(
+        form="follow-subgoals",
+        factory=f"{_HERE}.builtin:FollowSubgoals",
+        role=Role.REFERENCE,
+        identified=True,
+        published=False,
+        option_labels={"points": "simple"},
+        action_size=None,
+        reads_subgoals=True,
+        script="follow-subgoals",
+        needs_evidence=False,
+        acts_out_answers=False,
+        server=None,
+        packages=(),
+    ),
+    "noop": PolicyKind(
+        form="noop",
+        factory=f"{_HERE}.builtin:Noop",
+        role=Role.REFERENCE,
+        identified=True,
+        published=False,
+        option_labels={},
+        action_size=ACTION_SIZE,
+        reads_subgoals=False,
+        script=None,
+        needs_evidence=False,
+        acts_out_answers=False,
+        server=None,
+        packages=(),
+    ),
+    "hold": PolicyKind(
+        form="hold",
+        factory=f"{_HERE}.baselines:Hold",
+        role=Role.REFERENCE,
+        identified=True,
+        published=False,
+        option_labels={"chunk": "chunk{}"},
+        action_size=None,
+        reads_subgoals=False,
+        script="hold",
+        needs_evidence=False,
+        acts_out_answers=False,
+        server=None,
+        packages=(),
+    ),
+    "mean": PolicyKind(
+        form="mean",
+        factory=f"{_HERE}.baselines:Mean",
+        role=Role.REFERENCE,
+        identified=True,
+        published=False,
+        option_labels={},
+        action_size=None,
+        reads_subgoals=False,
+        script="mean",
+        needs_evidence=False,
+        acts_out_answers=False,
+        server=None,
+        packages=(),
+    ),
+    "answers": PolicyKind(
+        form="answers:folder of a run of questions, or answers:file.csv",
+        factory=f"{_HERE}.answers:ActOutAnswers",
+        target="(?P<path>.+)",
+        no_effect=("path",),
+        role=Role.LEARNED,
+        identified=False,
+        published=False,
+        option_labels={},
+        action_size=None,
+        reads_subgoals=False,
+        script="answer",
+        needs_evidence=False,
+        acts_out_answers=True,
+        server=None,
+        packages=(),
+    ),
+    "websocket": PolicyKind(
+        form="websocket://host:port, with commas between several servers, each once, or websocket "
+        'with serve="COMMAND with {port}"',
+        factory=f"{_HERE}.websocket:WebsocketPolicy",
+        target=rf"//{_SERVER}(?:,{_SERVER})*|(?!//).*\{{port\}}.*",
+        extra="evaluate",
+        no_effect=_SERVER_OPTIONS,
+        valid=_valid_addresses,
+        role=Role.LEARNED,
+        identified=False,
+        published=True,
+        option_labels={},
+        action_size=ACTION_SIZE,
+        reads_subgoals=True,
+        script=None,
+        needs_evidence=False,
+        acts_out_answers=False,
+        server=Server(one_client=True, starter="ServedPolicy"),
+        packages=(),
+    ),
+    "vla-eval": PolicyKind(
+        form="vla-eval:ws://host:port, with commas between several servers, each once",
+        factory="robomme_interference_data.evaluate.vla_eval.policy:VlaEvalPolicy",
+        target=rf"ws://{_SERVER}(?:,{_SERVER})*",
+        extra="vla-eval",
+        no_effect=_SERVER_OPTIONS,
+        valid=_valid_addresses,
+        role=Role.LEARNED,
+        identified=False,
+        published=False,
+        option_labels={},
+        action_size=ACTION_SIZE,
+        reads_subgoals=False,
+        script=None,
+        needs_evidence=False,
+        acts_out_answers=False,
+        # Some servers have one client: their hello shows it, see `VlaEvalPolicy.one_client`.
+        server=Server(one_client=False, starter=None),
+        packages=("vla-eval",),
+    ),
+    "lerobot": PolicyKind(
+        form="lerobot:namespace/name[@revision] or lerobot:folder",
+        factory=f"{_HERE}.lerobot:LeRobotPolicy",
+        target="(?P<path>.+)",
+        extra="build",
+        no_effect=("source", "device"),
+        on_hub=True,
+        role=Role.LEARNED,
+        identified=False,
+        published=False,
+        option_labels={},
+        action_size=ACTION_SIZE,
+        reads_subgoals=False,
+        script=None,
+        needs_evidence=False,
+        acts_out_answers=False,
+        server=None,
+        packages=("lerobot",),
+    ),
+    "python": PolicyKind(
+        form="python:module:factory",
+        factory="",
+        target=r"[A-Za-z_][\w.]*:[A-Za-z_]\w*",
+        role=Role.OWN,
+        identified=True,
+        published=True,
+        option_labels={},
+        action_size=None,
+        reads_subgoals=True,
+        script=None,
+        needs_evidence=False,
+        acts_out_answers=False,
+        server=None,
+        packages=(),
+    ),
+}
+"""Name to kind, in the order of messages."""
