@@ -120,7 +120,7 @@ class ServePolicy:
     def __call__(self, task: Address, worker: Worker) -> None:
         """Answer all connections until the run ends."""
         config, number = self.config, task.number
-        if config.executor == "processes" and config.policies != 1:
+        if not config.on_cluster and config.policies != 1:
             choose_gpu(number)  # on a cluster Ray does it
         batcher: Batcher[Connection] = Batcher(
             lambda: make_policy(config.policy, config.policy_options, worker=number),  # type: ignore[arg-type, return-value]
@@ -191,7 +191,7 @@ def policy_processes(config: RunConfig) -> Iterator[tuple[Address, ...]]:
     """
     failures = list[WorkerError]()
     count = config.policies or 0
-    executor = make_executor(replace(config, workers=count, gpus_per_worker=config.gpus_per_policy))
+    executor = make_executor(replace(config, workers=count, resources=config.policy_resources))
     with ExitStack() as stack:
         session = stack.enter_context(executor.session(ServePolicy(config)))
         directory = Directory(executor.host)

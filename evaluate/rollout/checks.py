@@ -32,7 +32,7 @@ from robomme_interference_data.evaluate.systems import (
     name_system,
 )
 from robomme_interference_data.retrieval.select import Rule
-from robomme_interference_data.runtime.executor import is_share
+from robomme_interference_data.runtime.executor import Resources
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.simulators.registry import (
@@ -167,16 +167,17 @@ def _check_policies(config: RunConfig, kind: PolicyKind, policy: Policy) -> None
     """Check the settings of shared policies, and that the policy can be shared."""
     if config.policies is None:
         own = "policies that are not shared"
-        unused = ("max_batch_size", "batch_wait_timeout_s", "gpus_per_policy")
+        unused = ("max_batch_size", "batch_wait_timeout_s", "policy_resources")
         check_unused(config, unused, own, "Set `policies`.")
         return
-    if config.executor == "processes":
+    if config.on_cluster:
+        Resources.parse("policy_resources", config.policy_resources)
+    else:
         own = "policies on this machine, which share its GPUs"
-        check_unused(config, ("gpus_per_policy",), own, 'Set `executor` to "ray".')
+        check_unused(config, ("policy_resources",), own, 'Set `executor` to "ray".')
     for name, valid, expected in (
         ("policies", 1 <= config.policies <= config.workers, f"1 to `workers`, {config.workers}"),
         ("max_batch_size", config.max_batch_size >= 1, "1 or more"),
-        ("gpus_per_policy", is_share(config.gpus_per_policy), "0 to 1, or a whole number"),
         ("batch_wait_timeout_s", 0 <= config.batch_wait_timeout_s < math.inf, "0 or more"),
     ):
         if not valid:

@@ -81,11 +81,8 @@ class RunConfig(WorkConfig):
 
     policy: str = setting(
         group=_POLICY,
-        help="replay or recall (both also with :framesamp or :window), oracle, guess, "
-        "follow-subgoals, noop, hold or mean (both --offline), answers:FOLDER, "
-        "websocket://HOST:PORT (several with commas), "
-        "websocket with --serve, vla-eval:ws://HOST:PORT (several with commas), "
-        "lerobot:REPO[@REVISION], lerobot:FOLDER or python:module:factory.",
+        help="Policy, such as replay:framesamp:32, oracle, websocket://HOST:PORT, lerobot:REPO or "
+        "python:module:factory; all kinds: docs/reference/policies.md.",
     )
     buffer_set: str = setting(
         name="-", metavar="BUFFER_SET", help="Folder of the buffer set, or its NAMESPACE/NAME."
@@ -115,23 +112,27 @@ class RunConfig(WorkConfig):
     policies: int | None = setting(
         None,
         metavar="N",
-        group=_POLICY,
+        group=_EXECUTION,
         help="Processes with one policy each that the workers share; default: one per worker, in "
         "its process.",
     )
     max_batch_size: int = setting(
         8,
         metavar="N",
-        group=_POLICY,
+        group=_EXECUTION,
         help="Maximum rollouts for which a shared policy acts at once.",
     )
     batch_wait_timeout_s: float = setting(
         0.01,
-        group=_POLICY,
+        group=_EXECUTION,
         help="Maximum seconds that an idle shared policy waits for a larger batch.",
     )
-    gpus_per_policy: float = setting(
-        0.0, group=_POLICY, help="Share of a GPU that Ray reserves for each shared policy."
+    policy_resources: tuple[str, ...] = setting(
+        (),
+        metavar="cpus=N,gpus=N",
+        group=_EXECUTION,
+        help="What Ray reserves for each shared policy.",
+        shown="cpus=1,gpus=0",
     )
     subgoals: str | None = setting(
         None,

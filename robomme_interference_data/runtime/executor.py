@@ -5,14 +5,15 @@ task that hangs. Pebble can, but neither retries it, nor ends the processes that
 reports where it hung.
 """
 
+import math
 import os
 import platform
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from importlib import metadata
-from typing import Any
+from typing import Any, Self
 
 from robomme_interference_data.errors import InvalidOptionError, WorkerError
 from robomme_interference_data.lazy import load_extra
@@ -20,12 +21,14 @@ from robomme_interference_data.schema.settings import setting
 
 from .process import ProcessScheduler, end_if_starting
 from .scheduler import Scheduler
+from .specs import bind_options
 from .worker import Outcome, Task, Worker, attempt
 
 __all__ = [
     "Executor",
     "Outcome",
     "Processes",
+    "Resources",
     "Serial",
     "Session",
     "Task",
@@ -35,49 +38,75 @@ __all__ = [
 ]
 
 
+_EXECUTION = "Execution"
+
+
 @dataclass(frozen=True, kw_only=True)
 class WorkersConfig:
     """Settings of the workers."""
 
-    workers: int = setting(1, help="Worker processes.", metavar="N", group="Execution")
+    workers: int = setting(1, help="Worker processes.", metavar="N", group=_EXECUTION)
     executor: str = setting(
-        "processes", help="processes (on this machine) or ray (on a cluster).", group="Execution"
+        "processes",
+        metavar="processes|ray|ray:ADDRESS",
+        help="Where workers run: on this machine, or on the Ray cluster of this machine, of the "
+        "head at HOST:PORT, or local (for this command).",
+        group=_EXECUTION,
     )
-    ray_address: str = setting(
-        "auto",
-        metavar="ADDRESS",
-        help="Address of the Ray cluster: auto, local or HOST:PORT.",
-        group="Execution",
-    )
-    cpus_per_worker: float = setting(
-        1.0, help="CPUs that Ray reserves for each worker.", group="Execution"
-    )
-    gpus_per_worker: float = setting(
-        0.0, help="Share of a GPU that Ray reserves for each worker.", group="Execution"
+    resources: tuple[str, ...] = setting(
+        (),
+        metavar="cpus=N,gpus=N",
+        help="What Ray reserves for each worker; a GPU may be shared.",
+        shown="cpus=1,gpus=0",
+        group=_EXECUTION,
     )
 
+    @property
+    def on_cluster(self) -> bool:
+        """Whether workers run on a cluster, which has resources to reserve."""
+        return self.executor != "processes"
 
-def is_share(gpus: float) -> bool:
-    """Whether Ray can reserve so much of a GPU, or so many GPUs."""
-    return 0 <= gpus < float("inf") and (gpus <= 1 or gpus % 1 == 0)
+
+@dataclass(frozen=True)
+class Resources:
+    """What Ray reserves for a process: CPUs, and GPUs or a share of one."""
+
+    cpus: float = 1.0
+    gpus: float = 0.0
+
+    @classmethod
+    def parse(cls, setting: str, texts: Sequence[str]) -> Self:
+        """Read `cpus=2` and `gpus=0.5`; `setting` is where they stand, for the message.
+
+        Raises:
+            InvalidOptionError: A resource is unknown, or its number cannot be reserved.
+        """
+        resources = cls(**bind_options(f"`{setting}`", cls, {}, texts))
+        if not 0 <= resources.cpus < math.inf:
+            raise InvalidOptionError.expected(f"`{setting}`: cpus", resources.cpus, "0 or more")
+        whole = resources.gpus <= 1 or resources.gpus % 1 == 0  # Ray shares one GPU, not several
+        if not (0 <= resources.gpus < math.inf and whole):
+            expected = "0 to 1, or a whole number"
+            raise InvalidOptionError.expected(f"`{setting}`: gpus", resources.gpus, expected)
+        return resources
 
 
 def make_executor(config: WorkersConfig) -> "Executor":
     """Return the executor that the settings describe."""
-    if config.executor == "processes":
-        for field in fields(WorkersConfig)[2:]:
-            if getattr(config, field.name) != field.default:
-                raise InvalidOptionError(
-                    f'{field.name} has no effect with executor="processes"',
-                    'Set executor="ray", or omit it.',
-                )
+    if not config.on_cluster:
+        if config.resources:
+            raise InvalidOptionError(
+                '`resources` has no effect with executor="processes"',
+                'Set executor="ray", or omit it.',
+            )
         return Processes(config.workers)
-    if config.executor != "ray":
-        raise InvalidOptionError.one_of("executor", config.executor, ("processes", "ray"))
+    name, colon, address = config.executor.partition(":")
+    if name != "ray":
+        known = ("processes", "ray", "ray:HOST:PORT", "ray:local")
+        raise InvalidOptionError.one_of("executor", config.executor, known)
+    resources = Resources.parse("resources", config.resources)
     make = load_extra(f"{__package__}.ray_cluster", "RayWorkers", 'executor="ray"', "cluster")
-    executor: Executor = make(
-        config.workers, config.ray_address, config.cpus_per_worker, config.gpus_per_worker
-    )
+    executor: Executor = make(config.workers, address if colon else "auto", resources)
     return executor
 
 

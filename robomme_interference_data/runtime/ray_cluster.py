@@ -15,7 +15,7 @@ import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import chdir, closing, contextmanager, redirect_stdout, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from robomme_interference_data.errors import InvalidOptionError, WorkerError, first_line
 
-from .executor import Executor, Session, describe, is_share
+from .executor import Executor, Resources, Session, describe
 from .process import CLOSE_S, START_S, end_if_starting
 from .safe_path import SAFE_PATH, safe_path
 from .scheduler import Scheduler
@@ -63,25 +63,19 @@ class RayWorkers(Executor):
         workers: Maximum number of workers; those that do not fit start when a node joins.
         address: `auto` for the cluster of this machine, `HOST:PORT` of its head, or `local` for a
             cluster that ends with the work.
-        cpus: CPUs that Ray reserves for each worker.
-        gpus: Share of a GPU that Ray reserves for each worker.
+        resources: What Ray reserves for each worker.
     """
 
     workers: int
     address: str = "auto"
-    cpus: float = 1.0
-    gpus: float = 0.0
+    resources: Resources = field(default_factory=Resources)
 
     def __post_init__(self) -> None:
-        is_address = re.fullmatch(r"auto|local|[^/]+:\d{1,5}", self.address)
-        for name, value, valid, expected in (
-            ("workers", self.workers, self.workers >= 1, "1 or more"),
-            ("cpus_per_worker", self.cpus, 0 <= self.cpus < float("inf"), "0 or more"),
-            ("gpus_per_worker", self.gpus, is_share(self.gpus), "0 to 1, or a whole number"),
-            ("ray_address", self.address, is_address, "auto, local or HOST:PORT"),
-        ):
-            if not valid:
-                raise InvalidOptionError.expected(name, value, expected)
+        if self.workers < 1:
+            raise InvalidOptionError.expected("workers", self.workers, "1 or more")
+        if not re.fullmatch(r"auto|local|[^/]+:\d{1,5}", self.address):
+            expected = "ray, ray:local or ray:HOST:PORT"
+            raise InvalidOptionError.expected("executor", f"ray:{self.address}", expected)
 
     @property
     def host(self) -> str:
@@ -219,10 +213,10 @@ class _RayScheduler(Scheduler[_RayWorker]):
         super().__init__(function, config.workers)
         actor: Any = WorkerActor
         dumps: Any = cloudpickle.dumps
-        options = {"num_cpus": config.cpus, "num_gpus": config.gpus, "max_restarts": 0}
-        self.make_actor = actor.options(**options).remote
+        cpus, gpus = config.resources.cpus, config.resources.gpus
+        self.make_actor = actor.options(num_cpus=cpus, num_gpus=gpus, max_restarts=0).remote
         self.arguments, self.versions = (dumps(function), str(Path.cwd())), describe(function)
-        self._needs = f"{config.cpus:g} CPUs and {config.gpus:g} GPUs"
+        self._needs = f"{cpus:g} CPUs and {gpus:g} GPUs"
 
     def start(self, number: int) -> _RayWorker:
         """Request a worker."""

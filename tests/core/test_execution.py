@@ -18,6 +18,7 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import (
     Processes,
+    Resources,
     Serial,
     Worker,
     WorkersConfig,
@@ -122,8 +123,10 @@ def test_only_files_of_the_last_attempt_count() -> None:
 
 def test_executors_by_name() -> None:
     assert make_executor(WorkersConfig(workers=3)) == Processes(3)
-    executor = make_executor(WorkersConfig(workers=8, executor="ray", gpus_per_worker=0.25))
-    assert vars(executor) == {"workers": 8, "address": "auto", "cpus": 1.0, "gpus": 0.25}
+    settings = WorkersConfig(workers=8, executor="ray:head:6379", resources=("gpus=0.25",))
+    expected = {"workers": 8, "address": "head:6379", "resources": Resources(cpus=1, gpus=0.25)}
+    assert vars(make_executor(settings)) == expected
+    assert vars(make_executor(WorkersConfig(executor="ray")))["address"] == "auto"
 
 
 @pytest.mark.parametrize(
@@ -131,10 +134,12 @@ def test_executors_by_name() -> None:
     [
         ({"executor": "rey"}, "'rey' is none of processes, ray"),
         ({"workers": 0}, "workers 0"),
-        ({"gpus_per_worker": 0.5}, 'gpus_per_worker has no effect with executor="processes"'),
-        ({"executor": "ray", "cpus_per_worker": float("nan")}, "cpus_per_worker nan"),
-        ({"executor": "ray", "gpus_per_worker": 1.5}, "gpus_per_worker 1.5"),
-        ({"executor": "ray", "ray_address": "ray://a:1x"}, "ray_address 'ray://a:1x'; expected"),
+        ({"resources": ("gpus=0.5",)}, '`resources` has no effect with executor="processes"'),
+        ({"executor": "ray", "resources": ("cpus=NaN",)}, "`resources`: cpus nan"),
+        ({"executor": "ray", "resources": ("gpus=1.5",)}, "`resources`: gpus 1.5"),
+        ({"executor": "ray", "resources": ("tpus=1",)}, "Its options: cpus, gpus."),
+        ({"executor": "ray://a:1x"}, "executor 'ray://a:1x'; expected"),
+        ({"executor": "ray:"}, "executor 'ray:'; expected"),
     ],
 )
 def test_settings_of_workers_are_checked(settings: dict[str, Any], message: str) -> None:

@@ -41,13 +41,13 @@ IDENTITY = {
 FREE = {
     WorkConfig: {
         *("families", "episodes", "conditions", "shard"),  # the plan, which may grow
-        *("workers", "executor", "ray_address", "cpus_per_worker", "gpus_per_worker"),
+        *("workers", "executor", "resources"),
         *("no_resume", "cache", "rollout_timeout_s", "max_errors", "track"),
     },
     RunConfig: {
         *("out", "robomme_python", "videos", "check_lesson", "simulator_timeout_s"),
         *("history_chunk", "serve"),
-        *("policies", "max_batch_size", "batch_wait_timeout_s", "gpus_per_policy"),
+        *("policies", "max_batch_size", "batch_wait_timeout_s", "policy_resources"),
     },
     AskConfig: {"out"},
 }

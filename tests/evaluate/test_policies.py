@@ -203,9 +203,8 @@ def test_simulators_of_the_package_declare_which_episodes_they_play(name: str) -
 def test_no_check_compares_the_name_of_a_kind() -> None:
     folder = Path(evaluate.__file__).parent
     names = {*POLICIES.kinds, *SIMULATORS}
-    for path in (
-        one for room in ("policies", "rollout", "run") for one in folder.glob(f"{room}/*.py")
-    ):
+    rooms = ("policies", "rollout", "run")
+    for path in [path for room in rooms for path in (folder / room).glob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.Compare):
                 texts = {one.value for one in ast.walk(node) if isinstance(one, ast.Constant)}

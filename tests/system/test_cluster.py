@@ -57,7 +57,7 @@ def driver(
     """The command, as a user runs it."""
     words = f"evaluate {GOLDEN} {policy} --simulator {runs.WORLD} --system mine"
     words += " --families VideoRepick,MoveCube"
-    words += f" --executor ray --ray-address {address} --json"
+    words += f" --executor ray:{address} --json"
     command = [sys.executable, "-m", "robomme_interference_data.cli.main", *words.split()]
     return subprocess.Popen(
         [*command, "--out", str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -157,7 +157,11 @@ def test_a_node_that_differs_is_one_error_that_says_how(cluster: Any) -> None:
     node = ray_cluster.add_node(cluster, cpus=2, MARK="other")
     try:
         with pytest.raises(WorkerError, match=r"node .*: mark is other there, none here"):
-            list(ray_workers.RayWorkers(1, cluster.address, cpus=2).run(Marked(), [7]))
+            list(
+                ray_workers.RayWorkers(1, cluster.address, ray_workers.Resources(cpus=2)).run(
+                    Marked(), [7]
+                )
+            )
     finally:
         cluster.remove_node(node, allow_graceful=False)
 
@@ -205,7 +209,9 @@ def test_a_build_has_the_bytes_of_one_process(cluster: Any, tmp_path: Path) -> N
 
 def test_processors_that_no_node_has_are_waited_for(cluster: Any) -> None:
     """A worker begins when a node with room for it joins."""
-    work = ray_workers.RayWorkers(1, cluster.address, cpus=2).run(behave, [("value", 7)])
+    work = ray_workers.RayWorkers(1, cluster.address, ray_workers.Resources(cpus=2)).run(
+        behave, [("value", 7)]
+    )
     node = None
     try:
         node = ray_cluster.add_node(cluster, cpus=2)

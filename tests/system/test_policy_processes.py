@@ -105,8 +105,11 @@ def test_a_policy_that_cannot_be_loaded_is_one_error(
         ({"max_batch_size": 0}, "max_batch_size 0; expected 1 or more"),
         ({"batch_wait_timeout_s": -1.0}, "batch_wait_timeout_s -1.0; expected 0 or more"),
         ({"policies": None, "max_batch_size": 2}, "`max_batch_size` has no effect"),
-        ({"gpus_per_policy": 0.5}, "`gpus_per_policy` has no effect on policies on this machine"),
-        ({"executor": "ray", "gpus_per_policy": 1.5}, "gpus_per_policy 1.5; expected 0 to 1, or"),
+        (
+            {"policy_resources": ("gpus=0.5",)},
+            "`policy_resources` has no effect on policies on this",
+        ),
+        ({"executor": "ray", "policy_resources": ("gpus=1.5",)}, "`policy_resources`: gpus 1.5"),
     ],
 )
 def test_what_cannot_be_shared_is_an_error(
