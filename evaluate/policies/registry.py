@@ -22,6 +22,9 @@ from .policy import Policy
 BUILTINS = ("replay", "recall", "oracle", "guess", "follow-subgoals", "noop", "hold", "mean")
 """Policies without learned weights."""
 
+REFERENCES = ("recall", "oracle", "guess", "follow-subgoals", "noop", "hold", "mean")
+"""Policies whose results are bounds: with the answer, by chance, or without motion."""
+
 _SERVER = r"(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):[0-9]{1,5}"
 
 
@@ -102,6 +105,12 @@ def server_addresses(text: str) -> tuple[tuple[str, int], ...]:
     """Return host and port of each server that a policy names, in order."""
     spec = POLICIES.parse(text)
     return _addresses(spec.target) if spec.kind in ("websocket", "vla-eval") else ()
+
+
+def policy_memory(text: str) -> str | None:
+    """Return the rule by which a policy keeps frames, `framesamp:32`; None if it declares none."""
+    memory = POLICIES.parse(text).given.get("memory")
+    return None if memory is None else str(Memory.parse(memory))
 
 
 def starts_server(text: str) -> bool:
