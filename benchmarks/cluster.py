@@ -33,6 +33,7 @@ from robomme_interference_data.evaluate.run.kind import Run
 from robomme_interference_data.evaluate.run.log import open_log
 from robomme_interference_data.evaluate.run.plan import WorkItem, shuffle_work
 from robomme_interference_data.evaluate.run.progress import RunProgress
+from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Processes
 from robomme_interference_data.runtime.ray_cluster import RayWorkers
@@ -64,7 +65,7 @@ def drive(rollouts: int, workers: int) -> list[str]:
         RunProgress() as shown,
     ):
         shown.start(todo, [])
-        task = Nothing(Run(config, "noop", "none", "none"))
+        task = Nothing(Run(config, "noop", SystemFacts(), "none", "none"))
         memory: list[int] = []
         with closing(RayWorkers(workers, "local").run(task, todo)) as outcomes:
             next(outcomes)

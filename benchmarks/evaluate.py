@@ -24,10 +24,12 @@ from robomme_interference_data.evaluate.policies.policy import Policy, RolloutIn
 from robomme_interference_data.evaluate.rollout.rollout import run_rollout
 from robomme_interference_data.evaluate.run.kind import Run
 from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.evaluate.run.row import Rollout
+from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Executor
 from robomme_interference_data.schema.conditions import NO_HISTORY
-from robomme_interference_data.schema.rollouts import Rollout, Status
+from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.base import Observation
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
 
@@ -123,7 +125,7 @@ def overhead(
     actions = oracle_actions(episode, simulator)
     policy = Recorded(actions)
     config = RunConfig("python:recorded", Path(buffer_set.location), Path("nowhere"))
-    run = Run(config, "recorded", buffer_set.name, buffer_set.revision)
+    run = Run(config, "recorded", SystemFacts(), buffer_set.name, buffer_set.revision)
 
     def bare() -> None:
         simulator.reset(str(episode), demonstration=False)

@@ -3,8 +3,9 @@
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.kind import Run
 from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.runtime.executor import Worker
-from robomme_interference_data.schema.rollouts import Rollout, Status
+from robomme_interference_data.schema.rollouts import Status
 
 
 class Nothing:

@@ -10,6 +10,7 @@ from typing import Any
 from robomme_interference_data.constants import PROTOCOL_VERSION, RUN_HEADER, RUN_RECORD, RUN_TABLES
 from robomme_interference_data.errors import InvalidOptionError, PublishError, counted
 from robomme_interference_data.evaluate.run.log import RunHeader, read_record
+from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.score.comparisons import offline as offline_tables
 from robomme_interference_data.evaluate.score.config import Expected, Settings
 from robomme_interference_data.evaluate.score.outcomes import STATUSES
@@ -21,7 +22,7 @@ from robomme_interference_data.evaluate.score.tables.cells import Coverage
 from robomme_interference_data.evaluate.score.writing import write_score
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.schema.codec import to_dict
-from robomme_interference_data.schema.rollouts import TIMING_COLUMNS, Rollout, Status
+from robomme_interference_data.schema.rollouts import TIMING_COLUMNS, Status
 from robomme_interference_data.simulators.registry import RECORDINGS
 from robomme_interference_data.storage.files import digest_json, sha256_file
 from robomme_interference_data.viz.figure import open_figure, save_figure

@@ -1,24 +1,73 @@
-"""The systems of the paper, and the benchmark's own controls, as data.
+"""What a system is, as columns of its rows; and the systems that are known by name.
 
-A system is a policy together with its memory mechanism. Its name labels the rows of a run; a name
-of this table implies the conditions and limits in it.
+A system is a policy together with its memory mechanism. Its name is only the label of its rows:
+`SystemFacts` are columns of the rows, and scores are paired by them. Rows of others may have a name
+alone: `SYSTEMS` is the one table that maps names to facts.
 """
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
+from typing import Annotated
 
 from robomme_interference_data.constants import MAX_STEPS, POSITION_LIMIT
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError
 from robomme_interference_data.schema.conditions import NO_HISTORY
-from robomme_interference_data.schema.sampling import Memory
+from robomme_interference_data.schema.subgoal import ORACLE
 
 _FREE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
+@dataclass(frozen=True, kw_only=True)
+class SystemFacts:
+    """What a system is. Systems that agree in all facts but one differ in that one alone."""
+
+    policy: Annotated[
+        str | None,
+        "Kind of the policy, such as `replay` or `websocket`; for questions, of the model. None if "
+        "unknown.",
+    ] = None
+    policy_id: Annotated[
+        str | None,
+        "What identifies the policy among those of its kind: a digest of its options, metadata and "
+        "files, without where it runs. Of published rows a name. None if unknown.",
+    ] = None
+    memory: Annotated[
+        str | None,
+        "Rule by which the memory keeps frames, `full`, `framesamp:32` or `window:32`; None if "
+        "unknown, or if it keeps no frames.",
+    ] = None
+    retrieval: Annotated[
+        str | None,
+        "Encoder, camera if it is not `front`, and rule of the retrieval step, such as "
+        "`siglip@wrist/max/0.923`; None without one.",
+    ] = None
+    subgoals: Annotated[
+        str | None,
+        "What writes the policy's subgoals: `oracle`, `oracle in words`, or kind of the model and "
+        "digest of model, prompt and options; None without subgoals.",
+    ] = None
+    reads_history: Annotated[
+        bool, "Whether it reads the history; if not, only `no-history` applies."
+    ] = True
+    reference: Annotated[
+        bool,
+        "Whether it is only a reference, which is never ranked: with the answer, with what a "
+        "memory shows of it, by chance, or without motion.",
+    ] = False
+
+    def applies(self, condition: str) -> bool:
+        """Whether a condition applies: a retrieval step needs a history."""
+        return self.retrieval is None if condition == NO_HISTORY else self.reads_history
+
+
+FACT_COLUMNS = tuple(field.name for field in fields(SystemFacts))
+"""Names of the columns of `SystemFacts`."""
+
+
 @dataclass(frozen=True)
 class System:
-    """One system.
+    """A system that is known by name, or one with a new name.
 
     Attributes:
         name: Name in rows, options and file names.
@@ -26,62 +75,68 @@ class System:
         representation: Content of the memory, such as `frames` or `tokens`; `none` without memory.
         integration: How the memory enters the policy: `modulator`, `context`, `expert`,
             `subgoals`, or None.
-        with_history: Whether conditions other than `no-history` apply.
-        subgoals: Output of a vision-language model in front of the policy: `simple_subgoal`,
-            `grounded_subgoal`, or None without a model.
-        retrieval: Whether a retrieval step selects what the memory gets.
-        step: Changes of that step from the paper's, in the name of a control, such as `joined`.
-        sampling: Spelling of the `Memory` by which it keeps frames; None if unknown, or if it
-            keeps none.
+        facts: The facts of rows that have nothing but this name.
+        base: Name of the published system without the retrieval step; None without one.
         position_limit: Maximum history and live frames together in memory; None: no limit.
         paper: Whether the paper reports it.
-        reference: Whether it is a reference only: with the answer, with what a memory shows of it,
-            by chance, or without motion. Such a system is never ranked.
     """
 
     name: str
     display: str
     representation: str
     integration: str | None = None
-    with_history: bool = True
-    subgoals: str | None = None
-    retrieval: bool = False
-    step: str = ""
-    sampling: str | None = None
+    facts: SystemFacts = SystemFacts()
+    base: str | None = None
     position_limit: int | None = None
     paper: bool = False
-    reference: bool = False
 
     @property
     def keeps_frames(self) -> bool | None:
         """Whether its released server keeps frames; None if no server was released."""
         return self.position_limit is not None if self.paper else None
 
-    def applies(self, condition: str) -> bool:
-        """Whether a condition applies: retrieval needs a history, a system without memory none."""
-        return not self.retrieval if condition == NO_HISTORY else self.with_history
-
 
 def _released(
-    name: str, display: str, memory: str, integration: str, *, retrieval: bool = False
+    name: str,
+    display: str,
+    representation: str,
+    integration: str,
+    *,
+    base: str | None = None,
+    retrieval: str | None = None,
 ) -> System:
     """A system whose server keeps frames, with an embedding for each of 4096 positions."""
     return System(
-        *(name, display, memory, integration),
-        retrieval=retrieval,
+        name,
+        display,
+        representation,
+        integration,
+        facts=SystemFacts(
+            policy="websocket",
+            policy_id=base or name,
+            memory="framesamp:32" if representation == "frames" else None,
+            retrieval=retrieval,
+        ),
+        base=base,
         position_limit=POSITION_LIMIT,
         paper=True,
-        sampling="framesamp" if memory == "frames" else None,
     )
 
 
-def _symbolic(name: str, display: str, memory: str, subgoals: str) -> System:
+def _symbolic(name: str, display: str, representation: str, subgoals: str) -> System:
     """A system whose server has no memory: the model in front of it reads the history."""
-    return System(name, display, memory, "subgoals", subgoals=subgoals, paper=True)
+    facts = SystemFacts(policy="websocket", policy_id=name, subgoals=subgoals)
+    return System(name, display, representation, "subgoals", facts=facts, paper=True)
 
 
 PAPER_SYSTEMS: tuple[System, ...] = (
-    System("pi05_baseline", "π0.5 (baseline)", "none", with_history=False, paper=True),
+    System(
+        "pi05_baseline",
+        "π0.5 (baseline)",
+        "none",
+        facts=SystemFacts(policy="websocket", policy_id="pi05_baseline", reads_history=False),
+        paper=True,
+    ),
     _released("perceptual-framesamp-modul", "FrameSamp-Modul", "frames", "modulator"),
     _released("perceptual-tokendrop-modul", "TokenDrop-Modul", "tokens", "modulator"),
     _released("perceptual-framesamp-context", "FrameSamp-Context", "frames", "context"),
@@ -94,80 +149,84 @@ PAPER_SYSTEMS: tuple[System, ...] = (
     _symbolic("symbolic-groundsg", "GroundSG", "text with points", "grounded_subgoal"),
     _symbolic("memer", "MemER", "text with points and key frames", "grounded_subgoal"),
     _released(
-        *("retrieval-framesamp-modul", "Retrieval-FrameSamp-Modul"),
-        *("frames", "modulator"),
-        retrieval=True,
+        "retrieval-framesamp-modul",
+        "Retrieval-FrameSamp-Modul",
+        "frames",
+        "modulator",
+        base="perceptual-framesamp-modul",
+        retrieval="siglip-so400m/visual-episodic-absthr",
     ),
 )
 """The twelve systems of the paper's main table in its order, then the one with retrieval."""
 
-_KEPT = {"Full": "all frames", "FrameSamp": "frames", "Window": "last frames"}
 
-
-def _control(kind: str, *, retrieval: bool, reference: bool = False) -> tuple[System, ...]:
-    """A control with each memory rule."""
-    name = f"Retrieval-{kind}" if retrieval else kind
-    return tuple(
-        System(
-            *(f"{name}-{rule}".lower(), f"{name}-{rule}", frames),
-            retrieval=retrieval,
-            sampling=rule.lower(),
-            reference=reference,
-        )
-        for rule, frames in _KEPT.items()
+def _without_memory(
+    policy: str, subgoals: str | None = None, *, label: str = "", reads_history: bool = True
+) -> System:
+    """A reference without a memory of its own."""
+    facts = SystemFacts(
+        policy=policy,
+        policy_id=policy,
+        subgoals=subgoals,
+        reads_history=reads_history,
+        reference=True,
     )
+    label = label or policy
+    return System(label, label.title(), "none", facts=facts)
+
+
+_MEMORIES = {
+    "Full": ("full", "all frames"),
+    "FrameSamp": ("framesamp:32", "frames"),
+    "Window": ("window:32", "last frames"),
+}
+
+
+def _with_memory(
+    display: str, policy: str, rule: str, *, option: str = "", retrieval: bool = False
+) -> System:
+    """A built-in policy, or the ideal observer of questions, with a memory."""
+    memory, representation = _MEMORIES[rule]
+    display = "-".join(filter(None, (display, rule, option.title())))
+    facts = SystemFacts(
+        policy=policy,
+        policy_id=f"{policy} {option}".strip(),
+        memory=memory,
+        retrieval="thumbnail/max/adaptive" if retrieval else None,
+        reference=policy == "recall",
+    )
+    return System(display.lower(), display, representation, facts=facts)
+
+
+def _with_memories(display: str, policy: str, *, retrieval: bool = False) -> list[System]:
+    """The same with each memory."""
+    return [_with_memory(display, policy, rule, retrieval=retrieval) for rule in _MEMORIES]
 
 
 _CONTROLS = (
-    *(
-        System(name.lower(), name, "none", reference=True)
-        for name in (
-            *("Oracle", "Guess", "Noop"),
-            *("Follow-Subgoals", "Follow-Subgoals-Oracle", "Follow-Subgoals-Oracle-Simple"),
-        )
-    ),
-    *_control("Replay", retrieval=False),
-    *_control("Replay", retrieval=True),
-    *_control("Recall", retrieval=False, reference=True),
-    *_control("Recall", retrieval=True, reference=True),
-    System("questions-guess", "Questions-Guess", "none", reference=True),
-    System(
-        *("retrieval-questions-guess", "Retrieval-Questions-Guess", "none"),
-        retrieval=True,
-        reference=True,
-    ),
-    *_control("Questions-Recall", retrieval=False, reference=True),
-    *_control("Questions-Recall", retrieval=True, reference=True),
+    _without_memory("oracle"),
+    _without_memory("guess"),
+    _without_memory("noop"),
+    _without_memory("follow-subgoals"),
+    _without_memory("follow-subgoals", ORACLE, label="follow-subgoals-oracle"),
+    _without_memory("follow-subgoals", f"{ORACLE} in words", label="follow-subgoals-oracle-simple"),
+    *_with_memories("Replay", "replay"),
+    *_with_memories("Retrieval-Replay", "replay", retrieval=True),
+    *_with_memories("Recall", "recall"),
+    *_with_memories("Retrieval-Recall", "recall", retrieval=True),
+    _without_memory("guess", label="questions-guess"),
+    *_with_memories("Questions-Recall", "recall"),
+    *_with_memories("Retrieval-Questions-Recall", "recall", retrieval=True),
     # Baselines along recordings.
-    System("hold", "Hold", "none", with_history=False, reference=True),
-    System("mean", "Mean", "none", with_history=False, reference=True),
+    _without_memory("hold", reads_history=False),
+    _without_memory("mean", reads_history=False),
+    # Rows of these are published in docs/results, in the layout of the released ones.
+    _with_memory("Replay", "replay", "FrameSamp", option="extrapolate"),
+    _with_memory("Retrieval-Replay", "replay", "FrameSamp", option="extrapolate", retrieval=True),
 )
-
-_SIZE = re.compile(r"(?:(?<=-framesamp)|(?<=-window))[0-9]+")
-"""The size of a memory in the name of a control, as in `replay-window8`; see `Memory.label`."""
 
 SYSTEMS: dict[str, System] = {system.name: system for system in (*PAPER_SYSTEMS, *_CONTROLS)}
 """Name to system: the paper's, then the built-in policies. The order is that of tables."""
-
-
-def known_system(name: str) -> System | None:
-    """Return a system of the table, or a control with another memory or retrieval step; else None.
-
-    The change follows the control's name, as in `retrieval-replay-window8-joined`.
-    """
-    size = _SIZE.search(name)
-    if size is not None:
-        usual = known_system(_SIZE.sub("", name, count=1))
-        if usual is None or usual.sampling is None or usual.paper:
-            return None
-        display = f"{usual.display} ({size.group()} frames)"
-        sampling = f"{usual.sampling}:{size.group()}"
-        return replace(usual, name=name, display=display, sampling=sampling)
-    for control in _CONTROLS:
-        step = name.removeprefix(f"{control.name}-")
-        if control.retrieval and step != name:
-            return replace(control, name=name, display=f"{control.display} ({step})", step=step)
-    return SYSTEMS.get(name)
 
 
 def name_system(name: str) -> System:
@@ -177,34 +236,17 @@ def name_system(name: str) -> System:
             f"{name!r} is not the name of a system",
             "Expected up to 64 letters, digits, '.', '_' and '-', such as my-memory.",
         )
-    return known_system(name) or System(name, name, "own")
+    return SYSTEMS.get(name) or System(name, name, "own")
 
 
 def display_name(name: str) -> str:
     """Return the name for tables and figures; a new name stays unchanged."""
-    known = known_system(name)
-    return name if known is None else known.display
+    return SYSTEMS[name].display if name in SYSTEMS else name
 
 
-def base_of(name: str) -> str | None:
-    """Return the system without the retrieval step; None for one that has none."""
-    known = known_system(name)
-    if known is None or not known.retrieval:
-        return None
-    if _SIZE.search(name) and known.sampling is not None:
-        usual, memory = base_of(_SIZE.sub("", name, count=1)), Memory.parse(known.sampling)
-        return usual and usual.replace(memory.rule, memory.label)
-    plain = name.removeprefix("retrieval-")
-    base = next((one for one in SYSTEMS if plain.startswith(one)), f"perceptual-{plain}")
-    # An option of the policy, which it has without retrieval too.
-    option = "-extrapolate"
-    return base + option * plain.startswith(base + option)
-
-
-def is_reference(name: str) -> bool:
-    """Whether a system is only a reference, see `System.reference`; a new one never is."""
-    known = known_system(name)
-    return known is not None and known.reference
+def published_base(name: str) -> str | None:
+    """Return the published system that a published system has a retrieval step in front of."""
+    return SYSTEMS[name].base if name in SYSTEMS else None
 
 
 def check_history(system: System, frames: Mapping[str, int]) -> None:

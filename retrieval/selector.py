@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.data.buffer_set import BufferSet
+from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.embeddings import BufferSetIndex, index_folder
 from robomme_interference_data.data.views import live_embedding
 from robomme_interference_data.errors import InvalidOptionError
@@ -31,9 +32,9 @@ class RetrievalStep:
         self.rule = Rule.parse(rule, published_threshold(self.encoder))
         self.camera = camera
 
-    def label(self, buffer: Buffer) -> str:
-        """Return index and rule, such as `siglip/max/0.923`, for buffers like this one."""
-        camera = buffer.query.dataset.camera(self.camera)
+    def label(self, dataset: Dataset) -> str:
+        """Return index and rule, such as `siglip/max/0.923`, for histories from a dataset."""
+        camera = dataset.camera(self.camera)
         return f"{PurePath(index_folder(self.encoder, camera)).name}/{self.rule}"
 
     def _chosen(self, buffer: Buffer, query: NDArray[np.floating]) -> NDArray[np.int64]:

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from .data.loading import load_buffer, load_buffer_set
     from .data.query import Query
     from .errors import InterferenceError
+    from .evaluate.run.row import Rollout
     from .ids import EpisodeId
     from .schema.conditions import Condition
     from .schema.manifest import BufferManifest, Session, SessionEntry
     from .schema.records import EpisodeRecord
-    from .schema.rollouts import Rollout
     from .storage.cache import DecodedCache
 
 __all__ = [
@@ -61,7 +61,7 @@ __getattr__ = lazy_exports(
         ".schema.conditions": "Condition",
         ".schema.records": "EpisodeRecord",
         ".schema.manifest": "BufferManifest Session SessionEntry",
-        ".schema.rollouts": "Rollout",
+        ".evaluate.run.row": "Rollout",
         ".errors": "InterferenceError",
     },
 )

@@ -32,7 +32,7 @@ ROWS = {
     "Episodes: `meta/interference.parquet` of a dataset": "schema.records:EpisodeRecord",
     "Evidence spans of an episode": "schema.records:EvidenceSpan",
     "Identity of a dataset: `meta/interference.json`": "schema.records:DatasetIdentity",
-    "Rollouts: `rollouts.jsonl`, `.csv`, `.parquet`": "schema.rollouts:Rollout",
+    "Rollouts: `rollouts.jsonl`, `.csv`, `.parquet`": "evaluate.run.row:Rollout",
     "Questions: `questions.parquet`": "data.questions:Question",
 }
 """Titles of tables and files to the dataclass that declares them."""

@@ -18,9 +18,9 @@ from robomme_interference_data.evaluate.run.config import (
     nothing_to_retrieve,
     with_retrieval,
 )
-from robomme_interference_data.evaluate.run.kind import Run, RunKind
+from robomme_interference_data.evaluate.run.kind import Run, RunKind, retrieval_text, short_digest
 from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
-from robomme_interference_data.evaluate.systems import known_system, name_system
+from robomme_interference_data.evaluate.systems import SYSTEMS, SystemFacts, name_system
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.simulators.registry import recorded_scene
@@ -47,6 +47,17 @@ class Questions(RunKind[AskConfig]):
         if config.model not in OWN:
             with closing(ModelResponder(config)) as responder:
                 self.metadata, self._images = responder.metadata(), responder.images
+
+    def facts(self) -> SystemFacts:
+        """Return what the system is: the model, and what it sees of the past."""
+        config, own = self.config, self.config.model in OWN
+        return SystemFacts(
+            policy=config.model if own else MODELS.parse(config.model).kind,
+            policy_id=short_digest({"model": self._model_identity(), "control": config.control}),
+            memory=None if config.model == "guess" else config.memory,
+            retrieval=retrieval_text(config, self.buffer_set),
+            reference=own,
+        )
 
     def refusal(self, condition: str) -> InterferenceError | None:
         """Return why a condition does not apply, or None."""
@@ -83,16 +94,20 @@ class Questions(RunKind[AskConfig]):
 
     def identity(self, plan: Plan) -> dict[str, Any]:
         """Return what of questions and model can change an answer."""
-        config, model = self.config, self.metadata
-        if config.model not in OWN:
-            model = model_identity(config.model, config.model_options, model["model"])
-            model["prompt_sha256"] = self.metadata["prompt_sha256"]
+        config = self.config
         return {
             "memory": str(self.memory),
             "control": config.control,
-            "model": model,
+            "model": self._model_identity(),
             "questions": digest_questions(self._questions.values()),
         }
+
+    def _model_identity(self) -> dict[str, Any]:
+        config = self.config
+        if config.model in OWN:
+            return self.metadata
+        model = model_identity(config.model, config.model_options, self.metadata["model"])
+        return model | {"prompt_sha256": self.metadata["prompt_sha256"]}
 
 
 def _check_settings(config: AskConfig) -> None:
@@ -129,7 +144,7 @@ def _name(config: AskConfig) -> str:
             "Set `system`, such as qwen3-vl-4b, or qwen3-vl-4b-blank for a control.",
         )
     name_system(name)
-    if name != default and known_system(name) is not None:
+    if name != default and name in SYSTEMS:
         raise InvalidOptionError(
             f"{name} is the name of another system than {config.model}",
             "Set `system` to a name of your own.",

@@ -8,19 +8,15 @@ from typing import Any
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.data.questions import Question, digest_questions, read_questions
 from robomme_interference_data.evaluate.run.config import AskConfig
-from robomme_interference_data.evaluate.run.kind import (
-    Job,
-    Run,
-    RunTask,
-    history_columns,
-    model_columns,
-)
+from robomme_interference_data.evaluate.run.kind import Job, Run, RunTask, history_columns
+from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.evidence import known_parts
-from robomme_interference_data.schema.rollouts import Rollout, Status
+from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.sampling import Memory
 
+from .columns import model_columns
 from .responders import OWN, ModelResponder, Prompted
 from .subgoal_writer import History
 
@@ -84,7 +80,7 @@ class AskTask(RunTask[AskConfig]):
             difficulty=query.difficulty,
             goal=query.goal,
             steps=0,
-            **history_columns(buffer, given, self.selector, memory),
+            **history_columns(buffer, given, memory, retrieved=self.selector is not None),
             answer=letter,
             chance=question.chance,
             **columns,

@@ -16,9 +16,6 @@ from robomme_interference_data.simulators.base import Observation, Simulator
 
 from .model import Video
 
-ORACLE = "oracle"
-"""Name of the writer that reads the simulator."""
-
 
 class History:
     """The history frames that a policy gets, of the first camera; decoded on request."""

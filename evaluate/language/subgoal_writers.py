@@ -7,14 +7,17 @@ from dataclasses import replace
 from typing import Any
 
 from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.evaluate.policies.registry import policy_options
 from robomme_interference_data.evaluate.run.config import RunConfig
+from robomme_interference_data.evaluate.run.kind import short_digest
 from robomme_interference_data.runtime.specs import bind_options
+from robomme_interference_data.schema.subgoal import ORACLE
 
 from .model_writer import ModelWriter
 from .models import MODELS, model_identity
 from .published_prompts import PUBLISHED, load_published
 from .subgoal_prompt import DEFAULT_PROMPT
-from .subgoal_writer import ORACLE, OracleWriter, SubgoalWriter
+from .subgoal_writer import OracleWriter, SubgoalWriter
 
 _WRITER_OPTIONS = [
     one.name
@@ -80,6 +83,17 @@ def subgoals_identity(config: RunConfig, metadata: Mapping[str, Any]) -> Any:
     writer = metadata["subgoals"]
     model = model_identity(str(config.subgoals), model_options, writer["model"])
     return model | {"prompt_sha256": writer["prompt_sha256"]} | writer_options
+
+
+def subgoals_text(config: RunConfig, metadata: Mapping[str, Any]) -> str | None:
+    """Return what writes subgoals as `SystemFacts` have it; see `subgoals_identity`."""
+    if config.subgoals is None:
+        return None
+    if config.subgoals == ORACLE:
+        points = policy_options(config.policy, config.policy_options).get("points", True)
+        return ORACLE if points else f"{ORACLE} in words"
+    kind = MODELS.parse(config.subgoals).kind
+    return f"{kind} {short_digest(subgoals_identity(config, metadata))}"
 
 
 def _split(config: RunConfig) -> tuple[dict[str, Any], Sequence[str]]:

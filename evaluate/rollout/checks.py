@@ -8,7 +8,6 @@ from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, EXECUTIO
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import InterferenceError, InvalidOptionError, UnknownNameError
-from robomme_interference_data.evaluate.language.subgoal_writer import ORACLE
 from robomme_interference_data.evaluate.policies.capabilities import PolicyKind, Role
 from robomme_interference_data.evaluate.policies.policy import BATCH_METHODS, Policy
 from robomme_interference_data.evaluate.policies.registry import (
@@ -25,16 +24,17 @@ from robomme_interference_data.evaluate.run.config import (
 )
 from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
 from robomme_interference_data.evaluate.systems import (
+    SYSTEMS,
     System,
-    base_of,
+    SystemFacts,
     check_history,
-    known_system,
     name_system,
 )
 from robomme_interference_data.retrieval.select import Rule
 from robomme_interference_data.runtime.executor import Resources
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.sampling import Memory
+from robomme_interference_data.schema.subgoal import ORACLE
 from robomme_interference_data.simulators.registry import (
     RECORDINGS,
     SIMULATORS,
@@ -202,7 +202,7 @@ def _check_name(config: RunConfig, system: System) -> None:
     kind, retrieval = policy_kind(config.policy), config.retrieval is not None
     fault = None
     if not system.paper:
-        if known_system(system.name) is not None and (
+        if system.name in SYSTEMS and (
             kind.role not in (Role.CONTROL, Role.REFERENCE) or default_system(config) != system.name
         ):
             fault = f"the policy {config.policy} is not the control {system.name}"
@@ -210,13 +210,16 @@ def _check_name(config: RunConfig, system: System) -> None:
     elif not kind.published:
         fault = f"the policy {config.policy} is not the paper's system {system.name}"
     # Code of the user may write the subgoals itself.
-    elif (system.subgoals is None) is (config.subgoals is not None) and kind.role is not Role.OWN:
-        needs = "no subgoals" if system.subgoals is None else "subgoals of a model (`subgoals`)"
+    elif (system.facts.subgoals is None) is (
+        config.subgoals is not None
+    ) and kind.role is not Role.OWN:
+        acts_on_none = system.facts.subgoals is None
+        needs = "no subgoals" if acts_on_none else "subgoals of a model (`subgoals`)"
         fault = f"system {system.name} acts on {needs}, and `subgoals` is {config.subgoals}"
     elif config.subgoals == ORACLE:
         fault = f"system {system.name} has subgoals of a model, and {ORACLE} knows the answer"
-    elif system.retrieval != retrieval:
-        expected = "a" if system.retrieval else "no"
+    elif (system.facts.retrieval is not None) != retrieval:
+        expected = "a" if system.facts.retrieval else "no"
         fault = f"system {system.name} has {expected} retrieval step, and `retrieval` is "
         fault += str(config.retrieval)
     elif retrieval and Rule.parse(config.retrieval_rule).method != "max":
@@ -284,19 +287,15 @@ def check_plan(
         check_history(system, longest)
 
 
-def condition_refusal(
-    system: System, reads_history: bool, condition: str
-) -> InterferenceError | None:
-    """Return why a condition does not apply, or None."""
-    if condition != NO_HISTORY and not (system.with_history and reads_history):
-        subject = "the policy" if system.with_history else system.name
-        return InvalidOptionError(
-            f"{subject} takes no history, so {condition} has no effect",
-            f"Set `conditions` to {NO_HISTORY}.",
-        )
-    if not system.applies(condition):
+def condition_refusal(facts: SystemFacts, condition: str) -> InterferenceError | None:
+    """Return why a condition does not apply to a system, or None."""
+    if facts.applies(condition):
+        return None
+    if condition == NO_HISTORY:
         return nothing_to_retrieve(
-            f"Run {base_of(system.name)} under {NO_HISTORY}: without history, {system.name} is "
-            "the same system."
+            f"Run {NO_HISTORY} without `retrieval`: without history, it is the same system."
         )
-    return None
+    return InvalidOptionError(
+        f"the system takes no history, so {condition} has no effect",
+        f"Set `conditions` to {NO_HISTORY}.",
+    )

@@ -15,14 +15,15 @@ from robomme_interference_data.errors import (
     PolicyServerError,
     SimulatorCrashError,
 )
-from robomme_interference_data.evaluate.language.subgoal_writer import ORACLE
 from robomme_interference_data.evaluate.language.subgoal_writers import (
     describe_subgoals,
     pin_subgoals,
     subgoals_identity,
+    subgoals_text,
     with_published,
 )
 from robomme_interference_data.evaluate.policies.answers import Answers, read_answers
+from robomme_interference_data.evaluate.policies.capabilities import Role
 from robomme_interference_data.evaluate.policies.identity import (
     check_memory_kind,
     check_metadata,
@@ -34,15 +35,17 @@ from robomme_interference_data.evaluate.policies.identity import (
 from robomme_interference_data.evaluate.policies.registry import (
     POLICIES,
     policy_kind,
+    policy_memory,
     policy_options,
     with_server,
 )
 from robomme_interference_data.evaluate.policies.sockets import Address
 from robomme_interference_data.evaluate.run.config import RunConfig, check_unused
-from robomme_interference_data.evaluate.run.kind import Run, RunKind
+from robomme_interference_data.evaluate.run.kind import Run, RunKind, retrieval_text, short_digest
 from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
-from robomme_interference_data.evaluate.systems import name_system
+from robomme_interference_data.evaluate.systems import SystemFacts, name_system
 from robomme_interference_data.runtime.executor import Session
+from robomme_interference_data.schema.subgoal import ORACLE
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.registry import (
     RECORDINGS,
@@ -84,11 +87,26 @@ class Rollouts(RunKind[RunConfig]):
         self.metadata = self._policy_metadata | self._subgoal_metadata
         self.versions = simulator_versions(config.simulator, config.robomme_python)
 
+    def facts(self) -> SystemFacts:
+        """Return what the system is."""
+        config, spec = self.config, POLICIES.parse(self.config.policy)
+        published = self._system.facts if self._system.paper else SystemFacts()
+        return SystemFacts(
+            policy=spec.kind,
+            policy_id=short_digest(self._policy_identity()),
+            memory=policy_memory(config.policy) or published.memory,
+            retrieval=retrieval_text(config, self.buffer_set),
+            subgoals=subgoals_text(config, self._subgoal_metadata),
+            # A policy without memory may have a subgoal writer that reads the history.
+            reads_history=published.reads_history
+            and (self._policy.wants_history or config.subgoals is not None),
+            reference=config.subgoals == ORACLE
+            or (policy_kind(config.policy).role is Role.REFERENCE and config.subgoals is None),
+        )
+
     def refusal(self, condition: str) -> InterferenceError | None:
         """Return why a condition does not apply to the system and its policy, or None."""
-        # A policy without memory may have a subgoal writer that reads the history.
-        reads = self._policy.wants_history or self.config.subgoals is not None
-        return condition_refusal(self._system, reads, condition)
+        return condition_refusal(self.facts(), condition)
 
     def check(self, plan: Plan, items: Sequence[WorkItem]) -> None:
         """Check every rollout."""
@@ -140,8 +158,12 @@ class Rollouts(RunKind[RunConfig]):
         return {
             "simulator_version": dict(self.versions),
             "subgoals": subgoals_identity(config, self._subgoal_metadata),
-            **policy_identity(config.policy, config.policy_options, self._policy_metadata),
+            **self._policy_identity(),
         }
+
+    def _policy_identity(self) -> dict[str, Any]:
+        config = self.config
+        return policy_identity(config.policy, config.policy_options, self._policy_metadata)
 
 
 _UNUSED = ("simulator", "shift", "check_lesson", "videos")

@@ -15,16 +15,18 @@ from robomme_interference_data.constants import ACTION_CHUNK, MAX_STEPS
 from robomme_interference_data.data.buffer import Buffer, Chunk
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import InvalidOptionError, PolicyError, RunError
+from robomme_interference_data.evaluate.language.columns import model_columns
 from robomme_interference_data.evaluate.language.subgoal_writer import History, SubgoalWriter
 from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.history import HistoryReader
-from robomme_interference_data.evaluate.run.kind import Run, history_columns, model_columns
+from robomme_interference_data.evaluate.run.kind import Run, history_columns
 from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.systems import check_history, name_system
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.evidence import among
-from robomme_interference_data.schema.rollouts import Rollout, Status
+from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.schema.shifts import NO_SHIFT
 from robomme_interference_data.schema.subgoal import Subgoal
@@ -127,8 +129,7 @@ def run_rollout(
     except Exception as error:
         vars(error)["progress"] = {"steps": live.steps, **_model_columns(writer)}
         raise
-    sampling = name_system(run.system).sampling
-    memory = Memory.parse(sampling) if sampling else None
+    memory = None if run.facts.memory is None else Memory.parse(run.facts.memory)
     times: dict[str, Any] = {name: round(value, 4) for name, value in clock.items()}
     return run.row(
         item,
@@ -137,7 +138,7 @@ def run_rollout(
         difficulty=info.difficulty,
         goal=info.goal,
         steps=live.steps,
-        **history_columns(buffer, given, selector, memory),
+        **history_columns(buffer, given, memory, retrieved=selector is not None),
         **_model_columns(writer),
         **(simulator.columns() if isinstance(simulator, Simulator) else {}),
         **times,

@@ -16,7 +16,7 @@ from robomme_interference_data.errors import (
     WorkerRetiredError,
     first_line,
 )
-from robomme_interference_data.evaluate.language.subgoal_writer import ORACLE, SubgoalWriter
+from robomme_interference_data.evaluate.language.subgoal_writer import SubgoalWriter
 from robomme_interference_data.evaluate.language.subgoal_writers import make_writer
 from robomme_interference_data.evaluate.policies.answers import Answers
 from robomme_interference_data.evaluate.policies.policy import Policy
@@ -25,11 +25,13 @@ from robomme_interference_data.evaluate.policies.sockets import Address
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.kind import Job, Run, RunTask
 from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.codec import to_dict
-from robomme_interference_data.schema.rollouts import Rollout, Status
+from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.schema.subgoal import ORACLE
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.checks import check_drawn
 from robomme_interference_data.simulators.registry import (

@@ -25,7 +25,7 @@ from robomme_interference_data.runtime.executor import (
     make_executor,
 )
 from robomme_interference_data.schema.codec import arrow_schema, to_pandas, to_table
-from robomme_interference_data.schema.rollouts import Rollout, Status
+from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.storage.files import atomic_path
 
 from .config import AskConfig, RunConfig, check_shared, with_camera
@@ -33,6 +33,7 @@ from .identity import invocation, now, plain, run_identity
 from .kind import Job, Run, RunKind
 from .log import RunLog, count_statuses, is_done, open_log, read_record, row_line, row_of
 from .plan import Plan, WorkItem, plan_work, shuffle_work
+from .row import Rollout
 from .tracking import Tracking, open_tracker
 
 if TYPE_CHECKING:
@@ -127,7 +128,7 @@ def run_evaluation(
         existing = read_record(folder)
         todo = [item for item in items if item not in existing or not is_done(existing[item])]
         executor = executor or make_executor(config)
-        run: Run[Any] = Run(config, kind.system, buffer_set.name, buffer_set.revision)
+        run: Run[Any] = Run(config, kind.system, kind.facts(), buffer_set.name, buffer_set.revision)
         session: Session | None = None
         if kind.needs_session(todo):
             stack.enter_context(kind.shared())
@@ -137,7 +138,8 @@ def run_evaluation(
         with open_log(folder, identity, buffer_set.name, resume=not config.no_resume) as log:
             log.begin(invocation(kind, plan, command))
             # The buffer set may have moved to another folder: its label in rows stays the same.
-            run = dataclasses.replace(run, buffer_set=log.header.buffer_set)
+            # And what a server reports is known since `open`.
+            run = dataclasses.replace(run, facts=kind.facts(), buffer_set=log.header.buffer_set)
             callbacks = [] if progress is None else [progress]
             if config.track is not None:
                 opened = partial(open_tracker, config.track, folder, plain(identity))
@@ -240,7 +242,7 @@ def _row(
     error, trace = outcome.error, outcome.trace
     if error is None:
         row, trace = outcome.value
-        row = dataclasses.replace(row, buffer_set=run.buffer_set)
+        row = dataclasses.replace(row, buffer_set=run.buffer_set, policy_id=run.facts.policy_id)
         try:
             row_of(row_line(row))
         except (ValueError, OverflowError, RecursionError) as unstorable:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from robomme_interference_data.constants import PROTOCOL_VERSION
+from robomme_interference_data.schema.codec import to_dict
 
 from .kind import RunKind, make_selector, package_versions
 from .log import Invocation
@@ -28,6 +29,7 @@ def run_identity(kind: RunKind[Any], plan: Plan) -> dict[str, Any]:
     config = kind.config
     return {
         "system": kind.system,
+        "facts": to_dict(kind.facts()),
         "simulator": config.simulator,
         "revision": kind.buffer_set.revision,
         "split": config.split,

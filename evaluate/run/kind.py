@@ -10,29 +10,33 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robomme_interference_data.constants import PROTOCOL_VERSION
+from robomme_interference_data.constants import DEMONSTRATIONS, PROTOCOL_VERSION
 from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.evaluate.policies.registry import policy_kind
+from robomme_interference_data.evaluate.systems import SystemFacts
+from robomme_interference_data.retrieval.columns import retrieval_columns
 from robomme_interference_data.runtime.executor import Session, Worker
-from robomme_interference_data.schema.rollouts import Rollout, Status, success_of
+from robomme_interference_data.schema.codec import to_dict
+from robomme_interference_data.schema.rollouts import Status, success_of
 from robomme_interference_data.schema.sampling import (
     Memory,
-    even_sample,
     evidence_kept,
     lesson_frames,
     lesson_share,
 )
 from robomme_interference_data.simulators.registry import simulator_class
+from robomme_interference_data.storage.files import digest_json
 
 from .config import AskConfig, RetrievalConfig, RunConfig
 from .history import HistoryReader
 from .plan import Plan, WorkItem
+from .row import Rollout
 
 if TYPE_CHECKING:
-    from robomme_interference_data.retrieval.selector import RetrievalStep, Selector
+    from robomme_interference_data.retrieval.selector import Selector
 
 
 @dataclass(frozen=True)
@@ -50,12 +54,14 @@ class Run[C: RunConfig | AskConfig]:
     Attributes:
         config: Its settings; a model on the Hub has its commit.
         system: The label of its rows.
+        facts: What the system is.
         buffer_set: Label of the buffer set in its rows.
         revision: `BufferSet.revision`.
     """
 
     config: C
     system: str
+    facts: SystemFacts
     buffer_set: str
     revision: str
 
@@ -77,7 +83,13 @@ class Run[C: RunConfig | AskConfig]:
 
     def row(self, item: WorkItem, status: Status, **values: Any) -> Rollout:
         """Return the row of a work item."""
-        return Rollout(**self.key(item), status=str(status), success=success_of(status), **values)
+        return Rollout(
+            **self.key(item),
+            **to_dict(self.facts),
+            status=str(status),
+            success=success_of(status),
+            **values,
+        )
 
 
 def make_selector(config: RetrievalConfig) -> "Selector | None":
@@ -87,6 +99,23 @@ def make_selector(config: RetrievalConfig) -> "Selector | None":
     from robomme_interference_data.retrieval.selector import Selector
 
     return Selector(config.retrieval, rule=config.retrieval_rule, camera=config.retrieval_camera)
+
+
+def retrieval_text(config: RetrievalConfig, buffer_set: BufferSet) -> str | None:
+    """Return the retrieval step of a run as `SystemFacts` have it; None if it has none."""
+    if config.retrieval is None:
+        return None
+    from robomme_interference_data.retrieval.selector import RetrievalStep
+
+    step = RetrievalStep(
+        config.retrieval, rule=config.retrieval_rule, camera=config.retrieval_camera
+    )
+    return step.label(buffer_set.datasets[DEMONSTRATIONS])
+
+
+def short_digest(identity: Mapping[str, Any]) -> str:
+    """Return what identifies a policy or a model in a column: 16 letters of a SHA-256."""
+    return digest_json([identity])[:16]
 
 
 def package_versions(config: RunConfig | AskConfig) -> dict[str, str]:
@@ -109,47 +138,27 @@ def package_versions(config: RunConfig | AskConfig) -> dict[str, str]:
 
 
 def history_columns(
-    buffer: Buffer, given: Sequence[int], step: "RetrievalStep | None", memory: Memory | None
+    buffer: Buffer, given: Sequence[int], memory: Memory | None, *, retrieved: bool
 ) -> dict[str, Any]:
     """Return the columns about the frames of a buffer that a policy or model was given.
 
     Args:
         buffer: The history.
         given: The frames, as ascending indices.
-        step: The retrieval step that chose them; None if all frames were given.
         memory: What of them the memory keeps; None if unknown.
+        retrieved: Whether a retrieval step chose them; if not, all frames were given.
     """
     share = lesson_share(buffer.sessions, given) if given else None
     columns: dict[str, Any] = {
         "history_frames": len(given),
         "lesson_frames": lesson_frames(buffer.sessions, given),
         "lesson_share": share,
-        "retrieval_model": step.label(buffer) if step else None,
     }
-    if step is not None and share is not None:
-        columns |= {"retrieval_start": given[0], "retrieval_stop": given[-1] + 1}
-        frames = len(even_sample(len(given)))
-        filler = (frames - 1 - round(share * frames)) / frames
-        for part, fraction in {"lesson": share, "filler": filler, "query": 1 / frames}.items():
-            columns[f"retrieval_selected_{part}_fraction"] = fraction
+    if retrieved and share is not None:
+        columns |= retrieval_columns(given, share)
     if memory is not None and buffer.evidence is not None:
         columns["evidence_kept"] = evidence_kept(buffer.evidence, memory.kept(given))
     return columns
-
-
-def model_columns(calls: int, tokens: Sequence[int | None], faults: int) -> dict[str, Any]:
-    """Return the columns about a vision-language model, given the tokens of each answer.
-
-    A total that the files of a run cannot hold becomes None, and counts as a fault.
-    """
-    counts = [count for count in tokens if count is not None]
-    total = sum(counts)
-    stored = all(count >= 0 for count in counts) and total < 1 << 63
-    return {
-        "model_calls": calls,
-        "model_tokens": total if counts and stored else None,
-        "model_faults": faults + (not stored),
-    }
 
 
 class RunTask[C: RunConfig | AskConfig](ABC):
@@ -225,6 +234,10 @@ class RunKind[C: RunConfig | AskConfig](ABC):
     @abstractmethod
     def prepare(self) -> None:
         """Check the settings, and identify the policy or model."""
+
+    @abstractmethod
+    def facts(self) -> SystemFacts:
+        """Return what the system is; after `open`, with what its servers report."""
 
     @abstractmethod
     def refusal(self, condition: str) -> InterferenceError | None:

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from robomme_interference_data.constants import FORMAT_VERSION, RUN_HEADER, RUN_RECORD, RUN_TABLES
 from robomme_interference_data.errors import FormatError, RunError, first_line, visible
 from robomme_interference_data.schema.codec import arrow_schema, from_dict, to_dict, to_table
-from robomme_interference_data.schema.rollouts import FINAL, Rollout, Status
+from robomme_interference_data.schema.rollouts import FINAL, Status
 from robomme_interference_data.storage.files import (
     atomic_path,
     canonical_json,
@@ -32,6 +32,7 @@ from robomme_interference_data.storage.parquet import writing
 from robomme_interference_data.storage.staging import file_lock
 
 from .plan import Plan, WorkItem
+from .row import Rollout
 
 ERRORS_LOG = "errors.log"
 

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.errors import RunError
-from robomme_interference_data.schema.rollouts import TIMING_COLUMNS, Rollout
+from robomme_interference_data.schema.rollouts import TIMING_COLUMNS
 from robomme_interference_data.storage.files import LocalFiles
 
 from .log import ERRORS_LOG, check_same_run, is_done, open_log, read_run
 from .plan import WorkItem
+from .row import Rollout
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,9 @@ from typing import Any, Self
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId, count_numbers, format_numbers, parse_numbers
 from robomme_interference_data.schema.conditions import in_order, parse_condition
-from robomme_interference_data.schema.rollouts import Rollout
 from robomme_interference_data.storage.files import canonical_json
+
+from .row import Rollout
 
 _SHARD = re.compile(r"(\d{1,6})/(\d{1,6})")
 

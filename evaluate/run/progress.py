@@ -10,12 +10,13 @@ from robomme_interference_data.errors import visible
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.progress import WorkProgress, duration
 from robomme_interference_data.schema.conditions import parse_condition
-from robomme_interference_data.schema.rollouts import Rollout, Status
+from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.registry import RECORDINGS
 from robomme_interference_data.viz.tables import Table
 
 from .log import is_done
 from .plan import WorkItem
+from .row import Rollout
 
 Cell = tuple[str, str]
 """Family and condition."""

@@ -18,9 +18,10 @@ from typing import Any, Protocol, Self
 
 from robomme_interference_data.constants import RUN_METRICS
 from robomme_interference_data.errors import InvalidOptionError, MissingExtraError, first_line
-from robomme_interference_data.schema.rollouts import Rollout, Status
+from robomme_interference_data.schema.rollouts import Status
 
 from .plan import WorkItem
+from .row import Rollout
 
 logger = logging.getLogger(__name__)
 

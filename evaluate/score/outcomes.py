@@ -5,13 +5,14 @@ from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
-from robomme_interference_data.evaluate.systems import SYSTEMS, known_system, name_system
+from robomme_interference_data.evaluate.systems import FACT_COLUMNS, SYSTEMS, SystemFacts
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, in_order
 from robomme_interference_data.schema.rollouts import Status
@@ -49,10 +50,28 @@ class Outcomes:
     expected: Flags  # the episodes of a complete cell, (E,)
     due: Flags  # the cells that are expected or have rows, (S, C)
     unpinned: Flags  # systems whose rows name no revision of a buffer set, (S,)
+    facts: tuple[frozenset[SystemFacts], ...]  # of each system; only `policy_id` varies, (S,)
 
     def cell(self, system: str, condition: str) -> tuple[int, int]:
         """Return the place of a cell on the first two axes."""
         return self.systems.index(system), self.conditions.index(condition)
+
+    def facts_of(self, system: str) -> frozenset[SystemFacts]:
+        """Return the facts of a system: several if it has runs of different weights."""
+        return self.facts[self.systems.index(system)]
+
+    def is_reference(self, system: str) -> bool:
+        """Whether a system is only a reference, which is never ranked."""
+        return any(facts.reference for facts in self.facts_of(system))
+
+    @property
+    def retrieving(self) -> list[str]:
+        """The systems with a retrieval step."""
+        return [
+            name
+            for name, of_system in zip(self.systems, self.facts, strict=True)
+            if any(facts.retrieval is not None for facts in of_system)
+        ]
 
     def ran(self, system: str) -> list[str]:
         """Return the conditions under which a system has rows."""
@@ -233,8 +252,13 @@ def _outcomes(
             difficulty[place] = DIFFICULTIES.index(row.difficulty)
         if row.chance is not None:
             chance[place] = row.chance
-    known = [name_system(system) for system in systems]
-    applies = np.array([[one.applies(c) and c in due for c in conditions] for one in known])
+    facts = _facts_of(rows, systems)
+    applies = np.array(
+        [
+            [c in due and all(one.applies(c) for one in of_system) for c in conditions]
+            for of_system in facts
+        ]
+    )
     return Outcomes(
         simulator,
         systems,
@@ -249,11 +273,17 @@ def _outcomes(
         expected=np.array([key in expected for key in axes[2]]),
         due=applies | (status >= 0).any(axis=(2, 3)),
         unpinned=np.array([(simulator, system) in unpinned for system in systems]),
+        facts=facts,
     )
 
 
+def _facts_of(rows: Sequence[Row], systems: Sequence[str]) -> tuple[frozenset[SystemFacts], ...]:
+    facts: dict[str, set[SystemFacts]] = {system: set() for system in systems}
+    for system, *values in set(map(attrgetter("system", *FACT_COLUMNS), rows)):
+        facts[system].add(SystemFacts(**dict(zip(FACT_COLUMNS, values, strict=True))))
+    return tuple(map(frozenset, facts.values()))
+
+
 def _table_order(system: str) -> tuple[int, str]:
-    known = known_system(system)
-    if known is None:
-        return len(SYSTEMS), system
-    return [*SYSTEMS].index(system.removesuffix(f"-{known.step}")), system
+    names = [*SYSTEMS]
+    return names.index(system) if system in SYSTEMS else len(names), system

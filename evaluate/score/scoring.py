@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from robomme_interference_data.errors import FormatError, RunError, counted
-from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.stats.bootstrap import DRAWS
 from robomme_interference_data.viz.tables import Table
@@ -14,6 +13,7 @@ from .comparisons.contrast import Contrast
 from .comparisons.tables import SPECS, comparison_table
 from .config import Against, Expected, Settings
 from .outcomes import Outcomes, offline_outcomes, outcomes_of
+from .partners import base_of, ceilings_of
 from .rows.reading import Rows, read_rows
 from .tables import action_error, cells, chance, equivalence, evidence_kept, paper
 
@@ -85,6 +85,14 @@ class Score:
         """The outcomes of each simulator, and of recordings."""
         recordings = [] if self.recordings is None else [self.recordings]
         return [*self.outcomes.values(), *recordings]
+
+    def is_reference(self, simulator: str, system: str) -> bool:
+        """Whether a system is only a reference in a simulator, which is never ranked."""
+        return any(
+            outcomes.is_reference(system)
+            for outcomes in self.every
+            if outcomes.simulator == simulator and system in outcomes.systems
+        )
 
 
 def score(settings: Settings, draws: int = DRAWS) -> Score:
@@ -162,11 +170,10 @@ def _compared(
     compared, notes = list[Contrast](), list[str]()
     for outcomes in every:
         for system in outcomes.systems:
-            beside = {"base": base_of(system), "ceiling": evidence_kept.ceiling_of(system)}
+            ceiling = next(iter(ceilings_of(outcomes, system)), None)
+            beside = {"base": base_of(outcomes, system), "ceiling": ceiling}
             for role, other in beside.items():
-                if other is None or other not in outcomes.systems:
-                    beside[role] = None
-                elif why := _unpaired(rows, outcomes, system, other):
+                if other is not None and (why := _unpaired(rows, outcomes, system, other)):
                     beside[role] = None
                     simulator = outcomes.simulator
                     notes.append(f"{system} and {other} in {simulator} are not paired: {why}.")
@@ -198,7 +205,7 @@ def _unpaired(rows: Rows, outcomes: Outcomes, system: str, other: str) -> str:
         return (
             f"the rows of {whose} name no revision of a buffer set, so their histories may differ"
         )
-    steps = [rows.retrieval.get((outcomes.simulator, one)) for one in (system, other)]
+    steps = [next(iter(outcomes.facts_of(name))).retrieval for name in (system, other)]
     if None not in steps and steps[0] != steps[1]:
         return f"their retrieval steps differ: {' and '.join(map(str, steps))}"
     return ""

@@ -1,6 +1,6 @@
 """RoboMME-Interference as a benchmark of vla-eval: `vla-eval run` plays it against its servers."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread
@@ -134,7 +134,9 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
                 f"Set `conditions` to [{NO_HISTORY}], or serve a model with a memory.",
             )
         self._plan, _ = plan_run(kind)
-        self._run = Run(kind.config, kind.system, opened.name, opened.revision)
+        # Which server plays is not known here: without an identity, its rows are paired with none.
+        facts = replace(kind.facts(), policy="vla-eval", policy_id=None)
+        self._run = Run(kind.config, kind.system, facts, opened.name, opened.revision)
         self._policy = HarnessPolicy(**options)
         self._rollouts = RolloutTask(self._run, policy=self._policy)
         # A rollout asks its policy for actions, and vla-eval asks its benchmark for observations:
@@ -151,6 +153,7 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
             for condition in self._plan.conditions:
                 episode = EpisodeId.parse(f"{group}/{nth_number(numbers, 0)}")
                 key = self._run.key(WorkItem(condition, episode)) | {"episode": numbers}
+                key |= to_dict(self._run.facts)
                 name = f"{episode.family}/{condition}"
                 tasks.append({"name": name, "suite": episode.family, **key})
         return tasks

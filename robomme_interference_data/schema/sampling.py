@@ -4,7 +4,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Annotated, Self
 
 from robomme_interference_data.constants import SAMPLE_FRAMES
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
@@ -140,3 +140,21 @@ def evidence_kept(evidence: "Iterable[Evidence]", kept: Collection[int]) -> floa
             key = one.session.source, one.span
             seen[key] = seen.get(key, False) or one.seen(kept)
     return sum(seen.values()) / len(seen) if seen else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class HistoryColumns:
+    """The columns of rows that describe the history that a system got, and what its memory kept."""
+
+    history_frames: Annotated[int, "History frames that the policy received."]
+    lesson_frames: Annotated[int, "Lesson frames among them."]
+    lesson_share: Annotated[
+        float | None,
+        "Share of lesson frames in an even 32-frame sample of the received history and the first "
+        "live observation; None without history.",
+    ]
+    evidence_kept: Annotated[
+        float | None,
+        "Share of the lesson's evidence spans with a frame in the system's memory at the first "
+        "step; None if unknown or without a lesson.",
+    ] = None

@@ -16,10 +16,10 @@ from robomme_interference_data.evaluate import commands
 from robomme_interference_data.evaluate.run import evaluation as run_module
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.progress import RunProgress, estimate, rate_table
+from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS
-from robomme_interference_data.schema.rollouts import Rollout
 
 pytestmark = pytest.mark.usefixtures("trouble", "_serial")
 

@@ -180,7 +180,7 @@ def test_a_retrieval_step(tmp_path: Path) -> None:
             found[rule] = {(row.success, row.lesson_frames) for row in rows}
             recalled = ask(tmp_path / f"recall-{rule}", **settings).rows
             assert {row.system for row in recalled} == {f"retrieval-questions-recall-full-{rule}"}
-            assert all(row.retrieval_model for row in (*rows, *recalled))
+            assert {row.retrieval for row in (*rows, *recalled)} == {f"thumbnail/{rule}/adaptive"}
             if rule == "oracle":
                 assert {len(seen.images) for seen in server.seen} == {LESSON + 1}
                 assert all(row.success for row in recalled)

@@ -22,6 +22,7 @@ from robomme_interference_data.errors import InvalidOptionError, PolicyError
 from robomme_interference_data.evaluate.policies.builtin import Privileged
 from robomme_interference_data.evaluate.rollout.rollout import read_ahead
 from robomme_interference_data.evaluate.run.history import HistoryReader
+from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId
 
 pytestmark = pytest.mark.usefixtures("world")
@@ -97,13 +98,13 @@ def test_a_cache_that_cannot_be_written_costs_no_rollout(
 
 
 @pytest.mark.parametrize(
-    ("system", "kept"),
-    [("replay-window", 0.5), ("perceptual-framesamp-modul", 1), ("mine", None), ("oracle", None)],
+    ("memory", "kept"), [("window:32", 0.5), ("framesamp:32", 1), (None, None)]
 )
-def test_evidence_kept_if_the_sampling_is_known(system: str, kept: float | None) -> None:
+def test_evidence_kept_if_the_memory_is_known(memory: str | None, kept: float | None) -> None:
     """MoveCube's lesson of 48 frames shows the answer in frames 0 to 3, and in 31 to 38."""
-    assert roll("k0", Cheat(), system=system).evidence_kept == kept
-    assert roll("no-history", Cheat(), system=system).evidence_kept is None
+    facts = SystemFacts(memory=memory)
+    assert roll("k0", Cheat(), facts=facts).evidence_kept == kept
+    assert roll("no-history", Cheat(), facts=facts).evidence_kept is None
 
 
 def test_only_a_privileged_policy_gets_the_evidence() -> None:
@@ -127,9 +128,6 @@ class Chooses:
     def __init__(self, *frames: int):
         self.chosen = np.array(frames)
 
-    def label(self, buffer: Buffer) -> str:
-        return "chooses"
-
     def select(self, buffer: Buffer, image: np.ndarray) -> Any:
         return self.chosen
 
@@ -139,14 +137,14 @@ def test_the_policy_and_the_video_get_the_retrieved_frames() -> None:
     clip = SimpleNamespace(begin=lambda *given: shown.append(given[1]), step=lambda *_: None)
     row = roll("k3", policy, selector=Chooses(*range(40, 60)), clip=clip)
     assert policy.chunks == [(20, 20)] and shown == [[*range(40, 60)]]
-    assert (row.retrieval_model, row.retrieval_start, row.retrieval_stop) == ("chooses", 40, 60)
+    assert (row.retrieval_start, row.retrieval_stop) == (40, 60)
     # 20 frames and the live one are all in the sample; 8 of them are of the 48 frames' lesson.
     assert (row.history_frames, row.lesson_frames, row.lesson_share) == (20, 8, 8 / 21)
     assert row.retrieval_selected_lesson_fraction == 8 / 21
     assert row.retrieval_selected_filler_fraction == 12 / 21
     assert row.retrieval_selected_query_fraction == 1 / 21
     empty = roll("no-history", Cheat(), selector=Chooses())
-    assert (empty.retrieval_model, empty.retrieval_start) == ("chooses", None)
+    assert empty.retrieval_start is None
 
 
 def test_retrieved_frames_keep_the_position_limit() -> None:

@@ -14,6 +14,7 @@ from support.scoring import recording as row
 
 from robomme_interference_data.errors import FormatError, InvalidOptionError, RunError
 from robomme_interference_data.evaluate.run.plan import Plan
+from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.score.comparisons.compare import compare
 from robomme_interference_data.evaluate.score.plots.figures import draw_error_figure
 from robomme_interference_data.evaluate.score.report.methods import methods
@@ -21,7 +22,6 @@ from robomme_interference_data.evaluate.score.report.page import headlines
 from robomme_interference_data.evaluate.score.rows.export import export
 from robomme_interference_data.evaluate.score.rows.reading import read_rows
 from robomme_interference_data.evaluate.score.writing import write_score
-from robomme_interference_data.schema.rollouts import Rollout
 from robomme_interference_data.viz.figure import open_figure
 
 ERRORS = {  # of the values of actions, in episodes 0, 1, 2

@@ -184,7 +184,7 @@ def test_exported_rows_are_the_same_bytes_whatever_they_come_from(tmp_path: Path
     kept[1] = replace(kept[1], seed=None, difficulty=None)
     fractions = {f"retrieval_selected_{name}_fraction": 1 / 32 for name in ("lesson", "query")}
     fractions["retrieval_selected_filler_fraction"] = 0.46875
-    kept = made.changed(kept, retrieval_model="thumbnail/max/adaptive", **fractions)
+    kept = made.changed(kept, retrieval="thumbnail/max/adaptive", **fractions)
     rows = [*made.changed(kept, simulator="robomme"), *kept]
     # As pandas saves a column with a gap, and an author a number.
     path = made.write_csv(tmp_path / "a.csv", rows)

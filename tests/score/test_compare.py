@@ -10,8 +10,8 @@ from support.scoring import BASE, OWN, cells, run
 
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.run.plan import Plan
+from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.score.comparisons.compare import RunComparison, compare
-from robomme_interference_data.schema.rollouts import Rollout
 from robomme_interference_data.stats.intervals import newcombe_paired, wilson
 from robomme_interference_data.stats.sequential import look_levels
 

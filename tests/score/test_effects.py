@@ -6,9 +6,9 @@ import pytest
 from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, cells, record, records
 
+from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.schema.conditions import NO_HISTORY
-from robomme_interference_data.schema.rollouts import Rollout
 from robomme_interference_data.stats.intervals import fieller, newcombe_paired, wilson
 
 

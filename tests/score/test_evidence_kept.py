@@ -8,30 +8,12 @@ import pytest
 from support import scoring as made
 from support.scoring import REPLAY, record, records
 
+from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.score.report.methods import methods
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.score.tables.evidence_kept import ceiling_of
-from robomme_interference_data.schema.rollouts import Rollout
+from robomme_interference_data.evaluate.systems import name_system
+from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.stats.intervals import newcombe_paired, wilson
-
-
-@pytest.mark.parametrize(
-    ("system", "ceiling"),
-    [
-        ("replay-framesamp", "recall-framesamp"),
-        ("replay-full", "recall-full"),
-        ("replay-framesamp8", "recall-framesamp8"),
-        ("retrieval-replay-window-joined", "retrieval-recall-window-joined"),
-        ("retrieval-replay-full-extrapolate-joined", "retrieval-recall-full-joined"),
-        ("retrieval-framesamp-modul", "retrieval-recall-framesamp"),
-        ("perceptual-tokendrop-modul", None),  # it keeps parts of frames
-        ("oracle", None),
-        ("recall-framesamp", None),
-        ("mine", None),
-    ],
-)
-def test_a_ceiling_keeps_the_same_frames(system: str, ceiling: str | None) -> None:
-    assert ceiling_of(system) == ceiling
 
 
 def rows(outcomes: Mapping[str, tuple[str, str]]) -> list[Rollout]:
@@ -95,16 +77,13 @@ def test_failures_with_all_evidence_are_split_by_the_control(tmp_path: Path) -> 
 
 
 def test_the_control_is_the_system_itself_if_it_ran_with_the_answer(tmp_path: Path) -> None:
-    cells = {
-        ("oracle", "k0"): "s" * 12,
-        ("follow-subgoals-oracle", "k0"): "s" * 12,
-        (f"{REPLAY}-oracle", "k7"): "f" * 12,
-    }
-    found = scored(tmp_path, rows(KEPT), made.cells(cells))
+    cells = {("oracle", "k0"): "s" * 12, ("follow-subgoals-oracle", "k0"): "s" * 12}
+    told = replace(name_system(REPLAY).facts, subgoals="oracle", reference=True)
+    itself = made.changed(made.cells({("told", "k7"): "f" * 12}), **to_dict(told))
+    found = scored(tmp_path, rows(KEPT), made.cells(cells), itself)
     one = record(found, "evidence_use")
-    assert (one["control"], one["control_condition"]) == (f"{REPLAY}-oracle", "k7")
+    assert (one["control"], one["control_condition"]) == ("told", "k7")
     assert (one["execution"], one["use"]) == pytest.approx((1, 4 / 9 - 1))
-    del cells[f"{REPLAY}-oracle", "k7"]
     found = scored(tmp_path, rows(KEPT), made.cells(cells))
     assert record(found, "evidence_use")["control"] == "follow-subgoals-oracle"
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from support import scoring as made
 from support.scoring import BASE, OWN, cells
 
+from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.score.plots.curves import WIDTH, spread
 from robomme_interference_data.evaluate.score.plots.data import Data
 from robomme_interference_data.evaluate.score.plots.figures import (
@@ -22,7 +23,6 @@ from robomme_interference_data.evaluate.score.plots.figures import (
 from robomme_interference_data.evaluate.score.plots.styles import SeriesStyle, styles_of
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import PAPER_SYSTEMS, SYSTEMS
-from robomme_interference_data.schema.rollouts import Rollout
 from robomme_interference_data.viz.figure import open_figure
 
 
@@ -57,7 +57,7 @@ def shapes(styles: Iterable[SeriesStyle], *, color: bool = False) -> set[tuple[s
 
 def test_systems_differ_from_each_other_and_look_the_same_in_every_figure() -> None:
     own = [f"own-{number}" for number in range(48)]
-    without = [name for name, system in SYSTEMS.items() if not system.retrieval]
+    without = [name for name, system in SYSTEMS.items() if system.facts.retrieval is None]
     together = styles_of([*own, *without])
     assert len(shapes(together.values(), color=True)) == len(together)
     for name in without:
@@ -71,7 +71,7 @@ def test_systems_differ_from_each_other_and_look_the_same_in_every_figure() -> N
 
 def test_retrieval_steps_of_one_system_differ_in_color_and_marker() -> None:
     names = [f"retrieval-replay-full-{step}" for step in ("max", "oracle", "joined")]
-    found = styles_of(names).values()
+    found = styles_of(names, names).values()
     assert len({style.color for style in found}) == len({style.marker for style in found}) == 3
 
 

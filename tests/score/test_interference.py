@@ -57,7 +57,7 @@ def test_a_ceiling_is_behind_the_same_retrieval_step(tmp_path: Path) -> None:
 
     def steps(*names: str | None) -> Score:
         of = dict(zip((own, ceiling), names, strict=True))
-        given = [replace(row, retrieval_model=of.get(row.system)) for row in rows]
+        given = [replace(row, retrieval=of.get(row.system)) for row in rows]
         return made.score(made.write_parquet(tmp_path / "a.parquet", given))
 
     assert record(steps("siglip", "siglip"), "ceiling")["system"] == own

@@ -9,10 +9,12 @@ from support.scoring import OWN, REVISION
 
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.evaluate.score.rows.reading import read_rows
+from robomme_interference_data.evaluate.systems import SystemFacts
+from robomme_interference_data.schema.codec import to_dict
 
 KEY = {"system": OWN, "simulator": "tabletop", "buffer_set": "made", "revision": REVISION}
 KEY |= {"family": "MoveCube", "condition": "k0", "split": "test", "shift": "none"}
-KEY |= {"model_seed": 0, "protocol_version": 1}
+KEY |= {"model_seed": 0, "protocol_version": 1} | to_dict(SystemFacts())
 TASK = KEY | {"name": "MoveCube/k0", "episode": "0,3-5"}
 ROW = KEY | {"episode": 0, "status": "success", "success": True}
 

@@ -7,9 +7,9 @@ import numpy as np
 from support import scoring as made
 
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
+from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.score.tables.paper import published
 from robomme_interference_data.schema.conditions import parse_condition
-from robomme_interference_data.schema.rollouts import Rollout
 
 EPISODES = 50
 

@@ -14,10 +14,12 @@ from robomme_interference_data.evaluate.rollout.rollout import run_rollout
 from robomme_interference_data.evaluate.run.kind import Run
 from robomme_interference_data.evaluate.run.log import read_record
 from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.evaluate.run.row import Rollout
+from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Executor, Serial
 from robomme_interference_data.schema.codec import to_dict
-from robomme_interference_data.schema.rollouts import TIMING_COLUMNS, Rollout
+from robomme_interference_data.schema.rollouts import TIMING_COLUMNS
 
 CHEAT = "python:support.worlds:make_cheat"
 WORLD = "support.worlds:World"
@@ -60,10 +62,10 @@ def header(folder: Path) -> dict[str, Any]:
 def roll(condition: str, policy: Any, *, simulator: Any = None, **changes: Any) -> Rollout:
     """One rollout, outside of a run."""
     parts = {name: changes.pop(name) for name in ("selector", "clip", "writer") if name in changes}
-    system = changes.pop("system", "mine")
+    system, facts = changes.pop("system", "mine"), changes.pop("facts", SystemFacts())
     buffer_set = worlds.buffer_set_here()
     return run_rollout(
-        Run(config(**changes), system, buffer_set.name, buffer_set.revision),
+        Run(config(**changes), system, facts, buffer_set.name, buffer_set.revision),
         WorkItem(condition, EPISODE),
         simulator=simulator or worlds.World(),
         policy=policy,

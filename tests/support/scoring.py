@@ -13,13 +13,14 @@ import typer
 from typer.testing import CliRunner
 
 from robomme_interference_data.evaluate.run.log import RunHeader
+from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.score import commands
 from robomme_interference_data.evaluate.score.config import Against, Expected, Settings
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.scoring import score as compute
+from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
 from robomme_interference_data.schema.conditions import NO_HISTORY
-from robomme_interference_data.schema.rollouts import Rollout
 
 BASE, RETRIEVAL, OWN = "perceptual-framesamp-modul", "retrieval-framesamp-modul", "my-memory"
 FAMILIES = ("MoveCube", "InsertPeg")
@@ -83,6 +84,7 @@ def row(system: str, condition: str, family: str, episode: int, letter: str) -> 
     status = STATUS[letter]
     return Rollout(
         system=system,
+        **to_dict(name_system(system).facts),
         simulator="tabletop",
         buffer_set="made-up",
         revision=REVISION,
@@ -164,6 +166,11 @@ def questions(folder: Path) -> Score:
         for row in cells(ANSWERS)
     ]
     return score(write_parquet(folder / "questions.parquet", found))
+
+
+def renamed(given: Iterable[Rollout], names: Mapping[str, str]) -> list[Rollout]:
+    """The same rollouts with other labels."""
+    return [replace(row, system=names[row.system]) for row in given]
 
 
 def changed(given: Iterable[Rollout], **values: Any) -> list[Rollout]:

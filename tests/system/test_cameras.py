@@ -87,7 +87,7 @@ def test_retrieval_of_a_run_compares_the_first_camera(
     rows = run_evaluation(config, executor=Serial()).rows
     assert [row.status for row in rows] == ["measured", "measured"], rows[0].error
     expected = f"thumbnail@{camera or 'hand'}/max"
-    assert all(str(row.retrieval_model).startswith(expected) for row in rows)
+    assert all(str(row.retrieval).startswith(expected) for row in rows)
 
 
 def test_unknown_cameras_are_errors_that_name_the_option(

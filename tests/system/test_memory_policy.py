@@ -80,7 +80,7 @@ def test_it_learns_to_answer_and_writes_rows(program: Any, tmp_path: Path) -> No
     program("answer", run, indexed, *options, "--out", retrieved)
     rows = read_rows([retrieved]).rows
     assert {row.condition for row in rows} == {"k0", "k1"}  # no-history does not apply
-    assert {row.retrieval_model for row in rows} == {"thumbnail/max/adaptive"}
+    assert {row.retrieval for row in rows} == {"thumbnail/max/adaptive"}
 
 
 @pytest.mark.slow

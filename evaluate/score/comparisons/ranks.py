@@ -6,7 +6,6 @@ from itertools import combinations
 import numpy as np
 
 from robomme_interference_data.evaluate.score.outcomes import Flags, Outcomes, rate_of
-from robomme_interference_data.evaluate.systems import is_reference
 from robomme_interference_data.stats.significance import ALPHA, holm
 from robomme_interference_data.stats.signs import simultaneous
 from robomme_interference_data.viz.tables import Table
@@ -67,7 +66,7 @@ def ranked(outcomes: Outcomes) -> Iterator[tuple[str, dict[str, float], _Compare
         rates = {
             system: rate_of(outcomes.status[at, place]).value
             for at, system in enumerate(outcomes.systems)
-            if outcomes.complete[at, place] and not is_reference(system)
+            if outcomes.complete[at, place] and not outcomes.is_reference(system)
         }
         if len(rates) > 1:
             yield condition, rates, all_pairs(outcomes, condition, list(rates), every)

@@ -7,7 +7,6 @@ from itertools import combinations
 import numpy as np
 
 from robomme_interference_data.evaluate.score.outcomes import Outcomes, success
-from robomme_interference_data.evaluate.systems import is_reference
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.stats.bootstrap import (
     DRAWS,
@@ -100,7 +99,7 @@ def interactions_of(outcomes: Outcomes, draws: int = DRAWS) -> list[Contrast]:
     Each pair is tested once. Systems whose histories may differ are left out, and so are
     references.
     """
-    systems = [name for name in outcomes.systems if not is_reference(name)]
+    systems = [name for name in outcomes.systems if not outcomes.is_reference(name)]
     pairs, slopes, apart = list[tuple[str, str, list[str]]](), [], []
     for one, other in combinations(systems, 2):
         conditions = _falling(outcomes, one, other)

@@ -5,10 +5,11 @@ from collections.abc import Container, Sequence
 from copy import copy
 from typing import Self
 
+from robomme_interference_data.evaluate.score.partners import base_of
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.cells import Cell
 from robomme_interference_data.evaluate.score.tables.paper import by_family
-from robomme_interference_data.evaluate.systems import base_of
+from robomme_interference_data.evaluate.systems import published_base
 from robomme_interference_data.schema.conditions import Condition, Kind, in_order, parse_condition
 from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.viz.figure import INK
@@ -30,6 +31,7 @@ class Data:
             `<system>, published`.
         families: Families of the episodes, in canonical order.
         systems: Systems with rows.
+        bases: System to the one without the retrieval step, or None.
         absent: Published systems without rows that a system with retrieval is compared with.
         beside: Published systems that have rows, drawn as dashes.
         styles: Style of each system and of the chance level.
@@ -44,9 +46,11 @@ class Data:
 
     def __init__(self, score: Score, simulator: str):
         self.simulator = simulator
-        self.families = score.outcomes[simulator].families
         found = [one for one in score.cells if one.simulator == simulator and one.n]
         self.systems = list(dict.fromkeys(one.system for one in found))
+        outcomes = score.outcomes[simulator]
+        self.families = outcomes.families
+        self.bases = {system: base_of(outcomes, system) for system in self.systems}
         self.contrasts = [one for one in score.contrasts if one.simulator == simulator]
         noise = score.tables.get("noise")
         repeats = [row[3:5] for row in noise.rows if row[0] == simulator] if noise else []
@@ -63,8 +67,8 @@ class Data:
         )
         asked = sorted((one for one in found if one.chance >= 0), key=lambda one: one.n)
         self.chance = {one.part: one.chance for one in asked}
-        bases = [b for s in self.systems if (b := base_of(s)) and b not in self.systems]
-        self.styles = styles_of([*self.systems, *bases])
+        bases = [b for s in self.systems if (b := published_base(s)) and b not in self.systems]
+        self.styles = styles_of([*self.systems, *bases], outcomes.retrieving)
         self.styles[CHANCE] = SeriesStyle("chance", INK, "", ":", 0.9)
         self.cells: dict[tuple[str, str, str], Cell] = {
             (one.system, one.condition, one.part): one for one in found

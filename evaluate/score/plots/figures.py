@@ -11,7 +11,7 @@ import numpy as np
 from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.evaluate.score.comparisons.contrast import Contrast
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.systems import base_of
+from robomme_interference_data.evaluate.systems import published_base
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
 from robomme_interference_data.simulators.registry import RECORDINGS
 from robomme_interference_data.stats.significance import ALPHA
@@ -26,7 +26,7 @@ from robomme_interference_data.viz.figure import (
 
 from . import curves, forests, offline
 from .curves import curve, explained, legend
-from .data import FEW, Data
+from .data import FEW, PUBLISHED, Data
 
 _PAPER = {parse_condition(one).kind for one in DEFAULT_CONDITIONS}
 _ALL_KINDS = ("heatmap", "kinds", "interference", "ceiling")
@@ -148,8 +148,10 @@ def _difficulty(figure: Any, data: Data) -> bool:
 def _retrieval(figure: Any, data: Data) -> bool:
     systems = []
     for system in data.systems:
-        for base in (base_of(system), f"{base_of(system)}, published"):
-            systems += [system, base] if base in (*data.systems, *data.absent) else []
+        bases = (data.bases[system], f"{published_base(system)}{PUBLISHED}")
+        for base in bases:
+            if base in (*data.systems, *data.absent):
+                systems += [system, base]
     panels = {part or _ALL: (data, part) for part in ("", *data.parts(data.families))}
     return _panels(figure, data, panels, systems)
 

@@ -25,7 +25,7 @@ def action_error(figure: Any, score: Score) -> None:
     cells = [cell for cell in score.error_cells if not cell.part and cell.n]
     conditions = score.recordings.conditions if score.recordings else ()
     systems = list(dict.fromkeys(cell.system for cell in cells))
-    styles = styles_of(systems)
+    styles = styles_of(systems, score.recordings.retrieving if score.recordings else ())
     places = {condition: place for place, condition in enumerate(conditions)}
     figure.set_size_inches(WIDTH, _HIGH)
     axes = figure.subplots()

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from robomme_interference_data.evaluate.systems import SYSTEMS, known_system
+from robomme_interference_data.evaluate.systems import SYSTEMS, display_name
 from robomme_interference_data.viz.figure import GRAY, INK, Hue
 
 # By what the memory holds.
@@ -63,20 +63,19 @@ _TABLE = {
         *(_SHAPES.get(system.integration or "") or _FREE.pop(0)),
     )
     for system in SYSTEMS.values()
-    if not system.retrieval
+    if system.facts.retrieval is None
 }
 
 
-def styles_of(names: Sequence[str]) -> dict[str, SeriesStyle]:
+def styles_of(names: Sequence[str], retrieving: Sequence[str] = ()) -> dict[str, SeriesStyle]:
     """Return the styles of systems; those of the table look the same in every figure.
 
-    One system with retrieval is a dark star; several differ in color and marker. Up to two dozen
-    systems that are not in the table differ by marker or line, more by color.
+    One system with retrieval is a dark star; several, named by `retrieving`, differ in color and
+    marker. Up to two dozen systems that are not in the table differ by marker or line, more by
+    color.
     """
     styles: dict[str, SeriesStyle] = {}
-    known = {name: system for name in names if (system := known_system(name)) is not None}
-    retrieving = [name for name, system in known.items() if system.retrieval]
-    unknown = [name for name in names if name not in known]
+    unknown = [name for name in names if name not in (*_TABLE, *retrieving)]
     for name in names:
         if name in unknown:
             round_, shape = divmod(unknown.index(name), len(_FREE))
@@ -86,7 +85,7 @@ def styles_of(names: Sequence[str]) -> dict[str, SeriesStyle]:
             number = retrieving.index(name)
             marker, line = _RETRIEVAL_MARKERS[number % 6], _LINES[number % len(_LINES)]
             color = (INK, *_UNKNOWN)[number % (len(_UNKNOWN) + 1)]
-            styles[name] = SeriesStyle(known[name].display, color, marker, line, 2.2)
+            styles[name] = SeriesStyle(display_name(name), color, marker, line, 2.2)
         else:
             styles[name] = _TABLE[name]
     return styles

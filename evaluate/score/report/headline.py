@@ -7,7 +7,7 @@ from robomme_interference_data.evaluate.score.comparisons.contrast import START,
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.cells import Cell
 from robomme_interference_data.evaluate.score.tables.equivalence import BEYOND, EQUIVALENT, OPEN
-from robomme_interference_data.evaluate.systems import base_of, display_name, is_reference
+from robomme_interference_data.evaluate.systems import display_name, published_base
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.stats.intervals import wilson
 from robomme_interference_data.stats.significance import ALPHA, holm
@@ -28,7 +28,7 @@ def headline(score: Score, simulator: str) -> str:
     if score.recordings is not None and simulator == score.recordings.simulator:
         return offline_headline(score)
     found = [one for one in score.cells if one.simulator == simulator and not one.part]
-    cells = [cell for cell in found if not is_reference(cell.system)] or found
+    cells = [cell for cell in found if not cell.reference] or found
     complete = [cell for cell in cells if cell.complete]
     sentences = _leading(score, complete) if complete else [_nothing_complete(cells)]
     if not all(cell.complete for cell in found):
@@ -114,7 +114,7 @@ def _from_start(score: Score, fall: Contrast) -> str:
         if (one.simulator, one.condition, one.table) == key
         and one.against == (one.system, START)
         and (one is fall or one.complete)
-        and not (is_reference(one.system) and one is not fall)
+        and not (score.is_reference(one.simulator, one.system) and one is not fall)
     ]
     k, pairs = parse_condition(fall.condition).k, fall.pairs
     sessions = "distractor session" + ("s" if k > 1 else "")
@@ -166,7 +166,7 @@ def _equal(score: Score, fall: Contrast) -> list[str]:
 
 def _beside_base(score: Score, contrast: Contrast) -> list[str]:
     """State the published fall of the system without retrieval."""
-    base = base_of(contrast.system)
+    base = published_base(contrast.system)
     key = (contrast.simulator, base)
     rates = {c.condition: c.rate for c in score.published if (c.simulator, c.system) == key}
     if not {START, contrast.condition} <= {*rates}:

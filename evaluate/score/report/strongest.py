@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from robomme_interference_data.evaluate.score.comparisons import offline
 from robomme_interference_data.evaluate.score.comparisons.contrast import Contrast
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.systems import display_name, is_reference
+from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.stats.significance import ALPHA, holm
 from robomme_interference_data.stats.signs import simultaneous
@@ -27,7 +27,7 @@ def strongest(score: Score, simulator: str) -> str:
         for one in score.contrasts
         if one.simulator == simulator and one.table in EFFECTS and one.complete and one.pairs.n
     ]
-    found = [one for one in found if not is_reference(one.system)] or found
+    found = [one for one in found if not score.is_reference(simulator, one.system)] or found
     if not found:
         return ""
     ps = dict(zip(map(id, found), holm([one.pairs.p for one in found]), strict=True))

@@ -14,12 +14,21 @@ from robomme_interference_data.storage.files import atomic_path
 from .reading import Rows
 from .values import RELEASED_SIMULATOR, Row
 
-RELEASED_COLUMNS = (
-    *("family", "condition", "episode", "seed", "difficulty", "status", "success", "steps"),
-    *("retrieval_model", "retrieval_selected_lesson_fraction"),
-    *("retrieval_selected_filler_fraction", "retrieval_selected_query_fraction"),
-)
-"""The columns of the released retrieval rows, in their order."""
+RELEASED_COLUMNS = {
+    "family": "family",
+    "condition": "condition",
+    "episode": "episode",
+    "seed": "seed",
+    "difficulty": "difficulty",
+    "status": "status",
+    "success": "success",
+    "steps": "steps",
+    "retrieval_model": "retrieval",
+    "retrieval_selected_lesson_fraction": "retrieval_selected_lesson_fraction",
+    "retrieval_selected_filler_fraction": "retrieval_selected_filler_fraction",
+    "retrieval_selected_query_fraction": "retrieval_selected_query_fraction",
+}
+"""The columns of the released retrieval rows, in their order, to those of a run."""
 
 
 def export(rows: Rows, folder: Path) -> list[Path]:
@@ -29,12 +38,17 @@ def export(rows: Rows, folder: Path) -> list[Path]:
     RoboMME get its name as one more column. A timeout is written as `ongoing`.
     """
     seeds = len(rows.names("model_seed"))
-    other = sum(row.split != "test" for row in rows)
-    wrong = [f"{seeds} model seeds"] * (seeds > 1)
-    wrong += [f"{other:,} rows of train or val episodes"] * (other > 0)
+    other_splits = sum(row.split != "test" for row in rows)
     offline = sum(row.simulator == RECORDINGS for row in rows)
-    wrong += [f"{counted(offline, 'row')} of offline runs"] * (offline > 0)
-    wrong += [f"{rows.refused:,} bad rows"] * (rows.refused > 0)
+    wrong = []
+    if seeds > 1:
+        wrong.append(f"{seeds} model seeds")
+    if other_splits:
+        wrong.append(f"{other_splits:,} rows of train or val episodes")
+    if offline:
+        wrong.append(f"{counted(offline, 'row')} of offline runs")
+    if rows.refused:
+        wrong.append(f"{rows.refused:,} bad rows")
     if wrong:
         raise InvalidOptionError(
             f"rows to export: {', '.join(wrong)}; expected valid rows of rollouts of test "
@@ -45,15 +59,17 @@ def export(rows: Rows, folder: Path) -> list[Path]:
     for row in rows:
         files[folder / f"{row.system}-{row.simulator}_rollouts.csv"].append(row)
     for path, group in files.items():
-        extra = ["simulator"] * (group[0].simulator != RELEASED_SIMULATOR)
-        columns = attrgetter(*RELEASED_COLUMNS, *extra)
+        columns = dict(RELEASED_COLUMNS)
+        if group[0].simulator != RELEASED_SIMULATOR:
+            columns["simulator"] = "simulator"
+        values = attrgetter(*columns.values())
         with (
             atomic_path(path) as partial,
             partial.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file,
         ):
             writer = csv.writer(file)  # with CRLF, as released
-            writer.writerow([*RELEASED_COLUMNS, *extra])
-            writer.writerows(columns(_released(row)) for row in group)
+            writer.writerow(columns)
+            writer.writerows(values(_released(row)) for row in group)
     return sorted(files)
 
 

@@ -15,13 +15,17 @@ import pyarrow.json as pa_json
 from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD, RUN_TABLES
 from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
 from robomme_interference_data.evaluate.run.log import MOST_BYTES, RunHeader, whole_lines
+from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.ids import nth_number
 from robomme_interference_data.schema.codec import arrow_schema
-from robomme_interference_data.schema.rollouts import KEY_COLUMNS, Rollout, Status
+from robomme_interference_data.schema.rollouts import KEY_COLUMNS, Status
 from robomme_interference_data.storage.files import parse_json, read_bytes, read_header
 from robomme_interference_data.storage.parquet import open_parquet, read_table, reading
 
 _REQUIRED = ("family", "condition", "episode", "status", "success")
+_RELEASED_NAMES = {"variant": "system", "retrieval_model": "retrieval"}
+"""Columns of released files to their names here."""
+
 _MAX_ROWS = 1 << 20
 """Rows in a file, at most: the paper's grid has 25,200."""
 
@@ -86,7 +90,7 @@ def _select(
     """Return the column of the file that holds each of the named columns."""
     if twice := [name for name in header if header.count(name) > 1]:
         raise FormatError(f"{path} has two columns {twice[0]!r}", "Rename one of them.")
-    columns = {"system" if name == "variant" else name: name for name in header}
+    columns = {_RELEASED_NAMES.get(name, name): name for name in header}
     if missing := [name for name in _REQUIRED if name not in columns]:
         raise FormatError(
             f"{path} lacks the columns {', '.join(missing)}; it has {', '.join(header) or 'none'}",

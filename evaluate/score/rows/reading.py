@@ -3,7 +3,6 @@
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from robomme_interference_data.errors import (
     counted,
 )
 from robomme_interference_data.evaluate.run.log import RunHeader
-from robomme_interference_data.evaluate.systems import name_system
+from robomme_interference_data.evaluate.systems import FACT_COLUMNS, SYSTEMS, name_system
 from robomme_interference_data.schema.rollouts import FINAL, Status, success_of
 from robomme_interference_data.schema.shifts import NO_SHIFT
 from robomme_interference_data.simulators.registry import RECORDINGS
@@ -39,7 +38,6 @@ class Rows:
         sources: The files that were read (see `files.find_sources`).
         revisions: Simulator to the revision of its buffer set, where rows name one.
         unpinned: Simulator and system of rows that name no revision, such as released ones.
-        retrieval: Simulator and system to its retrieval steps, if it has any.
         refusals: The first bad rows that were left out: location and reason.
         refused: The number of bad rows.
     """
@@ -48,7 +46,6 @@ class Rows:
     sources: Mapping[Path, RunHeader | None]
     revisions: Mapping[str, str] = field(default_factory=dict)
     unpinned: frozenset[tuple[str, str]] = frozenset()
-    retrieval: Mapping[tuple[str, str], str] = field(default_factory=dict)
     refusals: tuple[str, ...] = ()
     refused: int = 0
 
@@ -83,6 +80,7 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
     checks.check_alike("revision", ("simulator",), "rows of different buffer sets do not mix")
     for column in ("difficulty", "seed", "chance"):
         checks.check_alike(column, _EPISODE, "an episode has one")
+    checks.check_facts()
     checks.check_repeats()
     refusals = [f"{checks.locate(at)}: {reason}" for at, reason in sorted(checks.reasons.items())]
     if refusals and not lenient:
@@ -100,13 +98,8 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
                 "set, others name no revision, like released rows",
                 "Their histories may differ: score the files separately, or compare them.",
             )
-    steps = {(row.simulator, row.system, row.retrieval_model) for row in rows}
-    retrieval = {
-        cell: ", ".join(str(step) for *_, step in group)
-        for cell, group in groupby(sorted(s for s in steps if s[-1]), lambda one: one[:2])
-    }
     shown = tuple(refusals[:_SHOWN])
-    return Rows(rows, sources, revisions, unpinned, retrieval, shown, len(refusals))
+    return Rows(rows, sources, revisions, unpinned, shown, len(refusals))
 
 
 _Location = tuple[int, int]
@@ -134,6 +127,8 @@ class _Checks:
             for name in Row._fields
         ]
         rows = map(Row._make, zip(*columns, strict=True))
+        if "policy" not in part.columns:
+            rows = map(_with_known_facts, rows)
         for at, (line, row) in enumerate(zip(part.lines, rows, strict=True)):
             if at not in wrong and (contradiction := _contradiction(row)):
                 wrong[at] = contradiction
@@ -151,20 +146,36 @@ class _Checks:
         path = self._paths[row[0]]
         return f"{path}, {'line' if path.suffix.lower() in ('.csv', '.jsonl') else 'row'} {row[1]}"
 
-    def check_alike(self, name: str, group: Sequence[str], why: str) -> None:
-        """Refuse rows whose value differs from the most frequent one of the same group."""
+    def check_alike(
+        self, name: str, group: Sequence[str], why: str, *, none_counts: bool = False
+    ) -> None:
+        """Refuse rows whose value differs from the most frequent one of the same group.
+
+        None is an unknown value, which fits all others, unless it counts.
+        """
         rows = self.sound.values()
         keys, values = [*map(attrgetter(*group), rows)], [*map(attrgetter(name), rows)]
         counts = defaultdict[Any, Counter[Any]](Counter)
         for key, value in zip(keys, values, strict=True):
-            if value is not None:
+            if none_counts or value is not None:
                 counts[key][value] += 1
         usual = {key: count.most_common(1)[0][0] for key, count in counts.items()}
         self._refuse(
             (at, f"{name} {value!r} beside {usual[key]!r}: {why}")
             for at, key, value in zip(self.sound, keys, values, strict=True)
-            if value is not None and value != usual[key]
+            if (none_counts or value is not None) and value != usual[key]
         )
+
+    def check_facts(self) -> None:
+        """Refuse rows whose facts differ from the most frequent ones of their system.
+
+        Rows of several model seeds may be of different weights.
+        """
+        for column in FACT_COLUMNS:
+            group = ["system", "simulator"]
+            if column == "policy_id":
+                group.append("model_seed")
+            self.check_alike(column, group, "a system has one", none_counts=True)
 
     def check_repeats(self) -> None:
         """Keep one row of each rollout, and none where its rows contradict each other."""
@@ -185,6 +196,17 @@ class _Checks:
         for at, reason in list(rows):
             del self.sound[at]
             self.reasons[at] = reason
+
+
+def _with_known_facts(row: Row) -> Row:
+    """Return a row that has nothing but the name of its system, with the facts of that name."""
+    if row.system not in SYSTEMS:
+        return row
+    facts = SYSTEMS[row.system].facts
+    known = {name: getattr(facts, name) for name in FACT_COLUMNS}
+    if row.retrieval is not None:  # a released column
+        known["retrieval"] = row.retrieval
+    return row._replace(**known)
 
 
 def _contradiction(row: Row) -> str:

@@ -43,7 +43,13 @@ class Row(NamedTuple):
     success: bool | None
     steps: int | None
     evidence_kept: float | None
-    retrieval_model: str | None
+    policy: str | None
+    policy_id: str | None
+    memory: str | None
+    retrieval: str | None
+    subgoals: str | None
+    reads_history: bool
+    reference: bool
     retrieval_selected_lesson_fraction: float | None
     retrieval_selected_filler_fraction: float | None
     retrieval_selected_query_fraction: float | None
@@ -54,8 +60,13 @@ class Row(NamedTuple):
 
 
 DEFAULTS = {
-    **{"simulator": RELEASED_SIMULATOR, "split": "test"},
-    **{"shift": NO_SHIFT, "model_seed": 0, "protocol_version": PROTOCOL_VERSION},
+    "simulator": RELEASED_SIMULATOR,
+    "split": "test",
+    "shift": NO_SHIFT,
+    "model_seed": 0,
+    "protocol_version": PROTOCOL_VERSION,
+    "reads_history": True,
+    "reference": False,
 }
 """Values of columns that the released CSV lacks; any other is None."""
 
@@ -89,7 +100,7 @@ def parse(name: str, value: Any) -> Any:
         case "split" | "difficulty" | "status":
             if text not in _NAMES[name]:
                 raise InvalidOptionError.one_of(name, text, _NAMES[name])
-        case "success":
+        case "success" | "reads_history" | "reference":
             if text.lower() not in _TRUTH:
                 raise ValueError("1, 0, true, false or nothing")
             return _TRUTH[text.lower()]

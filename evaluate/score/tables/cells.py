@@ -19,7 +19,7 @@ from robomme_interference_data.evaluate.score.outcomes import (
     Rate,
     rate_of,
 )
-from robomme_interference_data.evaluate.systems import display_name, is_reference
+from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.ids import EpisodeId, format_numbers
 from robomme_interference_data.schema.conditions import in_order
 from robomme_interference_data.schema.rollouts import Status
@@ -59,6 +59,7 @@ class Coverage:
     condition: str
     part: str  # family or difficulty; empty for all episodes
     n: int  # episodes that count: at least one rollout that is not an error
+    reference: bool = field(default=False, kw_only=True)  # the system is never ranked
     counts: tuple[int, ...] = field(default=(0,) * len(STATUSES), kw_only=True)  # by status
     expected: int = field(default=0, kw_only=True)  # number of expected episodes
     # Expected, but do not count with every model seed.
@@ -114,6 +115,7 @@ def coverage_of(
     """Return what is counted of a cell: its episodes `here`, those expected in it are `due`."""
     counts = outcomes.counts[system, condition]
     return {
+        "reference": outcomes.is_reference(outcomes.systems[system]),
         "counts": tuple(counts[here].sum(axis=0).tolist()),
         "expected": int((due & outcomes.expected).sum()),
         "missing": outcomes.chosen(due & outcomes.missing[system, condition]),
@@ -177,7 +179,7 @@ def _fixed(outcomes: Outcomes, system: int, condition: int, rate: Rate) -> tuple
 def _ranked(outcomes: Outcomes, cells: list[Cell], parts: Mapping[str, Flags]) -> list[Cell]:
     groups = defaultdict[tuple[str, str], list[int]](list)
     for place, cell in enumerate(cells):
-        if cell.complete and not is_reference(cell.system):
+        if cell.complete and not cell.reference:
             groups[cell.condition, cell.part].append(place)
     for (condition, part), places in groups.items():
         group = [cells[place] for place in places]
@@ -236,7 +238,7 @@ def main_grids(cells: Sequence[Cell]) -> list[Table]:
             for system in dict.fromkeys(cell.system for cell in found)
         ]
         errors = sum(cell.errors for cell in found)
-        references = dict.fromkeys(display_name(c.system) for c in found if is_reference(c.system))
+        references = dict.fromkeys(display_name(c.system) for c in found if c.reference)
         notes = [] if several or not episodes else [f"n = {episodes.pop()} in each cell."]
         if not grids:  # once for all grids
             notes.append(_NOTE + _BEST * any(cell.best for cell in whole))

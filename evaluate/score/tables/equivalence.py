@@ -11,7 +11,7 @@ from robomme_interference_data.evaluate.score.comparisons.tables import (
     TableSpec,
     comparison_table,
 )
-from robomme_interference_data.evaluate.systems import base_of
+from robomme_interference_data.evaluate.systems import published_base
 from robomme_interference_data.viz.tables import Table
 
 from .cells import Cell
@@ -57,7 +57,7 @@ def equivalence_table(
 def _with_published(cells: Iterable[Cell], published: Sequence[Cell]) -> Iterator[Contrast]:
     starts = {(one.simulator, one.system): one for one in published if one.condition == START}
     for cell in cells:
-        start = starts.get((cell.simulator, base_of(cell.system) or ""))
+        start = starts.get((cell.simulator, published_base(cell.system) or ""))
         if start is not None and cell.n and not cell.part:
             pairs = compare_unpaired(start.as_rate, cell.as_rate)
             against = (start.system, START)

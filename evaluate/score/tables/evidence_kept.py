@@ -9,32 +9,9 @@ from numpy.typing import NDArray
 from robomme_interference_data.evaluate.score.comparisons.pairs import pair
 from robomme_interference_data.evaluate.score.comparisons.tables import tested
 from robomme_interference_data.evaluate.score.outcomes import Outcomes, Statuses, counting, rate_of
-from robomme_interference_data.evaluate.systems import is_reference, known_system
-from robomme_interference_data.schema.sampling import Memory
+from robomme_interference_data.evaluate.score.partners import control_of
 from robomme_interference_data.stats.strata import mantel_haenszel
 from robomme_interference_data.viz.tables import Table
-
-CONTROLS = ("follow-subgoals-oracle", "oracle")
-"""Systems that know the answer, after `<system>-oracle`, the system itself when it is given it."""
-
-
-def ceiling_of(system: str) -> str | None:
-    """Return the ideal observer with a system's memory and retrieval step, if one is known."""
-    known = known_system(system)
-    if known is None or known.sampling is None or known.reference:
-        return None
-    step = known.step.removeprefix("extrapolate").removeprefix("-")  # not of the memory
-    name = f"recall-{Memory.parse(known.sampling).label}"
-    if known.retrieval:
-        name = f"retrieval-{name}"
-    return f"{name}-{step}" if step else name
-
-
-def control_of(outcomes: Outcomes, system: str) -> str | None:
-    """Return the system whose failures are failures of execution alone, if it has rows."""
-    names = (f"{system}-oracle", *CONTROLS)
-    return next((name for name in names if name in outcomes.systems and name != system), None)
-
 
 _Cell = tuple[str, str, str]
 
@@ -142,12 +119,7 @@ def _use(cells: _Cells) -> Table:
         system, condition = cell[1:]
         if (outcomes.chance >= 0).any():
             continue  # answers to questions are not executed
-        if (
-            kept is None
-            or is_reference(system)
-            or system.endswith("-oracle")
-            or not rate_of(kept).n
-        ):
+        if kept is None or outcomes.is_reference(system) or not rate_of(kept).n:
             continue
         control = control_of(outcomes, system)
         if control is None:
@@ -185,8 +157,8 @@ def _use(cells: _Cells) -> Table:
         "of the system. control: a system that knows the answer, so that its failures on the same "
         "episodes are of execution (Wilson's interval); the rest, use, is the paired difference "
         "to the control (intervals as in the table effects). The control is the system itself "
-        "with the simulator's subgoals (rows named <system>-oracle), else follow-subgoals-oracle, "
-        "else oracle, under the same condition if it has rows there. The last two have the "
+        "with the simulator's subgoals, else follow-subgoals with them, else oracle, "
+        "under the same condition if it has rows there. The last two have the "
         "simulator's own controller: with them, use includes what the system executes worse."
         + _ADVICE
         * alone,

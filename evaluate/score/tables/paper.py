@@ -12,7 +12,7 @@ from robomme_interference_data.evaluate.score.comparisons.pairs import compare_u
 from robomme_interference_data.evaluate.score.comparisons.ranks import tied_with_best
 from robomme_interference_data.evaluate.score.comparisons.tables import columns_of
 from robomme_interference_data.evaluate.score.rows.values import RELEASED_SIMULATOR
-from robomme_interference_data.evaluate.systems import base_of, display_name
+from robomme_interference_data.evaluate.systems import display_name, published_base
 from robomme_interference_data.stats.intervals import newcombe, wilson
 from robomme_interference_data.viz.tables import Table
 
@@ -118,7 +118,7 @@ def _comparable(cells: Iterable[Cell]) -> Iterator[tuple[Cell, Cell]]:
         known.setdefault((one.simulator, one.condition, one.part), []).append(one)
     papers = {one.system for one in published()}
     for cell in cells:
-        names = [name for name in (cell.system, base_of(cell.system)) if name in papers]
+        names = [name for name in (cell.system, published_base(cell.system)) if name in papers]
         beside = known.get((cell.simulator, cell.condition, cell.part), []) if cell.n else []
         if names:
             beside = [one for name in names for one in beside if one.system == name]
@@ -144,7 +144,7 @@ def paper_table(cells: Sequence[Cell], *, by_part: bool = False) -> Table:
         return Table(
             "paper", "Comparison with the published rates", columns_of(columns), rows, note
         )
-    ours = {name for cell in cells for name in (cell.system, base_of(cell.system))}
+    ours = {name for cell in cells for name in (cell.system, published_base(cell.system))}
     others: dict[str, list[str]] = {}
     for system, condition in differing():
         if system in ours:
