@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from robomme_interference_data.storage.files import Files
 
     from .facts import Facts
-    from .publisher import Publisher, RepoPlan
     from .repo import RepoFiles
+    from .repo_plan import RepoPlan
 
 _GROUP = "Publishing"
 
@@ -143,11 +143,11 @@ def publish(
     from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.runtime.progress import WorkProgress
 
-    from . import publish as publishing
-    from .publisher import Publisher
+    from .buffer_set_content import BufferSetContent, plan_buffer_set, publish_buffer_set
+    from .checks import check_buffer_set, missing_extras
     from .repo import HubRepository
 
-    missing = publishing.missing_extras()
+    missing = missing_extras()
     install = f'pip install "robomme-interference-data[{",".join(missing)}]"'
     if missing and not dry_run:
         raise MissingExtraError("publishing needs libraries that are not installed", install)
@@ -168,17 +168,15 @@ def publish(
     elif not dry_run:
         HubRepository(config.repo_id).check_rights(exists=False)  # checks may take hours
     with WorkProgress(quiet=as_json) as progress:
-        publishing.check_buffer_set(opened, progress)
-    content = publishing.BufferSetContent(opened, config)
+        check_buffer_set(opened, progress)
+    content = BufferSetContent(opened, config)
     if to is not None:
         _export(content.folder(), to, dry_run=dry_run, as_json=as_json)
         return
-    publisher = Publisher(config, private=private)
-    plans = publishing.plan_buffer_set(content, publisher)
+    plans = plan_buffer_set(content)
     done = _carry_out(
-        publisher,
         plans,
-        lambda: publishing.publish_buffer_set(content, publisher, plans),
+        lambda: publish_buffer_set(content, plans, private=private),
         dry_run=dry_run,
         yes=yes,
         as_json=as_json,
@@ -211,7 +209,7 @@ def publish_results(
     robomme-interference publish-results my-run --repo-id my-name/my-results --yes
     ```
     """
-    from .publisher import Publisher
+    from .repo_plan import plan_version, publish_version
     from .results import results_content, score_run
 
     content = results_content(score_run(run, expected), run, config)
@@ -220,10 +218,13 @@ def publish_results(
             content.files(config.requested or content.first), to, dry_run=dry_run, as_json=as_json
         )
         return
-    publisher = Publisher(config, private=private)
-    plan = publisher.plan(content)
+    plan = plan_version(content, config.requested)
     _carry_out(
-        publisher, [plan], lambda: [publisher.put(plan)], dry_run=dry_run, yes=yes, as_json=as_json
+        [plan],
+        lambda: [publish_version(plan, private=private)],
+        dry_run=dry_run,
+        yes=yes,
+        as_json=as_json,
     )
 
 
@@ -242,23 +243,22 @@ def _export(files: "RepoFiles", to: Path, *, dry_run: bool, as_json: bool) -> No
 
 
 def _carry_out(
-    publisher: "Publisher",
     plans: "list[RepoPlan]",
-    run: "Callable[[], list[RepoPlan]]",
+    publish_plans: "Callable[[], list[RepoPlan]]",
     *,
     dry_run: bool,
     yes: bool,
     as_json: bool,
 ) -> "list[RepoPlan]":
     """Show plans, ask for confirmation, carry them out and report; return the published ones."""
-    from .publisher import plan_table
+    from .repo_plan import check_rights, plan_table
 
     print_status(plan_table(plans).text())
     if not dry_run and any(plan.published is None for plan in plans):
-        publisher.check_rights(plans)
+        check_rights(plans)
         confirm("Publish this?", "publishing", yes=yes)
         with graceful_interrupt("What was sent is kept; a version exists once it has its tag"):
-            plans = run()
+            plans = publish_plans()
     if as_json:
         print_json([plan.to_dict() for plan in plans])
     elif not dry_run:

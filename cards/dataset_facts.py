@@ -18,7 +18,6 @@ from robomme_interference_data.constants import (
     RECORDS_PATH,
     REPORT_PATH,
     SHIFTED,
-    SUMS_PATH,
     UNITS,
 )
 from robomme_interference_data.data.buffer import Buffer
@@ -26,19 +25,14 @@ from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.questions import Question
-from robomme_interference_data.errors import (
-    FormatError,
-    InvalidOptionError,
-    MissingFileError,
-    counted,
-)
+from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
 from robomme_interference_data.schema.manifest import BufferManifest
 from robomme_interference_data.schema.records import EpisodeRecord
-from robomme_interference_data.storage.files import read_json, sha256_file
+from robomme_interference_data.storage.files import read_json
 from robomme_interference_data.viz.filmstrip import strip_png
 
-from .facts import CardTable, Facts, data_limits, dataset_rows, repositories_of, source_kinds_of
+from .facts import CardTable, Facts, data_limits, dataset_rows, repositories_of
 from .markdown import Raw, code
 from .tables import condition_table, count_table, goal_table, unit_table
 
@@ -51,7 +45,6 @@ _FOLDERS = {
     SHIFTED: "the first live observations under shifts of light, camera and clutter",
     EXECUTIONS: "what follows each lesson: live frames, states and actions",
 }
-_FILE_SETS = {"frames": "data/*/*.parquet", "videos": "videos/*/*/*.mp4"}
 
 
 def demonstrations_facts(dataset: Dataset) -> Facts:
@@ -89,14 +82,9 @@ def demonstrations_facts(dataset: Dataset) -> Facts:
         },
         kind=DEMONSTRATIONS,
         title="RoboMME-Interference demonstrations",
-        description="Demonstrations of RoboMME-Interference: "
-        f"{counted(len(records), 'query episode')}, {counted(frames, 'frame')}, "
-        f"families {', '.join(_families(records))}.",
-        origin="Recorded episodes were cut, encoded, decoded again and compared.",
         examples=frames,
-        tables=[_episodes(dataset, records)],
+        tables=[CardTable("episodes", EpisodeRecord, RECORDS_PATH, one_split(records))],
         provenance=dataset_rows(dataset),
-        file_sets=_FILE_SETS,
     )
 
 
@@ -126,12 +114,12 @@ def buffer_set_facts(buffer_set: BufferSet) -> Facts:
             f"Distractor units have {unit}, not the paper's {PAPER_UNIT}: results are not "
             "comparable with those of the benchmark."
         )
-    split_name, questions = one_split(queries), _questions(buffer_set)
-    tables = [CardTable("buffers", BufferManifest, _BUFFERS, header.rows, split_name)]
+    split_name, has_questions = one_split(queries), _has_questions(buffer_set)
+    tables = [CardTable("buffers", BufferManifest, _BUFFERS, split_name)]
     if DISTRACTORS in records:
-        tables.append(_episodes(datasets[DISTRACTORS], records[DISTRACTORS], one_split(units)))
-    if questions is not None:
-        tables.append(CardTable("questions", Question, QUESTIONS_PATH, questions, split_name))
+        tables.append(CardTable("episodes", EpisodeRecord, RECORDS_PATH, one_split(units)))
+    if has_questions:
+        tables.append(CardTable("questions", Question, QUESTIONS_PATH, split_name))
     return _facts(
         datasets,
         queries,
@@ -149,7 +137,7 @@ def buffer_set_facts(buffer_set: BufferSet) -> Facts:
             "counts": unit_table(queries, units),
             "goals": goal_table(lessons),
             "folders": {name: what for name, what in _FOLDERS.items() if name in datasets},
-            "questions": questions is not None,
+            "questions": has_questions,
             "header": header,
             "other_conditions": _beyond_paper(buffer_set.conditions),
             "same_family": same_family,
@@ -158,11 +146,6 @@ def buffer_set_facts(buffer_set: BufferSet) -> Facts:
         },
         kind="buffer_set",
         title="RoboMME-Interference buffers",
-        description="History buffers of RoboMME-Interference: "
-        f"{counted(len(manifests), 'buffer')} of {counted(len(queries), 'query episode')} "
-        f"under {', '.join(buffer_set.conditions)}, and the distractor units that they hold.",
-        origin="The sessions of every buffer were drawn by SHA-256, rule version "
-        f"{header.rule_version}, seed {header.seed}.",
         examples=sum(record.length for record in units),
         tables=tables,
         provenance=[
@@ -173,7 +156,6 @@ def buffer_set_facts(buffer_set: BufferSet) -> Facts:
         ],
         base_kind=DEMONSTRATIONS,
         base=header.datasets[DEMONSTRATIONS].location,
-        file_sets={**_FILE_SETS, "manifest": f"{MANIFESTS}/*.json"},
     )
 
 
@@ -201,7 +183,6 @@ def _facts(
         return {STRIP: strip_png(shown)}
 
     return Facts(
-        families=_families(queries),
         simulators=named,
         simulated=None not in simulators,
         limits=data_limits(queries, named, limits),
@@ -223,7 +204,6 @@ def _facts(
             for dataset in datasets.values()
             for repo_id, commit in repositories_of(dataset).items()
         },
-        source_kinds=source_kinds_of(datasets.values()),
         details={
             f"Sources of the {name or DEMONSTRATIONS}": recorded
             for name, recorded in sources.items()
@@ -254,25 +234,10 @@ def _records(dataset: Dataset) -> tuple[EpisodeRecord, ...]:
     return tuple(sorted(dataset.records(), key=lambda record: record.episode_id.sort_key))
 
 
-def _families(records: Iterable[EpisodeRecord]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(record.episode_id.family for record in records))
-
-
-def _episodes(
-    dataset: Dataset, records: Iterable[EpisodeRecord], split: str | None = None
-) -> CardTable:
-    digest = dataset.sums().get(RECORDS_PATH)
-    if digest is None:
-        where = dataset.files.describe()
-        raise FormatError.damaged(where, f"{RECORDS_PATH} is not in {SUMS_PATH}")
-    return CardTable("episodes", EpisodeRecord, RECORDS_PATH, digest, split or one_split(records))
-
-
-def _questions(buffer_set: BufferSet) -> str | None:
-    """Return the SHA-256 of the questions of a buffer set, or None if it has none."""
+def _has_questions(buffer_set: BufferSet) -> bool:
     with suppress(MissingFileError):
-        return sha256_file(buffer_set.files.path(QUESTIONS_PATH))
-    return None
+        return buffer_set.files.path(QUESTIONS_PATH).is_file()
+    return False
 
 
 def _skipped(datasets: Iterable[Dataset]) -> int:

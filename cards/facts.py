@@ -31,7 +31,6 @@ class CardTable:
     name: str
     record: type
     path: str
-    sha256: str
     split: str
 
 
@@ -42,17 +41,14 @@ class Facts:
     `examples` counts stored frames or rollouts; the first of `tables` loads by default. `limits`
     and `provenance` are plain text and Markdown; `pictures` draws files of the card by path, and
     `values` are further values of the template. `base` is the location of what the data was made
-    for, which `base_kind` names. `repositories` on the Hub (with commits) and `source_kinds` are
-    what it was built from. `details` are shown as JSON; `file_sets` are patterns of other files.
+    for, which `base_kind` names. `repositories` on the Hub (with commits) are what it was built
+    from. `details` are shown as JSON.
     """
 
     kind: str
     title: str
-    description: str
-    origin: str
     examples: int
     tables: Sequence[CardTable]
-    families: Sequence[str]
     simulators: Sequence[str]
     simulated: bool
     limits: Sequence[str]
@@ -62,15 +58,8 @@ class Facts:
     base_kind: str | None = None
     base: object = None
     repositories: Mapping[str, str | None] = field(default_factory=dict)
-    source_kinds: Sequence[str] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
-    file_sets: Mapping[str, str] = field(default_factory=dict)
     tags: Sequence[str] = ("LeRobot",)
-
-    @property
-    def tabletop(self) -> bool:
-        """Whether all its episodes are known to show one robot arm at a table."""
-        return self.simulated and {*self.simulators} <= {*SIMULATORS}
 
 
 # --- limits --------------------------------------------------------------------------------------
@@ -78,8 +67,11 @@ class Facts:
 
 def is_whole_grid(records: Sequence[EpisodeRecord]) -> bool:
     """Return whether queries are those of the paper: nine families, test episodes 0 to 49 each."""
-    ids = {(one.episode_id.family, one.episode_id.split, one.episode_id.index) for one in records}
-    return ids == {(f, "test", n) for f in FAMILIES for n in range(TEST_EPISODES)}
+    ids = {
+        (record.episode_id.family, record.episode_id.split, record.episode_id.index)
+        for record in records
+    }
+    return ids == {(family, "test", index) for family in FAMILIES for index in range(TEST_EPISODES)}
 
 
 def origin_limit(simulators: Sequence[str]) -> str:
@@ -128,12 +120,6 @@ def repositories_of(dataset: Dataset) -> dict[str, str | None]:
         with suppress(InvalidOptionError):  # the data is untrusted
             repositories[check_repo_id(repo)] = str(revision) if is_commit(revision) else None
     return repositories
-
-
-def source_kinds_of(datasets: Iterable[Dataset]) -> list[str]:
-    """Return the kinds of the sources that datasets were built from, such as `robomme-h5`."""
-    kinds = {source.get("kind") for dataset in datasets for source in dataset.identity.sources}
-    return sorted(kind for kind in kinds if isinstance(kind, str))
 
 
 def dataset_rows(dataset: Dataset, name: str = "") -> Rows:

@@ -9,9 +9,6 @@ from typing import NamedTuple
 from robomme_interference_data.errors import InvalidOptionError, nearest
 from robomme_interference_data.schema.settings import setting
 
-HUB = "https://huggingface.co"
-"""Address that cards link to, on whatever server they are published: equal data, equal cards."""
-
 OTHER = "other"
 """License of data whose publisher chooses none: the license of the recordings applies."""
 
@@ -54,14 +51,6 @@ class Version(NamedTuple):
     def tag(self) -> str:
         """The tag of the version in a repository."""
         return f"data-{self}"
-
-    def following(self, before: Mapping[str, str], now: Mapping[str, str]) -> "Version":
-        """Return the next version, given the digest of each part before and now."""
-        if any(now.get(name) != digest for name, digest in before.items()):
-            return Version(self.major + 1, 0, 0)
-        if now.keys() - before.keys():
-            return Version(self.major, self.minor + 1, 0)
-        return Version(self.major, self.minor, self.patch + 1)
 
 
 def versions_of(tags: Mapping[str, str]) -> dict[Version, str]:
@@ -125,7 +114,7 @@ class Publication:
             expected = "three numbers, such as 1.2.0"
             raise InvalidOptionError.expected("version", self.version, expected)
         if self.license not in LICENSES:
-            hint = f"All identifiers: {HUB}/docs/hub/repositories-licenses"
+            hint = "All identifiers: https://huggingface.co/docs/hub/repositories-licenses"
             hint = f"{nearest(self.license, LICENSES, more='')}\n{hint}".lstrip()
             expected = f"a license of the Hub, such as cc-by-4.0, or {OTHER}"
             raise InvalidOptionError.expected("license", self.license, expected, hint)
@@ -157,11 +146,6 @@ class Publication:
     def name(self) -> str:
         """Name of the repository in its namespace."""
         return self.repo_id.split("/")[1]
-
-    @property
-    def url(self) -> str:
-        """Page of the repository."""
-        return f"{HUB}/datasets/{self.repo_id}"
 
 
 @dataclass(frozen=True)

@@ -1,16 +1,12 @@
-"""The files of a card: `README.md`, pictures, and `croissant.json` for machines.
+"""The files of a card: `README.md` and pictures.
 
 Equal data, publication and version of this package (and, for pictures, of matplotlib) give equal
-bytes. `croissant.json` uses the vocabulary of Croissant 1.0 and its extension for responsible AI;
-of the latter it has the minimum that dataset tracks require.
+bytes.
 """
 
 import json
 from importlib import metadata
-from pathlib import PurePosixPath
 from typing import Any
-
-import pyarrow as pa
 
 from robomme_interference_data.constants import (
     FORMAT_VERSION,
@@ -23,10 +19,10 @@ from robomme_interference_data.viz.templates import fill
 
 from .facts import Facts
 from .markdown import Raw, block, code, escape, quoted, table
-from .publication import HUB, OTHER, Publication
-from .tables import column_table, columns_of
+from .publication import OTHER, Publication
+from .tables import column_table
 
-README, CROISSANT = "README.md", "croissant.json"
+README = "README.md"
 
 PAPER = "https://robotmemorybench.com"
 BIBTEX = f"""@article{{rathi2026robommeinterference,
@@ -54,21 +50,6 @@ _FILTERS = {
     "number": "{:,}".format,
 }
 
-_TYPES = {
-    pa.string(): "sc:Text",
-    pa.int64(): "sc:Integer",
-    pa.float64(): "sc:Float",
-    pa.bool_(): "sc:Boolean",
-    pa.binary(): "sc:ImageObject",
-}
-_FORMATS = {
-    ".parquet": "application/x-parquet",
-    ".json": "application/json",
-    ".jsonl": "application/jsonlines",
-    ".csv": "text/csv",
-    ".mp4": "video/mp4",
-}
-
 
 def card_files(facts: Facts, publication: Publication) -> dict[str, bytes]:
     """Return the files of a card, by their path in the repository.
@@ -78,13 +59,12 @@ def card_files(facts: Facts, publication: Publication) -> dict[str, bytes]:
         publication: The version; without a `base` it gets the one that the data names.
     """
     publication = publication.made_for(facts.base)
-    text, data = card_text(facts, publication), croissant(facts, publication)
-    return {README: text.encode(), **facts.pictures(), CROISSANT: data}
+    return {README: card_text(facts, publication).encode(), **facts.pictures()}
 
 
 def is_card(path: str) -> bool:
     """Return whether a file of a repository belongs to its card."""
-    return path.startswith("README") or path == CROISSANT
+    return path.startswith("README")
 
 
 def card_text(facts: Facts, publication: Publication) -> str:
@@ -168,36 +148,3 @@ def size_category(count: int) -> str:
     if power < 0:
         return "n<1K"
     return f"{names[power]}<n<{names[power + 1]}" if power + 1 < len(names) else "n>1T"
-
-
-def croissant(facts: Facts, publication: Publication) -> bytes:
-    """Return `croissant.json`: JSON that is safe inside a page's script element."""
-    repositories = dict(facts.repositories)
-    if publication.base:
-        repo_id, _, commit = publication.base.partition("@")
-        repositories[repo_id] = commit
-    values = {
-        "publication": publication,
-        "namespace": publication.repo_id.split("/")[0],
-        "facts": facts,
-        "hub": HUB,
-        "other": OTHER,
-        "bibtex": BIBTEX,
-        "repositories": sorted(repositories.items()),
-        "types": _TYPES,
-        "columns": columns_of,
-    }
-    filters = {"tojson": json.dumps, "format": _format}  # that of jinja2 sorts keys
-    package = "robomme_interference_data.cards"
-    text = fill(package, "croissant.json.j2", values, what="croissant.json", filters=filters)
-    return as_bytes(json.loads(text))
-
-
-def as_bytes(data: Any) -> bytes:
-    """Return JSON, without `<`."""
-    text = json.dumps(data, indent=2, ensure_ascii=False).replace("<", "\\u003c")
-    return f"{text}\n".encode(errors="backslashreplace")
-
-
-def _format(path: str) -> str:
-    return _FORMATS.get(PurePosixPath(path).suffix.lower(), "application/octet-stream")

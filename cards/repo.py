@@ -8,13 +8,6 @@ from functools import cached_property, partial
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
-from robomme_interference_data.constants import (
-    DEMONSTRATIONS,
-    INDEX_DIR,
-    OPTIONAL_DATASETS,
-    PARTS_PATH,
-    QUESTIONS_PATH,
-)
 from robomme_interference_data.errors import HubError, PublishError
 from robomme_interference_data.storage.files import all_files, sha256_file
 from robomme_interference_data.storage.hub_call import HubCall
@@ -22,9 +15,6 @@ from robomme_interference_data.storage.staging import replace_folder, staging_di
 
 if TYPE_CHECKING:
     from huggingface_hub.hf_api import RepoFile as RemoteFile
-
-_ROOTS = ("data", "videos", INDEX_DIR, DEMONSTRATIONS, QUESTIONS_PATH, *OPTIONAL_DATASETS)
-"""Optional files and folders at the root of an export."""
 
 
 @dataclass(frozen=True)
@@ -79,14 +69,19 @@ class Difference:
     def __bool__(self) -> bool:
         return bool(self.sent or self.removed)
 
+    @property
+    def paths(self) -> tuple[str, ...]:
+        """All of them."""
+        return (*self.sent, *self.removed)
+
     def __str__(self) -> str:
         lists = {"differ": self.sent, "are no longer part of it": self.removed}
-        parts = [
+        texts = [
             f"{len(paths):,} files {what} (such as {paths[0]})"
             for what, paths in lists.items()
             if paths
         ]
-        return ", ".join(parts)
+        return ", ".join(texts)
 
 
 def compare(files: Mapping[str, LocalFile], existing: "Mapping[str, RemoteFile]") -> Difference:
@@ -111,21 +106,19 @@ def total_size(files: Mapping[str, LocalFile], paths: Iterable[str] | None = Non
 
 
 def write_folder(files: RepoFiles, out: Path) -> bool:
-    """Write files into a folder, all or none, replacing an earlier export.
+    """Write files into a new or empty folder, all or none.
 
     Returns False if the folder already holds exactly these files.
     """
     existing = all_files(out) if out.is_dir() else []
-    known = {*_ROOTS, *(path.split("/")[0] for path in files)}
-    others = [path for path in existing if path.split("/")[0] not in known]
-    if others or (existing and PARTS_PATH not in existing) or (out.exists() and not out.is_dir()):
-        example = f": it holds {others[0]}" if others else ""
-        message = f"{out} exists and is not an earlier export{example}"
-        raise PublishError(message, "Choose another folder.")
     if existing == sorted(files) and all(
         LocalFile(out / path).sha256 == files[path].sha256 for path in existing
     ):
         return False
+    if existing or (out.exists() and not out.is_dir()):
+        example = f", such as {existing[0]}" if existing else ""
+        message = f"{out} exists and holds something else{example}"
+        raise PublishError(message, "Remove it, or choose another folder.")
     out = out.resolve()
     with staging_dir(out) as staging:
         made = staging / "made"

@@ -2,14 +2,13 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from robomme_interference_data.constants import PROTOCOL_VERSION, RUN_HEADER, RUN_RECORD, RUN_TABLES
-from robomme_interference_data.errors import InvalidOptionError, PublishError, counted
-from robomme_interference_data.evaluate.run.log import RunHeader, read_record
+from robomme_interference_data.errors import InvalidOptionError, PublishError
+from robomme_interference_data.evaluate.run.log import RunHeader
 from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.score.comparisons import offline as offline_tables
 from robomme_interference_data.evaluate.score.config import Expected, Settings
@@ -21,19 +20,18 @@ from robomme_interference_data.evaluate.score.scoring import Score, score
 from robomme_interference_data.evaluate.score.tables.cells import Coverage
 from robomme_interference_data.evaluate.score.writing import write_score
 from robomme_interference_data.evaluate.systems import display_name
-from robomme_interference_data.schema.codec import to_dict
-from robomme_interference_data.schema.rollouts import TIMING_COLUMNS, Status
+from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.registry import RECORDINGS
-from robomme_interference_data.storage.files import digest_json, sha256_file
+from robomme_interference_data.storage.files import sha256_file
 from robomme_interference_data.viz.figure import open_figure, save_figure
 from robomme_interference_data.viz.tables import Columns, Table
 
 from .facts import CardTable, Facts, Rows, origin_limit
 from .markdown import Raw, code, escape
 from .publication import Publication, Version
-from .publisher import RepoContent
 from .render import card_files
 from .repo import LocalFile, RepoFiles
+from .repo_plan import RepoContent
 
 _ERROR_PICTURE = f"README-{RECORDINGS}.png"
 
@@ -67,7 +65,6 @@ def results_facts(results: Score | Path) -> Facts:
         name="rollouts",
         record=Rollout,
         path=file.name,
-        sha256=sha256_file(file),
         split=splits.pop() if len(splits) == 1 else "mixed",
     )
     every = found.every
@@ -93,18 +90,12 @@ def results_facts(results: Score | Path) -> Facts:
     return Facts(
         kind="results",
         title="RoboMME-Interference results",
-        description=f"{what} {', '.join(names)} on RoboMME-Interference: "
-        f"{counted(len(found.rows), 'row')}.",
-        origin="A policy acted along recordings, one row per episode."
-        if offline
-        else "A policy was rolled out in a simulator, one row per episode.",
         examples=len(found.rows),
         tables=[rows],
-        families=tuple(found.rows.names("family")),
         simulators=tuple(one.simulator for one in every),
         simulated=not offline,
         limits=_limits(found),
-        provenance=_provenance(found, run, rows),
+        provenance=_provenance(found, run, file),
         pictures=lambda: _pictures(found, figures),
         values={
             "systems": names,
@@ -191,14 +182,14 @@ def _pictures(found: Score, figures: dict[str, str]) -> dict[str, bytes]:
         return {path.name: path.read_bytes() for path in sorted(Path(folder).iterdir())}
 
 
-def _provenance(found: Score, run: RunHeader | None, table: CardTable) -> Rows:
+def _provenance(found: Score, run: RunHeader | None, table: Path) -> Rows:
     """Return the provenance of results: buffer set, revision, rows and policy."""
     rows: Rows = [("buffer set of the run", code(run.buffer_set))] if run is not None else []
     for simulator, revision in sorted(found.rows.revisions.items()):
         rows.append((f"revision of the buffer set, {escape(simulator)}", code(revision)))
     if found.rows.unpinned:
         rows.append(("revision of the buffer set", "not in the rows"))
-    rows.append((f"SHA-256 of `{table.path}`", code(table.sha256)))
+    rows.append((f"SHA-256 of `{table.name}`", code(sha256_file(table))))
     if run is not None:
         policy = run.identity.get("policy")
         rows.append(("policy", code(policy) if policy else "not recorded"))
@@ -279,11 +270,4 @@ def results_content(found: Score, run: Path, config: Publication) -> RepoContent
             facts, Publication(config.repo_id, str(version), config.license, None, command)
         )
 
-    parts = {str(item): _rollout_digest(to_dict(row)) for item, row in read_record(run).items()}
-    return RepoContent(config.repo_id, Version(1, 0, 0), files, parts, card, RUN_HEADER)
-
-
-def _rollout_digest(row: dict[str, Any]) -> str:
-    """Return a digest of the outcome of a rollout, without its timing."""
-    left_out: Iterable[str] = {*TIMING_COLUMNS, "attempt", "video"}
-    return digest_json([{name: value for name, value in row.items() if name not in left_out}])
+    return RepoContent(config.repo_id, Version(1, 0, 0), files, card, RUN_HEADER)

@@ -154,8 +154,6 @@ DATASETS = (DEMONSTRATIONS, DISTRACTORS, *OPTIONAL_DATASETS)
 
 QUESTIONS_PATH = "questions.parquet"
 """Questions about the past; optional."""
-PARTS_PATH = "parts.json"
-"""Digests of a published version's content, from which the next version number follows."""
 
 MANIFESTS = "manifests"
 MANIFEST_HEADER = "manifest.json"

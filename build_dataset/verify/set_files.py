@@ -10,16 +10,12 @@ from robomme_interference_data.constants import (
     INDEX_DIR,
     INFO_PATH,
     MANIFESTS,
-    PARTS_PATH,
     QUESTIONS_PATH,
 )
 from robomme_interference_data.storage.files import all_files
 from robomme_interference_data.storage.staging import staging_path
 
-_BESIDE = (
-    rf"(README|LICENSE)[^/]*|croissant\.json|{PARTS_PATH}"
-    r"|\.gitattributes|\.git/.*|\.cache/huggingface/.*"
-)
+_BESIDE = r"(README|LICENSE)[^/]*|\.gitattributes|\.git/.*|\.cache/huggingface/.*"
 """Cards, and files of Git and of the Hub's client."""
 
 _IN_DATASET = re.compile(rf"({'|'.join((*DATASET_FOLDERS, INDEX_DIR))})/.*|{_BESIDE}")

@@ -22,7 +22,6 @@ from robomme_interference_data.constants import (
     MANIFEST_ROWS,
     MANIFESTS,
     OPTIONAL_DATASETS,
-    PARTS_PATH,
     QUESTIONS_PATH,
     SHIFTED,
     SUMS_PATH,
@@ -51,7 +50,7 @@ _EPISODES, _CONTENT = "Episodes", "Content"
 _CARD = re.compile(r"(README|LICENSE)[^/]*")
 """Files for readers, at the root of a repository."""
 
-_LEFT_OUT = re.compile(rf"\..*|{PARTS_PATH}|{INDEX_DIR}/.*|({'|'.join(OPTIONAL_DATASETS)})/.*")
+_LEFT_OUT = re.compile(rf"\..*|{INDEX_DIR}/.*|({'|'.join(OPTIONAL_DATASETS)})/.*")
 """Files of a repository that a whole buffer set may have, and that are not copied with it."""
 
 _STAGED = "copy"

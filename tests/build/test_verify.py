@@ -77,7 +77,7 @@ def test_a_clean_buffer_set() -> None:
 
 
 def test_unmanaged_files_are_no_violation(own_buffers: Path) -> None:
-    for name in ("README.md", "README-strip.png", "croissant.json", "LICENSE"):
+    for name in ("README.md", "README-strip.png", "LICENSE"):
         (own_buffers / "distractors" / name).write_text("mine")
     (own_buffers / "demonstrations" / ".gitattributes").write_text("")
     assert violations(own_buffers, decode=False) == []

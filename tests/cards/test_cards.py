@@ -8,11 +8,18 @@ import pytest
 import yaml
 from support.buffer_sets import GOLDEN
 from support.cards import CARDS, OF_BUFFER_SET, without_version
+from support.tabletop import TABLETOP
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.cards.dataset_facts import STRIP, buffer_set_facts
-from robomme_interference_data.cards.render import BIBTEX, CROISSANT, PAPER, README, card_files
+from robomme_interference_data.cards.render import BIBTEX, PAPER, README, card_files, card_text
+from robomme_interference_data.cards.tables import columns_of
 from robomme_interference_data.constants import RECORDS_PATH
+from robomme_interference_data.data.questions import Question
+from robomme_interference_data.schema.codec import arrow_schema
+from robomme_interference_data.schema.manifest import BufferManifest
+from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.schema.rollouts import Rollout
 
 NAMES = ("demonstrations", "buffer_set", "results")
 ROOT = Path(__file__).parents[2]
@@ -22,11 +29,10 @@ ROOT = Path(__file__).parents[2]
 def test_golden_cards(made: dict[str, dict[str, bytes]], name: str) -> None:
     files = made[name]
     picture = "README-tabletop.png" if name == "results" else STRIP
-    assert files.keys() == {README, CROISSANT, picture}
+    assert files.keys() == {README, picture}
     assert files[picture].startswith(b"\x89PNG\r\n\x1a\n")
-    for path, suffix in ((README, "md"), (CROISSANT, "json")):
-        golden = (CARDS / f"{name}.{suffix}").read_text(encoding="utf-8")
-        assert without_version(files[path]) == golden
+    golden = (CARDS / f"{name}.md").read_text(encoding="utf-8")
+    assert without_version(files[README]) == golden
 
 
 def test_the_same_data_gives_the_same_bytes(made: dict[str, dict[str, bytes]]) -> None:
@@ -80,3 +86,20 @@ def test_the_citation_is_the_project_s() -> None:
     assert paper["url"] == PAPER
     for part in (paper["title"], paper["url"], paper["year"], paper["month"], name):
         assert f"{{{part}}}" in BIBTEX
+
+
+@pytest.mark.parametrize("record", [BufferManifest, EpisodeRecord, Question, Rollout])
+def test_every_column_is_described(record: type) -> None:
+    columns = columns_of(record)
+    names = {column.name for column in columns}
+    assert names == {*arrow_schema(record).names} - {"feature_sha256"}
+    for column in columns:
+        for part in (column, *column.parts):
+            assert part.meaning.endswith((".", "…")) and "`" not in part.meaning, part.name
+
+
+@pytest.mark.parametrize(("buffer_set", "has_questions"), [(TABLETOP, True), (GOLDEN, False)])
+def test_questions_are_a_table_of_their_own(buffer_set: Path, has_questions: bool) -> None:
+    text = card_text(buffer_set_facts(load_buffer_set(buffer_set)), OF_BUFFER_SET)
+    assert ("`questions.parquet`" in text) == has_questions
+    assert ("config_name: questions" in text) == has_questions

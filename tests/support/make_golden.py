@@ -9,7 +9,7 @@ from support.cards import cards, without_version
 from support.tabletop import make_tabletop
 
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
-from robomme_interference_data.cards.render import CROISSANT, README
+from robomme_interference_data.cards.render import README
 
 FAMILIES = ("VideoRepick", "MoveCube", "PatternLock")
 
@@ -25,10 +25,8 @@ def make_sample(root: Path) -> None:
 def make_cards(folder: Path) -> None:
     """Write the text of the cards, without the version of this package."""
     for name, files in cards():
-        for path, suffix in ((README, "md"), (CROISSANT, "json")):
-            if path in files:
-                text = without_version(files[path])
-                (folder / f"{name}.{suffix}").write_text(text, encoding="utf-8", newline="\n")
+        text = without_version(files[README])
+        (folder / f"{name}.md").write_text(text, encoding="utf-8", newline="\n")
 
 
 if __name__ == "__main__":

@@ -8,15 +8,15 @@ from support.buffer_sets import plan_again  # noqa: F401
 from support.hub_server import HubServer
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.cards import publish as publish_module
-from robomme_interference_data.cards.facts import Facts
-from robomme_interference_data.cards.publication import Publication, PublishConfig
-from robomme_interference_data.cards.publish import (
+from robomme_interference_data.cards import buffer_set_content
+from robomme_interference_data.cards.buffer_set_content import (
     BufferSetContent,
     plan_buffer_set,
     publish_buffer_set,
 )
-from robomme_interference_data.cards.publisher import Publisher, RepoPlan
+from robomme_interference_data.cards.facts import Facts
+from robomme_interference_data.cards.publication import Publication, PublishConfig
+from robomme_interference_data.cards.repo_plan import RepoPlan, check_rights
 
 UNITS, LESSONS = "someone/tiny", "someone/tiny-demonstrations"
 
@@ -26,10 +26,9 @@ def plain_cards(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def card(_: Facts, about: Publication) -> dict[str, bytes]:
         text = f"---\nlicense: {about.license}\n---\n{about}\n"
-        picture, machines = about.repo_id.encode(), b"{}"
-        return {"README.md": text.encode(), "README-strip.png": picture, "croissant.json": machines}
+        return {"README.md": text.encode(), "README-strip.png": about.repo_id.encode()}
 
-    monkeypatch.setattr(publish_module, "card_files", card)
+    monkeypatch.setattr(buffer_set_content, "card_files", card)
 
 
 def content_of(root: Path, repo_id: str = UNITS, **options: Any) -> BufferSetContent:
@@ -38,19 +37,20 @@ def content_of(root: Path, repo_id: str = UNITS, **options: Any) -> BufferSetCon
 
 
 def plan(
-    root: Path, repo_id: str = UNITS, private: bool = False, **options: Any
-) -> tuple[BufferSetContent, Publisher, list[RepoPlan]]:
+    root: Path, repo_id: str = UNITS, **options: Any
+) -> tuple[BufferSetContent, list[RepoPlan]]:
     """Plan to publish a buffer set."""
     content = content_of(root, repo_id, **options)
-    publisher = Publisher(content.config, private=private)
-    return content, publisher, plan_buffer_set(content, publisher)
+    return content, plan_buffer_set(content)
 
 
-def publish(root: Path, repo_id: str = UNITS, **options: Any) -> list[RepoPlan]:
+def publish(
+    root: Path, repo_id: str = UNITS, private: bool = False, **options: Any
+) -> list[RepoPlan]:
     """Publish a buffer set; return what became of its repositories."""
-    content, publisher, plans = plan(root, repo_id, **options)
-    publisher.check_rights(plans)
-    return publish_buffer_set(content, publisher, plans)
+    content, plans = plan(root, repo_id, **options)
+    check_rights(plans)
+    return publish_buffer_set(content, plans, private=private)
 
 
 def tags(hub: HubServer, repo_id: str) -> dict[str, str]:
