@@ -35,7 +35,8 @@ def find_columns(
 ) -> dict[str, str]:
     """Return logical name to column, of all columns that are used; `given` ones take precedence.
 
-    Every further column of color images is a camera of its own name.
+    Every further column of color images is a camera of its own name, unless another column has
+    been given that name.
     """
     columns = dict(given)
     for name, usual in _USUAL.items():
@@ -45,8 +46,15 @@ def find_columns(
         if name not in given and free:
             columns[name] = free[0]
     for column, feature in features.items():
-        if column not in columns.values() and _unmet("", feature) is None:
-            columns[column.removeprefix(CAMERA_PREFIX)] = column
+        name = column.removeprefix(CAMERA_PREFIX)
+        if column in columns.values() or name in given or _unmet("", feature) is not None:
+            continue
+        if name in columns:
+            raise SourceError(
+                f"{where}: the columns {columns[name]!r} and {column!r} are both camera {name!r}",
+                f"Name one of them differently in `columns`: NAME={column}",
+            )
+        columns[name] = column
     for name, column in columns.items():
         if column not in features:
             raise UnknownNameError.among(f"columns {name}: column", column, where, features)

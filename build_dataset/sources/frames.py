@@ -12,7 +12,7 @@ from typing import Any, override
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import InvalidIdError, SourceError
+from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, SourceError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators.base import choose_cameras
 from robomme_interference_data.storage.parquet import RowSpan
@@ -60,7 +60,7 @@ class FramesSource(Source):
                     f"camera {camera!r} of {episode} has two recordings: {other} and {path}",
                     "Keep one of them.",
                 )
-        cameras = {camera for paths in images.values() for camera in paths} or {"front"}
+        cameras = {camera for paths in images.values() for camera in paths}
         for episode, paths in images.items():
             if missing := cameras - paths.keys():
                 camera = min(missing)
@@ -82,6 +82,13 @@ class FramesSource(Source):
     @override
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
         key: _Key = episode.key
+        if not key.images and cameras != ():
+            raise InvalidOptionError(
+                f"{self._folder} has neither videos nor images",
+                f"Add {self._folder}/videos/CAMERA/{episode.id}.mkv or "
+                f"{self._folder}/images/CAMERA/{episode.id}/000000.png and so on, with the name of "
+                "the camera, or set `cameras` to none, to store states alone.",
+            )
         chosen = choose_cameras(cameras, tuple(key.images))
         if self._state(key.images) != key.state:
             raise SourceError("its files have changed since they were listed", "Start again.")

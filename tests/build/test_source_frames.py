@@ -205,7 +205,7 @@ HARMS: list[tuple[Callable[[Path], Any], str]] = [
     ),
     (
         lambda f: shutil.rmtree(f / "images"),
-        f"no images of camera 'front'(.|\n)*videos/front/{DRAWER}.mkv",
+        f"neither videos nor images(.|\n)*videos/CAMERA/{DRAWER}.mkv(.|\n)*`cameras` to none",
     ),
     (misplaced(f"videos/wrist/{DRAWER}.mkv"), "0.mkv is not a readable video"),
     (misplaced("videos/front/A/train/3.mkv"), "3.mkv belongs to A/train/3, which frames.parq"),
@@ -218,6 +218,14 @@ def test_broken_folders(tmp_path: Path, harm: Callable[[Path], Any], message: st
     write(tmp_path)
     harm(tmp_path)
     assert re.search(message, refused(tmp_path))
+
+
+def test_a_folder_without_images_holds_states(tmp_path: Path) -> None:
+    write_table(tmp_path, four(fps=30))
+    source = FramesSource(tmp_path)
+    recording = source.read(source.episodes()[0], ())
+    assert recording.robot == Robot(30)
+    assert [frame.images for frame in recording.frames] == [{}] * 4
 
 
 def test_cameras_that_differ(tmp_path: Path) -> None:

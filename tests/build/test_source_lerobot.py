@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from support.goal_texts import GOALS
@@ -136,6 +137,22 @@ def test_another_robot_keeps_its_cameras_rate_names_and_type(tmp_path: Path) -> 
     assert set(next(top.frames).images) == {"top", "left", "right"}
     with pytest.raises(InvalidOptionError, match="is no camera name"):
         read(root, columns={"../x": "observation.images.front"})
+
+
+def test_a_given_column_takes_precedence_over_the_one_of_its_name(tmp_path: Path) -> None:
+    episode = make_episode(1, 4, MOVE, 2, cameras=("front", "left", "right"))
+    root = write_lerobot(tmp_path, one(episode))
+    for name in ("front", "left"):
+        chosen = read(root, columns={name: "observation.images.right"})
+        seen = next(chosen.frames).images
+        np.testing.assert_array_equal(seen[name], episode.images["right"][0])
+        assert "right" not in seen
+    with pytest.raises(UnknownNameError, match="'nothing' is not in"):
+        read(root, columns={"left": "nothing"})
+    copy = {"left": {"dtype": "image", "shape": [48, 64, 3]}}
+    edit_info(root, lambda info: info["features"].update(copy))
+    with pytest.raises(SourceError, match=r"are both camera 'left'(.|\n)*NAME=left"):
+        read(root)
 
 
 @pytest.mark.parametrize("version", VERSIONS)
