@@ -103,7 +103,7 @@ class Dataset:
                 f"{files.describe()} is a LeRobot dataset, but not one of history sessions: "
                 f"{IDENTITY_PATH} is missing",
                 "Build one from it.",
-                f"build distractors DIR --source lerobot:{files.location}",
+                f"build DIR --only distractors --source lerobot:{files.location}",
             ) from None
         self.identity = read_header(path, DatasetIdentity)
         self._name = files.describe()
