@@ -296,8 +296,10 @@ def _csv(record: type, records: Sequence[Any]) -> str:
     from robomme_interference_data.schema.codec import to_dict
     from robomme_interference_data.viz.tables import Table, record_columns
 
-    rows = [tuple(to_dict(one).values()) for one in records]
-    return Table("records", "", record_columns(record), rows).csv()
+    columns = record_columns(record)
+    values = map(to_dict, records)  # in the order of the fields, the columns in that of the schema
+    rows = [[named_values.get(name) for name in columns] for named_values in values]
+    return Table("records", "", columns, rows).csv()
 
 
 def _check_calibration(

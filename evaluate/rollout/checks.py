@@ -13,7 +13,12 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.errors import InterferenceError, InvalidOptionError, UnknownNameError
+from robomme_interference_data.errors import (
+    InterferenceError,
+    InvalidOptionError,
+    UnknownNameError,
+    named,
+)
 from robomme_interference_data.evaluate.language.subgoal_writer import ORACLE
 from robomme_interference_data.evaluate.policies.policy import BATCH_METHODS, Policy
 from robomme_interference_data.evaluate.policies.registry import BUILTINS, POLICIES, policy_options
@@ -61,12 +66,13 @@ def default_system(config: RunConfig) -> str:
     """
     spec = POLICIES.parse(config.policy)
     # Folders, revisions and served models have the same names for different checkpoints.
-    named = ("websocket", "vla-eval", "lerobot", "answers")
-    learned = config.policy if spec.kind in named else config.subgoals
+    trained = ("websocket", "vla-eval", "lerobot", "answers")
+    learned = config.policy if spec.kind in trained else config.subgoals
     if learned not in (None, ORACLE):
         raise InvalidOptionError(
             f"the rows of {learned} need a name: its text does not identify it",
-            "Set `system`, such as perceptual-framesamp-modul, or a name of your own: see "
+            f"Set {named('system')}, such as perceptual-framesamp-modul, or a name of your own: "
+            "see "
             "docs/how-to/paper-systems.md.",
         )
     remembers = spec.kind in ("replay", "recall")
@@ -94,7 +100,8 @@ def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> 
     """Check the settings against each other, the buffer set and the policy."""
     if config.simulator == RECORDINGS and not config.offline:
         raise InvalidOptionError(
-            "recordings are no simulator to choose", "Set `offline` for an offline evaluation."
+            "recordings are no simulator to choose",
+            f"Set {named('offline')} for an offline evaluation.",
         )
     find_simulator(config.simulator)
     check_shift(config.simulator, config.shift)
@@ -115,7 +122,7 @@ def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> 
     if config.videos:
         from robomme_interference_data.simulators.play import check_pillow
 
-        check_pillow("`videos`")
+        check_pillow(named("videos"))
 
 
 def _check_cameras(config: RunConfig, demonstrations: Dataset, policy: Policy) -> None:
@@ -137,16 +144,17 @@ def _check_cameras(config: RunConfig, demonstrations: Dataset, policy: Policy) -
         raise UnknownNameError(
             f"the live camera {camera!r} is not in the simulator {config.simulator}, which draws "
             f"{', '.join(live.cameras)}",
-            "To act along the recordings of this buffer set, without a simulator, set `offline`. "
-            "In the simulator, set another policy, or another `retrieval_camera`.",
+            "To act along the recordings of this buffer set, without a simulator, set "
+            f"{named('offline')}. "
+            f"In the simulator, set another policy, or another {named('retrieval_camera')}.",
         )
 
 
 def _script_hint(config: RunConfig, kind: str) -> str:
     if config.offline:
-        return "Leave out `offline`, or set another policy."
+        return f"Leave out {named('offline')}, or set another policy."
     if kind in simulator_class(RECORDINGS).policies:
-        return "Set `offline`: it repeats recorded actions."
+        return f"Set {named('offline')}: it repeats recorded actions."
     return "Set another simulator, such as tabletop, or another policy."
 
 
@@ -170,13 +178,17 @@ def _check_policies(config: RunConfig, policy: Policy) -> None:
     if config.policies is None:
         own = "policies that are not shared"
         unused = ("max_batch_size", "batch_wait_timeout_s", "gpus_per_policy")
-        check_unused(config, unused, own, "Set `policies`.")
+        check_unused(config, unused, own, f"Set {named('policies')}.")
         return
     if config.executor == "processes":
         own = "policies on this machine, which share its GPUs"
-        check_unused(config, ("gpus_per_policy",), own, 'Set `executor` to "ray".')
+        check_unused(config, ("gpus_per_policy",), own, f"Set {named('executor', 'ray')}.")
     for name, valid, expected in (
-        ("policies", 1 <= config.policies <= config.workers, f"1 to `workers`, {config.workers}"),
+        (
+            "policies",
+            1 <= config.policies <= config.workers,
+            f"1 to {named('workers')}, {config.workers}",
+        ),
         ("max_batch_size", config.max_batch_size >= 1, "1 or more"),
         ("gpus_per_policy", is_share(config.gpus_per_policy), "0 to 1, or a whole number"),
         ("batch_wait_timeout_s", 0 <= config.batch_wait_timeout_s < math.inf, "0 or more"),
@@ -193,8 +205,10 @@ def _check_policies(config: RunConfig, policy: Policy) -> None:
         fault = f"it has no {' and no '.join(missing)}"
     if fault is not None:
         raise InvalidOptionError(
-            f"the policy {config.policy} cannot be shared by workers (`policies`): {fault}",
-            "Leave out `policies`; docs/how-to/your-own-policy.md describes shared policies.",
+            f"the policy {config.policy} cannot be shared by workers ({named('policies')}): "
+            f"{fault}",
+            f"Leave out {named('policies')}; docs/how-to/your-own-policy.md describes shared "
+            "policies.",
         )
 
 
@@ -211,19 +225,25 @@ def _check_name(config: RunConfig, system: System) -> None:
     elif kind not in ("websocket", "python"):
         fault = f"the policy {config.policy} is not the paper's system {system.name}"
     elif (system.subgoals is None) is (config.subgoals is not None) and kind == "websocket":
-        needs = "no subgoals" if system.subgoals is None else "subgoals of a model (`subgoals`)"
-        fault = f"system {system.name} acts on {needs}, and `subgoals` is {config.subgoals}"
+        needs = (
+            "no subgoals"
+            if system.subgoals is None
+            else f"subgoals of a model ({named('subgoals')})"
+        )
+        fault = (
+            f"system {system.name} acts on {needs}, and {named('subgoals')} is {config.subgoals}"
+        )
     elif config.subgoals == ORACLE:
         fault = f"system {system.name} has subgoals of a model, and {ORACLE} knows the answer"
     elif system.retrieval != retrieval:
         expected = "a" if system.retrieval else "no"
-        fault = f"system {system.name} has {expected} retrieval step, and `retrieval` is "
+        fault = f"system {system.name} has {expected} retrieval step, and {named('retrieval')} is "
         fault += str(config.retrieval)
     elif retrieval and Rule.parse(config.retrieval_rule).method != "max":
         fault = f"the retrieval step of {system.name} has the rule max, not {config.retrieval_rule}"
     if fault is not None:
         raise InvalidOptionError(
-            fault, "Set `system` to a name of your own: see docs/how-to/paper-systems.md."
+            fault, f"Set {named('system')} to a name of your own: see docs/how-to/paper-systems.md."
         )
 
 
@@ -232,7 +252,7 @@ def _check_subgoals(config: RunConfig) -> None:
     for name in ("subgoal_prompt", "subgoal_options"):
         if getattr(config, name) and config.subgoals in (None, ORACLE):
             raise InvalidOptionError(
-                f"`{name}` has no effect without a model that writes subgoals",
+                f"{named(name)} has no effect without a model that writes subgoals",
                 'Set subgoals="openai:URL#MODEL", or leave it out.',
             )
     if config.subgoals is None:
@@ -240,7 +260,8 @@ def _check_subgoals(config: RunConfig) -> None:
     if POLICIES.parse(config.policy).kind not in READS_SUBGOALS:
         raise InvalidOptionError(
             f"the policy {config.policy} reads no subgoals",
-            f"Set `policy` to {', '.join(READS_SUBGOALS)}, or leave out `subgoals`.",
+            f"Set {named('policy')} to {', '.join(READS_SUBGOALS)}, or leave out "
+            f"{named('subgoals')}.",
         )
 
 
@@ -273,8 +294,9 @@ def check_plan(
         if families and episode.family not in families:
             raise InvalidOptionError(
                 f"{config.simulator} does not play the family {episode.family} of {episode}",
-                f"It plays {', '.join(sorted(families))}. Set `families` to some of them, or "
-                '`simulator` to one that plays these episodes, such as "module:class".',
+                f"It plays {', '.join(sorted(families))}. Set {named('families')} to some of "
+                "them, or "
+                f"{named('simulator')} to one that plays these episodes, such as module:class.",
             )
     if system.position_limit is not None and config.retrieval is None:
         planned, longest = set(items), dict.fromkeys(plan.conditions, 0)
@@ -293,7 +315,7 @@ def condition_refusal(
         subject = "the policy" if system.with_history else system.name
         return InvalidOptionError(
             f"{subject} takes no history, so {condition} has no effect",
-            f"Set `conditions` to {NO_HISTORY}.",
+            f"Set {named('conditions')} to {NO_HISTORY}.",
         )
     if not system.applies(condition):
         return nothing_to_retrieve(

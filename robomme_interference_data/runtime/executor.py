@@ -14,7 +14,7 @@ from dataclasses import dataclass, fields, replace
 from importlib import metadata
 from typing import Any
 
-from robomme_interference_data.errors import InvalidOptionError, WorkerError
+from robomme_interference_data.errors import InvalidOptionError, WorkerError, named
 from robomme_interference_data.lazy import load_extra
 from robomme_interference_data.schema.settings import setting
 
@@ -68,13 +68,14 @@ def make_executor(config: WorkersConfig) -> "Executor":
         for field in fields(WorkersConfig)[2:]:
             if getattr(config, field.name) != field.default:
                 raise InvalidOptionError(
-                    f'{field.name} has no effect with executor="processes"',
-                    'Set executor="ray", or omit it.',
+                    f"{named(field.name)} has no effect with {named('executor', 'processes')}",
+                    f"Set {named('executor', 'ray')}, or leave it out.",
                 )
         return Processes(config.workers)
     if config.executor != "ray":
         raise InvalidOptionError.one_of("executor", config.executor, ("processes", "ray"))
-    make = load_extra(f"{__package__}.ray_cluster", "RayWorkers", 'executor="ray"', "cluster")
+    what = named("executor", "ray")
+    make = load_extra(f"{__package__}.ray_cluster", "RayWorkers", what, "cluster")
     executor: Executor = make(
         config.workers, config.ray_address, config.cpus_per_worker, config.gpus_per_worker
     )

@@ -84,7 +84,7 @@ def test_datasets_that_conditions_need(tmp_path: Path) -> None:
     for name, needed in (("raw-k1", "distractors-raw"), ("misled-k0", "contradictions")):
         with pytest.raises(SourceError, match=f"{name} needs the dataset {needed}") as caught:
             plan_manifests(datasets_in(root), ("k1", name))
-        assert f"build {needed}" in str(caught.value.command)
+        assert f"--only {needed}" in str(caught.value.command)
     records = [record("contradictions", "PatternLock/test/1/2", lesson=40)]
     write_metadata(root / "contradictions", "contradictions", records)
     plan = plan_manifests(datasets_in(root), ("stale-k1",))
