@@ -268,8 +268,8 @@ def test_output_inside_a_buffer_set_is_an_error(
 
 
 def table_rows(out: str) -> list[list[str]]:
-    """The rows under the line of dashes."""
-    lines = out[out.index("\n-----") :].splitlines()[2:]
+    """The rows under the line below the heads."""
+    lines = out[out.index("\n─────") :].splitlines()[2:]
     return [re.split(r"  +", line.strip()) for line in takewhile(str.strip, lines)]
 
 
