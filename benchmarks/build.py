@@ -18,11 +18,16 @@ from pathlib import Path
 import av
 from common import Times, interleave, positive, print_machine, print_table, run
 
-from robomme_interference_data.build_dataset.build import build_dataset
-from robomme_interference_data.build_dataset.frame_selection import select_demonstration
-from robomme_interference_data.build_dataset.image_stats import ImageStats
-from robomme_interference_data.build_dataset.lerobot_writer import load_lerobot, require_lerobot
-from robomme_interference_data.build_dataset.plan import BuildPlan, list_episodes
+from robomme_interference_data.build_dataset.dataset.build import build_dataset
+from robomme_interference_data.build_dataset.dataset.frame_selection import select_demonstration
+from robomme_interference_data.build_dataset.dataset.image_stats import ImageStats
+from robomme_interference_data.build_dataset.dataset.lerobot_writer import (
+    load_lerobot,
+    require_lerobot,
+)
+from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan
+from robomme_interference_data.build_dataset.dataset.stage import StageTask
+from robomme_interference_data.build_dataset.plan.episodes import choose_episodes
 from robomme_interference_data.build_dataset.sources import (
     Frame,
     Recording,
@@ -30,7 +35,6 @@ from robomme_interference_data.build_dataset.sources import (
     SourceEpisode,
     open_source,
 )
-from robomme_interference_data.build_dataset.stage import StageTask
 from robomme_interference_data.constants import CAMERA_PREFIX, DEMONSTRATIONS, FPS
 from robomme_interference_data.runtime.executor import Executor, Processes, Serial, Worker
 from robomme_interference_data.runtime.progress import WorkProgress
@@ -106,7 +110,7 @@ def recordings(folder: Path) -> str:
 def measure(source: Source, folder: Path, options: argparse.Namespace) -> None:
     """Time the steps of a build on all demonstrations of a source; print the table."""
     codec, workers = get_codec(options.codec), options.workers
-    episodes = tuple(episode for _, episode in list_episodes([source]))
+    episodes = tuple(episode for _, episode in choose_episodes([source]))
     held = Held({str(episode.id): read(source, episode) for episode in episodes})
     cameras = tuple(sorted(held.frames(episodes[0])[0].images))
     count = sum(len(held.frames(episode)) for episode in episodes)
@@ -120,9 +124,9 @@ def measure(source: Source, folder: Path, options: argparse.Namespace) -> None:
         made.mkdir()
         return made
 
-    def plan(source: Source) -> BuildPlan:
+    def plan(source: Source) -> DatasetPlan:
         tasks = tuple((0, episode) for episode in episodes)
-        return BuildPlan(DEMONSTRATIONS, (source,), tasks, cameras, codec.name)
+        return DatasetPlan(DEMONSTRATIONS, (source,), tasks, cameras, codec.name)
 
     def stage(source: Source) -> None:
         task = StageTask(plan(source))

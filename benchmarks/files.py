@@ -28,7 +28,7 @@ from common import (
 from load import Span, choose_buffer, open_lerobot, spans_of
 
 from robomme_interference_data import Buffer, BufferSet, load_buffer_set
-from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
+from robomme_interference_data.build_dataset.dataset.lerobot_writer import require_lerobot
 from robomme_interference_data.constants import (
     ACTION,
     CAMERA_PREFIX,

@@ -26,7 +26,7 @@ from loopback_hub import Hub, Run, running
 from made_buffer_set import write_buffer_set
 
 from robomme_interference_data import load_buffer, load_buffer_set
-from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
+from robomme_interference_data.build_dataset.dataset.lerobot_writer import require_lerobot
 from robomme_interference_data.cards.publication import PublishConfig
 from robomme_interference_data.cards.publish import (
     BufferSetContent,

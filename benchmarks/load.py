@@ -34,7 +34,7 @@ from common import (
 from numpy.typing import NDArray
 
 from robomme_interference_data import Buffer, BufferSet, DecodedCache, load_buffer_set
-from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
+from robomme_interference_data.build_dataset.dataset.lerobot_writer import require_lerobot
 from robomme_interference_data.constants import FRONT
 from robomme_interference_data.schema.conditions import parse_condition
 

@@ -28,11 +28,11 @@ from common import (
 from support.made_up import record, write_metadata
 
 from robomme_interference_data.build_dataset.manifests import (
-    in_folder,
     plan_manifests,
     planned_buffers,
     write_manifests,
 )
+from robomme_interference_data.build_dataset.plan.planned import datasets_in
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,
@@ -102,8 +102,8 @@ def timed(way: Callable[[Path], None], root: Path) -> tuple[float, int]:
 
 
 def written(root: Path, conditions: Sequence[str] = CONDITIONS) -> None:
-    """Write the manifests as `build manifests` does, without a limit of positions."""
-    plan = plan_manifests(in_folder(root), conditions, position_limit=None)
+    """Write the manifests as `build --only manifests` does, without a limit of positions."""
+    plan = plan_manifests(datasets_in(root), conditions, position_limit=None)
     for _ in write_manifests(plan, root):
         pass
 
@@ -111,7 +111,7 @@ def written(root: Path, conditions: Sequence[str] = CONDITIONS) -> None:
 def plainly(root: Path) -> None:
     """Write the same rows one by one."""
     schema = arrow_schema(BufferManifest)
-    buffers = planned_buffers(plan_manifests(in_folder(root), CONDITIONS, position_limit=None))
+    buffers = planned_buffers(plan_manifests(datasets_in(root), CONDITIONS, position_limit=None))
     with pq.ParquetWriter(root / "plain.parquet", schema, compression="zstd") as writer:
         for batch in batched(buffers, 1024):
             rows = [to_dict(manifest) for manifest in batch]

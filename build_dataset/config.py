@@ -1,16 +1,33 @@
 """The settings of a build."""
 
 import os
+import re
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 
-from robomme_interference_data.constants import POSITION_LIMIT, UNIT_FRAMES, UNIT_STRIDE
+from robomme_interference_data.constants import (
+    DATASETS,
+    MANIFESTS,
+    OPTIONAL_DATASETS,
+    POSITION_LIMIT,
+    UNIT_FRAMES,
+    UNIT_STRIDE,
+    Unit,
+)
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.runtime.executor import WorkersConfig
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS
 from robomme_interference_data.schema.settings import setting
 
 _CPUS = os.cpu_count() or 1
+
+QUESTIONS = "questions"
+
+FURTHER_PARTS = (*OPTIONAL_DATASETS, QUESTIONS)
+"""Parts of a buffer set that it may lack."""
+
+PARTS = (*DATASETS, MANIFESTS, QUESTIONS)
+"""Parts of a buffer set, in the order of their build."""
 
 
 NO_CAMERAS = ("none",)
@@ -19,36 +36,63 @@ NO_CAMERAS = ("none",)
 
 @dataclass(frozen=True)
 class BuildConfig(WorkersConfig):
-    """Settings of a build of one dataset."""
+    """Settings of a build: of a whole buffer set, or of one part of it."""
 
+    buffer_set: Path = setting(
+        name="-", metavar="BUFFER_SET", help="Folder of the buffer set to create or extend."
+    )
     source: tuple[str, ...] = setting(
+        (),
         whole=True,
         metavar="SOURCE",
         help="robomme-h5:FOLDER, lerobot:FOLDER, lerobot:NAMESPACE/NAME[/FOLDER][@REVISION], "
         "frames:FOLDER, tabletop, robomme, MODULE:CLASS of your simulator "
         "or sample[:FAMILY,…]; repeat for several.",
     )
-    buffer_set: Path = setting(
-        name="-", metavar="BUFFER_SET", help="Folder of the buffer set to create or extend."
+    parts: tuple[str, ...] = setting(
+        (),
+        name="--with",
+        metavar="PART,…",
+        help=f"Parts to build beside those that the conditions need: {', '.join(FURTHER_PARTS)}.",
+        group="Parts",
     )
-    families: tuple[str, ...] = setting((), help="Families; default: all.", group="Episodes")
+    only: str | None = setting(
+        None,
+        metavar="PART",
+        help=f"Build one part alone: {', '.join(PARTS)}.",
+        shown="demonstrations, distractors, what conditions need, manifests",
+        group="Parts",
+    )
+    demonstrations: str | None = setting(
+        None,
+        metavar="NAME",
+        help="Use published demonstrations, NAMESPACE/NAME[@REVISION], or a copy of those in a "
+        "folder: builds units and manifests for them.",
+        group="Parts",
+    )
+    families: tuple[str, ...] = setting(
+        (), help="Families of the query episodes; default: all.", group="Episodes"
+    )
     split: str | None = setting(
-        None, help="train, val or test.", shown="all; for units train", group="Episodes"
+        None, help="Split of the query episodes: train, val or test.", shown="all", group="Episodes"
     )
     episodes: str | None = setting(
         None,
-        help="Episode indices, such as 0-49 or 0,3,10-12; default: all, of tabletop's 900 train "
-        "episodes a family 0-99.",
+        help="Indices of the query episodes, such as 0-49 or 0,3,10-12; default: all, of "
+        "tabletop's 900 train episodes a family 0-99.",
         group="Episodes",
     )
-    unit_frames: int = setting(
-        UNIT_FRAMES,
-        help="Frames of a distractor unit; another number than the paper's is for episodes that "
-        "are shorter.",
+    unit_episodes: str | None = setting(
+        None,
+        help="Indices of the train episodes that units are cut from, such as 0-3; default: all.",
         group="Episodes",
     )
-    unit_stride: int = setting(
-        UNIT_STRIDE, help="Raw frames from one frame of a unit to the next.", group="Episodes"
+    unit: str = setting(
+        f"{UNIT_FRAMES}x{UNIT_STRIDE}",
+        metavar="FRAMESxSTRIDE",
+        help="Frames of a distractor unit, and raw frames from one of them to the next; another "
+        "unit than the paper's is for episodes that are shorter.",
+        group="Episodes",
     )
     cameras: tuple[str, ...] = setting(
         (),
@@ -60,7 +104,7 @@ class BuildConfig(WorkersConfig):
         help="av1-lossless (bit-exact) or lerobot-default (smaller, lossy).",
         group="Encoding",
     )
-    version: str = setting("1.0.0", help="Version of the dataset.", group="Encoding")
+    version: str = setting("1.0.0", help="Version of the datasets.", group="Encoding")
     time_limit_s: float | None = setting(
         None,
         help="Seconds for one episode; a slower one is retried once.",
@@ -92,36 +136,8 @@ class BuildConfig(WorkersConfig):
 
 
 @dataclass(frozen=True)
-class AllConfig(BuildConfig):
-    """Settings of a build of a whole buffer set."""
-
-    unit_episodes: str | None = setting(
-        None,
-        help="Indices of the train episodes that units are cut from, such as 0-3; default: all.",
-        group="Episodes",
-    )
-    shifted: bool = setting(
-        False, help="Also build the query episodes' views under each shift (tabletop only)."
-    )
-    executions: bool = setting(
-        False, help="Also build what follows each lesson: live frames, states and actions."
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class NewConfig(BuildConfig):
-    """Settings of a build of a buffer set for published demonstrations."""
-
-    demonstrations: str = setting(
-        metavar="NAME",
-        help="Repository of the demonstrations, NAMESPACE/NAME[@REVISION], or their folder, which "
-        "is linked.",
-    )
-
-
-@dataclass(frozen=True)
-class PlanConfig:
-    """Settings of a buffer set's manifests; what is not given stays as planned."""
+class BuffersConfig:
+    """Settings of the buffers that a buffer set plans; what is not given stays as planned."""
 
     conditions: tuple[str, ...] = setting(
         (),
@@ -154,3 +170,11 @@ def parse_position_limit(text: str) -> int | None:
     if not text.isdecimal() or int(text) == 0:
         raise InvalidOptionError.expected("position_limit", text, "a positive number or none")
     return int(text)
+
+
+def parse_unit(text: str) -> Unit:
+    """Parse the size of a unit, such as `32x8`."""
+    match = re.fullmatch(r"([1-9][0-9]*)x([1-9][0-9]*)", text, re.ASCII)
+    if match is None:
+        raise InvalidOptionError.expected("unit", text, "FRAMESxSTRIDE, such as 32x8")
+    return Unit(int(match[1]), int(match[2]))

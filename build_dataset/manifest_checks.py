@@ -4,7 +4,7 @@ from collections.abc import Collection, Iterable, Mapping
 
 from robomme_interference_data.constants import DEMONSTRATIONS, EXECUTIONS, SHIFTED
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.errors import SourceError
+from robomme_interference_data.errors import SourceError, named
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import Condition
 
@@ -19,7 +19,7 @@ def check_needs(conditions: Iterable[Condition], available: Collection[str]) -> 
                 raise SourceError(
                     f"{condition} needs the dataset {name}, which the buffer set lacks",
                     f"Build it first, or leave {condition} out.",
-                    f"build {name} BUFFER_SET --source KIND:PATH",
+                    f"build BUFFER_SET --only {name} --source KIND:PATH",
                 )
 
 
@@ -32,7 +32,8 @@ def check_features(datasets: Mapping[str, Dataset]) -> None:
             raise SourceError(
                 "sessions of the datasets cannot follow one another in a buffer: "
                 + "; ".join(found),
-                "Build all with the same `cameras`, from sources with the same rates and sizes.",
+                f"Build all with the same {named('cameras')}, from sources with the same rates and "
+                "sizes.",
             )
 
 
@@ -49,7 +50,7 @@ def check_scenes(shifted: Dataset, base: Dataset) -> None:
         raise SourceError(
             f"{shifted.files.describe()} {problem}",
             "Build it from all query episodes, or remove it.",
-            f"build {SHIFTED}",
+            f"build BUFFER_SET --only {SHIFTED} --source KIND:PATH",
         )
 
 
@@ -77,5 +78,5 @@ def check_executions(executions: Dataset, base: Dataset) -> None:
                 f"{executions.files.describe()}: {episode} is of another recording: "
                 + "; ".join(found),
                 "Build both from the same recordings.",
-                f"build {EXECUTIONS}",
+                f"build BUFFER_SET --only {EXECUTIONS} --source KIND:PATH",
             )

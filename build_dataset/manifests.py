@@ -19,29 +19,19 @@ from robomme_interference_data.constants import (
     FORMAT_VERSION,
     IDENTITY_PATH,
     MANIFEST_HEADER,
-    MANIFEST_PATH,
     MANIFEST_ROWS,
     MANIFESTS,
     MAX_STEPS,
-    OPTIONAL_DATASETS,
     POSITION_LIMIT,
     QUESTIONS_PATH,
     RULE_VERSION,
     SHIFTED,
     UNITS,
 )
-from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.data.manifest_table import pending_rows
 from robomme_interference_data.data.query_sessions import QuerySessions, SessionSource
-from robomme_interference_data.errors import (
-    BuildError,
-    FormatError,
-    InvalidOptionError,
-    MissingFileError,
-    SourceError,
-)
+from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError, named
 from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, Condition, in_order
 from robomme_interference_data.schema.manifest import (
@@ -49,13 +39,12 @@ from robomme_interference_data.schema.manifest import (
     ManifestDataset,
     ManifestHeader,
 )
-from robomme_interference_data.storage.files import Files, LocalFiles, sha256_file, write_json
+from robomme_interference_data.storage.files import Files, sha256_file, write_json
 from robomme_interference_data.storage.hub import HubFiles
 from robomme_interference_data.storage.parquet import writing
 from robomme_interference_data.storage.staging import staging_dir
 
 from .manifest_checks import check_executions, check_features, check_needs, check_scenes
-from .replan import Planned
 
 _BATCH = 1024
 """Rows in a row group: finding one buffer reads few bytes."""
@@ -80,49 +69,6 @@ class ManifestPlan:
         return self.datasets[DEMONSTRATIONS]
 
 
-def in_folder(root: Path) -> dict[str, Files]:
-    """Return the datasets of the buffer set that is built in a folder, by name."""
-    optional = (name for name in OPTIONAL_DATASETS if (root / name / IDENTITY_PATH).is_file())
-    return {name: LocalFiles(root / name) for name in (DEMONSTRATIONS, DISTRACTORS, *optional)}
-
-
-def datasets_now(root: Path, planned: Planned | None) -> dict[str, Files]:
-    """Return the datasets of a folder as `in_folder`, or its demonstrations on the Hub."""
-    files = in_folder(root)
-    if planned is not None and not (root / DEMONSTRATIONS).is_dir():
-        location = planned.header.datasets[DEMONSTRATIONS].location
-        if location is not None:
-            files[DEMONSTRATIONS] = HubFiles.parse(location)
-    return files
-
-
-def read_planned(root: Path) -> Planned | None:
-    """Read what the buffer set in a folder plans now; None if that is nothing."""
-    if not (root / MANIFEST_PATH).is_file():
-        return None
-    try:
-        opened = load_buffer_set(root)
-        check_is_own(opened)
-        return Planned(opened.header, frozenset(opened.episode_ids))
-    except (FormatError, MissingFileError) as error:
-        raise FormatError(
-            error.message,
-            f"Restore it, or remove {root / MANIFESTS} and plan all conditions anew: which ones "
-            "were planned cannot be read.",
-        ) from None
-
-
-def check_is_own(buffer_set: BufferSet) -> None:
-    """Check that a buffer set may be changed: a copy of a published one stays as it is."""
-    if buffer_set.copy is not None:
-        raise BuildError(
-            f"{buffer_set.location} is a copy of {buffer_set.copy.record.location}, and a "
-            "published buffer set never changes",
-            "Build one of your own with the same demonstrations:",
-            buffer_set.planning(),
-        )
-
-
 def plan_manifests(
     files: Mapping[str, Files],
     conditions: Sequence[str | Condition] = DEFAULT_CONDITIONS,
@@ -139,7 +85,7 @@ def plan_manifests(
             raise InvalidOptionError(
                 f"{one.describe()} is a dataset of {dataset.kind}; expected {name}",
                 f"Move it away, and build the {name} in its place.",
-                f"build {name} BUFFER_SET --source KIND:PATH",
+                f"build BUFFER_SET --only {name} --source KIND:PATH",
             )
     check_features(opened)
     for name in {*UNITS} & opened.keys():
@@ -148,13 +94,13 @@ def plan_manifests(
             raise SourceError(
                 "distractor units must come from train episodes, so that no query's scene leaks "
                 f"into another buffer; found {', '.join(sorted(splits))}",
-                f'Build the {name} with split="train".',
+                f"Build the {name} with {named('split', 'train')}.",
             )
-        if DISTRACTORS in opened and opened[name].unit != opened[DISTRACTORS].unit.of(name):
+        if DISTRACTORS in opened and opened[name].unit != opened[DISTRACTORS].unit.in_dataset(name):
             raise SourceError(
                 f"the {name} have units of {opened[name].unit}, the distractors of "
                 f"{opened[DISTRACTORS].unit}",
-                "Build both with the same `unit_frames` and `unit_stride`.",
+                f"Build both with the same {named('unit')}.",
             )
     if SHIFTED in opened:
         check_scenes(opened[SHIFTED], opened[DEMONSTRATIONS])
@@ -176,8 +122,8 @@ def planned_buffers(plan: ManifestPlan) -> Iterator[BufferManifest]:
                 raise InvalidOptionError(
                     f"{manifest} needs {needed} positions ({manifest.history_frames} history "
                     f"frames + {MAX_STEPS} steps); the limit is {limit}",
-                    'Leave out the condition, or set position_limit="none" for systems without a '
-                    "limit.",
+                    f"Leave out the condition, or set {named('position_limit', 'none')} for "
+                    "systems without a limit.",
                 )
             yield manifest
 

@@ -32,7 +32,7 @@ Marks = Sequence[Sequence[Pixel]]
 def make_questions(buffer_set: BufferSet) -> Iterator[Question]:
     """Make the questions of a buffer set, in canonical order."""
     module = "robomme_interference_data.build_dataset.question_pictures"
-    picture = load_extra(module, "picture", "build questions", "retrieval")
+    picture = load_extra(module, "picture", "build --only questions", "retrieval")
     for question, marks in planned_questions(buffer_set):
         view = buffer_set.query(question.episode_id).frame()
         scene = recorded_scene(buffer_set.query(question.episode_id))

@@ -126,7 +126,7 @@ def publish(
     yes: Yes = False,
     as_json: AsJson = False,
 ) -> None:
-    """Publish a buffer set on the Hub, as two repositories with cards.
+    r"""Publish a buffer set on the Hub, as two repositories with cards.
 
     The demonstrations come first, then the units with the manifests. All hashes and rules are
     checked before anything is sent. A published version never changes; its tag, such as data-1.0.0,
@@ -134,9 +134,12 @@ def publish(
 
     Examples:
     ```
-    robomme-interference publish my-buffers --repo-id my-name/my-buffers --dry-run
-    robomme-interference publish my-buffers --repo-id my-name/my-buffers --license cc-by-4.0
-    robomme-interference publish my-buffers --repo-id my-name/my-buffers --to export/
+    robomme-interference publish my-buffers --repo-id my-name/my-buffers \
+      --dry-run
+    robomme-interference publish my-buffers --repo-id my-name/my-buffers \
+      --license cc-by-4.0
+    robomme-interference publish my-buffers --repo-id my-name/my-buffers \
+      --to export/
     ```
     """
     from robomme_interference_data.constants import DEMONSTRATIONS, INDEX_DIR
@@ -199,14 +202,16 @@ def publish_results(
     yes: Yes = False,
     as_json: AsJson = False,
 ) -> None:
-    """Publish the results of a run on the Hub: rows, scores, a report and a card.
+    r"""Publish the results of a run on the Hub: rows, scores, a report and a card.
 
     A published version never changes. Videos of rollouts are not published.
 
     Examples:
     ```
-    robomme-interference publish-results my-run --repo-id my-name/my-results --dry-run
-    robomme-interference publish-results my-run --repo-id my-name/my-results --yes
+    robomme-interference publish-results my-run --repo-id my-name/my-results \
+      --dry-run
+    robomme-interference publish-results my-run --repo-id my-name/my-results \
+      --yes
     ```
     """
     from .repo_plan import plan_version, publish_version

@@ -1,4 +1,4 @@
-"""The commands `ceiling`, `shortcuts`, `evaluate`, `ask` and `merge`."""
+"""The commands `ceiling`, `evaluate`, `ask` and `merge`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -22,7 +22,7 @@ from .run.config import AskConfig, CeilingConfig, RunConfig
 
 @with_settings
 def ceiling(buffer_set: BufferSetFolder, config: CeilingConfig, as_json: AsJson = False) -> None:
-    """Print the maximum success that a memory rule allows, without a rollout.
+    r"""Print the maximum success that a memory rule allows, without a rollout.
 
     That is the share of the evidence that it keeps and the success rate of the ideal
     observer: no policy with that memory can do better.
@@ -31,7 +31,8 @@ def ceiling(buffer_set: BufferSetFolder, config: CeilingConfig, as_json: AsJson 
     ```
     robomme-interference ceiling my-buffers --memory window
     robomme-interference ceiling my-buffers --memory framesamp:64 --frames 2
-    robomme-interference ceiling my-buffers --retrieval thumbnail --shift light:2
+    robomme-interference ceiling my-buffers --retrieval thumbnail \
+      --shift light:2
     ```
     """
     from robomme_interference_data.data.loading import load_buffer_set
@@ -54,30 +55,6 @@ def ceiling(buffer_set: BufferSetFolder, config: CeilingConfig, as_json: AsJson 
     echo(module.ceiling_table(cells, title).text())
 
 
-def shortcuts(buffer_set: BufferSetFolder, as_json: AsJson = False) -> None:
-    """Print how far lesson length, goal and first live view reveal the answer.
-
-    A policy can use all three without any memory. Each episode is guessed from the others of
-    its family. Nothing is simulated.
-
-    Example:
-    ```
-    robomme-interference shortcuts my-buffers
-    ```
-    """
-    from robomme_interference_data.data.loading import load_buffer_set
-    from robomme_interference_data.schema.codec import to_dict
-
-    from . import shortcuts as module
-
-    opened = load_buffer_set(buffer_set)
-    found = [*module.shortcuts(module.cues_of(opened))]
-    if as_json:
-        print_json([to_dict(one) for one in found])
-        return
-    echo(module.shortcut_table(found, f"Shortcuts in {opened.name}").text())
-
-
 @with_settings
 def evaluate(config: RunConfig, as_json: AsJson = False) -> None:
     r"""Roll out a policy under the benchmark's conditions, one row per rollout.
@@ -92,12 +69,15 @@ def evaluate(config: RunConfig, as_json: AsJson = False) -> None:
 
     Examples:
     ```
-    robomme-interference evaluate my-buffers --policy replay:window --out runs/window
+    robomme-interference evaluate my-buffers --policy replay:window \
+      --out runs/window
 
-    robomme-interference evaluate my-buffers --policy replay --offline --out runs/offline
+    robomme-interference evaluate my-buffers --policy replay --offline \
+      --out runs/offline
 
-    robomme-interference evaluate my-buffers --policy websocket://localhost:8000 \
-      --system perceptual-framesamp-modul --conditions k0,k7 --out runs/framesamp \
+    robomme-interference evaluate my-buffers \
+      --policy websocket://localhost:8000 --system perceptual-framesamp-modul \
+      --conditions k0,k7 --out runs/framesamp \
       --policy-option checkpoint=mme_vla_suite/perceptual-framesamp-modul/79999
 
     robomme-interference evaluate my-buffers --policy lerobot:me/act@v1 \
@@ -113,11 +93,12 @@ def ask(config: AskConfig, as_json: AsJson = False) -> None:
 
     It sees the goal, the first live view with the possible answers marked, and the history frames
     that its memory keeps. Rows are scored like those of rollouts; OUT/answers has the transcripts.
-    First make the questions: robomme-interference build questions BUFFER_SET.
+    First make the questions: robomme-interference build BUFFER_SET --only questions.
 
     Examples:
     ```
-    robomme-interference ask my-buffers --model recall --out runs/recall --conditions k0,k7
+    robomme-interference ask my-buffers --model recall --out runs/recall \
+      --conditions k0,k7
 
     robomme-interference ask my-buffers --system qwen3-vl-4b --out runs/qwen \
       --model openai:http://localhost:8000/v1#Qwen/Qwen3-VL-4B-Instruct

@@ -1,4 +1,4 @@
-"""Charts of retrieval: `retrieval-score … --out` and `calibrate … --out`."""
+"""Charts of retrieval: `retrieval-score … --out`, with `--calibrate` or without."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

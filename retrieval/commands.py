@@ -1,4 +1,4 @@
-"""The commands of retrieval: `index`, `retrieve`, `retrieval-score` and `calibrate`."""
+"""The commands of retrieval: `index`, `retrieve` and `retrieval-score`."""
 
 import os
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ from robomme_interference_data.constants import (
     IDENTITY_PATH,
     MANIFEST_PATH,
 )
-from robomme_interference_data.errors import InvalidOptionError, MissingFileError, counted
+from robomme_interference_data.errors import InvalidOptionError, MissingFileError, counted, named
 from robomme_interference_data.runtime.executor import Serial, WorkersConfig, make_executor
 from robomme_interference_data.schema.settings import setting
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
@@ -43,6 +43,10 @@ if TYPE_CHECKING:
 
 _RETRIEVAL = "Retrieval"
 _EXECUTION = "Execution"
+_CALIBRATION = "Calibration"
+
+_SWEEP = (0.80, 0.99)
+"""First and last threshold that a calibration grades."""
 
 _ENCODER_HELP = (
     "thumbnail (no weights), siglip (the paper's model), or siglip:ID with the id or folder of "
@@ -110,7 +114,8 @@ def index(
     if not roots:
         raise MissingFileError(
             f"{buffer_set} is neither a buffer set nor a dataset of this package",
-            f"Build one: robomme-interference build all {buffer_set} --source KIND:PATH",
+            "Build one first:",
+            f"build {buffer_set} --source KIND:PATH",
         )
     planned = load_buffer_set(buffer_set) if (folder / MANIFEST_PATH).is_file() else None
     if planned is not None:
@@ -156,14 +161,15 @@ def retrieve(
     out: Picture = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show which part of a history retrieval chooses for the first live observation, and why.
+    r"""Show which part of a history retrieval chooses for the first live observation, and why.
 
     This needs the index of the encoder, but not its weights.
 
     Examples:
     ```
     robomme-interference retrieve my-buffers MoveCube/test/0 k7 --out why.png
-    robomme-interference retrieve my-buffers MoveCube/test/0 k7 --rule joined --shift light:2
+    robomme-interference retrieve my-buffers MoveCube/test/0 k7 --rule joined \
+      --shift light:2
     ```
     """
     from robomme_interference_data.data.loading import load_buffer_set
@@ -211,17 +217,43 @@ def retrieval_score(
     shift: Shift = NO_SHIFT,
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder for cells.csv, rows.csv (one row per query) and retrieval.png."),
+        typer.Option(
+            help="Folder for cells.csv, rows.csv (one row per query) and retrieval.png; of "
+            "--calibrate, for thresholds.png."
+        ),
     ] = None,
+    calibrate: Annotated[
+        bool,
+        typer.Option(
+            "--calibrate",
+            help="Instead of rules, fit the threshold below which histories are cut, and grade "
+            "others.",
+            rich_help_panel=_CALIBRATION,
+        ),
+    ] = False,
+    sweep: Annotated[
+        tuple[float, float],
+        typer.Option(
+            help="First and last threshold to grade, in steps of 0.01.",
+            rich_help_panel=_CALIBRATION,
+        ),
+    ] = _SWEEP,
     as_json: AsJson = False,
 ) -> None:
-    """Grade retrieval on every buffer with a lesson, without a simulator.
+    r"""Grade retrieval on every buffer with a lesson, without a simulator.
+
+    With --calibrate, the threshold is fitted as for the released rule: the middle between the 99th
+    percentile of the cosines across true borders of sessions and the 1st percentile of the lowest
+    cosine inside each session.
 
     Examples:
     ```
     robomme-interference retrieval-score my-buffers
     robomme-interference retrieval-score my-buffers --rules all --out my-score
-    robomme-interference retrieval-score my-buffers --shift light:2 --conditions k7
+    robomme-interference retrieval-score my-buffers --shift light:2 \
+      --conditions k7
+    robomme-interference retrieval-score my-buffers --calibrate \
+      --sweep 0.30 0.99
     ```
     """
     from robomme_interference_data.data.loading import load_buffer_set
@@ -232,14 +264,19 @@ def retrieval_score(
 
     check_output(out)
     name = encoders.encoder_name(encoder)
+    _check_calibration(rules, shift, sweep, calibrate=calibrate)
     parsed = select.parse_rules(rules, encoders.published_threshold(name))
     opened = load_buffer_set(buffer_set)
     camera = opened.datasets[DEMONSTRATIONS].camera(camera)
     about, measured = _measured(opened, name, camera, shift, families, conditions, as_json)
-    grades = [grade.grade(one, rule) for rule in parsed for one in measured]
+    if calibrate:
+        _calibrate(name, measured, about, sweep, out, as_json=as_json)
+        return
+    grades = [grade.grade(buffer, rule) for rule in parsed for buffer in measured]
     cells = list(grade.cells(grades))
     title = f"Retrieval on {about['buffer_set']}, encoder {name}, camera {camera}"
-    title += "" if shift == NO_SHIFT else f", shift {shift}"
+    if shift != NO_SHIFT:
+        title += f", shift {shift}"
     if len(parsed) == 1:
         title += f", rule {parsed[0]}"
     if out is not None:
@@ -259,54 +296,46 @@ def _csv(record: type, records: Sequence[Any]) -> str:
     from robomme_interference_data.schema.codec import to_dict
     from robomme_interference_data.viz.tables import Table, record_columns
 
-    rows = [tuple(to_dict(one).values()) for one in records]
-    return Table("records", "", record_columns(record), rows).csv()
+    columns = record_columns(record)
+    values = map(to_dict, records)  # in the order of the fields, the columns in that of the schema
+    rows = [[named_values.get(name) for name in columns] for named_values in values]
+    return Table("records", "", columns, rows).csv()
 
 
-def calibrate(
-    buffer_set: BufferSetFolder,
-    encoder: EncoderName = "thumbnail",
-    sweep: Annotated[
-        tuple[float, float],
-        typer.Option(
-            help="First and last threshold to grade, in steps of 0.01.", rich_help_panel=_RETRIEVAL
-        ),
-    ] = (0.80, 0.99),
-    families: Families = [],  # noqa: B006
-    conditions: Conditions = [],  # noqa: B006
-    camera: Camera = None,
-    out: Picture = None,
-    as_json: AsJson = False,
+def _check_calibration(
+    rules: Sequence[str], shift: str, sweep: tuple[float, float], *, calibrate: bool
 ) -> None:
-    """Fit the cosine below which histories are cut, and grade other thresholds.
+    """Check the sweep, and that no option is set which has no effect."""
+    from .calibrate import sweep_steps
 
-    The released rule takes the middle between the 99th percentile of the cosines across true cuts
-    and the 1st percentile of the lowest cosine inside each session.
+    sweep_steps(*sweep)
+    if not calibrate and sweep != _SWEEP:
+        raise InvalidOptionError(f"{named('sweep')} has no effect without {named('calibrate')}")
+    for name, changed in (("rules", rules != ["max"]), ("shift", shift != NO_SHIFT)):
+        if calibrate and changed:
+            raise InvalidOptionError(f"{named(name)} has no effect with {named('calibrate')}")
 
-    Examples:
-    ```
-    robomme-interference calibrate my-buffers
-    robomme-interference calibrate my-buffers --sweep 0.30 0.99 --out thresholds.png
-    ```
-    """
-    from robomme_interference_data.data.loading import load_buffer_set
+
+def _calibrate(
+    name: str,
+    measured: "list[Similarities]",
+    about: dict[str, Any],
+    sweep: tuple[float, float],
+    out: Path | None,
+    *,
+    as_json: bool,
+) -> None:
+    """Fit the threshold, print its grades, and draw them."""
     from robomme_interference_data.schema.codec import to_dict
 
-    from . import calibrate as fitting
-    from . import charts, encoders, select
+    from . import calibrate, charts, encoders, select
 
-    check_output(out)
-    name = encoders.encoder_name(encoder)
-    thresholds = fitting.sweep_steps(*sweep)
-    opened = load_buffer_set(buffer_set)
-    camera = opened.datasets[DEMONSTRATIONS].camera(camera)
-    about, measured = _measured(opened, name, camera, NO_SHIFT, families, conditions, as_json)
     rule = select.Rule.parse("max", encoders.published_threshold(name))
-    calibration = fitting.calibrate(measured, rule, thresholds)
-    title = f"Threshold of {name}, camera {camera}, on {about['buffer_set']}"
+    calibration = calibrate.calibrate(measured, rule, calibrate.sweep_steps(*sweep))
+    title = f"Threshold of {name}, camera {about['camera']}, on {about['buffer_set']}"
     if out is not None:
-        charts.draw_calibration(calibration, title, out)
-        print_status(f"{out} written")
+        charts.draw_calibration(calibration, title, out / "thresholds.png")
+        print_status(f"{out / 'thresholds.png'} written")
     if as_json:
         print_json(about | to_dict(calibration))
     else:

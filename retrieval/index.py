@@ -43,6 +43,7 @@ from robomme_interference_data.errors import (
     InterferenceError,
     InvalidOptionError,
     first_line,
+    named,
 )
 from robomme_interference_data.runtime.executor import Executor, Serial, Worker
 from robomme_interference_data.runtime.progress import WorkProgress
@@ -229,7 +230,8 @@ class _IndexBuilder:
             if not np.isfinite(outcome.value).all():
                 raise BuildError(
                     f"encoder {self.encoder.name!r} returned NaN or infinity for {episode_id}",
-                    'Its weights may be damaged, or its precision too low: try device="cpu".',
+                    "Its weights may be damaged, or its precision too low: try "
+                    f"{named('device', 'cpu')}.",
                 )
             with atomic_path(self.features[outcome.task]) as partial:
                 write_array(partial, outcome.value)

@@ -135,9 +135,11 @@ class Unit(NamedTuple):
         """Raw frames that an episode must have: 249 for the indices 0, 8, …, 248."""
         return (self.frames - 1) * self.stride + 1
 
-    def of(self, kind: str) -> "Unit":
-        """Return the unit in a dataset of a kind, given the one in the distractors."""
-        return Unit(self.frames * self.stride, 1) if kind == RAW_DISTRACTORS else self
+    def in_dataset(self, name: str) -> "Unit":
+        """Return the unit in another dataset of the buffer set; this is that of the distractors."""
+        if name == RAW_DISTRACTORS:  # the same raw frames, all of them
+            return Unit(self.frames * self.stride, 1)
+        return self
 
 
 PAPER_UNIT = Unit(UNIT_FRAMES, UNIT_STRIDE)

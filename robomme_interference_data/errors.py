@@ -1,13 +1,15 @@
 """Every error that this package raises on purpose.
 
 Each is also a fitting builtin, so that callers can catch either, and carries a `hint` on what to do
-next. Messages and hints name settings as in Python: `workers`, `executor="ray"`. The command line
-prints names in backticks, and any `name="value"`, as its options (`cli/hints.py`). Hints name pages
-of the documentation as in a checkout, `docs/how-to/vla-eval.md`, and show their address.
+next. Messages and hints name settings with `named`: as in Python, or as the options of the command
+that runs. Hints name pages of the documentation as in a checkout, `docs/how-to/vla-eval.md`, and
+show their address.
 """
 
 import re
-from collections.abc import Iterable, Sequence
+import shlex
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 from typing import Self
 
@@ -36,8 +38,7 @@ class InterferenceError(Exception):
         hint: What to do next, or None.
         command: Command of this package that helps, without the program's name, such as
             `verify my-buffers`; only the command line shows it.
-        option: Python name of the setting that is wrong, such as `workers`, if the message
-            contains it.
+        option: Python name of the setting that is wrong, such as `workers`; None if it is none.
     """
 
     def __init__(
@@ -100,13 +101,13 @@ class InvalidOptionError(InterferenceError, ValueError):
     @classmethod
     def expected(cls, option: str, given: object, expected: str, hint: str | None = None) -> Self:
         """Return the error for a setting: its Python name, the given value, the expected one."""
-        return cls(f"{option} {given!r}; expected {expected}", hint, option=option)
+        return cls(f"{_name_of(option)} {given!r}; expected {expected}", hint, option=option)
 
     @classmethod
     def one_of(cls, option: str, given: object, known: Iterable[str]) -> Self:
         """Return the error for a setting that is none of the known names."""
         names = list(known)
-        message = f"{option} {given!r} is none of {', '.join(names)}"
+        message = f"{_name_of(option)} {given!r} is none of {', '.join(names)}"
         return cls(message, nearest(str(given), names, more=""), option=option)
 
 
@@ -268,6 +269,44 @@ class WorkerRetiredError(InterferenceError, RuntimeError):
 
     Fix: nothing: it is handled inside a run.
     """
+
+
+# The names under which the reader of an error sets what is wrong: one command runs in a process.
+_option_names: Mapping[str, str] = {}
+
+
+@contextmanager
+def naming_options(names: Mapping[str, str]) -> Iterator[None]:
+    """Let errors name settings by the options of a command, `{"workers": "--workers"}`."""
+    global _option_names  # noqa: PLW0603 - also errors of other threads name the options
+    before, _option_names = _option_names, names
+    try:
+        yield
+    finally:
+        _option_names = before
+
+
+def option_names() -> Mapping[str, str]:
+    """Return the names that are in use, which worker processes do not have."""
+    return _option_names
+
+
+def named(setting: str, value: object = None) -> str:
+    """Return a setting as the reader of an error writes it, with a value if one is given.
+
+    In Python that is `workers` in backticks, or `executor="ray"`; in a command `--workers`, or
+    `--executor ray`.
+    """
+    if value is None:
+        return _option_names.get(setting, f"`{setting}`")
+    option = _option_names.get(setting)
+    if option is None:
+        return f'{setting}="{value}"' if isinstance(value, str) else f"{setting}={value}"
+    return f"{option} {shlex.quote(str(value))}"
+
+
+def _name_of(setting: str) -> str:
+    return _option_names.get(setting, setting)
 
 
 def nearest(given: str, known: Iterable[str], *, more: str = "Known: ") -> str:

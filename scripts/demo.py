@@ -17,7 +17,7 @@ COMMAND = Path(sys.executable).parent / "robomme-interference"
 ROLLOUTS = "--conditions k0,k7"
 STEPS = {
     "Play three test episodes and nine others, and plan buffers of them": (
-        "build all demo/buffers --source tabletop --split test --episodes 0 "
+        "build demo/buffers --source tabletop --split test --episodes 0 "
         "--families MoveCube,PatternLock,RouteStick --unit-episodes 2 --cameras front "
         "--conditions no-history,k0,k3,k7"
     ),

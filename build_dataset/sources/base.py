@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robomme_interference_data.constants import DIFFICULTIES
-from robomme_interference_data.errors import SourceError, nearest
+from robomme_interference_data.errors import SourceError, named, nearest
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EvidenceSpan
 
@@ -77,12 +77,12 @@ class Robot:
         if self.fps is None and given is None:
             raise SourceError(
                 "the recording does not state its frame rate",
-                "Give it with `fps`; in a frames folder a column fps can hold it.",
+                f"Give it with {named('fps')}; in a frames folder a column fps can hold it.",
             )
         if self.fps is not None and given is not None and not same_rate(self.fps, given):
             raise SourceError(
-                f"the recording states {self.fps:g} frames per second; fps is {given:g}",
-                "Leave out `fps`, or correct the recording.",
+                f"the recording states {self.fps:g} frames per second; {named('fps')} is {given:g}",
+                "Leave it out, or correct the recording.",
             )
         return self.fps or given  # type: ignore[return-value]
 

@@ -9,6 +9,7 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     SourceError,
     UnknownNameError,
+    named,
     nearest,
 )
 from robomme_interference_data.simulators.base import CAMERAS
@@ -64,20 +65,20 @@ def find_columns(
             raise SourceError(
                 f"{where}: column {column!r} holds {kind} of the shape {shape}; {name!r} needs "
                 f"{expected}",
-                f"Name the right one in `columns`: {name}=COLUMN. {guess}",
+                f"Name the right one with {named('columns', f'{name}=COLUMN')}. {guess}",
             )
     cameras = camera_names(columns)
     for name in cameras:
         if not _CAMERA.fullmatch(name):
             raise InvalidOptionError(
                 f"{where}: {name!r} is no camera name; expected letters, digits, - and _",
-                f"Name the camera in `columns`: NAME={columns[name]}",
+                f"Name the camera with {named('columns', f'NAME={columns[name]}')}.",
             )
     if "state" not in columns or not cameras:
         name, what = ("front", "camera") if not cameras else ("state", "robot state")
         raise SourceError(
             f"{where} has no {what}; its columns are: {', '.join(sorted(features))}",
-            f"Name its column in `columns`: {name}=COLUMN",
+            f"Name its column with {named('columns', f'{name}=COLUMN')}.",
         )
     return columns
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import ACTION, STATE, VALUE_NAMES
-from robomme_interference_data.errors import FormatError, SourceError
+from robomme_interference_data.errors import FormatError, SourceError, named
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import from_dict
 from robomme_interference_data.schema.evidence import spans_of_texts
@@ -33,10 +33,13 @@ from .robomme_families import BLOCKS, ROBOMME, families_for_goal
 
 _ROBOMME_REPOS = ("lerobot/robomme", "Yinpei/robomme_data_lerobot")
 _CORRECT = "Correct the dataset, or leave the episode out."
-_NAME_FAMILIES = (
-    "Name the family of every episode in a CSV file, `families_file`, with the first line "
-    "episode_index,family."
-)
+
+
+def _families_advice() -> str:
+    return (
+        f"Name the family of every episode in a CSV file, {named('families_file')}, with the first "
+        "line episode_index,family."
+    )
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,7 @@ class LeRobotSource(Source):
                 rows.part(rows.start, rows.start + lesson).texts(columns["subgoal"])
             )
         vectors = {STATE: "state", ACTION: "action"}
-        named = {feature: columns[name] for feature, name in vectors.items() if name in columns}
+        values = {feature: columns[name] for feature, name in vectors.items() if name in columns}
         streams = {camera: self._images(index, rows, columns[camera], exact) for camera in chosen}
         return Recording(
             goals=metadata.wordings,
@@ -131,7 +134,7 @@ class LeRobotSource(Source):
             exact=exact,
             frames=compose(streams, states, actions, lesson),
             evidence=evidence,
-            robot=self._robot(named, official=simulator == OFFICIAL),
+            robot=self._robot(values, official=simulator == OFFICIAL),
         )
 
     @cached_property
@@ -163,8 +166,10 @@ class LeRobotSource(Source):
         """
         robot = recorded_robot(self._lerobot, columns)
         size = (len(VALUE_NAMES),)
-        named = {f: VALUE_NAMES for f, name in columns.items() if self._lerobot.shape(name) == size}
-        return replace(robot, names=named | robot.names) if official else robot
+        if not official:
+            return robot
+        known = {f: VALUE_NAMES for f, name in columns.items() if self._lerobot.shape(name) == size}
+        return replace(robot, names=known | robot.names)
 
     def _images(
         self, index: int, rows: RowSpan, column: str, exact: bool
@@ -199,7 +204,7 @@ class LeRobotSource(Source):
             f"the families of the {len(rows)} episodes of {self._where} are unknown: it has no "
             "per-episode column episode_id or family, and is not one of RoboMME's with "
             f"{len(blocks)} of {len(BLOCKS)} families",
-            _NAME_FAMILIES,
+            _families_advice(),
         )
 
     def _check_goals(self, index: int, name: EpisodeId, goals: tuple[str, ...]) -> None:
@@ -210,7 +215,7 @@ class LeRobotSource(Source):
                 raise SourceError(
                     f"{self._where}: episode {index} would be {name}, but its goal {goal!r} "
                     f"cannot be one of {name.family}; it fits {others}",
-                    _NAME_FAMILIES,
+                    _families_advice(),
                 )
 
     def _state(self, index: int) -> tuple[Any, ...]:

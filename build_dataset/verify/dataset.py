@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.build_dataset.identity import (
+from robomme_interference_data.build_dataset.dataset.identity import (
     BuildReport,
     identity_of,
     listed_files,
     report_of,
 )
-from robomme_interference_data.build_dataset.image_stats import (
+from robomme_interference_data.build_dataset.dataset.image_stats import (
     ImageStats,
     Statistics,
     episode_statistics,
@@ -196,7 +196,7 @@ def _record(where: str, name: str, record: EpisodeRecord, unit: Unit) -> Iterato
     elif name == EXECUTIONS:
         expected = range(1, record.length + 1)
     else:
-        most, stride = unit.of(name)
+        most, stride = unit.in_dataset(name)
         expected = range((unit.raw_frames - 1) // stride + 1, most + 1)
     if record.length not in expected:
         yield Violation(where, f"holds {record.length} frames, not {expected[-1]}")

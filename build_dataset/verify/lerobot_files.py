@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from robomme_interference_data.build_dataset.image_stats import (
+from robomme_interference_data.build_dataset.dataset.image_stats import (
     QUANTILES,
     STATISTICS,
     Statistics,

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.constants import POSITION_LIMIT
-from robomme_interference_data.errors import FormatError, InvalidOptionError
+from robomme_interference_data.errors import FormatError, InvalidOptionError, named
 
 from .subgoal_prompt import Prompt, load_prompt
 
@@ -52,14 +52,14 @@ class Published:
 
     def check(self, name: str, prompt: Prompt, options: Mapping[str, Any]) -> None:
         """Raise an `InvalidOptionError` if a prompt, or one of all options, is another one."""
-        own = "Or set `system` to a name of your own: see docs/how-to/paper-systems.md."
+        own = f"Or set {named('system')} to a name of your own: see docs/how-to/paper-systems.md."
         command = (
             f"evaluate BUFFER_SET --system {name} --policy websocket://HOST:PORT --out RUN "
             f"--subgoals openai:URL#MODEL --subgoal-prompt CLONE/{FOLDER}/{self.file}"
         )
         if prompt.sha256 != self.sha256:
             raise InvalidOptionError(
-                f"`subgoal_prompt` is not the prompt of {name}",
+                f"{named('subgoal_prompt')} is not the prompt of {name}",
                 f"Set it to the file of a clone of {CLIENT}. {own}",
                 command,
             )

@@ -10,6 +10,7 @@ from robomme_interference_data.errors import (
     InterferenceError,
     InvalidOptionError,
     UnknownNameError,
+    named,
     nearest,
 )
 from robomme_interference_data.evaluate.run.config import (
@@ -63,7 +64,7 @@ class Questions(RunKind[AskConfig]):
         """Return why a condition does not apply, or None."""
         if self.config.retrieval is None or condition != NO_HISTORY:
             return None
-        return nothing_to_retrieve(f"Leave {NO_HISTORY} out of `conditions`.")
+        return nothing_to_retrieve(f"Leave {NO_HISTORY} out of {named('conditions')}.")
 
     def check(self, plan: Plan, items: Sequence[WorkItem]) -> None:
         """Check that the images fit, and that the ideal observer knows the possible answers."""
@@ -85,7 +86,8 @@ class Questions(RunKind[AskConfig]):
                 raise InvalidOptionError(
                     f"{item.episode}, {item.condition}: {kept} history frames and the picture; "
                     f"the model takes {self._images} images at most",
-                    f'Set model_options=("images={kept + 1}",), or a smaller `memory`.',
+                    f"Set {named('model_options', f'images={kept + 1}')}, or a smaller "
+                    f"{named('memory')}.",
                 )
 
     def task(self, run: Run[AskConfig]) -> AskTask:
@@ -141,12 +143,12 @@ def _name(config: AskConfig) -> str:
     if name is None:
         raise InvalidOptionError(
             f"the rows of {config.model} need a name",
-            "Set `system`, such as qwen3-vl-4b, or qwen3-vl-4b-blank for a control.",
+            f"Set {named('system')}, such as qwen3-vl-4b, or qwen3-vl-4b-blank for a control.",
         )
     name_system(name)
     if name != default and name in SYSTEMS:
         raise InvalidOptionError(
             f"{name} is the name of another system than {config.model}",
-            "Set `system` to a name of your own.",
+            f"Set {named('system')} to a name of your own.",
         )
     return name

@@ -17,6 +17,7 @@ from robomme_interference_data.errors import (
     MissingFileError,
     RunError,
     first_line,
+    named,
 )
 from robomme_interference_data.evaluate.run.config import AskConfig, RunConfig
 from robomme_interference_data.evaluate.run.log import is_done, read_run
@@ -108,7 +109,7 @@ def read_answers(
                 raise InvalidOptionError(
                     f"the answers in {path} have {name} {getattr(row, name)}, the rollouts "
                     f"{getattr(config, name)}",
-                    f"Set `{name}` to that of the answers.",
+                    f"Set {named(name)} to that of the answers.",
                 )
     chosen = {}
     for item in items:

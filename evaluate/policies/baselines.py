@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import ACTION_CHUNK
-from robomme_interference_data.errors import InvalidOptionError, PolicyError
+from robomme_interference_data.errors import InvalidOptionError, PolicyError, named
 from robomme_interference_data.simulators.base import Observation
 from robomme_interference_data.simulators.recordings import Recordings
 
@@ -25,7 +25,7 @@ class Mean(Policy):
     def reset(self, info: RolloutInfo) -> None:
         """Keep the recordings."""
         if not isinstance(info.simulator, Recordings):
-            raise PolicyError("baselines need recordings", "Set `offline`.")
+            raise PolicyError("baselines need recordings", f"Set {named('offline')}.")
         self._recordings = info.simulator
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:

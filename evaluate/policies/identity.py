@@ -8,7 +8,12 @@ from contextlib import ExitStack, closing, contextmanager, redirect_stdout, supp
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.errors import InvalidOptionError, PolicyError, PolicyServerError
+from robomme_interference_data.errors import (
+    InvalidOptionError,
+    PolicyError,
+    PolicyServerError,
+    named,
+)
 from robomme_interference_data.evaluate.run.identity import plain
 from robomme_interference_data.evaluate.systems import System
 from robomme_interference_data.schema.conditions import NO_HISTORY
@@ -151,7 +156,7 @@ def check_memory_kind(keeps: bool, server: str, system: System) -> None:
         f"the policy server {server} {actual}, and that of {system.name} {expected}: it serves "
         "another kind of model",
         f"Start it with the checkpoint of {system.name} (docs/how-to/paper-systems.md lists them) "
-        "and the history_config.txt beside it, or set `system` to a name of your own.",
+        f"and the history_config.txt beside it, or set {named('system')} to a name of your own.",
     )
 
 

@@ -7,7 +7,12 @@ from collections.abc import Sequence
 from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, EXECUTIONS, STATE
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.errors import InterferenceError, InvalidOptionError, UnknownNameError
+from robomme_interference_data.errors import (
+    InterferenceError,
+    InvalidOptionError,
+    UnknownNameError,
+    named,
+)
 from robomme_interference_data.evaluate.policies.capabilities import PolicyKind, Role
 from robomme_interference_data.evaluate.policies.policy import BATCH_METHODS, Policy
 from robomme_interference_data.evaluate.policies.registry import (
@@ -56,8 +61,8 @@ def default_system(config: RunConfig) -> str:
     if unidentified not in (None, ORACLE):
         raise InvalidOptionError(
             f"the rows of {unidentified} need a name: its text does not identify it",
-            "Set `system`, such as perceptual-framesamp-modul, or a name of your own: see "
-            "docs/how-to/paper-systems.md.",
+            f"Set {named('system')}, such as perceptual-framesamp-modul, or a name of your own: "
+            "see docs/how-to/paper-systems.md.",
         )
     memory = policy_memory(config.policy)
     parts = [spec.target if memory is None else Memory.parse(memory).label]
@@ -95,7 +100,7 @@ def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> 
     if simulator.plays_back and not config.offline:
         raise InvalidOptionError(
             f"{config.simulator} are no simulator to choose",
-            "Set `offline` for an offline evaluation.",
+            f"Set {named('offline')} for an offline evaluation.",
         )
     check_shift(config.simulator, config.shift)
     _check_policies(config, kind, policy)
@@ -113,7 +118,7 @@ def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> 
     if config.videos:
         from robomme_interference_data.simulators.play import check_pillow
 
-        check_pillow("`videos`")
+        check_pillow(named("videos"))
 
 
 def _check_cameras(config: RunConfig, demonstrations: Dataset, policy: Policy) -> None:
@@ -135,16 +140,17 @@ def _check_cameras(config: RunConfig, demonstrations: Dataset, policy: Policy) -
         raise UnknownNameError(
             f"the live camera {camera!r} is not in the simulator {config.simulator}, which draws "
             f"{', '.join(live.cameras)}",
-            "To act along the recordings of this buffer set, without a simulator, set `offline`. "
-            "In the simulator, set another policy, or another `retrieval_camera`.",
+            "To act along the recordings of this buffer set, without a simulator, set "
+            f"{named('offline')}. "
+            f"In the simulator, set another policy, or another {named('retrieval_camera')}.",
         )
 
 
 def _script_hint(config: RunConfig, kind: PolicyKind) -> str:
     if config.offline:
-        return "Leave out `offline`, or set another policy."
+        return f"Leave out {named('offline')}, or set another policy."
     if kind.script in simulator_class(RECORDINGS).policies:
-        return "Set `offline`: it repeats recorded actions."
+        return f"Set {named('offline')}: it repeats recorded actions."
     return "Set another simulator, such as tabletop, or another policy."
 
 
@@ -168,15 +174,19 @@ def _check_policies(config: RunConfig, kind: PolicyKind, policy: Policy) -> None
     if config.policies is None:
         own = "policies that are not shared"
         unused = ("max_batch_size", "batch_wait_timeout_s", "policy_resources")
-        check_unused(config, unused, own, "Set `policies`.")
+        check_unused(config, unused, own, f"Set {named('policies')}.")
         return
     if config.on_cluster:
         Resources.parse("policy_resources", config.policy_resources)
     else:
         own = "policies on this machine, which share its GPUs"
-        check_unused(config, ("policy_resources",), own, 'Set `executor` to "ray".')
+        check_unused(config, ("policy_resources",), own, f"Set {named('executor', 'ray')}.")
     for name, valid, expected in (
-        ("policies", 1 <= config.policies <= config.workers, f"1 to `workers`, {config.workers}"),
+        (
+            "policies",
+            1 <= config.policies <= config.workers,
+            f"1 to {named('workers')}, {config.workers}",
+        ),
         ("max_batch_size", config.max_batch_size >= 1, "1 or more"),
         ("batch_wait_timeout_s", 0 <= config.batch_wait_timeout_s < math.inf, "0 or more"),
     ):
@@ -192,8 +202,10 @@ def _check_policies(config: RunConfig, kind: PolicyKind, policy: Policy) -> None
         fault = f"it has no {' and no '.join(missing)}"
     if fault is not None:
         raise InvalidOptionError(
-            f"the policy {config.policy} cannot be shared by workers (`policies`): {fault}",
-            "Leave out `policies`; docs/how-to/your-own-policy.md describes shared policies.",
+            f"the policy {config.policy} cannot be shared by workers ({named('policies')}): "
+            f"{fault}",
+            f"Leave out {named('policies')}; docs/how-to/your-own-policy.md describes shared "
+            "policies.",
         )
 
 
@@ -214,19 +226,21 @@ def _check_name(config: RunConfig, system: System) -> None:
         config.subgoals is not None
     ) and kind.role is not Role.OWN:
         acts_on_none = system.facts.subgoals is None
-        needs = "no subgoals" if acts_on_none else "subgoals of a model (`subgoals`)"
-        fault = f"system {system.name} acts on {needs}, and `subgoals` is {config.subgoals}"
+        needs = "no subgoals" if acts_on_none else f"subgoals of a model ({named('subgoals')})"
+        fault = (
+            f"system {system.name} acts on {needs}, and {named('subgoals')} is {config.subgoals}"
+        )
     elif config.subgoals == ORACLE:
         fault = f"system {system.name} has subgoals of a model, and {ORACLE} knows the answer"
     elif (system.facts.retrieval is not None) != retrieval:
         expected = "a" if system.facts.retrieval else "no"
-        fault = f"system {system.name} has {expected} retrieval step, and `retrieval` is "
+        fault = f"system {system.name} has {expected} retrieval step, and {named('retrieval')} is "
         fault += str(config.retrieval)
     elif retrieval and Rule.parse(config.retrieval_rule).method != "max":
         fault = f"the retrieval step of {system.name} has the rule max, not {config.retrieval_rule}"
     if fault is not None:
         raise InvalidOptionError(
-            fault, "Set `system` to a name of your own: see docs/how-to/paper-systems.md."
+            fault, f"Set {named('system')} to a name of your own: see docs/how-to/paper-systems.md."
         )
 
 
@@ -235,7 +249,7 @@ def _check_subgoals(config: RunConfig) -> None:
     for name in ("subgoal_prompt", "subgoal_options"):
         if getattr(config, name) and config.subgoals in (None, ORACLE):
             raise InvalidOptionError(
-                f"`{name}` has no effect without a model that writes subgoals",
+                f"{named(name)} has no effect without a model that writes subgoals",
                 'Set subgoals="openai:URL#MODEL", or leave it out.',
             )
     if config.subgoals is None:
@@ -244,7 +258,7 @@ def _check_subgoals(config: RunConfig) -> None:
         able = [name for name, kind in POLICIES.kinds.items() if kind.reads_subgoals]
         raise InvalidOptionError(
             f"the policy {config.policy} reads no subgoals",
-            f"Set `policy` to {', '.join(able)}, or leave out `subgoals`.",
+            f"Set {named('policy')} to {', '.join(able)}, or leave out {named('subgoals')}.",
         )
 
 
@@ -275,8 +289,9 @@ def check_plan(
         if families and episode.family not in families:
             raise InvalidOptionError(
                 f"{config.simulator} does not play the family {episode.family} of {episode}",
-                f"It plays {', '.join(sorted(families))}. Set `families` to some of them, or "
-                '`simulator` to one that plays these episodes, such as "module:class".',
+                f"It plays {', '.join(sorted(families))}. Set {named('families')} to some of "
+                "them, or "
+                f"{named('simulator')} to one that plays these episodes, such as module:class.",
             )
     if system.position_limit is not None and config.retrieval is None:
         planned, longest = set(items), dict.fromkeys(plan.conditions, 0)
@@ -293,9 +308,9 @@ def condition_refusal(facts: SystemFacts, condition: str) -> InterferenceError |
         return None
     if condition == NO_HISTORY:
         return nothing_to_retrieve(
-            f"Run {NO_HISTORY} without `retrieval`: without history, it is the same system."
+            f"Run {NO_HISTORY} without {named('retrieval')}: it is the same system there."
         )
     return InvalidOptionError(
         f"the system takes no history, so {condition} has no effect",
-        f"Set `conditions` to {NO_HISTORY}.",
+        f"Set {named('conditions')} to {NO_HISTORY}.",
     )

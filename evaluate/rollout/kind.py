@@ -14,6 +14,7 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     PolicyServerError,
     SimulatorCrashError,
+    named,
 )
 from robomme_interference_data.evaluate.language.subgoal_writers import (
     describe_subgoals,
@@ -177,7 +178,8 @@ class Offline(Rollouts):
         check_unused(config, _UNUSED, "an offline evaluation", "Leave it out.")
         if config.subgoals == ORACLE:
             raise InvalidOptionError(
-                f"subgoals of {ORACLE} need a simulator", "Set a model, or leave out `offline`."
+                f"subgoals of {ORACLE} need a simulator",
+                f"Set a model, or leave out {named('offline')}.",
             )
         super().__init__(dataclasses.replace(config, simulator=RECORDINGS), buffer_set)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from robomme_interference_data.constants import DEMONSTRATIONS, SPLITS
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import InvalidOptionError, named
 from robomme_interference_data.runtime.executor import WorkersConfig
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.sampling import MEMORY_FORM
@@ -249,7 +249,7 @@ def check_unused(config: WorkConfig, names: Iterable[str], on: str, hint: str) -
     defaults = {one.name: one.default for one in fields(config)}
     for name in names:
         if getattr(config, name) != defaults[name]:
-            raise InvalidOptionError(f"`{name}` has no effect on {on}", hint)
+            raise InvalidOptionError(f"{named(name)} has no effect on {on}", hint)
 
 
 def with_camera[C: RetrievalConfig](config: C, buffer_set: "BufferSet") -> C:
@@ -270,8 +270,8 @@ def non_default_retrieval(config: RetrievalConfig) -> dict[str, str]:
         changed["retrieval_camera"] = config.retrieval_camera
     if changed and config.retrieval is None:
         raise InvalidOptionError(
-            f"`{next(iter(changed))}` has no effect without a retrieval step",
-            'Set `retrieval`, such as retrieval="siglip", or leave it out.',
+            f"{named(next(iter(changed)))} has no effect without a retrieval step",
+            f"Set {named('retrieval')}, such as siglip, or leave it out.",
         )
     return changed
 

@@ -17,7 +17,7 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
 from robomme_interference_data.constants import FORMAT_VERSION, RUN_HEADER, RUN_RECORD, RUN_TABLES
-from robomme_interference_data.errors import FormatError, RunError, first_line, visible
+from robomme_interference_data.errors import FormatError, RunError, first_line, named, visible
 from robomme_interference_data.schema.codec import arrow_schema, from_dict, to_dict, to_table
 from robomme_interference_data.schema.rollouts import FINAL, Status
 from robomme_interference_data.storage.files import (
@@ -176,10 +176,11 @@ def open_log(
     if existing and RUN_HEADER not in existing:
         raise RunError(
             f"{folder} holds other files ({', '.join(existing[:3])}) and no {RUN_HEADER}",
-            "Set `out` to a new folder.",
+            f"Set {named('out')} to a new folder.",
         )
     busy = RunError(
-        f"another process is writing {folder}", "Wait for it to end, or set another `out`."
+        f"another process is writing {folder}",
+        f"Wait for it to end, or set another {named('out')}.",
     )
     with file_lock(folder / ".lock", busy):
         if not existing:
@@ -188,7 +189,8 @@ def open_log(
             write_json(folder / RUN_HEADER, to_dict(header))
         elif not resume:
             raise RunError(
-                f"{folder} holds a run already", "Set another `out`, or leave out `no_resume`."
+                f"{folder} holds a run already",
+                f"Set another {named('out')}, or leave out {named('no_resume')}.",
             )
         header, rows = read_run(folder)
         check_same_run(folder, header.identity, identity)
@@ -260,7 +262,7 @@ def check_same_run(folder: Path, existing: Mapping[str, Any], expected: Mapping[
     if differences:
         raise RunError(
             f"{folder} holds another run: {'; '.join(differences)}",
-            f"Set another `out`, or the settings of the existing run (see {RUN_HEADER}).",
+            f"Set another {named('out')}, or the settings of the existing run (see {RUN_HEADER}).",
         )
 
 

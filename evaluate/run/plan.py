@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
-from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, named
 from robomme_interference_data.ids import EpisodeId, count_numbers, format_numbers, parse_numbers
 from robomme_interference_data.schema.conditions import in_order, parse_condition
 from robomme_interference_data.storage.files import canonical_json
@@ -138,7 +138,8 @@ def plan_work(
             raise UnknownNameError(
                 f"the buffer set has no query episode {group}/{(missing or [0])[0]}"
                 + (f" and {len(missing) - 1} more" if len(missing) > 1 else ""),
-                f"Its episodes of {group} are {format_numbers(numbers) or 'none'}; see `split`.",
+                f"Its episodes of {group} are {format_numbers(numbers) or 'none'}; see "
+                f"{named('split')}.",
             )
         if numbers:
             planned[group] = format_numbers(selected or numbers)
@@ -147,7 +148,7 @@ def plan_work(
         splits = sorted({one.split for one in every})
         raise InvalidOptionError(
             f"the buffer set has no {split} episode to run",
-            f"Set `split` to one of {', '.join(splits)}.",
+            f"Set {named('split')} to one of {', '.join(splits)}.",
         )
     return Plan(planned, names, shard)
 

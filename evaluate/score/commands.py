@@ -61,7 +61,7 @@ def score(
     ```
     robomme-interference score my-run another-run --out my-score
     robomme-interference score rollouts.csv --system retrieval-framesamp-modul \
-        --against paper --out my-score
+      --against paper --out my-score
     ```
     """
     from robomme_interference_data.runtime.memory import memory_limit
@@ -129,7 +129,7 @@ def compare(
     ] = "1/1",
     as_json: AsJson = False,
 ) -> None:
-    """Compare two runs, or two conditions of one run, paired over shared episodes.
+    r"""Compare two runs, or two conditions of one run, paired over shared episodes.
 
     Runs under different shifts can be compared: the difference is the effect of the shift.
 
@@ -137,7 +137,8 @@ def compare(
     ```
     robomme-interference compare my-run my-run-with-retrieval
     robomme-interference compare my-run --conditions k0,k7 --looks 2/5
-    robomme-interference compare my-run rollouts.csv --system-b retrieval-framesamp-modul
+    robomme-interference compare my-run rollouts.csv \
+      --system-b retrieval-framesamp-modul
     ```
     """
     from robomme_interference_data.runtime.memory import memory_limit

@@ -7,7 +7,7 @@ from typing import Any
 import yaml
 
 from robomme_interference_data.data.loading import load_buffer_set
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import InvalidOptionError, named
 from robomme_interference_data.evaluate.run.plan import plan_work
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.ids import count_numbers
@@ -23,7 +23,8 @@ def check_label(system: str) -> None:
     if name_system(system).paper:
         raise InvalidOptionError(
             f"a server of vla-eval is not the paper's system {system}",
-            "Set `system` to a name of your own; docs/how-to/vla-eval.md lists what differs.",
+            f"Set {named('system')} to a name of your own; docs/how-to/vla-eval.md lists what "
+            "differs.",
         )
 
 

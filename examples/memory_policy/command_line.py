@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 import torch
 
-from robomme_interference_data.cli.hints import shown_error
-from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.errors import InterferenceError, naming_options
 
 
 def whole(least: int, step: int = 1) -> Callable[[str], int]:
@@ -69,11 +68,13 @@ def default_device() -> str:
 
 def run(main: Callable[[argparse.Namespace], None], args: argparse.Namespace) -> None:
     """Run a program; end it with one text if the input is wrong or the user interrupts."""
+    options = {name: f"--{name.replace('_', '-')}" for name in vars(args)}
     try:
-        main(args)
+        with naming_options(options):
+            main(args)
     except InterferenceError as error:
-        options = {name: f"--{name.replace('_', '-')}" for name in vars(args)}
-        raise SystemExit("error: " + "\n".join(shown_error(error, options).lines)) from None
+        command = "" if error.command is None else f"\nRun: robomme-interference {error.command}"
+        raise SystemExit(f"error: {error}{command}") from None
     except OSError as error:
         raise SystemExit(f"error: {error}") from None
     except KeyboardInterrupt:

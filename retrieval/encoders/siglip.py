@@ -15,6 +15,7 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     MissingExtraError,
     first_line,
+    named,
 )
 from robomme_interference_data.storage.hub import HubFiles, locate
 from robomme_interference_data.storage.weights import digest_weights
@@ -66,7 +67,7 @@ class Siglip:
             torch.empty(0, device=self._device)
         except (RuntimeError, AssertionError) as error:
             message = f"device {device!r} cannot be used: {first_line(error)}"
-            raise InvalidOptionError(message, 'Try device="cpu".') from None
+            raise InvalidOptionError(message, f"Try {named('device', 'cpu')}.") from None
         self._dtype = torch.float32
         if self._device.type == "cuda":
             self._dtype = torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float16

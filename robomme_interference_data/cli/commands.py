@@ -62,12 +62,13 @@ def list_buffers(
 
 
 def list_conditions(as_json: AsJson = False) -> None:
-    """List the kinds of conditions: the history that each prescribes, and its purpose.
+    r"""List the kinds of conditions: the history that each prescribes, and its purpose.
 
     Examples:
     ```
     robomme-interference conditions
-    robomme-interference build manifests my-buffers --conditions no-history,k0,k7,before-k7,held-k7
+    robomme-interference build my-buffers --only manifests \
+      --conditions no-history,k0,k7,before-k7,held-k7
     ```
     """
     from robomme_interference_data.constants import MAX_K
@@ -98,14 +99,15 @@ def fetch(
     dry_run: Annotated[bool, typer.Option(help="Only print what would be fetched.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Fetch a buffer set from the Hub, or the part of it that some buffers need.
+    r"""Fetch a buffer set from the Hub, or the part of it that some buffers need.
 
     Existing files are not fetched again; every file is checked against its SHA-256.
 
     Examples:
     ```
     robomme-interference fetch namespace/name@data-1.0.0
-    robomme-interference fetch namespace/name --conditions k3 --families MoveCube --cameras front
+    robomme-interference fetch namespace/name --conditions k3 \
+      --families MoveCube --cameras front
     robomme-interference fetch namespace/name --index thumbnail --to my-buffers
     ```
     """

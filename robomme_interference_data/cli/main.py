@@ -5,15 +5,22 @@ import os
 import signal
 import sys
 import traceback
-from dataclasses import asdict
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from importlib import metadata
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn, Self
 
 import typer
+from typer.core import TyperCommand
 
 from robomme_interference_data.build_dataset import commands as building
 from robomme_interference_data.cards import commands as publishing
-from robomme_interference_data.errors import InterferenceError, first_line
+from robomme_interference_data.errors import (
+    InterferenceError,
+    NoRendererError,
+    first_line,
+    naming_options,
+)
 from robomme_interference_data.evaluate import commands as evaluating
 from robomme_interference_data.evaluate.score import commands as scoring
 from robomme_interference_data.evaluate.vla_eval import commands as vla_eval
@@ -21,22 +28,67 @@ from robomme_interference_data.retrieval import commands as retrieving
 from robomme_interference_data.simulators import commands as simulating
 from robomme_interference_data.storage.hub import check_endpoint
 
-from . import commands, show_commands
+from . import commands, show_command, verify_command
 from .console import echo, log_to_stderr, print_status
-from .help import App, Group
-from .hints import PROGRAM, ShownError, option_names, shown_error
+
+PROGRAM = "robomme-interference"
 
 
-class _Root(Group):
-    """Lists the commands below the titles of `_GROUPS`."""
+@dataclass(frozen=True)
+class ShownError:
+    """An error as the command line shows it: as lines, or with `--json` as these fields.
 
-    def sections(self) -> dict[str, list[str]]:
-        return {title: [name for name, _ in group] for title, group in _GROUPS.items()}
+    Attributes:
+        type: Name of its class.
+        message: What was given and what was expected.
+        hint: What to do next, or None.
+        command: A whole command that helps, or None.
+    """
+
+    type: str
+    message: str
+    hint: str | None = None
+    command: str | None = None
+
+    @classmethod
+    def of(cls, error: InterferenceError) -> Self:
+        """Return an error of this package as it is shown."""
+        command = error.command
+        if command is None and isinstance(error, NoRendererError):
+            command = "doctor"
+        whole = None if command is None else f"{PROGRAM} {command}"
+        return cls(type(error).__name__, error.message, error.hint, whole)
 
 
-app = App(
-    cls=_Root,
+class _Command(TyperCommand):
+    """A command whose errors name its own options and arguments."""
+
+    def make_context(self, *args: Any, **settings: Any) -> Any:
+        """Parse the arguments."""
+        try:
+            return super().make_context(*args, **settings)
+        except typer.BadParameter as error:
+            # Typer's newer versions let pydantic check values, which says what it raised.
+            error.message = error.message.removeprefix("Value error, ")
+            raise
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command."""
+        with naming_options(dict(map(_name_and_option, self.params))):
+            return super().invoke(ctx)
+
+
+def _name_and_option(parameter: Any) -> tuple[str, str]:
+    """Return the Python name of a parameter, and its option, or the argument in the usage."""
+    if parameter.param_type_name == "argument":
+        return parameter.name, parameter.metavar or parameter.name.upper()
+    return parameter.name, max(parameter.opts, key=len)
+
+
+app = typer.Typer(
     name=PROGRAM,
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
     help="History buffers for RoboMME-Interference: build, load, stream and score.",
     epilog="""A buffer set is a folder with demonstrations, distractor units and manifests.
@@ -44,7 +96,7 @@ Options shown with NAME,… accept several values: separate them by commas or re
 
 ```
 robomme-interference doctor
-robomme-interference build all my-buffers --source robomme-h5:recordings/
+robomme-interference build my-buffers --source robomme-h5:recordings/
 robomme-interference verify my-buffers
 robomme-interference list my-buffers
 robomme-interference show my-buffers MoveCube/train/0 k3 --out strip.png
@@ -52,31 +104,26 @@ robomme-interference show my-buffers MoveCube/train/0 k3 --out strip.png
 """,
 )
 
-_GROUPS = {
+_GROUPS: dict[str, tuple[tuple[str, Callable[..., None]], ...]] = {
     "Data": (
         ("doctor", commands.doctor),
-        ("build", building.app),
-        ("new-buffer-set", building.new_buffer_set),
-        ("verify", building.verify),
-        ("audit", building.audit),
+        ("build", building.build),
+        ("verify", verify_command.verify),
         ("fetch", commands.fetch),
     ),
     "Look": (
         ("conditions", commands.list_conditions),
         ("list", commands.list_buffers),
-        ("show", show_commands.show),
-        ("question", show_commands.show_question),
+        ("show", show_command.show),
         ("simulate", simulating.simulate),
     ),
     "Retrieval": (
         ("index", retrieving.index),
         ("retrieve", retrieving.retrieve),
         ("retrieval-score", retrieving.retrieval_score),
-        ("calibrate", retrieving.calibrate),
     ),
     "Rollouts": (
         ("ceiling", evaluating.ceiling),
-        ("shortcuts", evaluating.shortcuts),
         ("evaluate", evaluating.evaluate),
         ("ask", evaluating.ask),
         ("merge", evaluating.merge),
@@ -116,12 +163,9 @@ def _root(
         check_endpoint()  # before libraries that use the Hub are imported
 
 
-for _commands in _GROUPS.values():
+for _title, _commands in _GROUPS.items():
     for _name, _command in _commands:
-        if isinstance(_command, typer.Typer):
-            app.add_typer(_command, name=_name)
-        else:
-            app.command(_name)(_command)
+        app.command(_name, cls=_Command, rich_help_panel=_title)(_command)
 
 
 def main() -> None:
@@ -136,7 +180,7 @@ def main() -> None:
         # Outside its standalone mode, Typer returns the exit code and raises errors of usage.
         sys.exit(command(prog_name=PROGRAM, standalone_mode=not as_json))
     except InterferenceError as error:
-        _fail(shown_error(error, option_names(command, sys.argv[1:])), as_json)
+        _fail(ShownError.of(error), as_json)
     except _USAGE_ERROR as error:  # only with --json
         name, hint = type(error).__name__, None
         if error.ctx is not None:
@@ -168,10 +212,11 @@ def _fail(error: ShownError, as_json: bool, code: int = 1) -> NoReturn:
     if as_json:
         print_status(json.dumps(asdict(error)))
         sys.exit(code)
-    first, *further = error.lines
-    print_status(f"Error: {first}", fg=typer.colors.RED)
-    for line in further:
-        print_status(line)
+    print_status(f"Error: {error.message}", fg=typer.colors.RED)
+    if error.hint is not None:
+        print_status(error.hint)
+    if error.command is not None:
+        print_status(f"Run: {error.command}")
     sys.exit(code)
 
 

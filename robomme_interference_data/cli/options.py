@@ -14,6 +14,7 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
 
+from robomme_interference_data.errors import with_addresses
 from robomme_interference_data.schema.settings import SETTING
 
 
@@ -100,7 +101,7 @@ def _options(config: Any) -> list[inspect.Parameter]:
 def _option(field: dataclasses.Field[Any], kind: Any) -> inspect.Parameter:
     declared, default = field.metadata[SETTING], field.default
     attributes = {
-        "help": declared["help"],
+        "help": with_addresses(declared["help"]),
         "metavar": declared["metavar"],
         "envvar": declared["env"],
         "rich_help_panel": declared["group"],

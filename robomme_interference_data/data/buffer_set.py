@@ -226,10 +226,10 @@ class BufferSet:
         """Return the command that plans buffers under these conditions too."""
         if not self.is_own:
             location = self.header.datasets[DEMONSTRATIONS].location
-            command = f"new-buffer-set BUFFER_SET --demonstrations {location} --source KIND:PATH"
+            command = f"build BUFFER_SET --demonstrations {location} --source KIND:PATH"
             names = [name for name in self.conditions if name not in conditions]
             return f"{command} --conditions {','.join([*names, *conditions])}"
-        return f"build manifests {self.location} --conditions {','.join(conditions)}"
+        return f"build {self.location} --only manifests --conditions {','.join(conditions)}"
 
     @property
     def fix(self) -> str:

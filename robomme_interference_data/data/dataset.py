@@ -30,6 +30,7 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     MissingFileError,
     UnknownNameError,
+    named,
 )
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import from_dict, to_dict
@@ -103,7 +104,7 @@ class Dataset:
                 f"{files.describe()} is a LeRobot dataset, but not one of history sessions: "
                 f"{IDENTITY_PATH} is missing",
                 "Build one from it.",
-                f"build distractors DIR --source lerobot:{files.location}",
+                f"build DIR --only distractors --source lerobot:{files.location}",
             ) from None
         self.identity = read_header(path, DatasetIdentity)
         self._name = files.describe()
@@ -182,14 +183,14 @@ class Dataset:
         if not self.cameras:
             raise UnknownNameError(
                 f"{self._name} was stored without images; a camera is needed",
-                "Build a buffer set with `cameras`, such as front.",
+                f"Build a buffer set with {named('cameras')}, such as front.",
             )
         if plain is None:
             return self.cameras[0]
         if plain not in self.cameras:
             raise UnknownNameError(
                 f"camera {plain!r} is not in {self._name}",
-                f"Set `{option}` to one of its cameras: {', '.join(self.cameras)}.",
+                f"Set {named(option)} to one of its cameras: {', '.join(self.cameras)}.",
             )
         return plain
 

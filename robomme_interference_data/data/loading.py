@@ -60,7 +60,7 @@ def load_buffer_set(
                 fetch_command(files.root, record),
             ) from error
         hint = "Give a folder with demonstrations/, distractors/ and manifests/, or build one."
-        command: str | None = "build all BUFFER_SET --source KIND:PATH"
+        command: str | None = "build BUFFER_SET --source KIND:PATH"
         if isinstance(files, LocalFiles) and _is_unfinished(files.root):
             hint = "Its build has not finished: run the same build command again to resume it."
             command = None
@@ -141,9 +141,9 @@ def open_dataset(buffer_set: BufferSet, name: str, more: str = "") -> Dataset:
     hint, command = "Ask its publisher to add them.", None
     if buffer_set.is_own and Path(buffer_set.location, name, IDENTITY_PATH).is_file():
         hint = "It is built; plan the buffers again to include it."
-        command = f"build manifests {buffer_set.location}"
+        command = f"build {buffer_set.location} --only manifests"
     elif buffer_set.is_own:
-        hint = "Build them from the source of its demonstrations, then run build manifests again."
+        hint = "Build them from the source of its demonstrations, then plan the buffers again."
         command = f"build {name} {buffer_set.location} --source KIND:PATH"
     raise MissingFileError(
         f"{buffer_set.location} has no {name}", f"{hint} {more}".strip(), command

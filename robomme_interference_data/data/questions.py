@@ -94,7 +94,7 @@ def read_questions(buffer_set: BufferSet) -> dict[EpisodeId, Question]:
     """Read the questions of a buffer set, by query episode."""
     hint, command = "Only its publisher can make them again.", None
     if buffer_set.is_own:
-        hint, command = "", f"build questions {buffer_set.location}"
+        hint, command = "", f"build {buffer_set.location} --only questions"
     try:
         path = buffer_set.files.path(QUESTIONS_PATH)
     except MissingFileError:

@@ -67,7 +67,7 @@ class SetDatasets(Mapping[str, Dataset]):
                     f"{dataset.files.describe()} has revision {dataset.revision[:12]}…; the "
                     f"manifests were made for {recorded.revision[:12]}…",
                     self._buffer_set.fix,
-                    f"build manifests {self._buffer_set.location}"
+                    f"build {self._buffer_set.location} --only manifests"
                     if self._buffer_set.is_own
                     else None,
                 )

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from importlib import metadata
 from typing import Any, Self
 
-from robomme_interference_data.errors import InvalidOptionError, WorkerError
+from robomme_interference_data.errors import InvalidOptionError, WorkerError, named
 from robomme_interference_data.lazy import load_extra
 from robomme_interference_data.schema.settings import setting
 
@@ -96,8 +96,8 @@ def make_executor(config: WorkersConfig) -> "Executor":
     if not config.on_cluster:
         if config.resources:
             raise InvalidOptionError(
-                '`resources` has no effect with executor="processes"',
-                'Set executor="ray", or omit it.',
+                f"{named('resources')} has no effect with {named('executor', 'processes')}",
+                f"Set {named('executor', 'ray')}, or leave it out.",
             )
         return Processes(config.workers)
     name, colon, address = config.executor.partition(":")
@@ -105,7 +105,9 @@ def make_executor(config: WorkersConfig) -> "Executor":
         known = ("processes", "ray", "ray:HOST:PORT", "ray:local")
         raise InvalidOptionError.one_of("executor", config.executor, known)
     resources = Resources.parse("resources", config.resources)
-    make = load_extra(f"{__package__}.ray_cluster", "RayWorkers", 'executor="ray"', "cluster")
+    make = load_extra(
+        f"{__package__}.ray_cluster", "RayWorkers", named("executor", "ray"), "cluster"
+    )
     executor: Executor = make(config.workers, address if colon else "auto", resources)
     return executor
 

@@ -30,7 +30,7 @@ from itertools import islice
 from typing import Any
 
 from robomme_interference_data.constants import DISTRACTORS, FAMILIES, RULE_VERSION
-from robomme_interference_data.errors import BuildError, InvalidOptionError
+from robomme_interference_data.errors import BuildError, InvalidOptionError, named
 from robomme_interference_data.ids import EpisodeId
 
 from .conditions import Condition
@@ -62,7 +62,8 @@ class UnitPool:
             raise BuildError(
                 f"{query} needs {k} distractor units of other families; the pool has "
                 f"{count} ({', '.join(others) or 'no family'}), {k - count} too few",
-                "Build distractors from more episodes or families, or choose `conditions` with a "
+                "Build distractors from more episodes or families, or choose "
+                f"{named('conditions')} with a "
                 "smaller k.",
             )
         return list(islice(self._units(query, others), k))
@@ -77,7 +78,8 @@ class UnitPool:
             raise BuildError(
                 f"{query} needs {k} units of its own family; the pool has {len(units)} "
                 f"others, {k - len(units)} too few",
-                f"Build distractors from more episodes of {query.family}, or choose `conditions` "
+                f"Build distractors from more episodes of {query.family}, or choose "
+                f"{named('conditions')} "
                 "with a smaller k.",
             )
         first = 7 * query.index + self._offset("own", query.split, query.family)

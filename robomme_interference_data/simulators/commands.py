@@ -44,7 +44,7 @@ def simulate(
         ),
     ] = None,
 ) -> None:
-    """Play one episode: its demonstration, then a built-in policy.
+    r"""Play one episode: its demonstration, then a built-in policy.
 
     The video shows the cameras side by side, under a bar that names them and what is shown: blue
     during the demonstration, orange while the policy acts.
@@ -52,7 +52,8 @@ def simulate(
     Examples:
     ```
     robomme-interference simulate --family MoveCube --episode 3 --video out.mp4
-    robomme-interference simulate --simulator robomme --robomme-python PATH --family MoveCube
+    robomme-interference simulate --simulator robomme --robomme-python PATH \
+      --family MoveCube
     ```
     """
     from robomme_interference_data.ids import EpisodeId

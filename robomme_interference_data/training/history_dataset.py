@@ -89,7 +89,7 @@ class HistoryDataset:
             must be stored. `retrieval_rule` and `retrieval_camera` are those of `evaluate`.
         shifts: Shifts of the first live view, with weights; needs the dataset `shifted` and
             `chunk=0`, since only first views are stored.
-        questions: Whether items have the question about the past, see `build questions`.
+        questions: Whether items have the question about the past, see `build --only questions`.
         redraw: Draw the sessions of the conditions anew in every epoch, instead of the planned
             ones. Then conditions need not be planned.
         unit_episodes: With `redraw`, indices of the train episodes whose units may be drawn, such

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from html import escape
-from itertools import zip_longest
 from textwrap import fill, wrap
 from typing import Any, Literal
 
@@ -117,8 +116,18 @@ class Table:
         least 80. The columns that tell rows apart are repeated there. Bold cells end in `*`.
         """
         width = width or max(80, shutil.get_terminal_size().columns)
-        sides, heads, rows = self._layout("<", ">")
+        sides, heads, rows = self._layout("left", "right")
         rows = [[_COUNT_OF.sub(_NO_BREAK, _BOLD.sub(r"\1*", cell)) for cell in row] for row in rows]
+        widths = self._widths(heads, rows, width)
+        parts = [_fill(self.title, width)]
+        for block in self._blocks(rows, widths, width):
+            columns = [(heads[place], sides[place], widths[place]) for place in block]
+            parts.append(_aligned(columns, [[row[place] for place in block] for row in rows]))
+        parts.append(_fill(self.note, width))
+        return visible("\n\n".join(filter(None, parts)).replace(_SOLID_SPACE, " "))
+
+    def _widths(self, heads: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> list[int]:
+        """Return the width of each column: texts give way, so that more columns fit."""
         columns = list(zip(heads, *rows, strict=True))
         widths = [max(map(len, cells)) for cells in columns]
         least = [
@@ -127,29 +136,28 @@ class Table:
             else max(_longest_word(cells[:1]), *map(len, cells[1:]), 0)
             for cells, format_ in zip(columns, self.columns.values(), strict=True)
         ]
-        while sum(widths) + 2 * (len(widths) - 1) > width and widths != least:
-            wrappable = (i for i, size in enumerate(widths) if size > least[i])
+        while sum(widths) + _GAP * (len(widths) - 1) > width and widths != least:
+            wrappable = (place for place, size in enumerate(widths) if size > least[place])
             widths[max(wrappable, key=widths.__getitem__)] -= 1
+        return widths
+
+    def _blocks(
+        self, rows: Sequence[Sequence[str]], widths: Sequence[int], width: int
+    ) -> list[list[int]]:
+        """Return the columns of each block of the table; keys stand first in every block."""
         keys = self._keys(rows)
-        while len(keys) > 1 and sum(widths[key] + 2 for key in keys) + max(widths) > width:
+        while len(keys) > 1 and sum(widths[key] + _GAP for key in keys) + max(widths) > width:
             keys.pop()  # they must leave room for any other column
         blocks: list[list[int]] = [[]]
-        for column, size in enumerate(widths):
-            if column in blocks[-1]:
+        for place, size in enumerate(widths):
+            if place in blocks[-1]:
                 continue  # a key of a block that began before it
-            used = sum(widths[other] + 2 for other in blocks[-1])
+            used = sum(widths[shown] + _GAP for shown in blocks[-1])
             if used + size > width and not {*blocks[-1]} <= {*keys}:
                 blocks.append([*keys])
-            if column not in blocks[-1]:
-                blocks[-1].append(column)
-        parts = [_fill(self.title, width)]
-        for block in blocks:
-            formats = [(sides[column], widths[column]) for column in block]
-            rule = "  ".join("-" * size for _, size in formats)
-            lines = [_aligned([row[column] for column in block], formats) for row in [heads, *rows]]
-            parts.append("\n".join([lines[0], rule, *lines[1:]]))
-        parts.append(_fill(self.note, width))
-        return visible("\n\n".join(filter(None, parts)).replace("\xa0", " "))
+            if place not in blocks[-1]:
+                blocks[-1].append(place)
+        return blocks
 
     def _keys(self, rows: Sequence[Sequence[str]]) -> list[int]:
         """Return the columns that tell rows apart: the first ones of names and numbers that do."""
@@ -170,13 +178,15 @@ _BOLD = re.compile(r"\*\*(.+?)\*\*")
 _COUNT_OF = re.compile(r"(?<=\d) of (?=\d)")
 """Inside a count such as `6 of 12`, which is read as one number."""
 
-_NO_BREAK = "\xa0of\xa0"
+_SOLID_SPACE = "\ue000"
+"""Stands for a space where no line may end: rich breaks lines at no-break spaces, too."""
 
-_WORD = re.compile("[^ \t\n]+")
-"""What is not wrapped, no-break spaces included."""
+_NO_BREAK = f"{_SOLID_SPACE}of{_SOLID_SPACE}"
 
-# Names of commands and options have hyphens, and are copied.
-_wrap = partial(wrap, break_on_hyphens=False)
+_GAP = 2
+"""Spaces between columns."""
+
+# Addresses and commands are copied.
 _fill = partial(fill, break_on_hyphens=False, break_long_words=False)
 
 _MAX_WORD = 26
@@ -184,16 +194,29 @@ _MAX_WORD = 26
 
 
 def _longest_word(cells: Iterable[str]) -> int:
-    return max((len(word) for cell in cells for word in _WORD.findall(cell)), default=0)
+    return max((len(word) for cell in cells for word in cell.split()), default=0)
 
 
-def _aligned(cells: Sequence[str], formats: Sequence[tuple[str, int]]) -> str:
-    """Return a row, whose cells may take several lines; `formats` has their side and width."""
-    wrapped = [_wrap(cell, size) for cell, (_, size) in zip(cells, formats, strict=True)]
-    return "\n".join(
-        "  ".join(f"{c:{s}{w}}" for c, (s, w) in zip(line, formats, strict=True)).rstrip()
-        for line in zip_longest(*wrapped, fillvalue="")
+def _aligned(columns: Sequence[tuple[str, Any, int]], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table as lines, given the head, side and width of each column."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+    table = RichTable(
+        box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, _GAP - 1, 0, 0)
     )
+    for head, side, width in columns:
+        table.add_column(Text(head), justify=side, width=width, overflow="fold")
+    for row in rows:
+        table.add_row(*map(Text, row))
+    # Wide enough for all columns, which have their widths already.
+    total = sum(width + _GAP for _, _, width in columns)
+    console = Console(file=io.StringIO(), width=total, color_system=None)
+    with console.capture() as capture:
+        console.print(table)
+    return "\n".join(line.rstrip() for line in capture.get().splitlines())
 
 
 def record_columns(record: type) -> Columns:

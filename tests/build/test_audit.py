@@ -1,4 +1,4 @@
-"""`audit` finds leaks of the answer into a buffer set."""
+"""`verify --audit` finds leaks of the answer into a buffer set."""
 
 import json
 from functools import partial

@@ -9,16 +9,12 @@ import pytest
 from support.buffer_sets import GOLDEN, contents
 from support.made_up import MadeUpSource, record, write_metadata
 
-from robomme_interference_data.build_dataset.build import BuildResult, build_dataset
-from robomme_interference_data.build_dataset.config import AllConfig, BuildConfig, PlanConfig
-from robomme_interference_data.build_dataset.plan import (
-    BuildPlan,
-    like,
-    list_episodes,
-    plan_all,
-    plan_alone,
-    plan_build,
-)
+from robomme_interference_data.build_dataset.config import BuffersConfig, BuildConfig
+from robomme_interference_data.build_dataset.dataset.build import BuildResult, build_dataset
+from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan
+from robomme_interference_data.build_dataset.plan.datasets import plan_dataset
+from robomme_interference_data.build_dataset.plan.episodes import choose_episodes
+from robomme_interference_data.build_dataset.plan.parts import plan_alone, plan_build
 from robomme_interference_data.build_dataset.sources import Robot, Source
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.constants import FRONT
@@ -41,8 +37,8 @@ TRAIN = {f"{family}/train/{index}": (260, None) for family in ("A", "B") for ind
 def build(
     out: Path, *sources: Source, kind: str = "distractors", filters: Any = None, **options: Any
 ) -> BuildResult:
-    tasks = list_episodes(sources, **(filters or {}))
-    plan = BuildPlan(kind, sources, tasks, **options)
+    tasks = choose_episodes(sources, **(filters or {}))
+    plan = DatasetPlan(kind, sources, tasks, **options)
     return build_dataset(plan, out, Serial(), WorkProgress(quiet=True))
 
 
@@ -213,7 +209,7 @@ def test_what_cannot_follow_the_demonstrations_is_refused_before_it_is_built(
         "camera top: missing in the demonstrations, 24×16 pixels in B/train/1": (two, True),
     }
     for clause, (source, cameras_help) in clauses.items():
-        plan = like(BuildPlan("distractors", (source,), list_episodes((source,))), base)
+        plan = DatasetPlan("distractors", (source,), choose_episodes((source,))).matching(base)
         with pytest.raises(SourceError) as caught:
             build_dataset(plan, out, Serial(), WorkProgress(quiet=True))
         assert clause in caught.value.message
@@ -322,7 +318,7 @@ def made_up(*names: str) -> MadeUpSource:
 
 
 def listed(*sources: Any, **filters: Any) -> list[tuple[int, str]]:
-    return [(number, str(one.id)) for number, one in list_episodes(sources, **filters)]
+    return [(number, str(one.id)) for number, one in choose_episodes(sources, **filters)]
 
 
 def test_canonical_order_and_source_numbers() -> None:
@@ -355,27 +351,31 @@ def test_filters() -> None:
     assert "`" not in str(caught.value.hint)  # a filter would leave out both
 
 
-def config(tmp_path: Path, *source: str, **changes: Any) -> AllConfig:
-    return AllConfig(source=source or ("sample",), buffer_set=tmp_path / "out", **changes)
+def config(tmp_path: Path, *source: str, **changes: Any) -> BuildConfig:
+    return BuildConfig(source=source or ("sample",), buffer_set=tmp_path / "out", **changes)
 
 
 def test_units_are_of_train_episodes(tmp_path: Path) -> None:
-    plan = plan_build("distractors", config(tmp_path))
-    assert {one.id.split for _, one in plan.tasks} == {"train"}
-    plans, _ = plan_all(config(tmp_path, split="test", families=("MoveCube",)), PlanConfig())
-    assert [str(one.id) for _, one in plans["demonstrations"].tasks] == ["MoveCube/test/0"]
-    assert len(plans["distractors"].tasks) == 27
-    few, _ = plan_all(config(tmp_path, episodes="0", unit_episodes="0-1"), PlanConfig())
-    assert len(few["distractors"].tasks) == 18
+    plan = plan_dataset("distractors", config(tmp_path))
+    assert {one.id.split for _, one in plan.episodes} == {"train"}
+    plans = plan_build(
+        config(tmp_path, split="test", families=("MoveCube",)), BuffersConfig()
+    ).datasets
+    assert [str(one.id) for _, one in plans["demonstrations"].episodes] == ["MoveCube/test/0"]
+    assert len(plans["distractors"].episodes) == 27
+    few = plan_build(config(tmp_path, episodes="0", unit_episodes="0-1"), BuffersConfig())
+    assert len(few.datasets["distractors"].episodes) == 18
 
 
 def test_views_under_shifts_and_executions_are_of_the_queries(tmp_path: Path) -> None:
-    further = {"shifted": True, "executions": True}
-    asked = config(tmp_path, "tabletop", split="test", episodes="0-1", **further)
-    plans, change = plan_all(asked, PlanConfig(("k1",)))
+    further = ("shifted", "executions")
+    asked = config(tmp_path, "tabletop", split="test", episodes="0-1", parts=further)
+    planned = plan_build(asked, BuffersConfig(("k1",)))
+    plans, change = planned.datasets, planned.buffers
+    assert change is not None and planned.manifests and not planned.questions
     assert [*plans] == ["demonstrations", "distractors", *further]
     for name in further:
-        assert plans[name].tasks == plans["demonstrations"].tasks
+        assert plans[name].episodes == plans["demonstrations"].episodes
     assert (change.added, change.loses) == (("k1",), False)
 
 
@@ -384,18 +384,18 @@ def test_what_goes_with_demonstrations_has_their_episodes_and_cameras(
     kind: str, tmp_path: Path
 ) -> None:
     config = BuildConfig(source=("tabletop",), buffer_set=tmp_path)
-    assert len(plan_alone(kind, config).tasks) > 1000  # all: there are no demonstrations yet
+    assert len(plan_alone(kind, config).episodes) > 1000  # all: there are no demonstrations yet
     episodes = {"MoveCube/train/120", "PatternLock/test/1"}
     records = [record("demonstrations", episode, n) for n, episode in enumerate(sorted(episodes))]
     write_metadata(tmp_path / "demonstrations", "demonstrations", records)
     planned = plan_alone(kind, config)
-    asked = {f"{one.id.family}/{one.id.split}/{one.id.index}" for _, one in planned.tasks}
+    asked = {f"{one.id.family}/{one.id.split}/{one.id.index}" for _, one in planned.episodes}
     assert asked == episodes
     assert planned.cameras == ("front",)
     chosen = plan_alone(kind, replace(config, split="test", episodes="0-1", cameras=("wrist",)))
-    assert len(chosen.tasks) == 18 and chosen.cameras == ("wrist",)
+    assert len(chosen.episodes) == 18 and chosen.cameras == ("wrist",)
     units = plan_alone("distractors", config)
-    assert len(units.tasks) > 18 and units.cameras is None
+    assert len(units.episodes) > 18 and units.cameras == ("front",)
 
 
 @pytest.mark.parametrize(
@@ -412,8 +412,17 @@ def test_what_goes_with_demonstrations_has_their_episodes_and_cameras(
         ({}, {"conditions": ("x3",)}, InvalidIdError),
         ({}, {"position_limit": "many"}, InvalidOptionError),
         ({}, {"conditions": ("k63",)}, BuildError),
-        ({"shifted": True}, {}, InvalidOptionError),  # the sample has no lamps
+        ({"parts": ("shifted",)}, {}, InvalidOptionError),  # the sample has no lamps
         ({"source": ("sample:MoveCube",)}, {}, BuildError),
+        ({"parts": ("demonstrations",)}, {}, InvalidOptionError),
+        ({"source": ()}, {}, InvalidOptionError),
+        ({"only": "nothing"}, {}, InvalidOptionError),
+        ({"only": "executions", "parts": ("shifted",)}, {}, InvalidOptionError),
+        ({"only": "demonstrations"}, {"conditions": ("k0",)}, InvalidOptionError),
+        ({"only": "demonstrations", "unit": "5x5"}, {}, InvalidOptionError),
+        ({"only": "distractors", "episodes": "0", "unit_episodes": "1"}, {}, InvalidOptionError),
+        ({"only": "manifests"}, {}, InvalidOptionError),  # which needs no source
+        ({"only": "questions", "source": (), "cameras": ("front",)}, {}, InvalidOptionError),
     ],
 )
 def test_build_all_checks_options_before_it_reads(
@@ -421,7 +430,7 @@ def test_build_all_checks_options_before_it_reads(
 ) -> None:
     asked = {"source": ("sample",), "buffer_set": tmp_path / "out", **changes}
     with pytest.raises(error):
-        plan_all(AllConfig(**asked), PlanConfig(**plan))
+        plan_build(BuildConfig(**asked), BuffersConfig(**plan))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -429,15 +438,15 @@ def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     root = tmp_path / "out"
     root.mkdir()
     (root / ".hidden").touch()
-    plan_build("distractors", config(tmp_path))
+    plan_dataset("distractors", config(tmp_path))
     (root / "thesis.txt").write_text("mine")
     with pytest.raises(BuildError, match=r"out holds thesis.txt, and nothing of a buffer set"):
-        plan_build("distractors", config(tmp_path))
+        plan_dataset("distractors", config(tmp_path))
     staging_path(root / "demonstrations").mkdir()  # a build has begun: the file came later
-    plan_build("distractors", config(tmp_path))
+    plan_dataset("distractors", config(tmp_path))
     file = BuildConfig(source=("sample",), buffer_set=root / "thesis.txt")
     with pytest.raises(BuildError, match="is a file"):
-        plan_build("distractors", file)
+        plan_dataset("distractors", file)
 
 
 @pytest.mark.parametrize("name", ["demonstrations", "distractors", "manifests"])
@@ -446,4 +455,4 @@ def test_build_all_rejects_folders_with_unknown_files(tmp_path: Path, name: str)
     folder.mkdir(parents=True)
     (folder / "notes.txt").write_text("mine")
     with pytest.raises(BuildError, match=f"{name} exists"):
-        plan_all(config(tmp_path), PlanConfig())
+        plan_build(config(tmp_path), BuffersConfig())

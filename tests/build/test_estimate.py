@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from robomme_interference_data.build_dataset import estimate
-from robomme_interference_data.build_dataset.estimate import BuildEstimate, estimate_text
+from robomme_interference_data.build_dataset.dataset import estimate
+from robomme_interference_data.build_dataset.dataset.estimate import BuildEstimate, estimate_text
 
 
 def test_an_estimate_in_words() -> None:

@@ -13,8 +13,12 @@ from support.made_up import MadeUpSource, record, write_metadata
 from support.recordings import EPISODES, write_frames, write_h5
 
 from robomme_interference_data import load_buffer, load_buffer_set
-from robomme_interference_data.build_dataset.frame_selection import NothingToStore, select_execution
-from robomme_interference_data.build_dataset.manifests import in_folder, plan_manifests
+from robomme_interference_data.build_dataset.dataset.frame_selection import (
+    NothingToStore,
+    select_execution,
+)
+from robomme_interference_data.build_dataset.manifests import plan_manifests
+from robomme_interference_data.build_dataset.plan.planned import datasets_in
 from robomme_interference_data.build_dataset.sources import Frame, open_source
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
@@ -155,4 +159,4 @@ def test_executions_of_other_episodes(
     executions = [record("", QUERY, **live | known | changes)]
     write_metadata(tmp_path / EXECUTIONS, EXECUTIONS, executions)
     with pytest.raises(SourceError, match=message):
-        plan_manifests(in_folder(tmp_path), ("k0",))
+        plan_manifests(datasets_in(tmp_path), ("k0",))

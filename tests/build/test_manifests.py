@@ -10,11 +10,11 @@ from support.made_up import record, write_metadata
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.manifests import (
-    in_folder,
     plan_manifests,
     planned_buffers,
     write_manifests,
 )
+from robomme_interference_data.build_dataset.plan.planned import datasets_in
 from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
 from robomme_interference_data.errors import (
     BuildError,
@@ -48,7 +48,7 @@ def made_up(root: Path, *, queries: Any = None, units: Any = None) -> Path:
 def test_the_golden_manifests_come_out_again(tmp_path: Path, name: str) -> None:
     root = copy_buffer_set(tmp_path / name)
     assert (
-        sum(write_manifests(plan_manifests(in_folder(root), tuple(reversed(CONDITIONS))), root))
+        sum(write_manifests(plan_manifests(datasets_in(root), tuple(reversed(CONDITIONS))), root))
         == 15
     )
     assert contents(root) == contents(GOLDEN)
@@ -60,7 +60,7 @@ def test_buffers_of_train_episodes(tmp_path: Path) -> None:
     queries = [record("demonstrations", name) for name in names]
     root = made_up(tmp_path, queries=queries)
     conditions = ("k7", "before-k7", "absent-k7", "same-k2")
-    buffers = [*planned_buffers(plan_manifests(in_folder(root), conditions))]
+    buffers = [*planned_buffers(plan_manifests(datasets_in(root), conditions))]
     assert len(buffers) == len(names) * len(conditions)
     for one in buffers:
         units = [session.source for session in one.sessions if session.role == "distractor"]
@@ -73,28 +73,28 @@ def test_buffers_of_train_episodes(tmp_path: Path) -> None:
 def test_lesson_parts_without_digests_are_an_error(tmp_path: Path) -> None:
     queries = [record("demonstrations", "MoveCube/test/0", span_sha256=None)]
     root = made_up(tmp_path, queries=queries)
-    assert len(list(planned_buffers(plan_manifests(in_folder(root), ("k1",))))) == 1
+    assert len(list(planned_buffers(plan_manifests(datasets_in(root), ("k1",))))) == 1
     for name in ("parts-k1", "held-k1"):
         with pytest.raises(FormatError, match="MoveCube/test/0: no digests of its parts"):
-            list(planned_buffers(plan_manifests(in_folder(root), (name,))))
+            list(planned_buffers(plan_manifests(datasets_in(root), (name,))))
 
 
 def test_datasets_that_conditions_need(tmp_path: Path) -> None:
     root = made_up(tmp_path)
     for name, needed in (("raw-k1", "distractors-raw"), ("misled-k0", "contradictions")):
         with pytest.raises(SourceError, match=f"{name} needs the dataset {needed}") as caught:
-            plan_manifests(in_folder(root), ("k1", name))
-        assert f"build {needed}" in str(caught.value.command)
+            plan_manifests(datasets_in(root), ("k1", name))
+        assert f"--only {needed}" in str(caught.value.command)
     records = [record("contradictions", "PatternLock/test/1/2", lesson=40)]
     write_metadata(root / "contradictions", "contradictions", records)
-    plan = plan_manifests(in_folder(root), ("stale-k1",))
+    plan = plan_manifests(datasets_in(root), ("stale-k1",))
     assert list(plan.datasets) == ["demonstrations", "distractors", "contradictions"]
     with pytest.raises(SourceError, match=r"contradictions lacks \w+/test/0"):
         list(planned_buffers(plan))
     queries = [record("demonstrations", "PatternLock/test/1")]
     one = made_up(tmp_path / "one", queries=queries)
     write_metadata(one / "contradictions", "contradictions", records)
-    [found] = planned_buffers(plan_manifests(in_folder(one), ("stale-k1",)))
+    [found] = planned_buffers(plan_manifests(datasets_in(one), ("stale-k1",)))
     roles = [(one.role, str(one.source), one.stop) for one in found.sessions[:2]]
     assert roles == [
         ("contradiction", "PatternLock/test/1/2", 40),
@@ -106,20 +106,22 @@ def test_datasets_that_conditions_need(tmp_path: Path) -> None:
 def test_a_buffer_is_exact_where_all_of_it_is(tmp_path: Path) -> None:
     units = [record("distractors", f"X{n}/train/0", exact=n != 1) for n in range(3)]
     queries = [record("demonstrations", "MoveCube/test/0")]
-    plan = plan_manifests(in_folder(made_up(tmp_path, queries=queries, units=units)), ("k0", "k3"))
+    plan = plan_manifests(
+        datasets_in(made_up(tmp_path, queries=queries, units=units)), ("k0", "k3")
+    )
     assert [one.exact for one in planned_buffers(plan)] == [True, False]
 
 
 def test_a_pool_too_small(tmp_path: Path) -> None:
     root = made_up(tmp_path)
     with pytest.raises(BuildError, match="needs 10 distractor units"):
-        list(write_manifests(plan_manifests(in_folder(root), ("k10",)), root))
+        list(write_manifests(plan_manifests(datasets_in(root), ("k10",)), root))
     assert list((root / "manifests").iterdir()) == []
 
 
 @pytest.mark.parametrize(("limit", "fits"), [(33 + 32 + 1300, True), (33 + 32 + 1299, False)])
 def test_the_position_limit(tmp_path: Path, limit: int, fits: bool) -> None:
-    plan = plan_manifests(in_folder(made_up(tmp_path)), ("k1",), position_limit=limit)
+    plan = plan_manifests(datasets_in(made_up(tmp_path)), ("k1",), position_limit=limit)
     if fits:
         assert len(list(planned_buffers(plan))) == 8
         return
@@ -131,7 +133,7 @@ def test_the_position_limit(tmp_path: Path, limit: int, fits: bool) -> None:
 def test_units_must_be_of_train_episodes(tmp_path: Path) -> None:
     units = [record("distractors", "InsertPeg/test/0"), record("distractors", "Drawer/val/0")]
     with pytest.raises(SourceError, match="must come from train episodes.* test, val"):
-        plan_manifests(in_folder(made_up(tmp_path, units=units)))
+        plan_manifests(datasets_in(made_up(tmp_path, units=units)))
 
 
 def test_datasets_that_do_not_fit(tmp_path: Path) -> None:
@@ -139,21 +141,21 @@ def test_datasets_that_do_not_fit(tmp_path: Path) -> None:
     info = root / "distractors" / "meta" / "info.json"
     info.write_text(info.read_text().replace("      4,\n", "      8,\n"))
     with pytest.raises(SourceError, match="cannot follow one another"):
-        plan_manifests(in_folder(root))
+        plan_manifests(datasets_in(root))
     info.write_text(info.read_text().replace("      8,\n", "      4,\n"))
-    plan_manifests(in_folder(root))
+    plan_manifests(datasets_in(root))
     info.write_text(info.read_text().replace('"fps": 10', '"fps": 12.5'))
     with pytest.raises(SourceError) as caught:
-        plan_manifests(in_folder(root))
+        plan_manifests(datasets_in(root))
     rates = "frames per second: 10 in the demonstrations, 12.5 in the distractors"
     assert rates in caught.value.message
     (root / "distractors").rename(root / "units")
     with pytest.raises(MissingFileError):
-        plan_manifests(in_folder(root))
+        plan_manifests(datasets_in(root))
     (root / "demonstrations").rename(root / "distractors")
     (root / "units").rename(root / "demonstrations")
     with pytest.raises(InvalidOptionError, match="is a dataset of distractors"):
-        plan_manifests(in_folder(root))
+        plan_manifests(datasets_in(root))
 
 
 @pytest.mark.parametrize("steps", range(4))
@@ -170,7 +172,7 @@ def test_an_interrupted_build_leaves_the_old_manifests_or_the_new_ones(
             left[0] -= 1
         return replace(path, target)
 
-    plan = plan_manifests(in_folder(root), ("k0",))
+    plan = plan_manifests(datasets_in(root), ("k0",))
     with monkeypatch.context() as patch:
         patch.setattr(Path, "replace", killed)
         with suppress(KeyboardInterrupt):
@@ -194,4 +196,4 @@ def test_unknown_files_are_kept(tmp_path: Path) -> None:
     (other / "manifests").mkdir()
     (other / "manifests" / "notes.txt").write_text("mine")
     with pytest.raises(BuildError, match=r"holds notes\.txt"):
-        list(write_manifests(plan_manifests(in_folder(other)), other))
+        list(write_manifests(plan_manifests(datasets_in(other)), other))

@@ -24,7 +24,7 @@ def sets(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     for cameras in ("none", "front"):
         made.append(tmp_path_factory.mktemp(cameras) / "set")
         command = (
-            *("build", "all", str(made[-1]), "--source", "sample", "--split", "test"),
+            *("build", str(made[-1]), "--source", "sample", "--split", "test"),
             *("--episodes", "0", "--unit-episodes", "0", "--families", "MoveCube,PatternLock"),
             *("--conditions", "k0,k1", "--cameras", cameras),
         )

@@ -293,7 +293,7 @@ def root(tmp_path: Path) -> Path:
 
 
 def test_the_command_makes_them(root: Path, run: Any) -> None:
-    code, out, _ = run("build", "questions", root, "--json")
+    code, out, _ = run("build", root, "--only", "questions", "--json")
     assert code == 0 and f'"questions": {len(QUERIES)}' in out
     assert bare(read_questions(load_buffer_set(root)).values()) == bare(
         read_questions(load_buffer_set(TABLETOP)).values()
@@ -302,7 +302,7 @@ def test_the_command_makes_them(root: Path, run: Any) -> None:
 
 def test_where_there_is_no_folder(tmp_path: Path, run: Any) -> None:
     """A buffer set on the Hub is not written to, and no folder of its name is made."""
-    code, _, err = run("build", "questions", tmp_path / "somebody" / "buffer_set")
+    code, _, err = run("build", tmp_path / "somebody" / "buffer_set", "--only", "questions")
     assert code == 1 and "robomme-interference fetch" in err
     assert not (tmp_path / "somebody").exists()
 
@@ -310,7 +310,7 @@ def test_where_there_is_no_folder(tmp_path: Path, run: Any) -> None:
 def test_a_full_disk_leaves_what_was_there(root: Path, run: Any) -> None:
     (root / QUESTIONS_PATH).write_bytes(b"as it was")
     with full_disk(50_000):
-        code, _, err = run("build", "questions", root)
+        code, _, err = run("build", root, "--only", "questions")
     assert code == 1 and "disk space" in err and "Traceback" not in err
     assert (root / QUESTIONS_PATH).read_bytes() == b"as it was"
     assert len(list(root.iterdir())) == 4

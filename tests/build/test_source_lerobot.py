@@ -13,7 +13,7 @@ from support.lerobot_layouts import DATA, TABLE, edit_columns, edit_info, write_
 from support.recordings import EPISODES, MOVE, PEG, Episode, check_recording, make_episode
 
 from robomme_interference_data.build_dataset.config import BuildConfig
-from robomme_interference_data.build_dataset.plan import plan_build
+from robomme_interference_data.build_dataset.plan.datasets import plan_dataset
 from robomme_interference_data.build_dataset.sources import Recording, Robot, open_source
 from robomme_interference_data.build_dataset.sources.robomme_families import BLOCKS
 from robomme_interference_data.errors import (
@@ -162,11 +162,11 @@ def test_a_families_file_can_mark_the_demonstrations(tmp_path: Path, version: st
     file = tmp_path / "families.csv"
     file.write_text("episode_index,family\n0,MoveCube\n")
     named = replace(config, families_file=file)
-    assert plan_build("distractors", named).tasks
+    assert plan_dataset("distractors", named).episodes
     with pytest.raises(SourceError, match=r"MoveCube/train/0(.|\n)*is_demo(.|\n)*exec_start_idx"):
-        plan_build("demonstrations", named)  # before anything is read
+        plan_dataset("demonstrations", named)  # before anything is read
     file.write_text("episode_index,family,exec_start_idx\n0,MoveCube,3\n")
-    assert plan_build("demonstrations", named).tasks
+    assert plan_dataset("demonstrations", named).episodes
     shown = [frame.is_demonstration for frame in read(root, families_file=file).frames]
     assert shown == [True] * 3 + [False]
 

@@ -6,11 +6,11 @@ from typing import Any
 import pytest
 from support.simulator_doubles import Double
 
-from robomme_interference_data.build_dataset.frame_selection import (
+from robomme_interference_data.build_dataset.dataset.frame_selection import (
     select_demonstration,
     select_frames,
 )
-from robomme_interference_data.build_dataset.plan import list_episodes
+from robomme_interference_data.build_dataset.plan.episodes import choose_episodes
 from robomme_interference_data.build_dataset.sources import Recording, open_source, simulator
 from robomme_interference_data.constants import DEMONSTRATIONS, FAMILIES
 from robomme_interference_data.errors import (
@@ -124,8 +124,8 @@ def test_episodes(name: str) -> None:
     source = open_source(name)
     ids = [episode.id for episode in source.episodes()]
     assert ids == sorted({*ids})
-    assert len(list_episodes([source])) == len(FAMILIES) * (100 + 50 + 50)
-    named = [one.id.index for _, one in list_episodes([source], numbers=(99, 100, 899, 900))]
+    assert len(choose_episodes([source])) == len(FAMILIES) * (100 + 50 + 50)
+    named = [one.id.index for _, one in choose_episodes([source], numbers=(99, 100, 899, 900))]
     assert sorted({*named}) == ([99, 100, 899] if name == "tabletop" else [99])
     assert len(named) == len(FAMILIES) * len({*named})
 

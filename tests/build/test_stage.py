@@ -15,23 +15,23 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from support.made_up import MadeUpSource, picture
 
-from robomme_interference_data.build_dataset import stage
-from robomme_interference_data.build_dataset.frame_selection import (
+from robomme_interference_data.build_dataset.dataset import stage
+from robomme_interference_data.build_dataset.dataset.frame_selection import (
     NothingToStore,
     select_demonstration,
     select_unit,
 )
-from robomme_interference_data.build_dataset.image_stats import ImageStats
-from robomme_interference_data.build_dataset.lerobot_writer import StoredEpisode
-from robomme_interference_data.build_dataset.plan import BuildPlan
-from robomme_interference_data.build_dataset.sources import Frame
-from robomme_interference_data.build_dataset.stage import (
+from robomme_interference_data.build_dataset.dataset.image_stats import ImageStats
+from robomme_interference_data.build_dataset.dataset.lerobot_writer import StoredEpisode
+from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan
+from robomme_interference_data.build_dataset.dataset.stage import (
     Staged,
     StageTask,
     keep_staged,
     read_staged,
     staged_name,
 )
+from robomme_interference_data.build_dataset.sources import Frame
 from robomme_interference_data.constants import DISTRACTORS
 from robomme_interference_data.errors import BuildError, SourceError
 from robomme_interference_data.runtime.executor import Serial
@@ -46,8 +46,8 @@ def digest(values: NDArray[Any]) -> str:
     return hashlib.sha256(values.tobytes()).hexdigest()
 
 
-def plan(source: MadeUpSource, kind: str = "demonstrations", **options: Any) -> BuildPlan:
-    return BuildPlan(kind, (source,), (), **options)
+def plan(source: MadeUpSource, kind: str = "demonstrations", **options: Any) -> DatasetPlan:
+    return DatasetPlan(kind, (source,), (), **options)
 
 
 def staged(

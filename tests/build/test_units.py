@@ -9,15 +9,17 @@ from support.buffer_sets import violations
 from support.made_up import MadeUpSource
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.config import BuildConfig
-from robomme_interference_data.build_dataset.frame_selection import NothingToStore, select_unit
-from robomme_interference_data.build_dataset.manifests import (
-    in_folder,
-    plan_manifests,
-    write_manifests,
+from robomme_interference_data.build_dataset.dataset.build import build_dataset
+from robomme_interference_data.build_dataset.dataset.frame_selection import (
+    NothingToStore,
+    select_unit,
 )
-from robomme_interference_data.build_dataset.plan import BuildPlan, plan_alone, plan_build
+from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan, PlannedEpisode
+from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
+from robomme_interference_data.build_dataset.plan.datasets import plan_dataset
+from robomme_interference_data.build_dataset.plan.parts import plan_alone
+from robomme_interference_data.build_dataset.plan.planned import datasets_in
 from robomme_interference_data.build_dataset.sources.base import Frame
 from robomme_interference_data.cards.dataset_facts import buffer_set_facts
 from robomme_interference_data.cards.publication import Publication
@@ -57,8 +59,8 @@ def test_a_unit_is_of_the_chosen_frames() -> None:
 
 def build(root: Path, kind: str, lengths: dict[str, Any], unit: Unit = SHORT) -> None:
     source = MadeUpSource(lengths)
-    tasks = tuple((0, one) for one in source.episodes())
-    plan = BuildPlan(kind, (source,), tasks, unit=unit)
+    episodes = tuple(PlannedEpisode(0, episode) for episode in source.episodes())
+    plan = DatasetPlan(kind, (source,), episodes, unit=unit)
     build_dataset(plan, root / kind, Serial(), WorkProgress(quiet=True))
 
 
@@ -69,12 +71,12 @@ def test_a_buffer_set_of_short_units(tmp_path: Path) -> None:
     build(tmp_path, RAW_DISTRACTORS, TRAIN, Unit(4, 2))
     conditions = ("k0", "k1", "held-k1", "raw-k1")
     with pytest.raises(SourceError, match="8 frames at stride 1, .* 4 frames at stride 3"):
-        plan_manifests(in_folder(tmp_path), conditions)
+        plan_manifests(datasets_in(tmp_path), conditions)
     with pytest.raises(BuildError, match="exists with units of 8 frames at stride 1, not of 12 "):
         build(tmp_path, RAW_DISTRACTORS, TRAIN)
     (tmp_path / RAW_DISTRACTORS).rename(tmp_path.with_name("other"))
     build(tmp_path, RAW_DISTRACTORS, TRAIN)
-    list(write_manifests(plan_manifests(in_folder(tmp_path), conditions), tmp_path))
+    list(write_manifests(plan_manifests(datasets_in(tmp_path), conditions), tmp_path))
     opened = load_buffer_set(tmp_path)
     # The lesson of 5 frames; then a unit of 4, its last frame 4 times, or its 11 raw frames.
     assert [len(opened.load("Lift/test/0", one)) for one in conditions] == [5, 9, 9, 16]
@@ -93,11 +95,14 @@ def test_a_buffer_set_of_short_units(tmp_path: Path) -> None:
 def test_only_short_episodes_are_an_error_that_names_the_options(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="11 raw frames; a unit needs 249") as caught:
         build(tmp_path, DISTRACTORS, TRAIN, Unit(32, 8))
-    assert "`unit_frames` and `unit_stride`" in str(caught.value.hint)
+    assert "`unit`" in str(caught.value.hint)
     assert not (tmp_path / DISTRACTORS).exists()
-    config = BuildConfig(("sample",), tmp_path, unit_frames=0)
-    with pytest.raises(InvalidOptionError, match="unit_frames 0; expected a positive number"):
-        plan_build(DISTRACTORS, config)
-    other = BuildConfig(("sample",), tmp_path, unit_frames=5)
-    with pytest.raises(InvalidOptionError, match="no effect on demonstrations"):
+    for text in ("0x8", "32", "5x", "-1x1"):
+        config = BuildConfig(source=("sample",), buffer_set=tmp_path, unit=text)
+        with pytest.raises(InvalidOptionError) as caught:
+            plan_dataset(DISTRACTORS, config)
+        assert caught.value.option == "unit"
+    other = BuildConfig(source=("sample",), buffer_set=tmp_path, unit="5x8")
+    with pytest.raises(InvalidOptionError) as caught:
         plan_alone("demonstrations", other)
+    assert caught.value.option == "unit"

@@ -24,7 +24,7 @@ from support.retrieval import QUIET, TwoSums, make_index
 from support.tabletop import TABLETOP, copy_tabletop
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.build_dataset.image_stats import QUANTILES
+from robomme_interference_data.build_dataset.dataset.image_stats import QUANTILES
 from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
 from robomme_interference_data.build_dataset.verify.lerobot_files import differing_statistics
 from robomme_interference_data.constants import QUESTIONS_PATH

@@ -151,7 +151,9 @@ def test_a_condition_is_suggested_only_where_it_can_be_planned(
     with pytest.raises(UnknownNameError) as caught:
         load_buffer_set(own_buffers).planned(condition)
     if missing is None:
-        assert caught.value.command == f"build manifests {own_buffers} --conditions {condition}"
+        assert (
+            caught.value.command == f"build {own_buffers} --only manifests --conditions {condition}"
+        )
     else:
         assert caught.value.command is None and missing in str(caught.value.hint)
 
@@ -255,7 +257,7 @@ def test_what_is_no_buffer_set(tmp_path: Path) -> None:
     for folder in (tmp_path, GOLDEN / "demonstrations"):
         with pytest.raises(MissingFileError, match="is not a buffer set") as caught:
             load_buffer_set(folder)
-        assert "build all" in str(caught.value.command)
+        assert "build BUFFER_SET" in str(caught.value.command)
     (tmp_path / "begun" / ".demonstrations.building").mkdir(parents=True)
     with pytest.raises(MissingFileError) as caught:
         load_buffer_set(tmp_path / "begun")
@@ -282,7 +284,7 @@ def test_another_dataset_than_the_manifests_name(own_buffers: Path) -> None:
     identity.write_text(identity.read_text().replace(revision, "0" * 64))
     with pytest.raises(HashMismatchError, match="the manifests were made for") as caught:
         load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
-    assert caught.value.command == f"build manifests {own_buffers}"
+    assert caught.value.command == f"build {own_buffers} --only manifests"
 
 
 @pytest.mark.parametrize(

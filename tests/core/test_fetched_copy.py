@@ -122,9 +122,9 @@ def test_commands_work_on_a_part(part: Path, run: Run, tmp_path: Path) -> None:
     [
         ("publish {} --repo-id someone/other --dry-run", "fetch"),
         ("index {}", "fetch"),
-        ("build manifests {} --conditions before-k1", "new-buffer-set"),
-        ("list {} --conditions before-k1", "new-buffer-set"),
-        ("build questions {}", "new-buffer-set"),
+        ("build {} --only manifests --conditions before-k1", "--demonstrations"),
+        ("list {} --conditions before-k1", "--demonstrations"),
+        ("build {} --only questions", "--demonstrations"),
     ],
 )
 def test_a_part_is_neither_changed_nor_published(

@@ -72,9 +72,7 @@ def test_what_is_published_is_not_planned_again(hub: HubServer) -> None:
     with pytest.raises(UnknownNameError, match="condition 'k2' is not in") as caught:
         load_buffer(QUERY, "k2", buffer_set=BUFFER_SET)
     command = str(caught.value.command)
-    assert f"new-buffer-set BUFFER_SET --demonstrations {BASE}@" in command and command.endswith(
-        "k7,k2"
-    )
+    assert f"build BUFFER_SET --demonstrations {BASE}@" in command and command.endswith("k7,k2")
 
 
 def test_no_hint_says_to_build_what_is_published(hub: HubServer, tmp_path: Path, run: Any) -> None:
@@ -88,7 +86,7 @@ def test_no_hint_says_to_build_what_is_published(hub: HubServer, tmp_path: Path,
         load_buffer_set(UNITS_WRONG).load(QUERY, "k3")
     hint = str(caught.value.hint)
     assert f"hf cache rm dataset/{BASE} dataset/{UNITS_WRONG}," in hint and "publisher" in hint
-    assert "build manifests" not in hint
+    assert "--only manifests" not in hint
     with pytest.raises(HashMismatchError) as caught:
         load_buffer_set(damaged).load(QUERY, "k3")
     assert "build the manifests again" in str(caught.value.hint)

@@ -136,7 +136,7 @@ def test_questions_of_other_demonstrations_are_stale(
     damage.renew_header(root)
     with pytest.raises(FormatError, match=words) as raised:
         read_questions(load_buffer_set(root))
-    assert raised.value.command == f"build questions {root}"
+    assert raised.value.command == f"build {root} --only questions"
 
 
 def test_further_columns_are_left_aside(tmp_path: Path) -> None:
@@ -150,22 +150,22 @@ def test_a_buffer_set_without_questions_says_how_to_make_them(tmp_path: Path) ->
     root = copy_buffer_set(tmp_path / "buffer_set")
     with pytest.raises(MissingFileError, match="has no questions") as raised:
         read_questions(load_buffer_set(root))
-    assert raised.value.command == f"build questions {root}"
+    assert raised.value.command == f"build {root} --only questions"
     (root / QUESTIONS_PATH).mkdir()
     with pytest.raises(InterferenceError):
         read_questions(load_buffer_set(root))
 
 
-# --- the command `question` --------------------------------------------------------------------
+# --- `show --question` --------------------------------------------------------------------
 
 
 def test_a_question_is_shown_in_words_and_as_a_picture(tmp_path: Path, run: Any) -> None:
-    code, out, err = run("question", TABLETOP, MOVE, "--out", tmp_path / "q.png")
+    code, out, err = run("show", TABLETOP, MOVE, "--question", "--out", tmp_path / "q.png")
     one = read_questions(load_buffer_set(TABLETOP))[MOVE]
     assert code == 0 and str(tmp_path / "q.png") in err
     assert (tmp_path / "q.png").read_bytes() == one.picture
     assert [line[10:] for line in out.splitlines()[1:]] == [one.text, *one.lines, "A"]
-    code, out, _ = run("question", TABLETOP, MOVE, "--json")
+    code, out, _ = run("show", TABLETOP, MOVE, "--question", "--json")
     assert code == 0 and json.loads(out)["options"] == list(one.lines)
 
 
@@ -179,5 +179,5 @@ def test_a_question_is_shown_in_words_and_as_a_picture(tmp_path: Path, run: Any)
     ],
 )
 def test_what_cannot_be_shown(words: tuple[object, ...], message: str, run: Any) -> None:
-    code, out, err = run("question", TABLETOP, *words)
+    code, out, err = run("show", TABLETOP, "--question", *words)
     assert (code, out) == (1, "") and message in err

@@ -12,13 +12,11 @@ from support.runs import CHEAT, config, run, run_one
 from support.worlds import World
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.build_dataset.build import build_dataset
-from robomme_interference_data.build_dataset.manifests import (
-    in_folder,
-    plan_manifests,
-    write_manifests,
-)
-from robomme_interference_data.build_dataset.plan import BuildPlan, list_episodes
+from robomme_interference_data.build_dataset.dataset.build import build_dataset
+from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan
+from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
+from robomme_interference_data.build_dataset.plan.episodes import choose_episodes
+from robomme_interference_data.build_dataset.plan.planned import datasets_in
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.constants import CONTRADICTIONS
 from robomme_interference_data.errors import (
@@ -83,11 +81,13 @@ def test_invalid_settings_are_errors_before_anything_is_written(
 
 def test_every_condition_needs_its_embeddings(tmp_path: Path) -> None:
     buffer_set, source = copy_buffer_set(tmp_path / "buffer_set"), SampleSource(size=32)
-    listed = list_episodes((source,), split="test", families=[one.split("/")[0] for one in QUERIES])
+    listed = choose_episodes(
+        (source,), split="test", families=[one.split("/")[0] for one in QUERIES]
+    )
     tasks = tuple((number, source.contradict(one)) for number, one in listed)
-    plan = BuildPlan(CONTRADICTIONS, (source,), tasks)
+    plan = DatasetPlan(CONTRADICTIONS, (source,), tasks)
     build_dataset(plan, buffer_set / CONTRADICTIONS, Serial(), QUIET)
-    sum(write_manifests(plan_manifests(in_folder(buffer_set), ("k0", "stale-k0")), buffer_set))
+    sum(write_manifests(plan_manifests(datasets_in(buffer_set), ("k0", "stale-k0")), buffer_set))
     make_index(buffer_set)
     settings = STEP | {"buffer_set": buffer_set, "families": ("MoveCube",)}
     with pytest.raises(MissingFileError, match=f"{CONTRADICTIONS} has no embeddings"):

@@ -1,4 +1,4 @@
-"""`index`, `retrieve`, `retrieval-score` and `calibrate`: output, files and errors."""
+"""`index`, `retrieve`, `retrieval-score`: output, files and errors."""
 
 import csv
 import json
@@ -69,7 +69,7 @@ def test_only_what_is_asked_for(run: Run, indexed: Path) -> None:
     lines = out.splitlines()
     rows = [line.split()[:3] for line in lines if line.split()[1:2] == ["k3"]][:3]
     assert rows == [["MoveCube", "k3", "1"], ["PatternLock", "k3", "1"], ["all", "k3", "2"]]
-    code, out, _ = run("calibrate", indexed, *picked, "--json")
+    code, out, _ = run("retrieval-score", indexed, *picked, "--calibrate", "--json")
     assert code == 0 and json.loads(out)["buffers"] == 2
     code, _, err = run("retrieval-score", indexed, "--conditions", "k2")
     assert code == 1 and "condition 'k2' is not in" in err
@@ -125,7 +125,7 @@ def test_scores_as_json_and_the_same_every_time(run: Run, tmp_path: Path, indexe
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("index nowhere", "build all nowhere --source KIND:PATH"),
+        ("index nowhere", "build nowhere --source KIND:PATH"),
         ("index {bare} --encoder thumbnial", "Did you mean 'thumbnail'"),
         ("index {bare} --camera side", "camera 'side'"),
         ("index {bare} --batch 0", "batch 0"),
@@ -133,7 +133,7 @@ def test_scores_as_json_and_the_same_every_time(run: Run, tmp_path: Path, indexe
         ("retrieval-score {buffer_set} --rules best", "there is no method 'best'"),
         (f"retrieve {{buffer_set}} {EPISODE} no-history", "the history is empty"),
         (f"retrieve {{buffer_set}} {EPISODE} k1 --out why.gif", "ends in"),
-        ("calibrate {buffer_set} --sweep 0.9 0.8", "sweep (0.9, 0.8)"),
+        ("retrieval-score {buffer_set} --calibrate --sweep 0.9 0.8", "sweep (0.9, 0.8)"),
     ],
 )
 def test_refusals(words: str, message: str, run: Run, indexed: Path, tiny_buffers: Path) -> None:
@@ -199,16 +199,18 @@ def test_explanation_of_a_history_without_the_lesson(indexed: Path, tmp_path: Pa
 
 
 def test_calibration(run: Run, tmp_path: Path, indexed: Path) -> None:
-    figure = tmp_path / "thresholds.svg"
-    code, out, err = run("calibrate", indexed, "--sweep", "0.1", "0.2", "--out", figure)
-    assert code == 0 and f"{figure} written" in err and figure.read_text().startswith("<?xml")
+    figure = tmp_path / "thresholds.png"
+    code, out, err = run(
+        "retrieval-score", indexed, "--calibrate", "--sweep", "0.1", "0.2", "--out", tmp_path
+    )
+    assert code == 0 and f"{figure} written" in err and figure.read_bytes().startswith(b"\x89PNG")
     assert "Fitted by the released rule: " in out and "in use (max/adaptive): " in out
     assert all(f"\n{family} " in out for family in FAMILIES)
     lines = out.splitlines()
     assert [line.split()[0] for line in lines[-11:]] == [f"{0.1 + n / 100:.2f}" for n in range(11)]
     heads = lines[-13].split()
     assert heads[1:3] == ["purity", "k0"] and heads[-2:] == ["coverage", "k7"]
-    code, out, err = run("calibrate", indexed, "--json")
+    code, out, err = run("retrieval-score", indexed, "--calibrate", "--json")
     found = json.loads(out)
     assert (code, err) == (0, "") and (found["left_out"], found["rule"]) == (3, "max/adaptive")
     middle = (found["cut_percentile"] + found["lowest_percentile"]) / 2

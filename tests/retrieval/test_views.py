@@ -58,12 +58,12 @@ def test_the_query_frame_is_that_of_the_shift(run: Run, seen: Path) -> None:
 
 def test_missing_views_and_unknown_shifts(run: Run, seen: Path, own_buffers: Path) -> None:
     code, _, err = run("retrieval-score", own_buffers, "--shift", "light:2")
-    assert code == 1 and f"build shifted {own_buffers} --source" in err
+    assert code == 1 and f"build {own_buffers} --only shifted --source" in err
     built = own_buffers / "shifted/meta/interference.json"
     built.parent.mkdir(parents=True)
     built.write_text("{}")  # built, but not in the manifests
     code, _, err = run("retrieval-score", own_buffers, "--shift", "light:2")
-    assert code == 1 and f"build manifests {own_buffers}" in err and "--source" not in err
+    assert code == 1 and f"build {own_buffers} --only manifests" in err and "--source" not in err
     assert "such as light:2" in run("retrieval-score", seen, "--shift", "dark")[2]
 
 

@@ -10,14 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.build_dataset.build import build_dataset
-from robomme_interference_data.build_dataset.frame_selection import select_frames
-from robomme_interference_data.build_dataset.manifests import (
-    in_folder,
-    plan_manifests,
-    write_manifests,
-)
-from robomme_interference_data.build_dataset.plan import BuildPlan, list_episodes
+from robomme_interference_data.build_dataset.dataset.build import build_dataset
+from robomme_interference_data.build_dataset.dataset.frame_selection import select_frames
+from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan
+from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
+from robomme_interference_data.build_dataset.plan.episodes import choose_episodes
+from robomme_interference_data.build_dataset.plan.planned import datasets_in
 from robomme_interference_data.build_dataset.sources import Frame, Source
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
@@ -46,13 +44,13 @@ def copy_buffer_set(folder: Path, buffer_set: Path = GOLDEN) -> Path:
 
 def build(root: Path, kind: str, source: Source, **episodes: Any) -> None:
     """Build a dataset of a buffer set from some episodes of a source."""
-    plan = BuildPlan(kind, (source,), list_episodes((source,), **episodes))
+    plan = DatasetPlan(kind, (source,), choose_episodes((source,), **episodes))
     build_dataset(plan, root / kind, Serial(), WorkProgress(quiet=True))
 
 
 def plan_again(root: Path, conditions: Iterable[str] = CONDITIONS, **options: Any) -> None:
     """Plan the buffers of a buffer set and replace its manifests."""
-    for _ in write_manifests(plan_manifests(in_folder(root), tuple(conditions), **options), root):
+    for _ in write_manifests(plan_manifests(datasets_in(root), tuple(conditions), **options), root):
         pass
 
 

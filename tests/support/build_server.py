@@ -104,7 +104,7 @@ class BuildServer:
 
 
 def _serve(log: str) -> None:
-    from robomme_interference_data.build_dataset.lerobot_writer import load_lerobot
+    from robomme_interference_data.build_dataset.dataset.lerobot_writer import load_lerobot
     from robomme_interference_data.cli import main as cli
 
     load_lerobot()

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from robomme_interference_data.build_dataset.identity import identity_of
+from robomme_interference_data.build_dataset.dataset.identity import identity_of
 from robomme_interference_data.build_dataset.sources import (
     Frame,
     Recording,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from support.buffer_sets import build, plan_again
 
-from robomme_interference_data.build_dataset.frame_selection import select_demonstration
+from robomme_interference_data.build_dataset.dataset.frame_selection import select_demonstration
 from robomme_interference_data.build_dataset.sources import Frame, Recording, SourceEpisode
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.constants import SHIFTED

@@ -102,7 +102,7 @@ def test_unknown_cameras_are_errors_that_name_the_option(
         (("index", arm, "--camera", "nope"), "--camera"),
         (("retrieve", arm, DRAWER, "k1", "--camera", "nope"), "--camera"),
         (("retrieval-score", arm, "--camera", "nope"), "--camera"),
-        (("calibrate", arm, "--camera", "nope"), "--camera"),
+        (("retrieval-score", arm, "--calibrate", "--camera", "nope"), "--camera"),
         (("ceiling", arm, *step[:4]), "--retrieval-camera"),
         (("evaluate", arm, *watcher, *step, "--offline"), "--retrieval-camera"),
         (("evaluate", arm, *watcher), "--offline"),  # the live views are the simulator's

@@ -1,6 +1,7 @@
 """The command line: help, exit codes and errors without a traceback; as a program."""
 
 import json
+import logging
 import os
 import re
 import shlex
@@ -11,6 +12,7 @@ from collections.abc import Callable, Iterator
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import typer
@@ -18,7 +20,9 @@ from support.buffer_sets import QUERIES, contents
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.cli import doctor
+from robomme_interference_data.cli.console import echo, log_to_stderr, print_json
 from robomme_interference_data.cli.main import app
+from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.schema.codec import to_dict
 
 EPISODE = QUERIES[1]
@@ -48,47 +52,63 @@ def in_buffer_set(arguments: str, buffer_set: Path) -> list[str]:
 # --- help ------------------------------------------------------------------------------------
 
 
+GROUPS = {
+    "Data": ["doctor", "build", "verify", "fetch"],
+    "Look": ["conditions", "list", "show", "simulate"],
+    "Retrieval": ["index", "retrieve", "retrieval-score"],
+    "Rollouts": ["ceiling", "evaluate", "ask", "merge", "vla-eval-config"],
+    "Scores": ["score", "compare", "power"],
+    "Publish": ["card", "publish", "publish-results"],
+}
+
+
 def test_commands_are_listed_in_groups(run: Run) -> None:
     code, out, err = run("--help")
     assert (code, err) == (0, "")
-    words = [line.strip().split("  ")[0].removesuffix(":") for line in out.splitlines()]
-    listed = [word for word in words if (word,) in ALL or word in GROUPS]
-    assert listed == [
-        *("Data", "doctor", "build", "new-buffer-set", "verify", "audit", "fetch"),
-        *("Look", "conditions", "list", "show", "question", "simulate"),
-        *("Retrieval", "index", "retrieve", "retrieval-score", "calibrate"),
-        *("Rollouts", "ceiling", "shortcuts", "evaluate", "ask", "merge", "vla-eval-config"),
-        *("Scores", "score", "compare", "power"),
-        *("Publish", "card", "publish", "publish-results"),
-    ]
+    order = [name for title, names in GROUPS.items() for name in (title, *names)]
+    found = re.findall(r"^[│╭]─? +?([A-Za-z-]+)", out, flags=re.M)
+    assert [word for word in found if word in order] == order
+    assert {name for (name, *_) in filter(None, ALL)} == {*order} - {*GROUPS}
 
 
-GROUPS = ("Data", "Look", "Retrieval", "Rollouts", "Scores", "Publish")
+def test_few_commands_with_few_options() -> None:
+    assert len(ALL) - 1 <= 22
+    for path, command in ALL.items():
+        options = [one.name for one in command.params if one.param_type_name == "option"]
+        if path not in (("evaluate",), ("ask",)):
+            assert len({*options} - {"as_json", "help"}) <= 27, path
 
 
 @pytest.mark.parametrize("path", ALL, ids=" ".join)
 def test_help_of_every_command(path: tuple[str, ...], run: Run) -> None:
     code, out, err = run(*path, "--help")
     assert (code, err) == (0, "")
-    assert "Usage: robomme-interference" in out
-    # An address is not broken: it is copied.
-    assert max(len(line) for line in out.splitlines() if "://" not in line) <= 80
-    assert "robomme-interference " in out.split("Usage:")[1].split("\n", 1)[1], "no example"
+    usage = "Usage: robomme-interference"
+    assert usage in out
+    assert "robomme-interference " in out.split(usage)[1].split("\n", 1)[1], "no example"
     for parameter in ALL[path].params:
         if parameter.name != "help":
             assert str(parameter.help or "").strip(), f"{parameter.name} has no help"
             if parameter.opts[0].startswith("--"):
                 assert max(parameter.opts, key=len) in out
-    for name in getattr(ALL[path], "commands", {}):
-        assert name in out
 
 
-def test_help_shows_options_in_groups_and_examples_last(run: Run) -> None:
-    out = run("build", "manifests", "--help")[1]
-    assert "[OPTIONS] BUFFER_SET\n" in out
+def test_help_shows_options_in_groups_and_examples(run: Run) -> None:
     out = run("index", "--help")[1]
-    order = ("\n  Embed", "Arguments:", "Execution:", "--workers", "--json", "Example")
+    order = (" Embed", "Example", "─ Arguments", "─ Retrieval", "─ Execution", "--workers")
     assert [word for word in sorted(order, key=out.index)] == list(order)
+
+
+def test_examples_are_not_wrapped_in_80_columns(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are copied."""
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr("typer.rich_utils.MAX_WIDTH", 80)
+    for path, command in ALL.items():
+        out = run(*path, "--help")[1]
+        text = f"{command.help}\n{command.epilog}"
+        for block in re.findall(r"```\n(.*?)```", text, flags=re.S):
+            for line in filter(None, map(str.strip, block.splitlines())):
+                assert line in out, path
 
 
 def test_help_imports_nothing_heavy() -> None:
@@ -134,16 +154,16 @@ run_program()
     [
         (["lits"], "No such command 'lits'"),
         (["list", ".", "--bad"], "No such option: --bad"),
-        (["build", "demonstrations", "--source", "frames:."], "Missing argument"),
+        (["build", "--source", "frames:."], "Missing argument"),
         (
             ["score", ".", "--out", "x", "--expected", "all"],
             "'--expected': 'all' is not one of 'benchmark', 'observed'",
         ),
-        (["build", "demonstrations"], "demonstrations [OPTIONS] BUFFER_SET\n"),
+        (["build"], "build [OPTIONS] {BUFFER_SET}\n"),
         (["list", ".", "--conditions", ""], "has an empty name"),
-        (["build", "manifests", ".", "--conditions", "k0,,k1"], "has an empty name"),
+        (["build", ".", "--only", "manifests", "--conditions", "k0,,k1"], "has an empty name"),
         (["list", ".", "--conditions", "k0,k1", "--conditions", "k0"], "'k0' is given 2 times"),
-        (["build", "all", ".", "--source", "sample", "--cameras", " "], "has an empty name"),
+        (["build", ".", "--source", "sample", "--cameras", " "], "has an empty name"),
     ],
 )
 def test_usage_errors(arguments: list[str], message: str, run: Run) -> None:
@@ -160,9 +180,9 @@ def test_usage_errors(arguments: list[str], message: str, run: Run) -> None:
     ("arguments", "words"),
     [
         ("list S/nowhere", ("neither a folder nor", "namespace/name")),
-        ("list S --conditions k9", ("'k9'", "build manifests", "--conditions k9")),
+        ("list S --conditions k9", ("'k9'", "--only manifests", "--conditions k9")),
         ("show S MoveCube/test/9 k3", ("MoveCube/test/9", EPISODE)),
-        ("build distractors S/x --source frmes:S", ("frmes", "frames:FOLDER")),
+        ("build S/x --only distractors --source frmes:S", ("frmes", "frames:FOLDER")),
     ],
 )
 def test_known_errors(arguments: str, words: tuple[str, ...], run: Run, tiny_buffers: Path) -> None:
@@ -173,11 +193,28 @@ def test_known_errors(arguments: str, words: tuple[str, ...], run: Run, tiny_buf
 
 
 @pytest.mark.parametrize(
+    ("arguments", "option", "name"),
+    [
+        ("list S/x --conditions k3 --families ,", "--families", "`"),
+        ("build S/x --source sample --only executions --unit 5x5", "--unit", "`unit`"),
+        ("build S/manifests --source sample", "BUFFER_SET", "`buffer_set`"),
+        ("index S --executor other", "--executor", "executor="),
+    ],
+)
+def test_errors_name_options_and_arguments(
+    arguments: str, option: str, name: str, run: Run, own_buffers: Path
+) -> None:
+    code, _, err = run(*in_buffer_set(arguments, own_buffers))
+    assert code != 0 and option in err and name not in err
+
+
+@pytest.mark.parametrize(
     ("arguments", "code", "kind", "helps"),
     [
-        (f"show S {EPISODE} k9", 1, "UnknownNameError", "build manifests S"),
+        (f"show S {EPISODE} k9", 1, "UnknownNameError", "build S --only manifests"),
         (f"show S {EPISODE} k3 --camera front", 1, "InvalidOptionError", None),
-        (f"show S {EPISODE}", 2, "MissingParameter", None),
+        (f"show S {EPISODE}", 1, "InvalidOptionError", "list S"),
+        ("show S", 2, "MissingParameter", None),
         ("list S --nope", 2, "NoSuchOption", None),
     ],
 )
@@ -231,8 +268,8 @@ def test_output_inside_a_buffer_set_is_an_error(
 
 
 def table_rows(out: str) -> list[list[str]]:
-    """The rows under the line of dashes."""
-    lines = out[out.index("\n-----") :].splitlines()[2:]
+    """The rows under the line below the heads."""
+    lines = out[out.index("\n─────") :].splitlines()[2:]
     return [re.split(r"  +", line.strip()) for line in takewhile(str.strip, lines)]
 
 
@@ -298,12 +335,53 @@ def test_show_as_json_and_as_a_picture(run: Run, tiny_buffers: Path, tmp_path: P
 
 def test_verify(run: Run, own_buffers: Path) -> None:
     code, out, _ = run("verify", own_buffers, "--json", "--no-decode")
-    assert (code, json.loads(out)) == (0, [])
+    assert (code, json.loads(out)) == (0, {"violations": []})
     (video, *_) = sorted(own_buffers.glob("demonstrations/videos/*front/*/*.mp4"))
     video.unlink()
     code, out, err = run("verify", own_buffers, "--no-decode")
     assert code == 1
     assert video.name in out and "Traceback" not in err
+
+
+# --- control characters ---------------------------------------------------------------------
+
+
+def test_logged_control_characters_are_escaped(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(logging.getLogger("robomme_interference_data"), "propagate", True)
+    log_to_stderr()
+    logger = logging.getLogger("robomme_interference_data.storage.hub")
+    logger.info("fetched %s", "\x1b[2Jname")
+    logger.debug("not shown")
+    assert capsys.readouterr().err == "fetched \\x1b[2Jname\n"
+
+
+HOSTILE = "\x1b[2J\x9b2J\x1b]0;title\x07"
+TO_OBEY = {"\x1b", "\x9b", "\x07"}
+
+
+@pytest.mark.parametrize(
+    "error", [InterferenceError(HOSTILE, HOSTILE), OSError(1, HOSTILE, HOSTILE), KeyError(HOSTILE)]
+)
+def test_control_characters_in_errors_are_escaped(
+    error: Exception, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "robomme_interference_data.cli.main.check_endpoint", Mock(side_effect=error)
+    )
+    code, out, err = run("conditions")
+    assert (code, out) == (1, "")
+    assert "[2J" in err and not TO_OBEY & {*err}
+
+
+def test_control_characters_in_output_are_escaped(capsys: pytest.CaptureFixture[str]) -> None:
+    echo(f"a\n\t{HOSTILE}")
+    print_json({"key": HOSTILE})
+    first, *rest = capsys.readouterr().out.splitlines()
+    assert first == "a"
+    assert not TO_OBEY & {*"".join(rest)}
+    assert json.loads("\n".join(rest[1:])) == {"key": HOSTILE}  # JSON has escapes of its own
 
 
 # --- as a program ---------------------------------------------------------------------------------
@@ -312,7 +390,7 @@ def test_verify(run: Run, own_buffers: Path) -> None:
 def test_output_folder_that_cannot_be_created(run: Run, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     out = tmp_path / "file" / "S"
-    code, printed, err = run("build", "demonstrations", out, "--source", "sample")
+    code, printed, err = run("build", out, "--only", "demonstrations", "--source", "sample")
     assert (code, printed) == (1, "")
     assert f"Error: {out.parent}" in err and "Not a directory" in err
     assert "resume" not in err  # the same command would fail again

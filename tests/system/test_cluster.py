@@ -21,8 +21,8 @@ from support.serve_policy import command
 from support.shared_policies import FAULT
 from support.worker_calls import Marked, behave, wait_until_gone
 
-from robomme_interference_data.build_dataset.build import build_dataset
-from robomme_interference_data.build_dataset.plan import BuildPlan
+from robomme_interference_data.build_dataset.dataset.build import build_dataset
+from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan
 from robomme_interference_data.errors import WorkerError
 from robomme_interference_data.evaluate.run.log import read_record
 from robomme_interference_data.runtime.executor import Executor, Serial
@@ -197,7 +197,7 @@ def test_a_token_that_is_missing(cluster: Any, tmp_path: Path) -> None:
 def test_a_build_has_the_bytes_of_one_process(cluster: Any, tmp_path: Path) -> None:
     source = MadeUpSource({f"MoveCube/test/{number}": (40, 20) for number in range(4)})
     tasks = tuple((0, episode) for episode in source.episodes())
-    plan = BuildPlan("demonstrations", (source,), tasks)
+    plan = DatasetPlan("demonstrations", (source,), tasks)
 
     def built(name: str, executor: Executor) -> dict[str, bytes]:
         with WorkProgress(quiet=True) as progress:

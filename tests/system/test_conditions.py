@@ -46,7 +46,7 @@ def _logged_in(login: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_buffers_of_other_conditions(own_buffers: Path, finish: Callable[..., None]) -> None:
     names = "k1,before-k1,held-k1,same-k1,parts-k1,absent-k1"
-    finish("build", "manifests", own_buffers, "--conditions", names)
+    finish("build", own_buffers, "--only", "manifests", "--conditions", names)
     opened = load_buffer_set(own_buffers)
     buffers = {name: opened.load(QUERY, name, verify=True) for name in names.split(",")}
     plain = buffers["k1"].frames()
@@ -60,7 +60,7 @@ def test_buffers_of_other_conditions(own_buffers: Path, finish: Callable[..., No
     lengths = {name: buffer.manifest.lesson_frames for name, buffer in buffers.items()}
     assert lengths == dict.fromkeys(buffers, 48) | {"absent-k1": 0}
     finish("verify", own_buffers)
-    finish("audit", own_buffers)
+    finish("verify", own_buffers, "--audit", "--no-decode")
 
 
 OPTIONAL_DATASETS = ("raw-k1", "stale-k1", "misled-k0")
@@ -77,9 +77,9 @@ def test_optional_datasets_are_published_and_fetched(
     selection = "--split test --families MoveCube --cameras front --unit-episodes 0 --workers 1"
     conditions = ",".join(("k1", *OPTIONAL_DATASETS))
     words = ("--source", "sample", "--conditions", conditions, *selection.split())
-    finish("build", "all", root, *words)
+    finish("build", root, *words)
     finish("verify", root)
-    finish("audit", root)
+    finish("verify", root, "--audit", "--no-decode")
     built = load_buffer_set(root)
     assert {*built.datasets} == {"demonstrations", "distractors", *NEEDED}
     lesson, unit = built.manifest(QUERY, "k1").sessions

@@ -19,9 +19,9 @@ def test_a_policy_trained_on_built_executions_acts(tmp_path: Path) -> None:
     from lerobot.utils.feature_utils import dataset_to_policy_features
     from support.lerobot_policies import SMALL, features, play
 
-    from robomme_interference_data.build_dataset.build import build_dataset
     from robomme_interference_data.build_dataset.config import BuildConfig
-    from robomme_interference_data.build_dataset.plan import plan_build
+    from robomme_interference_data.build_dataset.dataset.build import build_dataset
+    from robomme_interference_data.build_dataset.plan.datasets import plan_dataset
     from robomme_interference_data.constants import ACTION
     from robomme_interference_data.evaluate.policies.registry import make_policy
     from robomme_interference_data.runtime.executor import Serial
@@ -29,7 +29,7 @@ def test_a_policy_trained_on_built_executions_acts(tmp_path: Path) -> None:
 
     out = tmp_path / "executions"
     config = BuildConfig(source=("sample:MoveCube,PatternLock",), buffer_set=out, split="test")
-    plan = plan_build("executions", config)
+    plan = plan_dataset("executions", config)
     build_dataset(plan, out, Serial(), WorkProgress(quiet=True))
     options = {"device": "cpu", "push_to_hub": False, "pretrained_backbone_weights": None}
     act = make_policy_config("act", **options, **features(), **SMALL["act"])

@@ -48,7 +48,7 @@ def test_a_buffer_set_for_published_demonstrations(
 ) -> None:
     out = tmp_path / "own"
     given = ("--demonstrations", BASE, "--source", mine, "--workers", 1)
-    code, _, err = run("new-buffer-set", out, *given, "--conditions", "k0,k1,k2")
+    code, _, err = run("build", out, *given, "--conditions", "k0,k1,k2")
     assert code == 0, err
     assert "publish" in err
     buffer_set = load_buffer_set(out)
@@ -63,12 +63,12 @@ def test_a_buffer_set_for_published_demonstrations(
     assert [*verify_buffer_set(buffer_set)] == []
     # Again: nothing changes. With other units: a question, as planned buffers would get others.
     made = contents(out)
-    assert run("new-buffer-set", out, *given)[0] == 0
+    assert run("build", out, *given)[0] == 0
     assert contents(out) == made
-    code, _, err = run("new-buffer-set", out, *given[:2], "--source", "sample:Cup,Box")
+    code, _, err = run("build", out, *given[:2], "--source", "sample:Cup,Box")
     assert code == 1 and "k1, k2" in err and "--yes" in err
     assert contents(out) == made
-    assert run("build", "manifests", out, "--drop", "k2", "--yes")[0] == 0
+    assert run("build", out, "--only", "manifests", "--drop", "k2", "--yes")[0] == 0
     assert load_buffer_set(out).conditions == ("k0", "k1")
 
 
@@ -79,8 +79,8 @@ def test_a_buffer_set_for_demonstrations_in_a_folder(mine: str, tmp_path: Path, 
     before = {path: path.read_bytes() for path in base.rglob("*") if path.is_file()}
     out, export = tmp_path / "own", tmp_path / "export"
     given = ("--demonstrations", base, "--source", mine, "--workers", 1, "--conditions", "k0,k2")
-    assert run("new-buffer-set", out, *given)[0] == 0
-    assert run("new-buffer-set", out, *given)[0] == 0  # again: nothing to add
+    assert run("build", out, *given)[0] == 0
+    assert run("build", out, *given)[0] == 0  # again: nothing to add
     assert run("verify", out)[0] == 0
     publish = ("--repo-id", "me/own", "--to", export)
     assert run("publish", out, *publish)[0] == 0
@@ -90,7 +90,7 @@ def test_a_buffer_set_for_demonstrations_in_a_folder(mine: str, tmp_path: Path, 
     assert {path: path.read_bytes() for path in base.rglob("*") if path.is_file()} == before
     assert not (out / "demonstrations").is_symlink()  # it would lead out of the buffer set
     other = copy_tabletop(tmp_path / "other") / "demonstrations"
-    code, _, err = run("new-buffer-set", out, *given, "--demonstrations", other)
+    code, _, err = run("build", out, *given, "--demonstrations", other)
     assert code == 1 and "exists, and is not a copy of" in err
 
 
@@ -103,7 +103,7 @@ def test_retrieval_on_published_demonstrations(
     assert run("index", indexed)[0] == 0
     commit, out = hub.push(f"datasets/{BASE}", indexed), tmp_path / "own"
     given = ("--demonstrations", BASE, "--source", mine, "--workers", 1)
-    assert run("new-buffer-set", out, *given, "--conditions", "k0,k2")[0] == 0
+    assert run("build", out, *given, "--conditions", "k0,k2")[0] == 0
     code, printed, err = run("index", out)
     report = f"{out}/distractors/index/thumbnail: 64 frames, 64 embedded now\n"
     assert (code, printed) == (0, report)
@@ -128,7 +128,7 @@ def test_published_demonstrations_without_an_index(
 ) -> None:
     out = tmp_path / "own"
     given = ("--demonstrations", BASE, "--source", mine, "--workers", 1)
-    assert run("new-buffer-set", out, *given, "--conditions", "k1")[0] == 0
+    assert run("build", out, *given, "--conditions", "k1")[0] == 0
     code, _, err = run("index", out)
     assert code == 0 and "retrieval will not find the demonstrations" in err
     assert run("retrieve", out, "MoveCube/test/0", "k1")[0] == 1
@@ -161,6 +161,6 @@ def test_invalid_new_buffer_sets(
 ) -> None:
     out = tmp_path / "own"
     given = ("--source", mine, "--workers", 1)
-    code, _, err = run("new-buffer-set", out, *given, "--conditions", "k1", *options)
+    code, _, err = run("build", out, *given, "--conditions", "k1", *options)
     assert code == 1 and words in err
     assert not (out / "distractors").exists()

@@ -12,13 +12,11 @@ import pytest
 from numpy.typing import NDArray
 
 from robomme_interference_data import load_buffer, load_buffer_set
-from robomme_interference_data.build_dataset.build import build_dataset
-from robomme_interference_data.build_dataset.manifests import (
-    in_folder,
-    plan_manifests,
-    write_manifests,
-)
-from robomme_interference_data.build_dataset.plan import BuildPlan, list_episodes
+from robomme_interference_data.build_dataset.dataset.build import build_dataset
+from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan
+from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
+from robomme_interference_data.build_dataset.plan.episodes import choose_episodes
+from robomme_interference_data.build_dataset.plan.planned import datasets_in
 from robomme_interference_data.build_dataset.sources import open_source
 from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
 from robomme_interference_data.runtime.executor import Serial
@@ -111,11 +109,11 @@ def test_a_buffer_set_of_real_frames(shared_data: Path, recordings: Path, tmp_pa
     sources = {"demonstrations": f"frames:{tmp_path / 'lessons'}"}
     for kind, name in (sources | {"distractors": f"robomme-h5:{recordings}"}).items():
         source = open_source(name)
-        plan = BuildPlan(kind, (source,), list_episodes([source]), ("front",))
+        plan = DatasetPlan(kind, (source,), choose_episodes([source]), ("front",))
         result = build_dataset(plan, buffer_set / kind, Serial(), WorkProgress(unit="episodes"))
     assert result.skipped == {"PatternLock/train/0": "96 raw frames; a unit needs 249"}
     for _ in write_manifests(
-        plan_manifests(in_folder(buffer_set), ("k0", "k1"), 0, None), buffer_set
+        plan_manifests(datasets_in(buffer_set), ("k0", "k1"), 0, None), buffer_set
     ):
         pass
     assert list(verify_buffer_set(load_buffer_set(buffer_set))) == []

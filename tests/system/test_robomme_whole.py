@@ -5,14 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.config import BuildConfig
-from robomme_interference_data.build_dataset.manifests import (
-    in_folder,
-    plan_manifests,
-    write_manifests,
-)
-from robomme_interference_data.build_dataset.plan import plan_build
+from robomme_interference_data.build_dataset.dataset.build import build_dataset
+from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
+from robomme_interference_data.build_dataset.plan.datasets import plan_dataset
+from robomme_interference_data.build_dataset.plan.planned import datasets_in
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS
 from robomme_interference_data.errors import BuildError
 from robomme_interference_data.runtime.executor import Serial
@@ -22,7 +19,7 @@ from robomme_interference_data.simulators.robomme.simulator import EPISODES
 
 def build(kind: str, config: BuildConfig) -> int:
     """Build a dataset in this process; return how many episodes were added."""
-    plan = plan_build(kind, config)
+    plan = plan_dataset(kind, config)
     return build_dataset(plan, config.buffer_set / kind, Serial(), WorkProgress(quiet=True)).added
 
 
@@ -48,10 +45,12 @@ def test_an_evaluation_on_it(tmp_path: Path, robomme_python: Path) -> None:
     # The stand-in hides the answers of this family, so its oracle cannot complete an episode.
     with pytest.raises(BuildError, match="hides its answers"):
         build(DISTRACTORS, replace(queries, buffer_set=tmp_path / "units"))
-    units = BuildConfig(("sample:VideoRepick",), tmp_path, split="train", cameras=("front",))
+    units = BuildConfig(
+        source=("sample:VideoRepick",), buffer_set=tmp_path, split="train", cameras=("front",)
+    )
     build(DISTRACTORS, units)
     for _ in write_manifests(
-        plan_manifests(in_folder(tmp_path), ("no-history", "k0", "k1")), tmp_path
+        plan_manifests(datasets_in(tmp_path), ("no-history", "k0", "k1")), tmp_path
     ):
         pass
     config = RunConfig(

@@ -63,7 +63,7 @@ def ran(folder: Path) -> list[str]:
         pytest.param(SHARED, marks=pytest.mark.slow),
         pytest.param(f"{EVALUATE} --executor ray:local", marks=pytest.mark.slow),
         pytest.param("doctor", marks=pytest.mark.slow),
-        pytest.param("build all ../new --source sample --workers 2", marks=pytest.mark.slow),
+        pytest.param("build ../new --source sample --workers 2", marks=pytest.mark.slow),
         pytest.param("verify .", marks=pytest.mark.slow),
         pytest.param("index . --encoder thumbnail", marks=pytest.mark.slow),
         pytest.param("list .", marks=pytest.mark.slow),

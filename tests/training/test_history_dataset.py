@@ -302,7 +302,7 @@ def test_bad_input(options: dict[str, Any], error: type[Exception], match: str, 
 def test_a_buffer_set_without_executions(tiny_buffers: Path, tmp_path: Path) -> None:
     with pytest.raises(MissingFileError, match="executions") as raised:
         HistoryDataset(tiny_buffers, ["k0"], store=tmp_path)
-    assert raised.value.command == f"build executions {tiny_buffers} --source KIND:PATH"
+    assert raised.value.command == f"build {tiny_buffers} --only executions --source KIND:PATH"
     assert HistoryDataset(tiny_buffers, ["k0"], chunk=0, store=tmp_path, quiet=True)[0]
 
 
@@ -311,6 +311,6 @@ def test_manifests_planned_before_the_executions(executed_buffers: Path, tmp_pat
     shutil.copytree(GOLDEN / MANIFESTS, root / MANIFESTS, dirs_exist_ok=True)
     with pytest.raises(MissingFileError) as caught:
         HistoryDataset(root, ["k0"], store=tmp_path)
-    assert str(caught.value.command).startswith("build manifests")
+    assert str(caught.value.command).endswith("--only manifests")
     plan_again(root)
     assert len(HistoryDataset(root, ["k0"], store=tmp_path, quiet=True)) == 3 * LIVE

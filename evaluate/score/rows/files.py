@@ -13,7 +13,12 @@ import pyarrow as pa
 import pyarrow.json as pa_json
 
 from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD, RUN_TABLES
-from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
+from robomme_interference_data.errors import (
+    FormatError,
+    InvalidOptionError,
+    MissingFileError,
+    named,
+)
 from robomme_interference_data.evaluate.run.log import MOST_BYTES, RunHeader, whole_lines
 from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.ids import nth_number
@@ -100,8 +105,9 @@ def _select(
         raise FormatError(
             f"{path} names no system: it has no column 'system', and its name is not "
             "SYSTEM-SIMULATOR_rollouts.csv",
-            'Name it, such as system="retrieval-framesamp-modul" '
-            "(of two files that are compared: system_a, system_b).",
+            f"Name it, such as {named('system', 'retrieval-framesamp-modul')} (of two files "
+            "that are "
+            f"compared: {named('system_a')}, {named('system_b')}).",
         )
     return {name: columns[name] for name in names if name in columns}
 

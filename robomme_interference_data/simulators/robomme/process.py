@@ -19,6 +19,7 @@ from robomme_interference_data.errors import (
     MissingExtraError,
     SimulatorCrashError,
     UnknownNameError,
+    named,
     printed_last,
 )
 from robomme_interference_data.runtime.safe_path import SAFE_PATH
@@ -36,10 +37,14 @@ _ENVIRONMENT = {
     "PYTHONUNBUFFERED": "1",  # the last lines are not lost when it dies
 }
 
-_INSTALL = (
-    "Install RoboMME (https://github.com/RoboMME/robomme_benchmark) into a separate environment "
-    f"and set `robomme_python` to its Python, or export {PYTHON_VARIABLE}=PATH."
-)
+
+def _advice() -> str:
+    return (
+        "Install RoboMME (https://github.com/RoboMME/robomme_benchmark) into a separate "
+        f"environment and set {named('robomme_python')} to its Python, or export "
+        f"{PYTHON_VARIABLE}=PATH."
+    )
+
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -75,7 +80,7 @@ class Process:
         hello, _ = self._answer("start")
         if "problem" in hello:
             self.end()
-            raise MissingExtraError(f"{python} cannot run RoboMME: {hello['problem']}", _INSTALL)
+            raise MissingExtraError(f"{python} cannot run RoboMME: {hello['problem']}", _advice())
         self.families: tuple[str, ...] = tuple(hello["families"])
         self.patches: tuple[str, ...] = tuple(hello["patches"])
 
@@ -130,7 +135,7 @@ class Process:
 
 
 def _unusable(python: str, error: Exception) -> InvalidOptionError:
-    return InvalidOptionError(f"{python} cannot be run as RoboMME's Python: {error}", _INSTALL)
+    return InvalidOptionError(f"{python} cannot be run as RoboMME's Python: {error}", _advice())
 
 
 @cache
@@ -158,10 +163,10 @@ def find_python(python: str | os.PathLike[str] | None) -> str:
     given = os.fspath(python) if python is not None else os.environ.get(PYTHON_VARIABLE, "")
     if not given:
         raise InvalidOptionError(
-            "the robomme simulator needs RoboMME's own Python, and none is given", _INSTALL
+            "the robomme simulator needs RoboMME's own Python, and none is given", _advice()
         )
     # As text: `Path` would remove a leading "./" and leave the name of a program.
     if (executable := shutil.which(os.path.expanduser(given))) is None:  # noqa: PTH111
-        raise InvalidOptionError(f"{given} is not an executable file", _INSTALL)
+        raise InvalidOptionError(f"{given} is not an executable file", _advice())
     # Not resolved: the interpreter of a virtual environment is a link.
     return os.path.abspath(executable)  # noqa: PTH100

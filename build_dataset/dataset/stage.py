@@ -16,8 +16,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.build_dataset.alike import Look, differences
+from robomme_interference_data.build_dataset.sources import Frame, Recording, Robot
 from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, LESSONS, PAPER_UNIT, STATE
-from robomme_interference_data.errors import BuildError, InterferenceError, SourceError
+from robomme_interference_data.errors import (
+    BuildError,
+    InterferenceError,
+    SourceError,
+    named,
+    naming_options,
+    option_names,
+)
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.codec import to_dict
@@ -32,19 +41,14 @@ from robomme_interference_data.storage.encode import Codec, VideoEncoder, get_co
 from robomme_interference_data.storage.files import canonical_json, read_header, write_json
 from robomme_interference_data.storage.video import iter_frames
 
-from .alike import Look, differences
 from .frame_selection import NothingToStore, select_frames
 from .image_stats import ImageStats
 from .lerobot_writer import StoredEpisode
-from .plan import BuildPlan
-from .sources import Frame, Recording, Robot, SourceEpisode
+from .plan import DatasetPlan, PlannedEpisode
 
 _RECORD = "record.json"
 _LAYOUT = 7
 """Version of a staged episode's folder."""
-
-Task = tuple[int, SourceEpisode]
-"""Index of the source, and episode."""
 
 
 @dataclass(frozen=True)
@@ -72,11 +76,11 @@ class Staged:
         )
 
 
-def staged_name(plan: BuildPlan, task: Task) -> str:
+def staged_name(plan: DatasetPlan, planned: PlannedEpisode) -> str:
     """Return the name of a staged episode's folder: a hash of all that decides its content."""
-    number, episode = task
+    number, episode = planned
     codec = get_codec(plan.codec)
-    content = {
+    content: dict[str, object] = {
         "kind": plan.kind,
         "source": plan.sources[number].provenance,
         "episode": [str(episode.id), repr(episode.key)],
@@ -84,20 +88,31 @@ def staged_name(plan: BuildPlan, task: Task) -> str:
         "codec": [codec.vcodec, codec.pix_fmt, dict(codec.options)],
         "layout": _LAYOUT,
         "fps": plan.fps,
-        **({"unit": plan.unit} if plan.unit != PAPER_UNIT else {}),
     }
+    if plan.unit != PAPER_UNIT:
+        content["unit"] = plan.unit
     return hashlib.sha256(canonical_json(content).encode()).hexdigest()[:24]
 
 
 @dataclass(frozen=True)
 class StageTask:
-    """Stages episodes one by one, as a task of an executor."""
+    """Stages episodes one by one, as a task of an executor.
 
-    plan: BuildPlan
+    Attributes:
+        plan: The plan of the dataset.
+        option_names: How errors name settings, also in another process.
+    """
 
-    def __call__(self, task: Task, worker: Worker) -> Staged:
+    plan: DatasetPlan
+    option_names: Mapping[str, str] = field(default_factory=option_names)
+
+    def __call__(self, task: PlannedEpisode, worker: Worker) -> Staged:
         """Stage one episode, send its files, and return its metadata."""
-        number, episode = task
+        with naming_options(self.option_names):
+            return self._stage(task, worker)
+
+    def _stage(self, planned: PlannedEpisode, worker: Worker) -> Staged:
+        number, episode = planned
         with tempfile.TemporaryDirectory(dir=worker.folder) as name:
             folder = Path(name)
             try:
@@ -220,7 +235,7 @@ class _Writer:
                 raise SourceError(
                     f"{name} of stored frame {self.length} is {value.tolist()}; expected finite "
                     "float32 numbers",
-                    "Correct the recording, or leave the episode out with `episodes`.",
+                    f"Correct the recording, or leave the episode out with {named('episodes')}.",
                 )
             self._vectors[name].append(value)
             self.digests.update(name, value)

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.build_dataset.sources.base import Robot
 from robomme_interference_data.constants import ACTION, INFO_PATH
 from robomme_interference_data.errors import MissingExtraError
 from robomme_interference_data.schema.records import EpisodeRecord
@@ -28,7 +29,6 @@ from robomme_interference_data.storage.encode import Codec
 from robomme_interference_data.storage.files import write_text
 
 from .image_stats import STATISTICS
-from .sources.base import Robot
 
 _ONE_EPISODE_MB = 1e-6
 """Largest size of a file, 1 byte: no two episodes share one."""

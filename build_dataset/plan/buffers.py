@@ -6,8 +6,9 @@ What is planned stays planned: published results and running evaluations refer t
 from collections.abc import Collection
 from dataclasses import dataclass
 
+from robomme_interference_data.build_dataset.config import BuffersConfig, parse_position_limit
 from robomme_interference_data.constants import POSITION_LIMIT, RULE_VERSION
-from robomme_interference_data.errors import InvalidOptionError, counted
+from robomme_interference_data.errors import InvalidOptionError, counted, named
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import (
     DEFAULT_CONDITIONS,
@@ -15,22 +16,13 @@ from robomme_interference_data.schema.conditions import (
     in_order,
     parse_condition,
 )
-from robomme_interference_data.schema.manifest import ManifestHeader
 
-from .config import PlanConfig, parse_position_limit
-
-
-@dataclass(frozen=True)
-class Planned:
-    """The buffers that a buffer set plans now: their manifests' header, and the query episodes."""
-
-    header: ManifestHeader
-    queries: frozenset[EpisodeId]
+from .planned import PlannedBuffers
 
 
 @dataclass(frozen=True)
-class Replan:
-    """The next plan of a buffer set's buffers, and how it differs from the present one.
+class NextBuffers:
+    """The buffers that a buffer set plans next, and how they differ from the present ones.
 
     Attributes:
         conditions: The conditions, in the order of tables.
@@ -70,13 +62,13 @@ class Replan:
         return lines
 
 
-def replan(
-    planned: Planned | None,
-    request: PlanConfig,
+def next_buffers(
+    planned: PlannedBuffers | None,
+    request: BuffersConfig,
     *,
     queries: Collection[EpisodeId] | None = None,
     units_change: bool = False,
-) -> Replan:
+) -> NextBuffers:
     """Return the next plan: what is planned and what is requested, without what is to be dropped.
 
     Args:
@@ -89,7 +81,7 @@ def replan(
     Raises:
         InvalidOptionError: A condition to be dropped is requested too, or is not planned.
     """
-    dropped = {parse_condition(one).name for one in request.drop}
+    dropped = {parse_condition(name).name for name in request.drop}
     requested = [condition.name for condition in in_order(request.conditions or DEFAULT_CONDITIONS)]
     if request.position_limit is not None:
         limit = parse_position_limit(request.position_limit)
@@ -98,17 +90,19 @@ def replan(
     if planned is None:
         if dropped:
             raise InvalidOptionError(
-                f"drop {', '.join(sorted(dropped))}; no condition is planned yet",
+                f"{named('drop', ','.join(sorted(dropped)))}: no condition is planned yet",
                 "Leave it out.",
                 option="drop",
             )
-        return Replan(in_order(requested), request.seed or 0, limit, tuple(requested))
+        return NextBuffers(in_order(requested), request.seed or 0, limit, tuple(requested))
     header = planned.header
     for name in sorted(dropped - {*header.conditions}):
         raise InvalidOptionError.one_of("drop", name, header.conditions)
     if both := dropped & {*request.conditions}:
         raise InvalidOptionError(
-            f"conditions and drop both name {min(both)}", "Name it in one of them.", option="drop"
+            f"{named('conditions')} and {named('drop')} both name {min(both)}",
+            "Name it in one of them.",
+            option="drop",
         )
     seed = header.seed if request.seed is None else request.seed
     # All units are drawn by rank among all eligible ones, so one more can change any buffer.
@@ -116,7 +110,7 @@ def replan(
     kept = [name for name in header.conditions if name not in dropped]
     added = [name for name in request.conditions if name not in header.conditions]
     gone = set() if queries is None else planned.queries - {*queries}
-    return Replan(
+    return NextBuffers(
         conditions=in_order([*kept, *added]),
         seed=seed,
         position_limit=limit,

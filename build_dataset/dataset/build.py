@@ -12,6 +12,12 @@ from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from robomme_interference_data.build_dataset.alike import (
+    Look,
+    differ_in_cameras,
+    differences,
+    in_buffers,
+)
 from robomme_interference_data.constants import ACTION, INFO_PATH, UNITS
 from robomme_interference_data.errors import (
     BuildError,
@@ -21,6 +27,7 @@ from robomme_interference_data.errors import (
     SimulatorError,
     SourceError,
     first_line,
+    named,
 )
 from robomme_interference_data.runtime.executor import Executor, Outcome
 from robomme_interference_data.runtime.progress import WorkProgress
@@ -29,13 +36,12 @@ from robomme_interference_data.storage.encode import get_codec
 from robomme_interference_data.storage.files import canonical_json, read_json
 from robomme_interference_data.storage.staging import replace_folder, staging_dir
 
-from .alike import Look, differ_in_cameras, differences, in_buffers
 from .estimate import BuildEstimate
 from .existing import ExistingDataset, open_existing
 from .identity import complete_dataset, identity_of
 from .lerobot_writer import StoredEpisode, load_lerobot, require_lerobot, write_lerobot
-from .plan import BuildPlan
-from .stage import Staged, StageTask, Task, keep_staged, read_staged, staged_name
+from .plan import DatasetPlan, PlannedEpisode
+from .stage import Staged, StageTask, keep_staged, read_staged, staged_name
 
 
 @dataclass(frozen=True)
@@ -50,7 +56,7 @@ class BuildResult:
 
 
 def build_dataset(
-    plan: BuildPlan, out: Path, executor: Executor, progress: WorkProgress
+    plan: DatasetPlan, out: Path, executor: Executor, progress: WorkProgress
 ) -> BuildResult:
     """Build or extend one of a buffer set's datasets, a LeRobot v3 dataset in the folder `out`."""
     require_lerobot()
@@ -66,20 +72,20 @@ def build_dataset(
         existing = open_existing(out, plan)
         stored = list(existing.episodes) if existing else []
         skipped = dict(existing.skipped) if existing else {}
-        known = {*skipped, *(str(one.record.episode_id) for one in stored)}
-        todo = [task for task in plan.tasks if str(task[1].id) not in known]
+        known = {*skipped, *(str(episode.record.episode_id) for episode in stored)}
+        todo = [planned for planned in plan.episodes if str(planned.episode.id) not in known]
         before = len(stored)
         if todo or not existing:
             _stage(work, plan, todo, stored, skipped, executor, progress)
             _write(work, out, plan, existing, stored, skipped, progress)
-    frames = sum(one.record.length for one in stored)
+    frames = sum(episode.record.length for episode in stored)
     return BuildResult(out, len(stored), frames, len(stored) - before, skipped)
 
 
 def _stage(
     work: Path,
-    plan: BuildPlan,
-    todo: Sequence[Task],
+    plan: DatasetPlan,
+    todo: Sequence[PlannedEpisode],
     stored: list[StoredEpisode],
     skipped: dict[str, str],
     executor: Executor,
@@ -89,33 +95,35 @@ def _stage(
     built = stored[:1]  # of the dataset that is extended; all its episodes are alike
     limit = plan.time_limit_s or max(source.time_limit_s for source in plan.sources)
 
-    def folder(one: Task) -> Path:
-        return work / "episodes" / staged_name(plan, one)
+    def folder(planned: PlannedEpisode) -> Path:
+        return work / "episodes" / staged_name(plan, planned)
 
-    def take(one: Task, staged: Staged, *, before: bool, node: str | None = None) -> None:
+    def take(
+        planned: PlannedEpisode, staged: Staged, *, before: bool, node: str | None = None
+    ) -> None:
         progress.advance(1, before=before, node=node)
         if staged.skipped is not None:
             skipped[str(staged.episode_id)] = staged.skipped
         else:
-            episode = staged.stored(folder(one))
+            episode = staged.stored(folder(planned))
             try:
                 _check_like(episode, plan)
                 for earlier in built:
                     _check_alike(earlier, episode)
             except SourceError:
-                shutil.rmtree(folder(one))  # no later attempt can use it
+                shutil.rmtree(folder(planned))  # no later attempt can use it
                 raise
             stored.append(episode)
             _check_alike(stored[0], episode)
 
     missing = []
     progress.start("Reading and encoding", len(todo))
-    for one in todo:
-        done = read_staged(folder(one))
+    for planned in todo:
+        done = read_staged(folder(planned))
         if done is None:
-            missing.append(one)
+            missing.append(planned)
         else:
-            take(one, done, before=True)
+            take(planned, done, before=True)
     estimate = BuildEstimate(work, len(missing), executor.workers)
     failures: list[Outcome] = []
     # Closing ends the workers, also after an error.
@@ -133,15 +141,16 @@ def _stage(
         raise _failure(failures, len(todo))
 
 
-def _check_alike(one: StoredEpisode, other: StoredEpisode) -> None:
+def _check_alike(first: StoredEpisode, second: StoredEpisode) -> None:
     """Check that two episodes can be in one dataset; one may lack actions."""
-    without = {ACTION} - (one.features.keys() & other.features.keys())
-    names = [str(episode.record.episode_id) for episode in (one, other)]
-    looks = [_look(episode, without) for episode in (one, other)]
+    without = {ACTION} - (first.features.keys() & second.features.keys())
+    names = [str(episode.record.episode_id) for episode in (first, second)]
+    looks = [_look(episode, without) for episode in (first, second)]
     if found := differences((names[0], looks[0]), (names[1], looks[1])):
         raise SourceError(
             f"{names[0]} and {names[1]} cannot be in one dataset: {'; '.join(found)}",
-            "Choose `cameras` that all have, or build the sources into separate buffer sets."
+            f"Choose {named('cameras')} that all have, or build the sources into separate buffer "
+            "sets."
             if differ_in_cameras(*looks)
             else "Leave one of them out, or build them into separate buffer sets.",
         )
@@ -152,19 +161,23 @@ def _look(episode: StoredEpisode, without: set[str]) -> Look:
     return Look(features, episode.fps, episode.robot.type, episode.robot.names)
 
 
-def _check_like(episode: StoredEpisode, plan: BuildPlan) -> None:
+def _check_like(episode: StoredEpisode, plan: DatasetPlan) -> None:
     """Check that an episode can follow the demonstrations in a buffer."""
-    if plan.like is None:
+    if plan.must_match is None:
         return
     name = str(episode.record.episode_id)
     look = in_buffers(episode.features, episode.fps)
-    shared = {one: look.features[one] for one in plan.like.features if one in look.features}
-    if found := differences(("the demonstrations", plan.like), (name, look)):
+    shared = {
+        feature: look.features[feature]
+        for feature in plan.must_match.features
+        if feature in look.features
+    }
+    if found := differences(("the demonstrations", plan.must_match), (name, look)):
         raise SourceError(
             f"{name} cannot be in a buffer with the demonstrations: {'; '.join(found)}",
             "Choose recordings that are alike, or build a separate buffer set of them."
-            if differences(("", plan.like), ("", replace(look, features=shared)))
-            else "Choose the `cameras` of the demonstrations.",
+            if differences(("", plan.must_match), ("", replace(look, features=shared)))
+            else f"Choose the {named('cameras')} of the demonstrations.",
         )
 
 
@@ -187,7 +200,7 @@ def _failure(failures: Sequence[Outcome], total: int) -> InterferenceError:
 def _write(
     work: Path,
     out: Path,
-    plan: BuildPlan,
+    plan: DatasetPlan,
     existing: ExistingDataset | None,
     stored: Sequence[StoredEpisode],
     skipped: dict[str, str],
@@ -198,13 +211,13 @@ def _write(
         reasons = "; ".join(f"{name}: {why}" for name, why in list(skipped.items())[:5])
         raise SourceError(
             f"no episode yields {plan.kind}: {len(skipped)} unusable ({reasons})",
-            "`unit_frames` and `unit_stride` allow units of shorter episodes."
+            f"{named('unit')} allows units of shorter episodes."
             if plan.kind in UNITS
             else "Choose other episodes or sources.",
         )
-    ordered = sorted(stored, key=lambda one: one.record.episode_id)
+    ordered = sorted(stored, key=lambda episode: episode.record.episode_id)
     # Actions are stored only if all episodes have them: buffers do not hold them.
-    acted = all(ACTION in one.features for one in ordered)
+    acted = all(ACTION in episode.features for episode in ordered)
     features = {n: s for n, s in ordered[0].features.items() if acted or n != ACTION}
     with progress.status("Loading lerobot"):
         load_lerobot()
@@ -213,10 +226,10 @@ def _write(
     progress.start("Writing the LeRobot dataset", len(ordered))
     for _ in write_lerobot(made, plan.kind, ordered, features, get_codec(plan.codec)):
         progress.advance(1)
-    records = [_numbered(one.record, index, features) for index, one in enumerate(ordered)]
+    records = [_numbered(episode.record, index, features) for index, episode in enumerate(ordered)]
     provenances = [source.provenance for source in plan.sources]
     provenances += existing.dataset.identity.sources if existing else ()
-    sources = [one for _, one in sorted({canonical_json(p): p for p in provenances}.items())]
+    sources = [source for _, source in sorted({canonical_json(p): p for p in provenances}.items())]
     info = read_json(made / INFO_PATH)
     identity = identity_of(
         records, info, plan.kind, plan.version, plan.codec, sources, unit=plan.unit

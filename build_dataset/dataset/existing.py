@@ -4,24 +4,26 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from robomme_interference_data.build_dataset.alike import same_rate, unequal
+from robomme_interference_data.build_dataset.sources.base import Robot
+from robomme_interference_data.build_dataset.sources.columns import recorded_robot
+from robomme_interference_data.build_dataset.sources.simulator import SimulatorSource
 from robomme_interference_data.constants import ACTION, IDENTITY_PATH, REPORT_PATH, STATE, UNITS
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
+from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError, named
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.files import LocalFiles, read_header
 from robomme_interference_data.storage.lerobot import LeRobotFiles
 
-from .alike import same_rate, unequal
 from .identity import BuildReport
 from .image_stats import Statistics, before_scaling, episode_statistics
 from .lerobot_writer import StoredEpisode
-from .plan import BuildPlan
-from .sources.base import Robot
-from .sources.columns import recorded_robot
-from .sources.simulator import SimulatorSource
+from .plan import DatasetPlan
 
-_ADVICE = "Choose another `buffer_set`, or remove the folder first."
+
+def _advice() -> str:
+    return f"Choose another {named('buffer_set')}, or remove the folder first."
 
 
 @dataclass(frozen=True)
@@ -38,12 +40,12 @@ class ExistingDataset:
         return {episode.record.episode_id for episode in self.episodes}
 
 
-def open_existing(out: Path, plan: BuildPlan) -> ExistingDataset | None:
+def open_existing(out: Path, plan: DatasetPlan) -> ExistingDataset | None:
     """Open the dataset that a build extends; None if there is none."""
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return None
     if not (out / IDENTITY_PATH).is_file():
-        raise BuildError(f"{out} exists and is not a dataset of this package", _ADVICE)
+        raise BuildError(f"{out} exists and is not a dataset of this package", _advice())
     dataset = Dataset(LocalFiles(out))
     identity = dataset.identity
     existing = {
@@ -56,22 +58,23 @@ def open_existing(out: Path, plan: BuildPlan) -> ExistingDataset | None:
     cameras = identity.cameras if plan.cameras is None else plan.cameras
     planned["cameras"] = ", ".join(cameras) or "none"
     if found := unequal(("it", existing), ("this build", planned)):
-        raise BuildError(f"{out} exists with other settings: {'; '.join(found)}", _ADVICE)
-    if plan.kind in UNITS and dataset.unit != plan.unit.of(plan.kind):
+        raise BuildError(f"{out} exists with other settings: {'; '.join(found)}", _advice())
+    if plan.kind in UNITS and dataset.unit != plan.unit.in_dataset(plan.kind):
         raise BuildError(
-            f"{out} exists with units of {dataset.unit}, not of {plan.unit.of(plan.kind)}", _ADVICE
+            f"{out} exists with units of {dataset.unit}, not of {plan.unit.in_dataset(plan.kind)}",
+            _advice(),
         )
     # Another version of a simulator has other episodes under the same ids.
-    recorded = {one.get("kind"): one for one in identity.sources}
+    recorded = {source.get("kind"): source for source in identity.sources}
     for source in plan.sources:
         before = recorded.get(source.provenance["kind"], source.provenance)
         if "suite_version" in before and before != source.provenance:
             found = unequal(("it", before), ("this source", source.provenance))
-            raise BuildError(f"{out} exists, of another source: {'; '.join(found)}", _ADVICE)
+            raise BuildError(f"{out} exists, of another source: {'; '.join(found)}", _advice())
     if plan.fps is not None and not same_rate(plan.fps, dataset.fps):
         raise InvalidOptionError(
-            f"fps {plan.fps:g}; {out} has {dataset.fps:g} frames per second",
-            "Leave out `fps`, or choose another `buffer_set`.",
+            f"{named('fps')} is {plan.fps:g}; {out} has {dataset.fps:g} frames per second",
+            f"Leave it out, or choose another {named('buffer_set')}.",
             option="fps",
         )
     _check_recordings(out, dataset, plan)
@@ -83,14 +86,16 @@ def open_existing(out: Path, plan: BuildPlan) -> ExistingDataset | None:
     return ExistingDataset(dataset, tuple(episodes), report.reasons)
 
 
-def _check_recordings(out: Path, dataset: Dataset, plan: BuildPlan) -> None:
+def _check_recordings(out: Path, dataset: Dataset, plan: DatasetPlan) -> None:
     """Check that recordings are those that the dataset was built from: one of each source.
 
     Simulators, and repositories at a recorded commit, are the same by what is recorded of them.
     """
     known = {record.episode_id: record for record in dataset.records()}
     for number, source in enumerate(plan.sources):
-        again = [one for owner, one in plan.tasks if owner == number and one.id in known]
+        again = [
+            episode for owner, episode in plan.episodes if owner == number and episode.id in known
+        ]
         if not again or isinstance(source, SimulatorSource):
             continue
         if "revision" in source.provenance and source.provenance in dataset.identity.sources:
@@ -107,7 +112,7 @@ def _check_recordings(out: Path, dataset: Dataset, plan: BuildPlan) -> None:
             facts["frames per second"] = rate
         if found := unequal((str(out), stored), ("this source", facts)):
             raise SourceError(
-                f"{record.episode_id} exists with another recording: {'; '.join(found)}", _ADVICE
+                f"{record.episode_id} exists with another recording: {'; '.join(found)}", _advice()
             )
 
 

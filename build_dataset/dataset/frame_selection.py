@@ -12,10 +12,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import pairwise
 
+from robomme_interference_data.build_dataset.sources.base import Frame, Recording
 from robomme_interference_data.constants import EXECUTIONS, LESSONS, PAPER_UNIT, UNITS, Unit
-from robomme_interference_data.errors import InvalidOptionError, SourceError, counted
-
-from .sources.base import Frame, Recording
+from robomme_interference_data.errors import InvalidOptionError, SourceError, counted, named
 
 
 class NothingToStore(Exception):
@@ -27,8 +26,8 @@ def unmarked_error() -> SourceError:
     return SourceError(
         "the source does not mark which frames are the demonstration",
         "Demonstrations and executions need a column is_demo or exec_start_idx in the source, or "
-        "exec_start_idx in `families_file`; `columns` names another column, as in is_demo=NAME. "
-        "Distractor units can be built without.",
+        f"exec_start_idx in {named('families_file')}; {named('columns', 'is_demo=NAME')} names "
+        "another column. Distractor units can be built without.",
     )
 
 
@@ -47,7 +46,7 @@ def select_demonstration(frames: Iterable[Frame]) -> Iterator[Frame]:
 
 def select_unit(frames: Iterable[Frame], kind: str, unit: Unit = PAPER_UNIT) -> Iterator[Frame]:
     """Yield the frames of a unit in a dataset of a kind, given the one in the distractors."""
-    stored, count = unit.of(kind), 0
+    stored, count = unit.in_dataset(kind), 0
     most = stored.raw_frames
     for frame in frames:
         if count % stored.stride == 0:
@@ -73,8 +72,8 @@ def select_execution(frames: Iterable[Frame]) -> Iterator[Frame]:
         if frame.action is None:
             raise InvalidOptionError(
                 "the source has no actions of its live frames, which executions need",
-                "Record actions, name their column with `columns` (action=NAME), or build without "
-                "executions.",
+                f"Record actions, name their column with {named('columns', 'action=NAME')}, or "
+                "build without executions.",
                 option="source",
             )
         live += 1

@@ -1,0 +1,70 @@
+"""Checks before a build: its folder, units that suffice, planned buffers that would change."""
+
+from pathlib import Path
+
+from robomme_interference_data.build_dataset.config import BuffersConfig
+from robomme_interference_data.build_dataset.dataset.existing import ExistingDataset, open_existing
+from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan
+from robomme_interference_data.build_dataset.manifests import check_manifests_folder
+from robomme_interference_data.constants import DATASETS, DEMONSTRATIONS, DISTRACTORS, MANIFESTS
+from robomme_interference_data.errors import BuildError, named
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.schema.draw import UnitPool, check_units
+from robomme_interference_data.storage.staging import staging_path
+
+from .buffers import NextBuffers, next_buffers
+from .planned import PlannedBuffers, read_planned
+
+
+def check_root(root: Path) -> None:
+    """Check that a folder is absent, empty or, as far as a build has come, a buffer set."""
+    if root.exists() and not root.is_dir():
+        raise BuildError(f"{root} is a file", f"Choose another {named('buffer_set')}.")
+    parts = [root / name for name in (*DATASETS, MANIFESTS)]
+    if not root.exists() or any(path.exists() or staging_path(path).exists() for path in parts):
+        return
+    if strangers := sorted(path.name for path in root.iterdir() if not path.name.startswith(".")):
+        raise BuildError(
+            f"{root} holds {strangers[0]}, and nothing of a buffer set",
+            f"Choose a new or empty folder as {named('buffer_set')}.",
+        )
+
+
+def plan_more_units(units: DatasetPlan, root: Path) -> NextBuffers | None:
+    """Return how further units would change the buffers that are planned; None if none are."""
+    planned = read_planned(root)
+    if planned is None:
+        return None
+    existing = open_existing(root.resolve() / DISTRACTORS, units)
+    return next_buffers(planned, BuffersConfig(), units_change=_adds_episodes(units, existing))
+
+
+def check_plans(
+    queries: set[EpisodeId],
+    plans: dict[str, DatasetPlan],
+    root: Path,
+    planned: PlannedBuffers | None,
+    request: BuffersConfig,
+) -> NextBuffers:
+    """Check that datasets can be built or extended, and that units suffice; return the buffers."""
+    existing = {kind: open_existing(root.resolve() / kind, plan) for kind, plan in plans.items()}
+    demonstrations = existing.get(DEMONSTRATIONS)
+    if demonstrations is not None:
+        queries = queries | demonstrations.ids
+    units, built = plans[DISTRACTORS], existing[DISTRACTORS]
+    adds_units = _adds_episodes(units, built)
+    following = next_buffers(planned, request, queries=queries, units_change=adds_units)
+    available = {unit.episode.id for unit in units.episodes}
+    if built is not None:
+        available |= built.ids
+    check_units(UnitPool(available), queries, following.conditions)
+    check_manifests_folder(root)
+    return following
+
+
+def _adds_episodes(plan: DatasetPlan, existing: ExistingDataset | None) -> bool:
+    """Return whether a dataset lacks episodes that are to be built."""
+    if existing is None:
+        return True
+    known = {*existing.skipped, *map(str, existing.ids)}
+    return any(str(planned.episode.id) not in known for planned in plan.episodes)

@@ -1,0 +1,119 @@
+"""The plan of one dataset, given the settings of its build."""
+
+import math
+import re
+from collections.abc import Container, Sequence
+
+from robomme_interference_data.build_dataset.config import NO_CAMERAS, BuildConfig, parse_unit
+from robomme_interference_data.build_dataset.dataset.frame_selection import unmarked_error
+from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan, PlannedEpisode
+from robomme_interference_data.build_dataset.sources import Source, open_source, takes
+from robomme_interference_data.constants import (
+    CONTRADICTIONS,
+    EXECUTIONS,
+    LESSONS,
+    SHIFTED,
+    UNITS,
+    Unit,
+)
+from robomme_interference_data.errors import InvalidOptionError, named
+from robomme_interference_data.ids import EpisodeId, parse_numbers
+from robomme_interference_data.runtime.executor import make_executor
+from robomme_interference_data.storage.encode import get_codec
+
+from .checks import check_root
+from .episodes import choose_episodes
+
+
+def plan_dataset(
+    kind: str, config: BuildConfig, queries: Container[EpisodeId] | None = None
+) -> DatasetPlan:
+    """Open the sources and plan one dataset, of `queries` or of the episodes that are chosen."""
+    check_root(config.buffer_set)
+    _check_values(config)
+    unit = parse_unit(config.unit)
+    split = config.split
+    if split is None and kind in UNITS:
+        split = "train"
+    sources = _open_sources(kind, config, unit)
+    episodes = choose_episodes(
+        sources,
+        families=config.families,
+        split=split,
+        numbers=None if config.episodes is None else parse_numbers(config.episodes),
+        queries=queries,
+    )
+    if kind in (*LESSONS, EXECUTIONS):
+        for planned in episodes:
+            if not planned.episode.marked:
+                raise unmarked_error().about(planned.episode.id)
+    if kind == CONTRADICTIONS:
+        episodes = tuple(
+            PlannedEpisode(number, sources[number].contradict(episode))
+            for number, episode in episodes
+        )
+    cameras = tuple(sorted(config.cameras)) or None
+    return DatasetPlan(
+        kind=kind,
+        sources=sources,
+        episodes=episodes,
+        cameras=() if config.cameras == NO_CAMERAS else cameras,
+        codec=config.codec,
+        version=config.version,
+        time_limit_s=config.time_limit_s,
+        unit=unit,
+        fps=config.fps,
+    )
+
+
+def _check_values(config: BuildConfig) -> None:
+    get_codec(config.codec)
+    if not re.fullmatch(r"\d+\.\d+\.\d+", config.version, re.ASCII):
+        raise InvalidOptionError.expected("version", config.version, "a version such as 1.0.0")
+    if config.time_limit_s is not None and not config.time_limit_s > 0:
+        raise InvalidOptionError.expected("time_limit_s", config.time_limit_s, "a positive number")
+    if config.fps is not None and not 0 < config.fps < math.inf:
+        raise InvalidOptionError.expected("fps", config.fps, "a positive number")
+    make_executor(config)  # checks its settings
+    for name in ("columns", "families_file"):
+        if getattr(config, name) and not any(takes(text, name) for text in config.source):
+            raise InvalidOptionError(
+                f"{named(name)} has no effect on {', '.join(config.source)}",
+                "Only the source lerobot takes it: leave it out.",
+                option=name,
+            )
+
+
+def _open_sources(kind: str, config: BuildConfig, unit: Unit) -> tuple[Source, ...]:
+    columns = _columns(config.columns)
+    return tuple(
+        open_source(
+            text,
+            shifted=kind == SHIFTED,
+            columns=columns,
+            families_file=config.families_file,
+            robomme_python=config.robomme_python,
+            # A simulator draws only the frames that a unit stores.
+            every=unit.in_dataset(kind).stride if kind in UNITS else 1,
+        )
+        for text in config.source
+    )
+
+
+def _columns(texts: Sequence[str]) -> dict[str, str]:
+    columns: dict[str, str] = {}
+    for text in texts:
+        name, _, column = text.partition("=")
+        if not name or not column:
+            raise InvalidOptionError.expected(
+                "columns", text, "NAME=COLUMN, such as front=top_image"
+            )
+        if name in columns:
+            raise InvalidOptionError(
+                f"{named('columns')} names two columns for {name!r}: {columns[name]!r} and "
+                f"{column!r}",
+                "Give one.",
+                option="columns",
+            )
+        columns[name] = column
+    return columns

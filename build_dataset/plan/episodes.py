@@ -1,0 +1,77 @@
+"""Which episodes of the sources a dataset stores. Pure rules."""
+
+from collections.abc import Container, Iterable, Sequence
+from itertools import pairwise
+
+from robomme_interference_data.build_dataset.dataset.plan import PlannedEpisode
+from robomme_interference_data.build_dataset.sources import Source, SourceEpisode
+from robomme_interference_data.constants import SPLITS
+from robomme_interference_data.errors import InvalidOptionError, SourceError, counted
+from robomme_interference_data.ids import EpisodeId, format_numbers
+
+
+def choose_episodes(
+    sources: Sequence[Source],
+    *,
+    families: Iterable[str] = (),
+    split: str | None = None,
+    numbers: Iterable[int] | None = None,
+    queries: Container[EpisodeId] | None = None,
+) -> tuple[PlannedEpisode, ...]:
+    """List the episodes of sources that pass all filters, in canonical order.
+
+    Args:
+        sources: The sources.
+        families: Families; empty for all.
+        split: `train`, `val` or `test`; None for all.
+        numbers: Indices of episodes in their split; None for all but those that a source lists as
+            further ones.
+        queries: These episodes alone, whatever the other filters are; None to filter.
+
+    Raises:
+        InvalidOptionError: A family or split is unknown.
+        SourceError: No episode passes, or one is recorded twice.
+    """
+    listed = [
+        PlannedEpisode(number, episode)
+        for number, source in enumerate(sources)
+        for episode in source.episodes()
+    ]
+    known = {planned.episode.id.family for planned in listed}
+    chosen_families = set(families) or known
+    for family in sorted(chosen_families - known):
+        raise InvalidOptionError.one_of("families", family, sorted(known))
+    if split is not None and split not in SPLITS:
+        raise InvalidOptionError.one_of("split", split, SPLITS)
+    indices = None if numbers is None else set(numbers)
+
+    def passes(episode: SourceEpisode) -> bool:
+        if queries is not None:
+            return episode.id in queries
+        if episode.id.family not in chosen_families or split not in (None, episode.id.split):
+            return False
+        return not episode.further if indices is None else episode.id.index in indices
+
+    chosen = sorted(
+        (planned for planned in listed if passes(planned.episode)),
+        key=lambda planned: planned.episode.id.sort_key,
+    )
+    for first, second in pairwise(chosen):
+        if first.episode.id == second.episode.id:
+            raise SourceError(
+                f"{first.episode.id} is recorded twice (in source {first.source + 1} and source "
+                f"{second.source + 1})",
+                "Give only one of these sources, or name the episode differently in one of them.",
+            )
+    if not chosen:
+        filters = sorted(families)
+        if split is not None:
+            filters.insert(0, split)
+        if indices is not None:
+            filters.append(f"episodes {format_numbers(sorted(indices))}")
+        wanted = ", ".join(filters) or "a query episode"
+        raise SourceError(
+            f"no episode of {counted(len(listed), 'recorded episode')} is: {wanted}",
+            "Choose others.",
+        )
+    return tuple(chosen)

@@ -1,0 +1,100 @@
+"""The command `verify`."""
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from robomme_interference_data.errors import counted
+
+from .console import echo, print_json, print_status
+from .options import AsJson, BufferSetFolder
+
+if TYPE_CHECKING:
+    from robomme_interference_data.data.buffer_set import BufferSet
+    from robomme_interference_data.evaluate.shortcuts import Shortcut
+
+
+def verify(
+    buffer_set: BufferSetFolder,
+    decode: Annotated[
+        bool, typer.Option(help="Also decode all frames and check their hashes (slow).")
+    ] = True,
+    audit: Annotated[
+        bool,
+        typer.Option(
+            "--audit",
+            help="Also report how often units are used, at which positions families occur, what "
+            "leaks, and how far lesson length, goal and first live view reveal the answer.",
+        ),
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Recompute every hash and rule of a buffer set and list the violations; fails if there is one.
+
+    With --audit, a leak fails as well. A policy can use lesson length, goal and live view without
+    any memory: each episode is guessed from the others of its family.
+
+    Examples:
+    ```
+    robomme-interference verify my-buffers
+    robomme-interference verify my-buffers --audit --no-decode
+    ```
+    """
+    from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
+    from robomme_interference_data.data.loading import load_buffer_set
+    from robomme_interference_data.runtime.progress import WorkProgress
+
+    opened, progress = load_buffer_set(buffer_set), WorkProgress()
+    checks = verify_buffer_set(opened, decode=decode, progress=progress)
+    with progress:
+        violations = list(checks)
+    report: dict[str, Any] = {"violations": [vars(violation) for violation in violations]}
+    if not as_json:
+        for violation in violations:
+            echo(f"{violation.where}: {violation.what}")
+        what = "hashes and rules" if decode else "files, tables and rules (frames not decoded)"
+        print_status(
+            counted(len(violations), "violation")
+            if violations
+            else f"All {what} of {buffer_set} hold."
+        )
+    leaks = False
+    # A damaged buffer set may have no rows to audit.
+    if audit and not violations:
+        leaks = _audit(opened, report, as_json=as_json)
+    if as_json:
+        print_json(report)
+    if violations or leaks:
+        raise typer.Exit(1)
+
+
+def _audit(opened: "BufferSet", report: dict[str, Any], *, as_json: bool) -> bool:
+    """Add the audit and the shortcuts to the report, or print them; return whether it leaks."""
+    from robomme_interference_data.build_dataset.verify.audit import audit_buffer_set
+    from robomme_interference_data.evaluate.shortcuts import shortcut_table
+    from robomme_interference_data.schema.codec import to_dict
+    from robomme_interference_data.viz.tables import tables_text
+
+    audit = audit_buffer_set(opened)
+    shortcuts = _shortcuts(opened)
+    report["audit"] = audit.as_dict()
+    report["shortcuts"] = [to_dict(shortcut) for shortcut in shortcuts]
+    if not as_json:
+        tables = [*audit.tables()]
+        if shortcuts:
+            tables.append(shortcut_table(shortcuts, f"Shortcuts in {opened.name}"))
+        echo(tables_text(tables) + "\n")
+        for leak in audit.leaks:
+            echo(f"LEAK, {leak.kind}: {leak.where}")
+        print_status(counted(len(audit.leaks), "leak") if audit.leaks else "No leaks.")
+    return bool(audit.leaks)
+
+
+def _shortcuts(opened: "BufferSet") -> "list[Shortcut]":
+    """Return what reveals the answers; none without known evidence, as of recordings of a robot."""
+    from robomme_interference_data.evaluate.shortcuts import cues_of, shortcuts
+
+    records = (opened.query(episode).record for episode in opened.episode_ids)
+    if all(record.evidence is None for record in records):
+        return []
+    return [*shortcuts(cues_of(opened))]
