@@ -116,7 +116,7 @@ def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> 
     _check_cameras(config, buffer_set.datasets[DEMONSTRATIONS], policy)
     _check_robot(config, buffer_set, kind)
     if config.videos:
-        from robomme_interference_data.simulators.play import check_pillow
+        from robomme_interference_data.viz.episode_video import check_pillow
 
         check_pillow(named("videos"))
 

@@ -16,14 +16,14 @@ from memory_model import MemoryModel, load_checkpoint, on_device
 from torch.utils.data import BatchSampler, DataLoader
 
 from robomme_interference_data import EpisodeId, Rollout, load_buffer_set
-from robomme_interference_data.constants import PROTOCOL_VERSION
+from robomme_interference_data.constants import DEMONSTRATIONS, PROTOCOL_VERSION
 from robomme_interference_data.data.questions import LETTERS
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.run.kind import history_columns
 from robomme_interference_data.retrieval.selector import StoredSelector
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import NO_HISTORY
-from robomme_interference_data.storage.files import atomic_path
+from robomme_interference_data.storage.files import atomic_path, sha256_file
 from robomme_interference_data.training import HistoryDataset, Memory
 
 
@@ -62,6 +62,8 @@ def rows(model: MemoryModel, args: argparse.Namespace) -> Iterator[Rollout]:
     config, buffer_set = model.config, load_buffer_set(args.buffer_set)
     memory = Memory.parse(config.memory)
     step = StoredSelector(args.retrieval) if args.retrieval else None
+    label = None if step is None else step.label(buffer_set.datasets[DEMONSTRATIONS])
+    weights = sha256_file(args.checkpoint / "model.safetensors")[:16]
     applying = [one for one in buffer_set.conditions if step is None or one != NO_HISTORY]
     for condition in args.conditions or applying:
         data = HistoryDataset(
@@ -90,6 +92,10 @@ def rows(model: MemoryModel, args: argparse.Namespace) -> Iterator[Rollout]:
                 right += success
                 yield Rollout(
                     system=args.system,
+                    policy="python",
+                    policy_id=weights,
+                    memory=str(memory),
+                    retrieval=label,
                     simulator="questions",
                     buffer_set=buffer_set.name,
                     revision=buffer_set.revision,
@@ -106,7 +112,7 @@ def rows(model: MemoryModel, args: argparse.Namespace) -> Iterator[Rollout]:
                     status="success" if success else "fail",
                     success=success,
                     steps=0,
-                    **history_columns(buffer, given, step, memory),
+                    **history_columns(buffer, given, memory, retrieved=step is not None),
                     answer=LETTERS[option],
                     chance=1 / int((~batch["question.option_is_pad"][number]).sum()),
                 )

@@ -18,7 +18,7 @@ from robomme_interference_data.errors import (
     SimulatorCrashError,
     UnknownNameError,
 )
-from robomme_interference_data.simulators import Status, make_simulator, play
+from robomme_interference_data.simulators import Status, make_simulator
 from robomme_interference_data.simulators.base import action_array
 
 DOUBLE = "support.simulator_doubles:make"
@@ -130,22 +130,13 @@ def test_simulate_plays_an_episode_and_writes_what_is_seen(run: Run, tmp_path: P
     assert list(video.parent.iterdir()) == [video]
     with av.open(str(video)) as container:
         frames = [f.to_ndarray(format="rgb24").astype(int) for f in container.decode(video=0)]
-    # Five frames of the lesson, the first live one and three steps; 4×4 pixels twice, and a bar.
-    assert [frame.shape for frame in frames] == [(24, 8, 3)] * 9
-    red, blue = frames[4][8, 4, 0], frames[4][8, 4, 2]
-    assert blue > red + 100
-    assert frames[5][8, 4, 0] > frames[5][8, 4, 2] + 60
-    assert abs(frames[8][22, 1] - 200).max() < 40  # the front camera; the wrist's is 99
-
-
-def test_the_bar_of_a_video_names_what_is_shown() -> None:
-    images = {name: np.zeros((100, 160, 3), np.uint8) for name in ("front", "wrist")}
-    bar = play._bar(images, (0, 0, 0), "demonstration")
-    assert bar.shape == (20, 320, 3)
-    assert (bar[:, :160] > 128).any() and (bar[:, 160:] > 128).any()  # white letters
-    other = play._bar(images, (0, 0, 0), "policy: oracle")
-    assert not np.array_equal(bar[:, :160], other[:, :160])
-    assert np.array_equal(bar[:, 160:], other[:, 160:])
+    # Five frames of the lesson, the first live one and three steps; two views, and the text.
+    assert [frame.shape for frame in frames] == [(280, 768, 3)] * 9
+    views = frames[8][24:28]
+    assert abs(views[:, :4].mean(axis=(0, 1)) - 200).max() < 40  # the front camera
+    assert abs(views[:, 256:260].mean(axis=(0, 1)) - 99).max() < 40  # the wrist's
+    assert (frames[0][:20, :250] < 128).any() and (frames[0][:20, 256:500] < 128).any()  # headings
+    assert np.abs(frames[4][:, 512:] - frames[5][:, 512:]).max() > 100  # the text goes on
 
 
 @pytest.mark.parametrize(

@@ -160,13 +160,12 @@ def _use(cells: _Cells) -> Table:
         "with the simulator's subgoals, else follow-subgoals with them, else oracle, "
         "under the same condition if it has rows there. The last two have the "
         "simulator's own controller: with them, use includes what the system executes worse."
-        + _ADVICE
-        * alone,
+        + (_ADVICE if alone else ""),
     )
 
 
 _ADVICE = (
     " Without a control: evaluate the same episodes with --policy oracle (tabletop), or with the "
-    "system's own policy and --subgoals oracle --system <system>-oracle, and score both runs "
+    "system's own policy and --subgoals oracle, and score both runs "
     "together."
 )
