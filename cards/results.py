@@ -10,7 +10,6 @@ from robomme_interference_data.constants import PROTOCOL_VERSION, RUN_HEADER, RU
 from robomme_interference_data.errors import InvalidOptionError, PublishError
 from robomme_interference_data.evaluate.run.log import RunHeader
 from robomme_interference_data.evaluate.run.row import Rollout
-from robomme_interference_data.evaluate.score.comparisons import offline as offline_tables
 from robomme_interference_data.evaluate.score.config import Expected, Settings
 from robomme_interference_data.evaluate.score.outcomes import STATUSES
 from robomme_interference_data.evaluate.score.plots.data import Data
@@ -67,7 +66,7 @@ def results_facts(results: Score | Path) -> Facts:
         path=file.name,
         split=splits.pop() if len(splits) == 1 else "mixed",
     )
-    every = found.every
+    every = found.all_outcomes
     systems = dict.fromkeys(name for one in every for name in one.systems)
     names = list(map(display_name, systems))
     offline = not found.outcomes
@@ -80,9 +79,7 @@ def results_facts(results: Score | Path) -> Facts:
     if any(cell.n for cell in found.error_cells):
         captions[_ERROR_PICTURE] = "Action error by condition, offline"
     differences = [
-        found.tables[name]
-        for name in ("effects", offline_tables.CHANGES, offline_tables.SYSTEMS)
-        if name in found.tables
+        found.tables[name] for name in ("effects", "action_error_effects") if name in found.tables
     ]
     statuses = Counter(row.status for row in found.rows)
     what = "Action errors of" if offline else "Rollouts of"
@@ -132,7 +129,7 @@ def results_facts(results: Score | Path) -> Facts:
 
 
 def _limits(found: Score) -> list[str]:
-    limits = [origin_limit([one.simulator for one in found.every]), *found.notes]
+    limits = [origin_limit([one.simulator for one in found.all_outcomes]), *found.notes]
     what = "success rates" if found.outcomes else "action errors"
     if not all(cell.complete for cell in _whole(found)):
         limits.append(

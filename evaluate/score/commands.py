@@ -74,26 +74,26 @@ def score(
 
     check_output(out, export_to)
     with memory_limit(_MEMORY_BYTES):
-        found = compute(settings)
-    _print_notes([found.rows], found.notes)
+        scored = compute(settings)
+    _print_notes([scored.rows], scored.notes)
     with WorkProgress() as progress, progress.status("Drawing the figures"):
-        formats = [".png"] * png + [".pdf"] * pdf
-        exported = write_score(found, out, export_to, command_line(), formats)
+        formats = [suffix for suffix, wanted in ((".png", png), (".pdf", pdf)) if wanted]
+        exported = write_score(scored, out, export_to, command_line(), formats)
     for path in exported:
         print_status(f"{path} written")
     if as_json:
         print_json(
             {
-                "headlines": headlines(found),
-                "rows": len(found.rows),
-                "bad_rows": found.rows.refused,
-                "notes": list(found.notes),
+                "headlines": headlines(scored),
+                "rows": len(scored.rows),
+                "bad_rows": scored.rows.refused,
+                "notes": list(scored.notes),
                 "expected": settings.expected,
-                "tables": {name: table.records() for name, table in found.tables.items()},
+                "tables": {name: table.records() for name, table in scored.tables.items()},
             }
         )
     else:
-        echo(f"{tables_text(found.grids)}\n")
+        echo(f"{tables_text(scored.grids)}\n")
     print_status(f"Report: {out / 'report.html'}")
 
 
@@ -143,17 +143,22 @@ def compare(
     """
     from robomme_interference_data.runtime.memory import memory_limit
 
-    from .comparisons.compare import compare as compute
+    from .compare import compare as compute
 
     look = _look(looks)
     with memory_limit(_MEMORY_BYTES):
-        found = compute(run_a, run_b, (system_a, system_b), lenient, conditions or (), look)
-    _print_notes(found.runs, found.notes)
+        compared = compute(run_a, run_b, (system_a, system_b), lenient, conditions or (), look)
+    _print_notes(compared.runs, compared.notes)
     if as_json:
-        bad = [rows.refused for rows in found.runs]
-        print_json({"bad_rows": bad, "notes": list(found.notes), "rows": found.table.records()})
+        print_json(
+            {
+                "bad_rows": [rows.refused for rows in compared.runs],
+                "notes": list(compared.notes),
+                "rows": compared.table.records(),
+            }
+        )
     else:
-        echo(found.table.text())
+        echo(compared.table.text())
 
 
 def power(
@@ -172,9 +177,9 @@ def power(
 ) -> None:
     """Compute which differences a number of episodes can detect.
 
-    The share that flips by chance is in the table noise of a score, and in the output of compare
-    for two runs of one system. Two different systems differ in far more episodes than two runs of
-    one: for them, take flips of the table matrix.
+    The share that flips by chance is in the notes of a score with repeats, and in the output of
+    compare for two runs of one system. Two different systems differ in far more episodes than two
+    runs of one: for them, take flips of the table matrix.
 
     Examples:
     ```
@@ -184,22 +189,22 @@ def power(
     """
     from .power import plan
 
-    found = plan(margin / 100, episodes, flips, tests, looks)
+    planned = plan(margin / 100, episodes, flips, tests, looks)
     if as_json:
-        print_json(asdict(found))
+        print_json(asdict(planned))
         return
-    least = "none" if found.smallest is None else f"{100 * found.smallest:.1f} points"
+    least = "none" if planned.smallest is None else f"{100 * planned.smallest:.1f} points"
     lines = {
-        "noise: 95% range between two equal systems": f"±{100 * found.noise:.1f} points",
+        "noise: 95% range between two equal systems": f"±{100 * planned.noise:.1f} points",
         "smallest difference found with 80% power": least,
-        f"power to find {margin:g} points": f"{found.power:.0%}",
-        f"episodes that find {margin:g} points with 80% power": f"{found.needed:,}",
-        "smallest margin of equivalence with 80% power": f"±{100 * found.equal:.1f} points",
+        f"power to find {margin:g} points": f"{planned.power:.0%}",
+        f"episodes that find {margin:g} points with 80% power": f"{planned.needed:,}",
+        "smallest margin of equivalence with 80% power": f"±{100 * planned.equal:.1f} points",
     }
-    for look, level in enumerate(found.looks, start=1):
+    for look, level in enumerate(planned.looks, start=1):
         at = round(episodes * look / looks)
         lines[f"look {look} after {at:,} episodes: significant if p holm is below"] = f"{level:.2g}"
-    corrected = f", corrected for {tests:,} tests" * (tests > 1)
+    corrected = f", corrected for {tests:,} tests" if tests > 1 else ""
     echo(f"{episodes:,} episodes, of which {100 * flips:g}% flip by chance{corrected}\n")
     width = max(map(len, lines))
     for name, value in lines.items():
@@ -214,8 +219,8 @@ def _look(text: str) -> tuple[int, int]:
     return look, of
 
 
-def _print_notes(found: "Sequence[Rows]", notes: Sequence[str]) -> None:
-    for rows in found:
+def _print_notes(runs: "Sequence[Rows]", notes: Sequence[str]) -> None:
+    for rows in runs:
         for refusal in rows.refusals:
             print_status(f"left out: {refusal}")
         if rows.refused:

@@ -49,7 +49,7 @@ class Outcomes:
     chance: NDArray[np.float64]  # success of guessing, NaN unless a question, (E,)
     expected: Flags  # the episodes of a complete cell, (E,)
     due: Flags  # the cells that are expected or have rows, (S, C)
-    unpinned: Flags  # systems whose rows name no revision of a buffer set, (S,)
+    without_revision: Flags  # systems whose rows name no revision of a buffer set, (S,)
     facts: tuple[frozenset[SystemFacts], ...]  # of each system; only `policy_id` varies, (S,)
 
     def cell(self, system: str, condition: str) -> tuple[int, int]:
@@ -78,27 +78,30 @@ class Outcomes:
         has_rows = self.has_rows[self.systems.index(system)]
         return [condition for condition, has in zip(self.conditions, has_rows, strict=True) if has]
 
-    def pairable(self, one: str, other: str) -> bool:
+    def lacks_revision(self, system: str) -> bool:
+        """Whether the rows of a system name no revision of a buffer set."""
+        return bool(self.without_revision[self.systems.index(system)])
+
+    def pairable(self, system: str, other: str) -> bool:
         """Whether two systems had the same histories: both name a revision, or they are one."""
-        names = [self.systems.index(name) for name in (one, other)]
-        return one == other or not bool(self.unpinned[names].any())
+        return system == other or not (self.lacks_revision(system) or self.lacks_revision(other))
 
     @cached_property
     def families(self) -> tuple[str, ...]:
         """The families of the episodes, in canonical order."""
-        return tuple(dict.fromkeys(one.family for one in self.episodes))
+        return tuple(dict.fromkeys(episode.family for episode in self.episodes))
 
     @cached_property
     def family(self) -> NDArray[np.int64]:
         """The place in `families` of each episode's family, `(E,) int64`."""
         places = {name: place for place, name in enumerate(self.families)}
-        return np.array([places[one.family] for one in self.episodes])
+        return np.array([places[episode.family] for episode in self.episodes])
 
     def of_family(self, family: str) -> Flags:
         """Whether each episode is of a family, `(E,) bool`."""
-        return np.array([one.family == family for one in self.episodes], bool)
+        return np.array([episode.family == family for episode in self.episodes], bool)
 
-    def chosen(self, flags: Flags) -> list[EpisodeId]:
+    def episodes_of(self, flags: Flags) -> list[EpisodeId]:
         """Return the episodes of some flags, `(E,) bool`, in the canonical order."""
         return [self.episodes[place] for place in np.flatnonzero(flags).tolist()]
 
@@ -138,6 +141,18 @@ class Outcomes:
         """Whether exactly the expected episodes count, with every model seed, `(S, C) bool`."""
         return np.asarray(self.counted.any(-1) & ~(self.missing | self.other).any(-1))
 
+    @cached_property
+    def repeat_flips(self) -> tuple[int, int]:
+        """The number of repeated rollouts, and of those whose outcome flips.
+
+        Repeats differ only in the model seed; the two lowest of an episode that count are compared.
+        """
+        counts = counting(self.status)
+        order = counts.cumsum(axis=-1) * counts  # 1 for the lowest model seed that counts, …
+        first, second = (((order == n) & (self.status == _SUCCESS)).any(axis=-1) for n in (1, 2))
+        repeated = (order == 2).any(axis=-1)
+        return int(repeated.sum()), int((first != second)[repeated].sum())
+
 
 def counting(status: Statuses) -> Flags:
     """Whether rollouts count: an error is neither success nor failure."""
@@ -157,7 +172,7 @@ def mean_errors(action_l1: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(np.where(known, action_l1, 0).sum(-1) / known.sum(-1))
 
 
-class Rate(NamedTuple):
+class SuccessRate(NamedTuple):
     """A success rate."""
 
     n: int  # episodes that count
@@ -170,19 +185,19 @@ class Rate(NamedTuple):
         return wilson(self.value * self.trials if self.n else 0, self.trials)
 
 
-def rate_of(status: Statuses) -> Rate:
+def rate_of(status: Statuses) -> SuccessRate:
     """Return the rate of rollouts, `(E, M) int8`."""
     won, of = (status == _SUCCESS).sum(-1), counting(status).sum(-1)
     won, of = won[of > 0], of[of > 0]
     n, counts = len(of), np.unique(of).tolist()
     if not n:
-        return Rate(0, math.nan, 0)
+        return SuccessRate(0, math.nan, 0)
     value = float(sum(Fraction(int(won[of == count].sum()), count) for count in counts) / n)
     rates = won / of
     if n < 2:
-        return Rate(n, value, n)
+        return SuccessRate(n, value, n)
     spread = float(rates.var(ddof=1))
-    return Rate(n, value, effective_n(float(rates.mean()), spread, n, int(of.sum())))
+    return SuccessRate(n, value, effective_n(float(rates.mean()), spread, n, int(of.sum())))
 
 
 def outcomes_of(rows: Rows, expected: Expected) -> dict[str, Outcomes]:
@@ -209,29 +224,29 @@ def offline_outcomes(rows: Rows) -> Outcomes | None:
         if run is not None and run.identity.get("simulator") == RECORDINGS
         for item in run.items
     }
-    found = _outcomes(measured, RECORDINGS, Expected.OBSERVED, rows.unpinned, planned)
-    return replace(found, due=found.has_rows)
+    outcomes = _outcomes(measured, RECORDINGS, Expected.OBSERVED, rows.unpinned, planned)
+    return replace(outcomes, due=outcomes.has_rows)
 
 
 def _outcomes(
     rows: Sequence[Row],
     simulator: str,
     which: Expected,
-    unpinned: frozenset[tuple[str, str]],
+    without_revision: frozenset[tuple[str, str]],
     planned: Set[EpisodeId] = frozenset(),
 ) -> Outcomes:
     systems = tuple(sorted({row.system for row in rows}, key=_table_order))
     observed = {row.condition for row in rows}
     due = observed if which is Expected.OBSERVED else {*DEFAULT_CONDITIONS}
-    conditions = tuple(one.name for one in in_order(observed | due))
+    conditions = tuple(condition.name for condition in in_order(observed | due))
     model_seeds = tuple(sorted({row.model_seed for row in rows}))
     ids = {(row.family, row.split, row.episode) for row in rows}
-    expected = ids | {(one.family, one.split, one.index) for one in planned}
+    expected = ids | {(episode.family, episode.split, episode.index) for episode in planned}
     if which is Expected.BENCHMARK:
         expected = {
             (family, "test", index) for family in FAMILIES for index in range(TEST_EPISODES)
         }
-    episodes = sorted((EpisodeId(*one) for one in ids | expected), key=lambda one: one.sort_key)
+    episodes = sorted((EpisodeId(*key) for key in ids | expected), key=lambda each: each.sort_key)
 
     axes = (systems, conditions, [(e.family, e.split, e.index) for e in episodes], model_seeds)
     places = [{name: place for place, name in enumerate(axis)} for axis in axes]
@@ -255,7 +270,7 @@ def _outcomes(
     facts = _facts_of(rows, systems)
     applies = np.array(
         [
-            [c in due and all(one.applies(c) for one in of_system) for c in conditions]
+            [c in due and all(each.applies(c) for each in of_system) for c in conditions]
             for of_system in facts
         ]
     )
@@ -272,7 +287,7 @@ def _outcomes(
         chance,
         expected=np.array([key in expected for key in axes[2]]),
         due=applies | (status >= 0).any(axis=(2, 3)),
-        unpinned=np.array([(simulator, system) in unpinned for system in systems]),
+        without_revision=np.array([(simulator, name) in without_revision for name in systems]),
         facts=facts,
     )
 

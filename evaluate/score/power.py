@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from robomme_interference_data.errors import InvalidOptionError, counted
 from robomme_interference_data.stats.bootstrap import generator_of
 from robomme_interference_data.stats.intervals import newcombe_paired, z_of
-from robomme_interference_data.stats.sequential import MOST_LOOKS, look_levels
 from robomme_interference_data.stats.significance import ALPHA, mcnemar
 from robomme_interference_data.viz.tables import percent
 
@@ -61,6 +60,8 @@ class Plan:
 
 def plan(margin: float, episodes: int, flips: float, tests: int = 1, looks: int = 1) -> Plan:
     """Return what episodes can detect; the margin is a fraction."""
+    from robomme_interference_data.stats.sequential import MOST_LOOKS, look_levels  # not in scores
+
     for name, value, most in (("tests", tests, 10_000), ("looks", looks, MOST_LOOKS)):
         if not 1 <= value <= most:
             raise InvalidOptionError.expected(name, value, f"a number from 1 to {most:,}")
@@ -78,12 +79,16 @@ def plan(margin: float, episodes: int, flips: float, tests: int = 1, looks: int 
         )
     alpha = ALPHA / tests
     levels = look_levels(looks) if looks > 1 else ()
-    found = power(margin, episodes, flips, alpha)
+    chance = power(margin, episodes, flips, alpha)
     if levels:
-        found = _sequential(margin, episodes, flips, [level / tests for level in levels])
+        chance = _sequential(margin, episodes, flips, [level / tests for level in levels])
     noise = min(1.0, z_of(0.95) * math.sqrt(flips / episodes))
     return Plan(
-        *(episodes, flips, margin, noise, found),
+        episodes,
+        flips,
+        margin,
+        noise,
+        chance,
         smallest=smallest(episodes, flips, alpha),
         needed=needed(margin, flips, alpha),
         equal=_equal(episodes, flips),
@@ -95,11 +100,12 @@ def plan(margin: float, episodes: int, flips: float, tests: int = 1, looks: int 
 def _equal(episodes: int, flips: float) -> float:
     """Return the margin that 80% of the 90% intervals of two equal systems are within."""
     numbers = generator_of("equivalence").multinomial(episodes, [flips / 2] * 2 + [1 - flips], 500)
-    found = [
-        max(map(abs, newcombe_paired(rest // 2, gained, lost, rest - rest // 2, 1 - 2 * ALPHA)))
-        for gained, lost, rest in numbers.tolist()
-    ]
-    return float(np.quantile(found, POWER))
+    margins = []
+    for gained, lost, rest in numbers.tolist():
+        won, level = rest // 2, 1 - 2 * ALPHA
+        low, high = newcombe_paired(won, gained, lost, rest - won, level)
+        margins.append(max(abs(low), abs(high)))
+    return float(np.quantile(margins, POWER))
 
 
 def _sequential(margin: float, episodes: int, flips: float, levels: Sequence[float]) -> float:
@@ -169,19 +175,19 @@ def _powers(base: float, exponents: NDArray[np.int64]) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=64)
 def smallest(
-    episodes: int, flips: float, alpha: float = ALPHA, *, among: bool = False
+    episodes: int, flips: float, alpha: float = ALPHA, *, includes_difference: bool = False
 ) -> float | None:
     """Return the smallest difference that is found with 80% power, to 0.01 points, or None.
 
-    With `among`, `flips` is the share of the episodes that differs: those of the difference are
-    among them.
+    With `includes_difference`, `flips` is the share of the episodes that differ between two
+    systems, by chance or by the difference.
     """
 
     def is_found(margin: float) -> bool:
-        by_chance = max(0.0, flips - margin) if among else flips
+        by_chance = max(0.0, flips - margin) if includes_difference else flips
         return power(margin, episodes, by_chance, alpha) >= POWER
 
-    low, high = 0.0, flips if among else 1 - flips
+    low, high = 0.0, flips if includes_difference else 1 - flips
     if high <= 0 or not is_found(high):
         return None
     while high - low > 1e-4:
@@ -190,21 +196,23 @@ def smallest(
     return high
 
 
-def note(counts: Iterable[tuple[int, int, int]], tests: int) -> str:
+def note(counts: Iterable[tuple[int, int, int]], tests: int, effect: str = "") -> str:
     """Return a sentence on what comparisons with these pairs, gained and lost can detect.
 
     It uses the most episodes, and the median of the shares that differ. The correction is that of
-    the first of `tests` by Holm. Empty without pairs.
+    the first of `tests` by Holm. `effect` names the comparisons. Empty without pairs.
     """
-    found = [one for one in counts if one[0]]
-    if not found:
+    known = [(pairs, gained, lost) for pairs, gained, lost in counts if pairs]
+    if not known:
         return ""
-    n = min(MOST, max(pairs for pairs, _, _ in found))
-    differing = round(median((gained + lost) / pairs for pairs, gained, lost in found), 3)
-    least = smallest(n, differing, ALPHA / tests, among=True)
-    shown = "no difference" if least is None else f"a difference of {100 * least:.1f} points"
-    corrected = f" after correction for {tests} tests" * (tests > 1)
+    n = min(MOST, max(pairs for pairs, _, _ in known))
+    differing = round(median((gained + lost) / pairs for pairs, gained, lost in known), 3)
+    least = smallest(n, differing, ALPHA / tests, includes_difference=True)
+    detected = "no difference" if least is None else f"a difference of {100 * least:.1f} points"
+    if effect:
+        detected += f" by {effect}"
+    corrected = f" after correction for {tests} tests" if tests > 1 else ""
     return (
-        f" With {counted(n, 'episode')}, of which {percent(differing)} differ (the median "
-        f"here), {shown} can be detected with 80% power{corrected}."
+        f"With {counted(n, 'episode')}, of which {percent(differing)} differ (the median "
+        f"here), {detected} can be detected with 80% power{corrected}."
     )

@@ -2,48 +2,40 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from robomme_interference_data.errors import FormatError, RunError, counted
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.stats.bootstrap import DRAWS
-from robomme_interference_data.viz.tables import Table
+from robomme_interference_data.stats.intervals import wilson
+from robomme_interference_data.viz.tables import Table, percent
 
-from .comparisons import effects, families, offline, ranks, slopes
-from .comparisons.contrast import Contrast
-from .comparisons.tables import SPECS, comparison_table
 from .config import Against, Expected, Settings
 from .outcomes import Outcomes, offline_outcomes, outcomes_of
 from .partners import base_of, ceilings_of
 from .rows.reading import Rows, read_rows
-from .tables import action_error, cells, chance, equivalence, evidence_kept, paper
+from .tables import effects, families, ranks, slopes
+from .tables.cells import SuccessCell, cells_of, main_grids, main_table, parts_table
+from .tables.contrast import Contrast
+
+if TYPE_CHECKING:
+    from .tables.action_error import ErrorCell
 
 TABLES = (
     "main",
+    "parts",
     "chance",
-    "systems",
-    "ranks",
-    "family",
-    "difficulty",
-    "lift",
     "effects",
     "interaction",
     "equivalence",
-    "interference",
-    "by_evidence_kept",
     "evidence_effects",
     "evidence_use",
-    "ceiling",
     "decay",
-    "noise",
     "families",
-    "family_effects",
     "matrix",
     "action_error",
-    offline.CHANGES,
-    offline.SYSTEMS,
-    "coverage",
+    "action_error_effects",
     "paper",
-    "paper_family",
 )
 """Every table that a score may have, in order."""
 
@@ -56,7 +48,8 @@ class Score:
         settings: The settings.
         draws: Number of bootstrap samples.
         rows: The rows.
-        notes: Warnings for readers, such as that two systems are not paired.
+        notes: Sentences for readers, such as that two systems are not paired, and how many
+            outcomes flip between repeats.
         outcomes: Outcomes of the rollouts, by simulator.
         recordings: Outcomes of offline runs; None without any.
         contrasts: All comparisons, in the order of tables.
@@ -74,14 +67,14 @@ class Score:
     outcomes: Mapping[str, Outcomes]
     recordings: Outcomes | None
     contrasts: Sequence[Contrast]
-    published: Sequence[cells.Cell]
-    cells: Sequence[cells.Cell]
-    error_cells: Sequence[action_error.ErrorCell]
+    published: Sequence[SuccessCell]
+    cells: Sequence[SuccessCell]
+    error_cells: Sequence["ErrorCell"]
     tables: Mapping[str, Table]
     grids: Sequence[Table]
 
     @property
-    def every(self) -> list[Outcomes]:
+    def all_outcomes(self) -> list[Outcomes]:
         """The outcomes of each simulator, and of recordings."""
         recordings = [] if self.recordings is None else [self.recordings]
         return [*self.outcomes.values(), *recordings]
@@ -90,63 +83,64 @@ class Score:
         """Whether a system is only a reference in a simulator, which is never ranked."""
         return any(
             outcomes.is_reference(system)
-            for outcomes in self.every
+            for outcomes in self.all_outcomes
             if outcomes.simulator == simulator and system in outcomes.systems
         )
 
 
 def score(settings: Settings, draws: int = DRAWS) -> Score:
     """Score rows, with a number of bootstrap samples."""
-    rows = read_rows(settings.rows, settings.system, settings.lenient)
-    if not len(rows):
-        where = f"in {', '.join(map(str, settings.rows))}"
-        raise FormatError(
-            f"all {rows.refused:,} rows {where} are bad; the first is {rows.refusals[0]}"
-            if rows.refused
-            else f"there are no rows {where}",
-            "Give at least one valid row.",
-        )
-    if all(row.status == Status.ERROR for row in rows):
-        raise RunError(
-            f"{counted(len(rows), 'row')} in {', '.join(map(str, settings.rows))}, and all are "
-            "errors: there is nothing to score",
-            "See errors.log of the run, mend the cause, and run the same evaluate command again.",
-        )
+    rows = _rows(settings)
     outcomes = outcomes_of(rows, settings.expected)
+    simulated = tuple(outcomes.values())
     recordings = offline_outcomes(rows)
-    every = tuple(outcomes.values())
-    compared, notes = _compared(rows, every, draws)
-    error_cells = list[action_error.ErrorCell]()
-    error_grids = list[Table]()
-    if recordings is not None:
-        error_cells = action_error.error_cells(recordings, draws)
-        error_grids.append(action_error.error_grid(recordings, error_cells))
-        compared += offline.error_contrasts(recordings, draws)
-        notes += _unpinned(recordings)
-    by_family = [one for outcome in every for one in families.family_effects(outcome, compared)]
-    found = cells.cells_of(every)
-    published = paper.published() if settings.against is Against.PAPER else ()
+    cells = cells_of(simulated)
+    contrasts, notes = _compared(simulated, draws)
+    notes += [sentence for each in simulated if (sentence := _repeat_noise(each))]
     tables = [
-        *(cells.rate_table(found, name) for name in ("main", "family", "difficulty")),
-        chance.chance_table(outcomes, found),
-        ranks.rank_table(every),
-        *(comparison_table(name, [*compared, *by_family]) for name in SPECS),
-        families.families_table(every, compared),
-        *evidence_kept.evidence_tables(every),
-        slopes.decay_table(every, draws),
-        effects.noise_table(every),
-        cells.coverage_table([*found, *error_cells]),
-        action_error.error_table(error_cells),
+        main_table(cells),
+        parts_table(cells),
+        effects.effects_table(contrasts),
+        slopes.interaction_table(contrasts),
+        slopes.decay_table(simulated, draws),
+        families.families_table(simulated, contrasts),
+        ranks.matrix_table(contrasts),
     ]
-    if settings.margin is not None:
-        margin = settings.margin
-        tables.append(equivalence.equivalence_table(compared, found, published, margin))
-    if published:
+    grids = main_grids(cells)
+    error_cells = list["ErrorCell"]()
+    published: Sequence[SuccessCell] = ()
+    # The tables below are for some rows or settings only: what is not used is not imported.
+    if any(cell.chance >= 0 for cell in cells):
+        from .tables.chance import chance_table
+
+        tables.append(chance_table(outcomes, cells))
+    if any((each.evidence >= 0).any() for each in simulated):
+        from .tables.evidence_kept import evidence_tables
+
+        tables += evidence_tables(simulated)
+    if recordings is not None:
+        from .tables import action_error, action_error_effects
+
+        error_cells = action_error.error_cells(recordings, draws)
+        errors = action_error_effects.error_contrasts(recordings, draws)
+        tables.append(action_error.error_table(error_cells))
+        tables.append(action_error_effects.error_effects_table(errors))
+        grids.append(action_error.error_grid(recordings, error_cells))
+        contrasts += errors
+        notes += _not_compared_offline(recordings)
+    if settings.against is Against.PAPER:
+        from .tables import paper
+
+        published = paper.published()
         # The paper's rates are over the benchmark's grid.
-        whole = cells.cells_of(outcomes_of(rows, Expected.BENCHMARK).values())
-        tables += [paper.paper_table(whole), paper.paper_table(whole, by_part=True)]
+        whole = cells_of(outcomes_of(rows, Expected.BENCHMARK).values())
+        tables.append(paper.paper_table(whole))
         notes += paper.not_compared(whole)
-    tables = [one for one in tables if one.rows]
+    if settings.margin is not None:
+        from .tables.equivalence import equivalence_table
+
+        tables.append(equivalence_table(contrasts, cells, published, settings.margin))
+    filled = [table for table in tables if table.rows]
     return Score(
         settings,
         draws,
@@ -154,56 +148,91 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         tuple(notes),
         outcomes,
         recordings,
-        compared,
+        contrasts,
         published,
-        found,
+        cells,
         error_cells,
-        {table.name: table for table in sorted(tables, key=lambda one: TABLES.index(one.name))},
-        [*cells.main_grids(found), *error_grids],
+        {table.name: table for table in sorted(filled, key=lambda t: TABLES.index(t.name))},
+        grids,
     )
 
 
-def _compared(
-    rows: Rows, every: Sequence[Outcomes], draws: int
-) -> tuple[list[Contrast], list[str]]:
-    """Return all comparisons, and notes on systems that are not paired."""
-    compared, notes = list[Contrast](), list[str]()
-    for outcomes in every:
+def _rows(settings: Settings) -> Rows:
+    """Read the rows, of which some must be valid and no errors."""
+    rows = read_rows(settings.rows, settings.system, settings.lenient)
+    sources = ", ".join(map(str, settings.rows))
+    if not len(rows):
+        if rows.refused:
+            message = f"all {rows.refused:,} rows in {sources} are bad; the first is "
+            message += rows.refusals[0]
+        else:
+            message = f"there are no rows in {sources}"
+        raise FormatError(message, "Give at least one valid row.")
+    if all(row.status == Status.ERROR for row in rows):
+        raise RunError(
+            f"{counted(len(rows), 'row')} in {sources}, and all are errors: there is nothing to "
+            "score",
+            "See errors.log of the run, mend the cause, and run the same evaluate command again.",
+        )
+    return rows
+
+
+def _compared(all_outcomes: Sequence[Outcomes], draws: int) -> tuple[list[Contrast], list[str]]:
+    """Return all comparisons of rollouts, and notes on systems that are not paired."""
+    contrasts, notes = list[Contrast](), list[str]()
+    for outcomes in all_outcomes:
         for system in outcomes.systems:
             ceiling = next(iter(ceilings_of(outcomes, system)), None)
-            beside = {"base": base_of(outcomes, system), "ceiling": ceiling}
-            for role, other in beside.items():
-                if other is not None and (why := _unpaired(rows, outcomes, system, other)):
-                    beside[role] = None
+            partners = {"base": base_of(outcomes, system), "ceiling": ceiling}
+            for role, partner in partners.items():
+                why = "" if partner is None else _unpaired(outcomes, system, partner)
+                if why:
+                    partners[role] = None
                     simulator = outcomes.simulator
-                    notes.append(f"{system} and {other} in {simulator} are not paired: {why}.")
-            compared += effects.effects_of(outcomes, system, **beside)
-        compared += ranks.systems_of(outcomes) + slopes.interactions_of(outcomes, draws)
-    return compared, notes
+                    notes.append(f"{system} and {partner} in {simulator} are not paired: {why}.")
+            contrasts += effects.effects_of(outcomes, system, **partners)
+        contrasts += ranks.system_pairs(outcomes)
+        contrasts += slopes.interactions_of(outcomes, draws)
+    return contrasts, notes
 
 
-def _unpinned(recordings: Outcomes) -> list[str]:
+def _repeat_noise(outcomes: Outcomes) -> str:
+    """Return a sentence on how often two repeats of a rollout disagree; empty without repeats."""
+    pairs, flips = outcomes.repeat_flips
+    if not pairs:
+        return ""
+    low, high = wilson(flips, pairs)
+    return (
+        f"In {outcomes.simulator}, {flips:,} of {pairs:,} repeated rollouts "
+        f"({percent(flips / pairs)}, 95% interval {100 * low:.1f} to {100 * high:.1f}) have "
+        "another outcome with the next model seed: between conditions, a share of flips that does "
+        "not exceed this is noise."
+    )
+
+
+def _not_compared_offline(recordings: Outcomes) -> list[str]:
     """Return a note on systems offline that are not compared with others, if there are any."""
-    lone = [
+    names = [
         name
-        for name, unpinned in zip(recordings.systems, recordings.unpinned, strict=True)
-        if unpinned
+        for name, without in zip(recordings.systems, recordings.without_revision, strict=True)
+        if without
     ]
-    if not lone or len(recordings.systems) == 1:
+    if not names or len(recordings.systems) == 1:
         return []
+    verb = "is" if len(names) == 1 else "are"
     return [
-        f"Offline, {', '.join(lone)} {'is' if len(lone) == 1 else 'are'} compared with no other "
-        "system: the rows name no revision of a buffer set, so the recordings may differ."
+        f"Offline, {', '.join(names)} {verb} compared with no other system: the rows name no "
+        "revision of a buffer set, so the recordings may differ."
     ]
 
 
-def _unpaired(rows: Rows, outcomes: Outcomes, system: str, other: str) -> str:
+def _unpaired(outcomes: Outcomes, system: str, other: str) -> str:
     """Return why two systems cannot be paired; empty if they can."""
     if not outcomes.pairable(system, other):
-        lone = [one for one in (system, other) if (outcomes.simulator, one) in rows.unpinned]
-        whose = " and ".join(lone)
+        names = [name for name in (system, other) if outcomes.lacks_revision(name)]
         return (
-            f"the rows of {whose} name no revision of a buffer set, so their histories may differ"
+            f"the rows of {' and '.join(names)} name no revision of a buffer set, so their "
+            "histories may differ"
         )
     steps = [next(iter(outcomes.facts_of(name))).retrieval for name in (system, other)]
     if None not in steps and steps[0] != steps[1]:

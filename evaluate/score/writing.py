@@ -42,10 +42,10 @@ def write_score(
     for suffix, text in zip((".md", ".bib"), methods(score), strict=True):
         write_text(out / f"methods{suffix}", text)
     drawn = figures.draw_figures(score, out / "figures", (".svg", *formats))
-    for name in {f"{table}{suffix}" for table in TABLES for suffix in _SUFFIXES} - {*texts}:
+    for name in {f"{table}{suffix}" for table in TABLES for suffix in _SUFFIXES} - texts.keys():
         (out / "tables" / name).unlink(missing_ok=True)
-    for kind in figures.FIGURES:
-        for drawing in (out / "figures").glob(f"{kind}-*.svg"):
+    for figure in figures.FIGURES:
+        for drawing in (out / "figures").glob(f"{figure}-*.svg"):
             if MAKER.encode() not in drawing.read_bytes():
                 continue  # not written by this program
             for suffix in (".png", ".pdf"):

@@ -15,7 +15,7 @@ from support.scoring import recording as row
 from robomme_interference_data.errors import FormatError, InvalidOptionError, RunError
 from robomme_interference_data.evaluate.run.plan import Plan
 from robomme_interference_data.evaluate.run.row import Rollout
-from robomme_interference_data.evaluate.score.comparisons.compare import compare
+from robomme_interference_data.evaluate.score.compare import compare
 from robomme_interference_data.evaluate.score.plots.figures import draw_error_figure
 from robomme_interference_data.evaluate.score.report.methods import methods
 from robomme_interference_data.evaluate.score.report.page import headlines
@@ -60,7 +60,7 @@ def test_means_and_changes(tmp_path: Path, name: str, write: Callable[..., Path]
             (one["gained"], one["lost"]),
             pytest.approx(one["p"], abs=0.05),
         )
-        for one in found.tables["action_error_changes"].records()
+        for one in made.records(found, "action_error_effects")
     }
     assert changes == {
         ("k0", "no-history"): (3, -0.4, (3, 0), 0.25),  # three equal differences: 2 of 8 signs
@@ -71,7 +71,7 @@ def test_means_and_changes(tmp_path: Path, name: str, write: Callable[..., Path]
         ("k1", "held-k1"): (2, 0.1, (0, 2), 0.5),
     }
     # No interval of three episodes.
-    assert {one["low"] for one in found.tables["action_error_changes"].records()} == {None}
+    assert {one["low"] for one in made.records(found, "action_error_effects")} == {None}
     text, cited = methods(found)
     assert "recorded executions" in text and "Success rates" not in text and "efron1987" in cited
 
@@ -82,7 +82,7 @@ def test_intervals_of_enough_episodes(tmp_path: Path) -> None:
     cells += [row("k1", n, (0.2 + (n + 1) / 100,)) for n in range(12)]
     repeats = [replace(one, model_seed=1) for one in cells]
     found = made.score(made.write_parquet(tmp_path / "rows.parquet", [*cells, *repeats]))
-    [change] = found.tables["action_error_changes"].records()
+    [change] = made.records(found, "action_error_effects")
     assert (change["n"], round(change["difference"], 9)) == (12, 0.065)
     assert 0.03 < change["low"] < 0.065 < change["high"] < 0.1
     assert change["p"] == change["p_holm"] < 0.02
@@ -116,11 +116,11 @@ def test_broken_recordings_are_counted(broken: Path) -> None:
     [grid] = found.grids
     assert dict(grid.rows)["mine"] == "0.1550† n=4, errors: 2"
     assert dict(grid.rows)["other"] == "0.4050 n=6"
-    lacking = made.record(found, "coverage", system="mine", family="StackCups")
+    lacking = made.record(found, "action_error", system="mine", family="StackCups")
     assert (lacking["expected"], lacking["n"], lacking["errors"]) == (2, 0, 2)
     assert lacking["missing_episodes"] == lacking["error_episodes"] == "test 0-1"
     # Systems are compared over the recordings that count for both, and the pair is marked.
-    pair = made.record(found, "action_error_systems")
+    pair = made.record(found, "action_error_effects", effect="systems")
     assert (pair["system"], pair["against_system"], pair["n"]) == ("other", "mine", 4)
     assert (pair["difference"], pair["complete"]) == (0, False)
     assert "errors" in headlines(found)["recordings"].lower()
@@ -162,7 +162,7 @@ def test_systems_are_compared_with_each_other_and_with_baselines(tmp_path: Path)
         (one["system"], one["condition"], one["against_system"], one["against_condition"]): round(
             one["difference"], 9
         )
-        for one in found.tables["action_error_systems"].records()
+        for one in made.records(found, "action_error_effects", effect="systems")
     }
     assert pairs == {
         ("a", "k0", "hold", "no-history"): 0.05,
@@ -222,14 +222,14 @@ def test_systems_without_a_revision_are_not_compared(tmp_path: Path) -> None:
     path = tmp_path / "rows.csv"
     path.write_text("\n".join([head, *lines]) + "\n")
     found = made.score(path)
-    assert "action_error_systems" not in found.tables
+    assert "action_error_effects" not in found.tables
     assert [note for note in found.notes if "a, b" in note]
 
 
 def test_the_report_of_offline_runs_has_no_empty_part(tmp_path: Path) -> None:
     found = made.score(made.write_parquet(tmp_path / "rows.parquet", rows()))
     assert all(table.rows for table in found.tables.values())
-    assert [*found.tables] == ["action_error", "action_error_changes", "coverage"]
+    assert [*found.tables] == ["action_error", "action_error_effects"]
     write_score(found, tmp_path / "score", formats=(".png",))
     names = sorted(path.name for path in (tmp_path / "score/figures").iterdir())
     assert names == ["action_error-recordings.png", "action_error-recordings.svg"]
@@ -276,7 +276,7 @@ def test_rollouts_beside_them_are_scored_as_before(tmp_path: Path) -> None:
     both = made.write_parquet(tmp_path / "both.parquet", [*made.rows(), *rows()])
     alone = made.write_parquet(tmp_path / "alone.parquet", made.rows())
     found, expected = made.score(both, draws=50), made.score(alone, draws=50)
-    assert {*found.tables} - {*expected.tables} == {"action_error", "action_error_changes"}
+    assert {*found.tables} - {*expected.tables} == {"action_error", "action_error_effects"}
     for name, table in expected.tables.items():
         own = [row for row in found.tables[name].rows if row[0] != "recordings"]
         assert (own, found.tables[name].note) == ([*table.rows], table.note)
@@ -293,8 +293,8 @@ def test_two_policies_are_compared(tmp_path: Path) -> None:
     )
     found = compare(first, second)
     [change, family] = found.table.records()
-    assert (change["system_a"], change["system_b"], change["n"]) == ("a", "b", 12)
-    assert (round(change["action_l1_a"], 9), round(change["action_l1_b"], 9)) == (0.2, 0.135)
+    assert (change["against_system"], change["system"], change["n"]) == ("a", "b", 12)
+    assert (round(change["against_action_l1"], 9), round(change["action_l1"], 9)) == (0.2, 0.135)
     assert (round(change["difference"], 9), change["gained"], change["lost"]) == (-0.065, 12, 0)
     assert -0.1 < change["low"] < -0.065 < change["high"] < -0.03
     assert change["p"] < 0.01 and change["complete"]

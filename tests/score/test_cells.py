@@ -11,8 +11,8 @@ from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.schema.conditions import NO_HISTORY
 
 
-def grid_of(found: Score) -> list[tuple[str, ...]]:
-    return [row for grid in found.grids for row in grid.rows]
+def grid_of(found: Score) -> list[list[str]]:
+    return [list(row) for grid in found.grids for row in grid.rows]
 
 
 def test_best_is_each_that_cannot_be_told_from_the_highest_rate(tmp_path: Path) -> None:
@@ -37,7 +37,7 @@ def test_a_cell_is_complete_only_if_every_seed_is(tmp_path: Path) -> None:
         ("k0", 3, 0, True, 1),
         ("k7", 3, 2, False, None),
     ]
-    cell = record(found, "coverage", condition="k7")
+    cell = record(found, "parts", by="family", condition="k7")
     assert (cell["n"], cell["missing_episodes"], cell["error_episodes"]) == (
         *(3, "test 1-2", "test 1"),
     )
@@ -59,21 +59,21 @@ def test_cells_without_any_rollout_are_listed(tmp_path: Path) -> None:
         ("mine", "k0", 2),
         ("mine", "k3", 0),
     ]
-    coverage = [(r["system"], r["condition"], r["n"]) for r in made.records(found, "coverage")]
+    coverage = [
+        (r["system"], r["condition"], r["n"]) for r in made.records(found, "parts", by="family")
+    ]
     assert coverage == listed
-    assert made.records(found, "coverage")[-1]["missing_episodes"] == "test 0-1"
+    assert made.records(found, "parts", by="family")[-1]["missing_episodes"] == "test 0-1"
     assert grid_of(found)[:2] == [
-        ("π0.5 (baseline)", "0.0% [0.0, 65.8]", "n/a", "n/a"),
-        ("Retrieval-FrameSamp-Modul", "n/a", "missing†", "50.0% [9.5, 90.5]"),
+        ["π0.5 (baseline)", "0.0% [0.0, 65.8]", "n/a", "n/a"],
+        ["Retrieval-FrameSamp-Modul", "n/a", "missing†", "50.0% [9.5, 90.5]"],
     ]
     assert found.grids[0].note.startswith("n = 2 in each cell. ")  # said once where all are equal
-    # In no other table, as there is nothing to say of their parts.
-    assert len(found.tables["family"].rows) == 3
     found = made.score(path, expected=Expected.BENCHMARK)
     assert [c.system for c in found.cells if not c.part] == [
         *("pi05_baseline", *[made.RETRIEVAL] * 4, *["mine"] * 5)
     ]
-    nothing = made.records(found, "coverage", condition="k7")
+    nothing = made.records(found, "parts", by="family", condition="k7")
     assert len(nothing) == 2 * len(FAMILIES)
     assert {r["missing_episodes"] for r in nothing} == {"test 0-49"}
 
@@ -86,7 +86,7 @@ def test_the_benchmarks_grid_is_nine_families_of_fifty_episodes(tmp_path: Path) 
     more = made.released(tmp_path / "b.csv", [*lines, "my-memory,MoveCube,k0,50,,easy,fail,0,9"])
     found = made.score(more, expected=Expected.BENCHMARK)
     assert not record(found, "main", condition="k0")["complete"]
-    lacking = record(found, "coverage", condition="k0", family="MoveCube")
+    lacking = record(found, "parts", condition="k0", part="MoveCube")
     assert (lacking["n"], lacking["other_episodes"]) == (51, "test 50")
     few = made.score(made.released(tmp_path / "c.csv", lines[:12]), expected=Expected.BENCHMARK)
     assert record(few, "main", condition="k0")["missing"] == 450 - 12

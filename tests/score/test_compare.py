@@ -11,7 +11,7 @@ from support.scoring import BASE, OWN, cells, run
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.run.plan import Plan
 from robomme_interference_data.evaluate.run.row import Rollout
-from robomme_interference_data.evaluate.score.comparisons.compare import RunComparison, compare
+from robomme_interference_data.evaluate.score.compare import RunComparison, compare
 from robomme_interference_data.stats.intervals import newcombe_paired, wilson
 from robomme_interference_data.stats.sequential import look_levels
 
@@ -40,11 +40,11 @@ def test_model_seeds_are_matched(tmp_path: Path) -> None:
     found = compared(tmp_path, own(3, k0="ssff"), own(7, k0="sfff"))
     assert "with other model seeds" in found.notes[0]
     overall = found.table.records()[0]
-    assert (overall["pairs"], overall["gained"], overall["lost"]) == (4, 0, 1)
+    assert (overall["n"], overall["gained"], overall["lost"]) == (4, 0, 1)
     # With seed 7 on both sides, it is that seed: episode 0 is lost, and 1 gained.
     found = compared(tmp_path, own(3, k0="ffff") + own(7, k0="sf"), own(7, k0="fsss"))
     overall = found.table.records()[0]
-    assert (overall["n"], overall["pairs"], overall["gained"], overall["lost"]) == (4, 2, 1, 1)
+    assert (overall["n"], overall["gained"], overall["lost"], overall["flips"]) == (4, 1, 1, 1)
     assert "with partly other model seeds" in found.notes[0]
 
 
@@ -68,7 +68,7 @@ def test_two_conditions_of_one_run_are_compared(tmp_path: Path) -> None:
     rows = own(k0="ssssssf-", k7="sfffffse") + cells({(BASE, "k0"): "ss"})
     found = compare(made.write_csv(tmp_path / "a.csv", rows), conditions=("k0", "k7"))
     (overall, _) = found.table.records()
-    assert (overall["condition_a"], overall["condition_b"], overall["n"]) == ("k0", "k7", 7)
+    assert (overall["against_condition"], overall["condition"], overall["n"]) == ("k0", "k7", 7)
     assert (overall["gained"], overall["lost"], overall["p"]) == (1, 5, 14 / 64)
     # Episode 7 broke: the cell is not complete, and every p provisional.
     assert not overall["complete"] and "0.219†" in found.table.markdown()
@@ -105,7 +105,7 @@ def test_what_cannot_be_paired_is_not_compared(
 ) -> None:
     a, b = own(k0="sfsf"), made.changed(own(k0="sfsf"), **change)
     if not message:  # two systems, one a run, are compared
-        assert compared(tmp_path, a, b).table.records()[0]["system_b"] == "other"
+        assert compared(tmp_path, a, b).table.records()[0]["system"] == "other"
         a, message = [*a, *cells({(BASE, "k0"): "s"})], "no system is in both"
     with pytest.raises(InvalidOptionError, match=message):
         compared(tmp_path, a, b)

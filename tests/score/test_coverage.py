@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from robomme_interference_data.evaluate.score.comparisons.effects import retained
-from robomme_interference_data.evaluate.score.comparisons.pairs import pair
 from robomme_interference_data.evaluate.score.outcomes import rate_of, success
+from robomme_interference_data.evaluate.score.tables.effects import retained
+from robomme_interference_data.evaluate.score.tables.pairs import pair
 
 pytestmark = pytest.mark.slow
 

@@ -32,7 +32,7 @@ def test_retention_has_fiellers_interval(tmp_path: Path) -> None:
         "k7": "f" * 60,
     }
     found = scored(tmp_path, own(**outcomes))
-    kept = {c: record(found, "lift", condition=c) for c in ("k1", "k3", "k7")}
+    kept = {c: record(found, "effects", effect="history", condition=c) for c in ("k1", "k3", "k7")}
     assert [kept[c]["retention"] for c in kept] == pytest.approx([21 / 30, 1, 0])
     assert {kept[c]["retention_n"] for c in kept} == {60}
     # Of the lifts 0.35 and 0.5: variances 0.2275/59 and 0.25/59, covariance 0.35 · 0.5/59.
@@ -47,7 +47,7 @@ def test_retention_has_fiellers_interval(tmp_path: Path) -> None:
     assert (kept["k7"]["retention_low"], kept["k7"]["retention_high"]) == pytest.approx(bounds)
     # Where no-history lacks ten episodes, retention is of the other fifty.
     found = scored(tmp_path, own(**outcomes | {"none": "-" * 10 + "f" * 50}))
-    assert record(found, "lift", condition="k1")["retention_n"] == 50
+    assert record(found, "effects", effect="history", condition="k1")["retention_n"] == 50
 
 
 @pytest.mark.parametrize(("gained", "sure"), [(5, False), (6, True)])
@@ -57,7 +57,9 @@ def test_retention_is_of_a_lift_that_the_exact_test_is_sure_of(
     # Five gained and none lost: p = 2/32. Six: 2/64.
     k0 = "s" * gained + "f" * (20 - gained)
     found = scored(tmp_path, own(none="f" * 20, k0=k0, k7=k0))
-    assert record(found, "lift", condition="k7")["retention"] == (1.0 if sure else None)
+    assert record(found, "effects", effect="history", condition="k7")["retention"] == (
+        1.0 if sure else None
+    )
 
 
 def test_pairs_are_of_the_lowest_seed_that_counts_on_both_sides(tmp_path: Path) -> None:
@@ -67,14 +69,14 @@ def test_pairs_are_of_the_lowest_seed_that_counts_on_both_sides(tmp_path: Path) 
         cells({(OWN, "k0"): "sssss", (OWN, "k7"): "eeeef"}),
         cells({(OWN, "k0"): "fsf-s", (OWN, "k7"): "sfsss"}, seed=1),
     )
-    effect = record(found, "effects", condition="k7")
+    effect = record(found, "effects", condition="k7", effect="sessions")
     # Episodes 0 and 2 are gained and 1 is lost with seed 1; 4 is lost with seed 0.
-    assert (effect["n"], effect["pairs"]) == (5, 4)
+    assert effect["n"] == 5
     assert (effect["gained"], effect["lost"], effect["flips"]) == (2, 2, 1.0)
     # The test is of the means: 1/2, 1, 1/2, 1 and 1 at k0, then 1, 0, 1, 1 and 1/2. In halves the
     # differences are 1, −2, 1, 0 and −1, their sum −1: odd, so all sums are as far from 0.
     assert (effect["difference"], effect["p"]) == (-0.1, 1.0)
-    assert effect["interval"] == "clusters" and effect["low"] < -0.1 < effect["high"]
+    assert effect["low"] < -0.1 < effect["high"]
 
 
 def test_interval_and_test_of_repeats_agree(tmp_path: Path) -> None:
@@ -84,20 +86,21 @@ def test_interval_and_test_of_repeats_agree(tmp_path: Path) -> None:
         cells({(OWN, "k0"): "f" * 12, (OWN, "k7"): "ssffffffffff"}),
         cells({(OWN, "k0"): "f" * 12, (OWN, "k7"): "fsssssssssff"}, seed=1),
     )
-    effect = record(found, "effects", condition="k7")
-    assert (effect["gained"], effect["lost"], effect["pairs"]) == (2, 0, 12)
+    effect = record(found, "effects", condition="k7", effect="sessions")
+    assert (effect["gained"], effect["lost"], effect["n"]) == (2, 0, 12)
     assert effect["p"] == 2 / 2**10  # ten differ, all the same way
-    assert effect["p_mid"] == 1 / 2**10
     assert effect["low"] > 0
 
 
 def test_noise_is_of_the_two_lowest_seeds_that_count(tmp_path: Path) -> None:
     parts = [cells({(OWN, "k0"): text}, seed) for seed, text in enumerate(("ess-", "sfse", "fssf"))]
     found = scored(tmp_path, *parts, cells({(OWN, "k1"): "ss"}))
-    noise = record(found, "noise")
     # Episode 0 flips from seed 1 to 2, episode 1 from seed 0 to 1; episode 3 counts once.
-    assert (noise["pairs"], noise["flips"], noise["rate"]) == (3, 2, 2 / 3)
-    assert (noise["low"], noise["high"]) == wilson(2, 3)
+    assert found.outcomes["tabletop"].repeat_flips == (3, 2)
+    low, high = wilson(2, 3)
+    (note,) = found.notes
+    assert "2 of 3 repeated rollouts" in note
+    assert f"(66.7%, 95% interval {100 * low:.1f} to {100 * high:.1f})" in note
 
 
 def test_rows_without_a_revision_stand_beside_others_and_are_not_paired(tmp_path: Path) -> None:

@@ -42,9 +42,11 @@ def test_levels_are_compared_within_families(tmp_path: Path) -> None:
         "InsertPeg": ("sss", "333"),
     }
     found = scored(tmp_path, rows(outcomes))
-    rates = {r["kept"]: (r["n"], r["rate"]) for r in records(found, "by_evidence_kept")}
+    rates = {
+        r["kept"]: (r["n"], r["rate"]) for r in records(found, "evidence_effects", against_kept="")
+    }
     assert rates == {"all": (15, 10 / 15), "none": (12, 5 / 12)}
-    effect = record(found, "evidence_effects")
+    effect = record(found, "evidence_effects", kept="all", against_kept="none")
     assert (effect["kept"], effect["against_kept"], effect["families"]) == ("all", "none", 2)
     assert (effect["n"], effect["against_n"]) == (12, 12)
     assert effect["rate"] == effect["against_rate"] == pytest.approx(0.5)
@@ -55,8 +57,11 @@ def test_levels_are_compared_within_families(tmp_path: Path) -> None:
 
 def test_no_family_with_two_levels_has_no_effect(tmp_path: Path) -> None:
     found = scored(tmp_path, rows({"MoveCube": ("ssf", "333"), "InsertPeg": ("fff", "000")}))
-    assert "evidence_effects" not in found.tables
-    assert len(records(found, "by_evidence_kept")) == 2
+    levels = records(found, "evidence_effects")
+    assert [(row["kept"], row["against_kept"], row["p"]) for row in levels] == [
+        ("all", "", None),
+        ("none", "", None),
+    ]
 
 
 KEPT = {"MoveCube": ("sssssffffe" + "ff", "3333333333" + "12")}
@@ -99,4 +104,4 @@ def test_without_a_control_the_table_names_the_command(tmp_path: Path) -> None:
 def test_answers_are_not_executed(tmp_path: Path) -> None:
     asked = made.changed(rows({"MoveCube": ("ssf", "333")}), chance=0.5, steps=0)
     found = scored(tmp_path, asked)
-    assert "by_evidence_kept" in found.tables and "evidence_use" not in found.tables
+    assert "evidence_effects" in found.tables and "evidence_use" not in found.tables

@@ -144,31 +144,10 @@ def test_rates_by_family_are_used_where_they_add_up_to_the_published_ones() -> N
     assert cube == {NO_HISTORY: 18, "k0": 43, "k1": 33, "k3": 25, "k7": 16}
 
 
-def test_where_paper_and_repository_differ_is_told(tmp_path: Path) -> None:
-    system = "perceptual-tokendrop-modul"
-    rows = made.changed(cells({(system, "k0"): "sf", (system, "k7"): "ff"}), simulator="robomme")
-    found = made.score(made.write_csv(tmp_path / "a.csv", rows), paper=True)
-    table = found.tables["paper_family"]
-    assert table.note.endswith("They do not for: TokenDrop-Modul k1, k3, k7.")
-    (own,) = table.records()
-    assert (own["condition"], own["family"], own["n"]) == ("k0", "MoveCube", 2)
-    assert own["difference"] == own["rate"] - own["published_rate"] and not own["complete"]
-
-
-def test_a_system_of_ones_own_stands_beside_all_of_the_papers_by_family(tmp_path: Path) -> None:
+def test_a_few_episodes_of_ones_own_are_not_beside_the_papers(tmp_path: Path) -> None:
     rows = made.changed(cells({("replay-full", "k0"): "ssf"}), simulator="robomme")
     found = made.score(made.write_csv(tmp_path / "a.csv", rows), paper=True)
     assert "paper" not in found.tables  # three episodes of one family are no rate over nine
-    beside = made.records(found, "paper_family")
-    there = [one for one in by_family() if (one.part, one.condition) == ("MoveCube", "k0")]
-    assert [(one["published_system"], one["published_rate"]) for one in beside] == [
-        (one.system, one.rate) for one in there
-    ]
-    assert len(beside) > 5 and {one["n"] for one in beside} == {3}
-    for one in beside:
-        assert one["difference"] == pytest.approx(2 / 3 - one["published_rate"])
-        assert one["difference_low"] < one["difference"] < one["difference_high"]
-        assert not one["complete"]
 
 
 @pytest.mark.skipif(not PAPER.exists(), reason="the paper is not here")
@@ -204,17 +183,16 @@ def test_the_released_rows_give_the_published_numbers() -> None:
     assert whole["k0"].interval == pytest.approx((0.403560, 0.495083), abs=1e-6)
     k7 = record(found, "effects", condition="k7")
     assert (k7["n"], k7["gained"], k7["lost"], k7["p"], k7["difference"]) == (450, 13, 13, 1.0, 0.0)
-    cells = made.records(found, "family", family="VideoPlaceButton")
+    cells = made.records(found, "parts", part="VideoPlaceButton")
     assert [cell["successes"] for cell in cells] == [26, 28, 25, 30]
     ours = made.records(found, "paper", published_system=RETRIEVAL)
     assert {one["difference"] for one in ours} == {0.0}
-    cube = made.records(found, "paper_family", family="MoveCube", condition="k7")
-    assert [(one["n"], one["rate"], one["published_rate"]) for one in cube] == [
-        *((50, 0.86, 0.86), (50, 0.86, 0.32))
-    ]
-    # Counted from these very rows.
-    same = made.records(found, "paper_family", published_system=RETRIEVAL)
-    assert len(same) == 9 * 4 and {one["difference"] for one in same} == {0.0}
+    # The published rates by family are counted from these very rows.
+    theirs = {
+        (cell.condition, cell.part): cell.rate for cell in by_family() if cell.system == RETRIEVAL
+    }
+    own = made.records(found, "parts", by="family")
+    assert {(row["condition"], row["part"]): row["rate"] for row in own if row["n"]} == theirs
     # The ten episodes of docs/results/robomme.md are easier than the other forty.
     four = ("MoveCube", "InsertPeg", "PatternLock", "RouteStick")
     won = [r.episode for r in found.rows if r.success and r.condition == "k0" and r.family in four]

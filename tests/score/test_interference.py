@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from support import scoring as made
 from support.scoring import BASE, OWN, REPLAY, RETRIEVAL, record
 
-from robomme_interference_data.evaluate.score.comparisons.contrast import COMPARISONS, comparable
 from robomme_interference_data.evaluate.score.plots.data import Data
 from robomme_interference_data.evaluate.score.plots.figures import draw_figure
 from robomme_interference_data.evaluate.score.report.headline import headline
 from robomme_interference_data.evaluate.score.scoring import Score
+from robomme_interference_data.evaluate.score.tables.contrast import COMPARISONS, comparable
 from robomme_interference_data.schema.conditions import KINDS, NO_HISTORY, in_order, parse_condition
 from robomme_interference_data.viz.figure import open_figure
 
@@ -21,7 +21,7 @@ from robomme_interference_data.viz.figure import open_figure
 
 def test_behind_retrieval_the_floor_is_the_base_without_history(tmp_path: Path) -> None:
     outcomes = {(BASE, NO_HISTORY): "sfff", (RETRIEVAL, "absent-k1"): "ssff"}
-    found = record(made.kinds(tmp_path, outcomes), "interference")
+    found = record(made.kinds(tmp_path, outcomes), "effects", effect="interference")
     assert (found["against_system"], found["against_condition"]) == (BASE, NO_HISTORY)
     assert (found["gained"], found["lost"]) == (1, 0)
 
@@ -60,9 +60,10 @@ def test_a_ceiling_is_behind_the_same_retrieval_step(tmp_path: Path) -> None:
         given = [replace(row, retrieval=of.get(row.system)) for row in rows]
         return made.score(made.write_parquet(tmp_path / "a.parquet", given))
 
-    assert record(steps("siglip", "siglip"), "ceiling")["system"] == own
+    same = record(steps("siglip", "siglip"), "effects", effect="ideal observer")
+    assert same["system"] == own
     found = steps("siglip", "thumbnail")
-    assert "ceiling" not in found.tables
+    assert made.records(found, "effects", effect="ideal observer") == []
     (note,) = found.notes
     assert "retrieval steps differ: siglip and thumbnail" in note
     assert record(found, "effects")["against_system"] == "replay-full"  # that one has none

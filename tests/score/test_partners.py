@@ -74,7 +74,8 @@ def test_other_labels_give_the_same_pairs_and_figures(tmp_path: Path) -> None:
 
     shown = [repr(content(found, labels)) for found in scores]  # NaN equals itself in text
     assert shown[0] == shown[1]
-    assert {"effects", "ceiling", "evidence_use"} <= {*scores[0].tables}
+    assert {"effects", "evidence_use"} <= {*scores[0].tables}
+    assert made.records(scores[0], "effects", effect="ideal observer")
 
 
 def test_runs_of_several_weights_are_one_system(tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ from support import scoring as made
 from support.scoring import BASE, RETRIEVAL, cells, record, records, run
 
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evaluate.score.comparisons.pairs import NO_PAIRS, Pairs, pair
 from robomme_interference_data.evaluate.score.config import Expected, Settings
 from robomme_interference_data.evaluate.score.power import needed, plan, power, smallest
 from robomme_interference_data.evaluate.score.report.headline import headline
@@ -25,6 +24,7 @@ from robomme_interference_data.evaluate.score.tables.equivalence import (
     tost,
     verdict,
 )
+from robomme_interference_data.evaluate.score.tables.pairs import NO_PAIRS, Pairs, pair
 from robomme_interference_data.stats.intervals import newcombe, newcombe_paired
 from robomme_interference_data.stats.sequential import look_levels
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, cells, record, records
 
-from robomme_interference_data.evaluate.score.comparisons.tables import corrected
+from robomme_interference_data.evaluate.score.tables.comparison import corrected
 from robomme_interference_data.stats.intervals import newcombe, newcombe_paired
 from robomme_interference_data.stats.significance import holm, two_proportions
 
@@ -23,8 +23,8 @@ def first(won: int, of: int = 24) -> str:
 
 def test_equal_rates_lead_by_the_order_of_tables(tmp_path: Path) -> None:
     found = scored(tmp_path, {(OWN, "k0"): "sf", (BASE, "k0"): "fs"})
-    assert record(found, "systems")["against_system"] == BASE
-    assert {r["rank"] for r in records(found, "ranks")} == {1}
+    assert record(found, "main", system=OWN)["best_system"] == BASE
+    assert {r["rank"] for r in records(found, "main")} == {1}
     assert {r["best"] for r in records(found, "main")} == {True}
 
 
@@ -36,11 +36,13 @@ def test_systems_of_other_histories_are_not_paired(tmp_path: Path) -> None:
         cells({(BASE, "k0"): first(8, 10)}), simulator="robomme", difficulty="easy"
     )
     found = made.score(unpinned, made.write_csv(tmp_path / "b.csv", pinned))
-    row = record(found, "systems")
-    assert (row["system"], row["interval"], row["pairs"]) == (OWN, "unpaired", None)
-    assert row["p"] == two_proportions(1, 10, 8, 10) and row["p_mid"] is None
-    assert (row["low"], row["high"]) == pytest.approx(newcombe(1, 10, 8, 10))
-    assert "two proportions" in found.tables["systems"].note
+    row = record(found, "main", system=OWN)
+    assert row["p_holm"] == two_proportions(1, 10, 8, 10)
+    ends = (row["difference_low"], row["difference_high"])
+    assert ends == pytest.approx(newcombe(1, 10, 8, 10))
+    pair = record(found, "matrix")
+    assert (pair["gained"], pair["lost"], pair["p"]) == (None, None, row["p_holm"])
+    assert "two proportions" in found.tables["matrix"].note
     assert [r["best"] for r in records(found, "main")] == [True, False]
 
 
@@ -52,24 +54,26 @@ def test_two_systems_without_a_revision_are_not_paired(tmp_path: Path) -> None:
         for e in range(10)
     ]
     found = made.score(made.released(tmp_path / "a.csv", lines))
-    assert {r["interval"] for r in records(found, "matrix")} == {"unpaired"}
+    assert {r["gained"] for r in records(found, "matrix")} == {None}
     # The conditions of one system have the same demonstrations, and are paired.
-    assert {r["interval"] for r in records(found, "effects")} == {"newcombe"}
+    assert {r["lost"] for r in records(found, "effects")} == {0}
 
 
 def test_ranks_follow_from_the_significant_pairs(tmp_path: Path) -> None:
     rates = {"one": 12, "two": 11, "three": 6, "four": 2}
     found = scored(tmp_path, {(name, "k0"): first(won) for name, won in rates.items()})
     ranks = {
-        r["system"]: (r["rank"], r["rank_low"], r["rank_high"]) for r in records(found, "ranks")
+        r["system"]: (r["rank"], r["rank_low"], r["rank_high"]) for r in records(found, "main")
     }
     # As in test_cells: one and two are better than four, and no other pair differs.
     assert ranks == {"one": (1, 1, 3), "two": (2, 1, 3), "three": (3, 1, 4), "four": (4, 3, 4)}
     # Against the best, p is corrected over all six pairs too, and the intervals for all six.
-    row = record(found, "systems", system="four")
+    row = record(found, "main", system="four")
     assert row["p_holm"] == 6 * 2 / 2**10
     bounds = newcombe_paired(2, 10, 0, 12, 1 - 0.05 / 6)
-    assert (row["joint_low"], row["joint_high"]) == pytest.approx((-bounds[1], -bounds[0]))
+    assert (row["difference_low"], row["difference_high"]) == pytest.approx(
+        (-bounds[1], -bounds[0])
+    )
 
 
 def test_which_system_falls_faster(tmp_path: Path) -> None:

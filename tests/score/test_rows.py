@@ -15,7 +15,7 @@ from support import scoring as made
 from support.scoring import GOOD
 
 from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
-from robomme_interference_data.evaluate.score.comparisons.compare import compare
+from robomme_interference_data.evaluate.score.compare import compare
 from robomme_interference_data.evaluate.score.rows import files
 from robomme_interference_data.evaluate.score.rows.export import export
 from robomme_interference_data.evaluate.score.rows.reading import Rows, read_rows

@@ -7,7 +7,7 @@ import pytest
 from support import scoring as made
 from support.scoring import BASE, RETRIEVAL
 
-from robomme_interference_data.evaluate.score.comparisons.compare import compare
+from robomme_interference_data.evaluate.score.compare import compare
 from robomme_interference_data.evaluate.score.config import Expected
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.viz.tables import Table

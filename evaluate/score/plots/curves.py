@@ -144,7 +144,11 @@ def explained(data: Data, systems: Sequence[str], parts: Sequence[str], *notes: 
     drawn = [(s, c) for (s, _, part), c in data.cells.items() if s in systems and part in parts]
     hollow = any(not one.complete for _, one in drawn)
     dashes = any(system in (*data.absent, *data.beside) for system, _ in drawn)
-    marks = ["hollow: incomplete cell"] * hollow + ["dashes: published rates"] * dashes
+    marks = []
+    if hollow:
+        marks.append("hollow: incomplete cell")
+    if dashes:
+        marks.append("dashes: published rates")
     return "; ".join([*marks, *filter(None, notes)])
 
 

@@ -3,12 +3,11 @@
 import math
 from collections.abc import Container, Sequence
 from copy import copy
-from typing import Self
+from typing import Any, Self
 
 from robomme_interference_data.evaluate.score.partners import base_of
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.score.tables.cells import Cell
-from robomme_interference_data.evaluate.score.tables.paper import by_family
+from robomme_interference_data.evaluate.score.tables.cells import SuccessCell
 from robomme_interference_data.evaluate.systems import published_base
 from robomme_interference_data.schema.conditions import Condition, Kind, in_order, parse_condition
 from robomme_interference_data.stats.significance import ALPHA
@@ -40,76 +39,89 @@ class Data:
         contrasts: Comparisons of the systems that have rows.
         flips: Share of outcomes that differ between repeats; None without repeats.
         distinguishable: Condition and pair of systems that differ significantly.
-        by_evidence_kept: The rows of that table, without the simulator.
+        by_evidence_kept: The rate of each level of evidence, as rows of `evidence_effects`.
         chance: Success of guessing by part of the episodes, if all are questions.
     """
 
     def __init__(self, score: Score, simulator: str):
         self.simulator = simulator
-        found = [one for one in score.cells if one.simulator == simulator and one.n]
-        self.systems = list(dict.fromkeys(one.system for one in found))
         outcomes = score.outcomes[simulator]
         self.families = outcomes.families
+        own = [cell for cell in score.cells if cell.simulator == simulator and cell.n]
+        self.systems = list(dict.fromkeys(cell.system for cell in own))
         self.bases = {system: base_of(outcomes, system) for system in self.systems}
         self.contrasts = [one for one in score.contrasts if one.simulator == simulator]
-        noise = score.tables.get("noise")
-        repeats = [row[3:5] for row in noise.rows if row[0] == simulator] if noise else []
-        pairs, flips = map(sum, zip(*repeats, strict=True)) if repeats else (0, 0)
-        self.flips = flips / pairs if pairs else None
+        repeated, flips = outcomes.repeat_flips
+        self.flips = flips / repeated if repeated else None
         self.distinguishable = {
-            (one["condition"], frozenset((one["system"], one["against_system"])))
-            for one in (score.tables["matrix"].records() if "matrix" in score.tables else ())
-            if one["simulator"] == simulator and one["p_holm"] < ALPHA
+            (record["condition"], frozenset((record["system"], record["against_system"])))
+            for record in _records(score, "matrix", simulator)
+            if record["p_holm"] < ALPHA
         }
-        kept = score.tables.get("by_evidence_kept")
-        self.by_evidence_kept = (
-            [row[1:] for row in kept.rows if row[0] == simulator] if kept else []
-        )
-        asked = sorted((one for one in found if one.chance >= 0), key=lambda one: one.n)
-        self.chance = {one.part: one.chance for one in asked}
-        bases = [b for s in self.systems if (b := published_base(s)) and b not in self.systems]
+        # Rows with `against_kept` compare two levels of evidence.
+        self.by_evidence_kept = [
+            record
+            for record in _records(score, "evidence_effects", simulator)
+            if not record["against_kept"]
+        ]
+        asked = sorted((cell for cell in own if cell.chance >= 0), key=lambda cell: cell.n)
+        self.chance = {cell.part: cell.chance for cell in asked}
+        bases = [base for name in self.systems if (base := published_base(name))]
+        bases = [base for base in bases if base not in self.systems]
         self.styles = styles_of([*self.systems, *bases], outcomes.retrieving)
         self.styles[CHANCE] = SeriesStyle("chance", INK, "", ":", 0.9)
-        self.cells: dict[tuple[str, str, str], Cell] = {
-            (one.system, one.condition, one.part): one for one in found
+        self.cells: dict[tuple[str, str, str], SuccessCell] = {
+            (cell.system, cell.condition, cell.part): cell for cell in own
         }
         self.absent, self.beside = list[str](), list[str]()
-        for one in (*score.published, *(by_family() if score.published else ())):
-            if one.simulator == simulator and one.system in self.styles:
-                name = f"{one.system}{PUBLISHED}"
-                names = self.absent if one.system in bases else self.beside
-                names += [name] if name not in names else []
-                style, line = (
-                    self.styles[one.system],
-                    (0, (4, 2)) if one.system in bases else "none",
-                )
-                label = f"{style.label}, published"
-                self.styles[name] = SeriesStyle(label, style.color, "_", line, 1.2)
-                self.cells[name, one.condition, one.part] = one
+        self._add_published(score, bases)
         conditions = {condition for _, condition, _ in self.cells}
         self.conditions: Sequence[Condition] = in_order(conditions) if conditions else ()
         self.least = min((one.k for one in self.conditions if one.kind.counted), default=0)
 
+    def _add_published(self, score: Score, bases: Sequence[str]) -> None:
+        """Add the published cells of its systems, and of the systems without retrieval."""
+        if not score.published:
+            return
+        from robomme_interference_data.evaluate.score.tables.paper import by_family
+
+        for cell in (*score.published, *by_family()):
+            if cell.simulator != self.simulator or cell.system not in self.styles:
+                continue
+            name = f"{cell.system}{PUBLISHED}"
+            absent = cell.system in bases
+            names = self.absent if absent else self.beside
+            if name not in names:
+                names.append(name)
+            style = self.styles[cell.system]
+            line = (0, (4, 2)) if absent else "none"
+            self.styles[name] = SeriesStyle(
+                f"{style.label}, published", style.color, "_", line, 1.2
+            )
+            self.cells[name, cell.condition, cell.part] = cell
+
     @property
     def kinds(self) -> list[Kind]:
         """The kinds of its conditions, in the order of tables."""
-        return list(dict.fromkeys(one.kind for one in self.conditions))
+        return list(dict.fromkeys(condition.kind for condition in self.conditions))
 
     def of(self, kinds: Container[Kind]) -> Self:
         """Return the data of some kinds of conditions, at the same places on the x axis."""
-        found = copy(self)
-        found.conditions = [one for one in self.conditions if one.kind in kinds]
-        names = {one.name for one in found.conditions}
-        found.cells = {key: cell for key, cell in self.cells.items() if key[1] in names}
-        found.systems = [one for one in self.systems if any(one == key[0] for key in found.cells)]
-        return found
+        chosen = copy(self)
+        chosen.conditions = [each for each in self.conditions if each.kind in kinds]
+        names = {condition.name for condition in chosen.conditions}
+        chosen.cells = {key: cell for key, cell in self.cells.items() if key[1] in names}
+        drawn = {system for system, *_ in chosen.cells}
+        chosen.systems = [system for system in self.systems if system in drawn]
+        return chosen
 
     def x(self, condition: str) -> float:
         """Return the place on the x axis: log2(k + 1), right of conditions without a count."""
-        one, plain = parse_condition(condition), [c for c in self.conditions if not c.kind.counted]
-        if not one.kind.counted:
-            return 0.3 + 1.3 * plain.index(one)
-        return 0.3 + 1.3 * len(plain) + math.log2((one.k + 1) / (self.least + 1))
+        parsed = parse_condition(condition)
+        plain = [each for each in self.conditions if not each.kind.counted]
+        if not parsed.kind.counted:
+            return 0.3 + 1.3 * plain.index(parsed)
+        return 0.3 + 1.3 * len(plain) + math.log2((parsed.k + 1) / (self.least + 1))
 
     def parts(self, names: Sequence[str]) -> list[str]:
         """Return those of some parts that have cells with rows."""
@@ -122,5 +134,13 @@ class Data:
 
     def shown(self, systems: Sequence[str]) -> list[str]:
         """Return the conditions of the cells of some systems."""
-        found = {condition for system, condition, _ in self.cells if system in systems}
-        return [one.name for one in self.conditions if one.name in found]
+        drawn = {condition for system, condition, _ in self.cells if system in systems}
+        return [condition.name for condition in self.conditions if condition.name in drawn]
+
+
+def _records(score: Score, table: str, simulator: str) -> list[dict[str, Any]]:
+    """Return the rows of a table in one simulator; none without the table."""
+    if table not in score.tables:
+        return []
+    records = score.tables[table].records()
+    return [record for record in records if record["simulator"] == simulator]

@@ -6,10 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from textwrap import fill
 from typing import Any
 
-from robomme_interference_data.evaluate.score.comparisons.contrast import (
+from robomme_interference_data.evaluate.score.tables.contrast import (
     COMPARISONS,
     START,
     Contrast,
+    Role,
 )
 from robomme_interference_data.schema.conditions import KINDS, parse_condition
 from robomme_interference_data.stats.bootstrap import Interval
@@ -80,8 +81,10 @@ def _forest(
     grid[0].set_ylim(len(rows) - 0.4, -0.6)
     figure.suptitle(title, size=TITLE, color=INK)
     hollow = not all(one.complete for group in panels.values() for one in group.values())
-    lines = [*notes, "hollow: incomplete cell" * hollow]
-    legend(figure, "\n".join(filter(None, lines)))
+    lines = [note for note in notes if note]
+    if hollow:
+        lines.append("hollow: incomplete cell")
+    legend(figure, "\n".join(lines))
 
 
 def _by_system(
@@ -106,11 +109,11 @@ def effects(figure: Any, data: Data) -> bool:
     found: _Groups = {}
     for one in counted:
         name = ""
-        if one.table == "lift" and one.condition == START:
+        if one.role is Role.HISTORY and one.condition == START:
             name = f"{START} − {short(one.against[1])}"
-        elif one.table == "effects" and one.against == (one.system, START):
+        elif one.role is Role.SESSIONS:
             name = f"{one.condition} − {START}"
-        elif one.table == "effects" and parse_condition(one.condition).k == last:
+        elif one.role is Role.RETRIEVAL and parse_condition(one.condition).k == last:
             name = f"{one.condition}, with − without retrieval"
         if name:
             found.setdefault(name, {})[one.system] = one
@@ -133,7 +136,7 @@ def ceiling(figure: Any, data: Data) -> bool:
     """Draw how far systems are below the ideal observer with their memory."""
     found: _Groups = {}
     for one in data.contrasts:
-        if one.table == "ceiling" and one.pairs.n:
+        if one.role is Role.CEILING and one.pairs.n:
             found.setdefault(one.condition, {})[one.system] = one
     if not found:
         return False
@@ -145,7 +148,9 @@ def ceiling(figure: Any, data: Data) -> bool:
 def retention(figure: Any, data: Data) -> bool:
     """Draw the share of each system's lift that is left at the most sessions."""
     found = [
-        one for one in data.contrasts if one.table == "lift" and not math.isnan(one.retention.value)
+        one
+        for one in data.contrasts
+        if one.role is Role.HISTORY and not math.isnan(one.retention.value)
     ]
     if not found:
         return False
@@ -154,12 +159,17 @@ def retention(figure: Any, data: Data) -> bool:
         (c for c in found if c.condition == last),
         key=lambda c: (not c.complete, -c.retention.value),
     )
-    rows = {c.system: data.styles[c.system].label + " †" * (not c.complete) for c in found}
+    rows = {}
+    for one in found:
+        label = data.styles[one.system].label
+        rows[one.system] = label if one.complete else f"{label} †"
     absent = [data.styles[system].label for system in data.systems if system not in rows]
-    note = (
-        f"Not shown (no lift at k0 with p < {ALPHA}, or rows missing at {last}): "
-        f"{', '.join(absent)}"
-    )
+    note = ""
+    if absent:
+        note = (
+            f"Not shown (no lift at k0 with p < {ALPHA}, or rows missing at {last}): "
+            f"{', '.join(absent)}"
+        )
     figure.set_size_inches(WIDTH, 1.6 + 0.3 * max(2, len(found)))
     _forest(
         figure,
@@ -168,7 +178,7 @@ def retention(figure: Any, data: Data) -> bool:
         rows,
         f"Retention at {last}, {data.simulator}",
         f"({last} − no history) / (k0 − no history); 0: nothing left, 1: all; {_BARS}",
-        note * bool(absent),
+        note,
         value=lambda one: one.retention,
         scale=1,
         guides=(0, 1),
@@ -204,7 +214,7 @@ def _most_common(contrasts: Sequence[Contrast]) -> _Groups:
     found: dict[str, dict[int, list[Contrast]]] = {}
     for one in contrasts:
         condition = parse_condition(one.condition)
-        asks = one.asks or condition.kind.asks * (one.against == (one.system, START))
+        asks = condition.kind.asks if one.role is Role.SESSIONS else one.asks
         if asks and one.pairs.n:
             found.setdefault(asks, {}).setdefault(condition.k, []).append(one)
     counts = Counter(k for by_k in found.values() for k in by_k)
@@ -221,8 +231,8 @@ def _most_common(contrasts: Sequence[Contrast]) -> _Groups:
 def by_evidence_kept(figure: Any, data: Data) -> bool:
     """Draw success where all, some and none of the evidence was kept, by system."""
     names = {one.name for one in data.conditions}
-    rows = [row for row in data.by_evidence_kept if row[1] in names]
-    systems = list(dict.fromkeys(row[0] for row in rows))
+    rows = [row for row in data.by_evidence_kept if row["condition"] in names]
+    systems = list(dict.fromkeys(row["system"] for row in rows))
     if not systems:
         return False
     wide = min(3, len(systems))
@@ -231,12 +241,18 @@ def by_evidence_kept(figure: Any, data: Data) -> bool:
     ends: dict[str, dict[str, float]] = {system: {} for system in systems}
     for axes, system in zip(panels, systems, strict=True):
         for number, (level, style) in enumerate(_LEVELS.items()):
-            cells = [row for row in rows if row[0] == system and row[2] == level]
+            cells = [row for row in rows if (row["system"], row["kept"]) == (system, level)]
             if not cells:
                 continue
+            shift = 0.09 * (number - 1)
             points = [
-                (data.x(condition) + 0.09 * (number - 1), *(100 * value for value in values))
-                for _, condition, _, _, *values in cells
+                (
+                    data.x(row["condition"]) + shift,
+                    100 * row["rate"],
+                    100 * row["rate_low"],
+                    100 * row["rate_high"],
+                )
+                for row in cells
             ]
             mark(axes.plot(*zip(*(p[:2] for p in points), strict=True), **style.stroke), system)
             draw_points(axes, points, style, system, [True] * len(points))

@@ -3,10 +3,9 @@
 import math
 from collections.abc import Sequence
 
-from robomme_interference_data.evaluate.score.comparisons.contrast import START, Contrast
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.score.tables.cells import Cell
-from robomme_interference_data.evaluate.score.tables.equivalence import BEYOND, EQUIVALENT, OPEN
+from robomme_interference_data.evaluate.score.tables.cells import SuccessCell
+from robomme_interference_data.evaluate.score.tables.contrast import START, Contrast, Role
 from robomme_interference_data.evaluate.systems import display_name, published_base
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.stats.intervals import wilson
@@ -14,8 +13,7 @@ from robomme_interference_data.stats.significance import ALPHA, holm
 from robomme_interference_data.stats.signs import simultaneous
 from robomme_interference_data.viz.tables import percent, points
 
-from .offline import offline_headline
-from .strongest import named, shown
+from .strongest import difference_text, named
 
 
 def headline(score: Score, simulator: str) -> str:
@@ -26,26 +24,36 @@ def headline(score: Score, simulator: str) -> str:
     of the leader. A reference leads only if there is no other system.
     """
     if score.recordings is not None and simulator == score.recordings.simulator:
+        from .offline import offline_headline  # few scores have any
+
         return offline_headline(score)
-    found = [one for one in score.cells if one.simulator == simulator and not one.part]
-    cells = [cell for cell in found if not cell.reference] or found
+    own = [cell for cell in score.cells if cell.simulator == simulator and not cell.part]
+    cells = [cell for cell in own if not cell.reference] or own
     complete = [cell for cell in cells if cell.complete]
-    sentences = _leading(score, complete) if complete else [_nothing_complete(cells)]
-    if not all(cell.complete for cell in found):
-        done = sum(cell.complete for cell in found)
-        sentences.append(f"{done} of {len(found)} cells are complete.")
+    if complete:
+        # Where only references have rows, none is left out.
+        left_out = [cell for cell in own if cell.complete and cell not in complete]
+        sentences = _leading(score, complete, left_out)
+    else:
+        sentences = [_nothing_complete(cells)]
+    if not all(cell.complete for cell in own):
+        done = sum(cell.complete for cell in own)
+        sentences.append(f"{done} of {len(own)} cells are complete.")
     return " ".join(sentences)
 
 
-def _leading(score: Score, complete: Sequence[Cell]) -> list[str]:
+def _leading(
+    score: Score, complete: Sequence[SuccessCell], references: Sequence[SuccessCell]
+) -> list[str]:
     """State the best rate at k0 and how far it falls, or else the best rate."""
     best = _best(complete, START) or _best(complete, _best(complete)[0].condition)
     leader = best[0]
-    key = ("effects", leader.simulator, leader.system, (leader.system, START))
     falls = [
-        c
-        for c in score.contrasts
-        if (c.table, c.simulator, c.system, c.against) == key and c.pairs.n
+        contrast
+        for contrast in score.contrasts
+        if contrast.role is Role.SESSIONS
+        and (contrast.simulator, contrast.system) == (leader.simulator, leader.system)
+        and contrast.pairs.n
     ]
     rate = (
         f"In {leader.simulator}, {display_name(leader.system)} succeeds in {percent(leader.rate)} "
@@ -55,31 +63,51 @@ def _leading(score: Score, complete: Sequence[Cell]) -> list[str]:
     if leader.condition != START or not falls:
         first = f"{rate}under {named(leader.condition)} ({interval})."
         return [first, *_tied(complete, leader), *_hurting(score, leader)]
-    fall = max(falls, key=lambda one: parse_condition(one.condition).k)
+    fall = max(falls, key=lambda contrast: parse_condition(contrast.condition).k)
     first = f"{rate}if the history holds only the lesson ({START}, {interval}), "
     sentences = [first + _from_start(score, fall), *_tied(complete, leader)]
     if fall.complete:
         highest = _best(complete, fall.condition)[0]
         if highest.system != leader.system:
-            highest_rate = f"{percent(highest.rate)}, of {display_name(highest.system)}"
-            sentences.append(f"The highest rate at {fall.condition} is {highest_rate}.")
+            sentences.append(_highest(highest, references))
         sentences += _tied(complete, highest)
     sentences += _equal(score, fall) + _beside_base(score, fall)
     return sentences + _hurting(score, leader)
 
 
-def _chosen_interval(leader: Cell, complete: Sequence[Cell]) -> str:
+def _highest(highest: SuccessCell, references: Sequence[SuccessCell]) -> str:
+    """State the highest rate of a condition, and which references it leaves out."""
+    rate = f"{percent(highest.rate)}, of {display_name(highest.system)}"
+    text = f"The highest rate at {highest.condition} is {rate}"
+    higher = [
+        cell
+        for cell in references
+        if cell.condition == highest.condition and cell.rate > highest.rate
+    ]
+    if not higher:
+        return f"{text}."
+    names = _listed(higher)
+    be = "is" if len(higher) == 1 else "are"
+    return f"{text}, without the references, of which {names} {be} higher."
+
+
+def _chosen_interval(leader: SuccessCell, complete: Sequence[SuccessCell]) -> str:
     """Return the interval of the leader's rate, corrected for its choice among all systems."""
-    among = sum(cell.condition == leader.condition for cell in complete)
-    level = simultaneous(among)
-    low, high = wilson(leader.rate * leader.trials, leader.trials, level)
-    chosen = f", corrected for the choice among {among} systems" * (among > 1)
-    return f"95% interval {100 * low:.1f} to {100 * high:.1f}{chosen}"
+    systems = sum(cell.condition == leader.condition for cell in complete)
+    low, high = wilson(leader.rate * leader.trials, leader.trials, simultaneous(systems))
+    interval = f"95% interval {100 * low:.1f} to {100 * high:.1f}"
+    if systems > 1:
+        interval += f", corrected for the choice among {systems} systems"
+    return interval
 
 
-def _tied(complete: Sequence[Cell], first: Cell) -> list[str]:
+def _tied(complete: Sequence[SuccessCell], first: SuccessCell) -> list[str]:
     """Name the other systems that are not distinguishable from the best of a condition."""
-    cells = [c for c in complete if c.best and c.condition == first.condition and c is not first]
+    cells = [
+        cell
+        for cell in complete
+        if cell.best and cell.condition == first.condition and cell is not first
+    ]
     if not cells:
         return []
     be = "is" if len(cells) == 1 else "are"
@@ -87,12 +115,12 @@ def _tied(complete: Sequence[Cell], first: Cell) -> list[str]:
     return [f"Under {named(first.condition)}, {names}."]
 
 
-def _listed(cells: Sequence[Cell]) -> str:
+def _listed(cells: Sequence[SuccessCell]) -> str:
     *names, last = (display_name(cell.system) for cell in cells)
     return f"{', '.join(names)} and {last}" if names else last
 
 
-def _nothing_complete(cells: Sequence[Cell]) -> str:
+def _nothing_complete(cells: Sequence[SuccessCell]) -> str:
     counting = [cell for cell in cells if cell.n]
     if not counting:
         return f"In {cells[0].simulator}, no rollout counts yet."
@@ -107,37 +135,42 @@ def _nothing_complete(cells: Sequence[Cell]) -> str:
 
 def _from_start(score: Score, fall: Contrast) -> str:
     """State the leader's rate under a condition, and its fall among the falls of all systems."""
-    key = (fall.simulator, fall.condition, "effects")
     falls = [
-        one
-        for one in score.contrasts
-        if (one.simulator, one.condition, one.table) == key
-        and one.against == (one.system, START)
-        and (one is fall or one.complete)
-        and not (score.is_reference(one.simulator, one.system) and one is not fall)
+        contrast
+        for contrast in score.contrasts
+        if contrast.role is Role.SESSIONS
+        and (contrast.simulator, contrast.condition) == (fall.simulator, fall.condition)
+        and (contrast is fall or contrast.complete)
+        and (contrast is fall or not score.is_reference(contrast.simulator, contrast.system))
     ]
     k, pairs = parse_condition(fall.condition).k, fall.pairs
-    sessions = "distractor session" + ("s" if k > 1 else "")
+    sessions = "distractor session" if k == 1 else "distractor sessions"
     over = "" if fall.complete else f", incomplete, over its {pairs.n} episodes"
     counts = f"{pairs.gained} episodes gained, {pairs.lost} lost"
     return (
         f"and in {percent(pairs.second)} with {k} {sessions} after it ({fall.condition}{over}): "
-        f"{shown(fall, falls, 'the falls of {} systems', counts)}."
+        f"{difference_text(fall, falls, 'the falls of {} systems', counts)}."
     )
 
 
-def _hurting(score: Score, leader: Cell) -> list[str]:
+def _hurting(score: Score, leader: SuccessCell) -> list[str]:
     """Name the largest loss of the leader under conditions beyond the paper's."""
-    key = ("interference", leader.simulator, leader.system)
-    found = [c for c in score.contrasts if (c.table, c.simulator, c.system) == key and c.complete]
-    worst = min(found, key=lambda one: one.pairs.change.value, default=None)
+    effects = [
+        contrast
+        for contrast in score.contrasts
+        if contrast.role is Role.INTERFERENCE
+        and (contrast.simulator, contrast.system) == (leader.simulator, leader.system)
+        and contrast.complete
+    ]
+    worst = min(effects, key=lambda effect: effect.pairs.change.value, default=None)
     if worst is None or worst.pairs.change.value >= 0:
         return []
-    p = holm([one.pairs.p for one in found])[found.index(worst)]
+    p = holm([effect.pairs.p for effect in effects])[effects.index(worst)]
     loss = "largest loss is by" if p < ALPHA else "largest loss, which is not significant, is by"
+    change = difference_text(worst, effects, "{} comparisons")
     return [
         f"Under the conditions beyond the paper's, its {loss} {worst.asks}: {worst.condition} "
-        f"minus {named(worst.against[1])} is {shown(worst, found, '{} comparisons')}."
+        f"minus {named(worst.against[1])} is {change}."
     ]
 
 
@@ -145,30 +178,40 @@ def _equal(score: Score, fall: Contrast) -> list[str]:
     """State whether the leader's rate under a condition is equivalent to that at k0."""
     if "equivalence" not in score.tables:
         return []
+    from robomme_interference_data.evaluate.score.tables.equivalence import BEYOND, EQUIVALENT, OPEN
+
     sentences = []
     key = {"simulator": fall.simulator, "system": fall.system, "condition": fall.condition}
-    for one in score.tables["equivalence"].records():
-        if key.items() <= one.items() and one["against_condition"] == START:
-            margin = f"{100 * one['margin']:g}"
-            bounds = f"90% interval {points(one['low_90'])} to {points(one['high_90'])}"
-            whose = "its own" if one["against_system"] == fall.system else ""
-            whose = whose or f"{display_name(one['against_system'])}'s"
-            whose += " published" * (one["against_rows"] == "published")
-            shown = {
-                EQUIVALENT: f"is equivalent to {whose} {START} within ±{margin} points",
-                BEYOND: f"is more than {margin} points from {whose} {START}",
-                OPEN: f"is not shown to be within ±{margin} points of {whose} {START}",
-            }[one["verdict"].rstrip("†")]
-            early = ", provisional" * one["verdict"].endswith("†")
-            sentences.append(f"Its {fall.condition} {shown} ({bounds}{early}).")
+    for record in score.tables["equivalence"].records():
+        if not (key.items() <= record.items() and record["against_condition"] == START):
+            continue
+        margin = f"{100 * record['margin']:g}"
+        bounds = f"90% interval {points(record['low_90'])} to {points(record['high_90'])}"
+        if record["against_system"] == fall.system:
+            whose = "its own"
+        else:
+            whose = f"{display_name(record['against_system'])}'s"
+        if record["against_rows"] == "published":
+            whose += " published"
+        verdict = {
+            EQUIVALENT: f"is equivalent to {whose} {START} within ±{margin} points",
+            BEYOND: f"is more than {margin} points from {whose} {START}",
+            OPEN: f"is not shown to be within ±{margin} points of {whose} {START}",
+        }[record["verdict"].rstrip("†")]
+        if record["verdict"].endswith("†"):
+            bounds += ", provisional"
+        sentences.append(f"Its {fall.condition} {verdict} ({bounds}).")
     return sentences
 
 
 def _beside_base(score: Score, contrast: Contrast) -> list[str]:
     """State the published fall of the system without retrieval."""
     base = published_base(contrast.system)
-    key = (contrast.simulator, base)
-    rates = {c.condition: c.rate for c in score.published if (c.simulator, c.system) == key}
+    rates = {
+        cell.condition: cell.rate
+        for cell in score.published
+        if (cell.simulator, cell.system) == (contrast.simulator, base)
+    }
     if not {START, contrast.condition} <= {*rates}:
         return []
     return [
@@ -177,8 +220,8 @@ def _beside_base(score: Score, contrast: Contrast) -> list[str]:
     ]
 
 
-def _best(cells: Sequence[Cell], condition: str | None = None) -> list[Cell]:
+def _best(cells: Sequence[SuccessCell], condition: str | None = None) -> list[SuccessCell]:
     """Return the cells of the highest rate, in the order of tables, under one condition or all."""
-    found = [cell for cell in cells if condition in (None, cell.condition)]
-    highest = max((cell.rate for cell in found), default=math.nan)
-    return [cell for cell in found if cell.rate == highest]
+    candidates = [cell for cell in cells if condition in (None, cell.condition)]
+    highest = max((cell.rate for cell in candidates), default=math.nan)
+    return [cell for cell in candidates if cell.rate == highest]

@@ -1,14 +1,16 @@
 """The methods of a score as a paragraph for a paper, with its citations."""
 
+import math
 import re
 from importlib import resources
 from typing import Any
 
 import numpy as np
 
-from robomme_interference_data.evaluate.score.comparisons import families
 from robomme_interference_data.evaluate.score.outcomes import Outcomes
 from robomme_interference_data.evaluate.score.scoring import Score
+from robomme_interference_data.evaluate.score.tables import families
+from robomme_interference_data.evaluate.score.tables.contrast import Measure
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.viz.templates import fill
 
@@ -22,20 +24,14 @@ def methods(score: Score) -> tuple[str, str]:
 
     It names only methods that a table of the score uses.
     """
-    intervals = {
-        record["interval"]
-        for table in score.tables.values()
-        for record in table.records()
-        if record.get("interval")
-    }
-    lifts = score.tables["lift"].records() if "lift" in score.tables else []
+    successes = [one for one in score.contrasts if one.measure is Measure.SUCCESS]
     values: dict[str, Any] = {
         "parts": [_part(score, outcomes) for outcomes in score.outcomes.values()],
         "offline": None if score.recordings is None else _offline(score, score.recordings),
-        "repeats": "noise" in score.tables,
+        "repeats": any(outcomes.repeat_flips[0] for outcomes in score.outcomes.values()),
         "tables": set(score.tables),
-        "intervals": intervals,
-        "retention": any(one["retention"] is not None for one in lifts),
+        "intervals": {one.pairs.method for one in successes},
+        "retention": any(not math.isnan(one.retention.value) for one in successes),
         "margin": score.settings.margin,
         "draws": score.draws,
         "family_draws": families.DRAWS,
@@ -46,8 +42,8 @@ def methods(score: Score) -> tuple[str, str]:
     cited = set(_CITED.findall(text))
     file = resources.files(__package__).joinpath("data", "methods.bib")
     entries = file.read_text(encoding="utf-8").strip().split("\n\n")
-    chosen = [one for one in entries if one.partition("{")[2].partition(",")[0] in cited]
-    return text, "\n\n".join(chosen) + "\n"
+    entries = [entry for entry in entries if entry.partition("{")[2].partition(",")[0] in cited]
+    return text, "\n\n".join(entries) + "\n"
 
 
 def _offline(score: Score, recordings: Outcomes) -> dict[str, Any]:
@@ -65,17 +61,17 @@ def _offline(score: Score, recordings: Outcomes) -> dict[str, Any]:
 
 def _part(score: Score, outcomes: Outcomes) -> dict[str, Any]:
     present = np.flatnonzero(outcomes.has_episode.any(axis=0)).tolist()
-    cells = [one for one in score.cells if one.simulator == outcomes.simulator and not one.part]
+    cells = [cell for cell in score.cells if cell.simulator == outcomes.simulator and not cell.part]
     return {
         "simulator": outcomes.simulator,
         "asked": bool((outcomes.chance >= 0).any()),
         "systems": list(map(display_name, outcomes.systems)),
-        "conditions": list(dict.fromkeys(one.condition for one in cells if one.n)),
-        "rollouts": sum(sum(one.counts) for one in cells),
+        "conditions": list(dict.fromkeys(cell.condition for cell in cells if cell.n)),
+        "rollouts": sum(sum(cell.counts) for cell in cells),
         "episodes": len(present),
         "families": len({outcomes.episodes[place].family for place in present}),
         "seeds": len(outcomes.model_seeds),
-        "complete": sum(one.complete for one in cells),
+        "complete": sum(cell.complete for cell in cells),
         "cells": len(cells),
-        "errors": sum(one.errors for one in cells),
+        "errors": sum(cell.errors for cell in cells),
     }

@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 
-from robomme_interference_data.evaluate.score.comparisons.offline import CHANGES, SYSTEMS
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.action_error import ErrorCell
+from robomme_interference_data.evaluate.score.tables.contrast import Measure
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.schema.conditions import NO_HISTORY, parse_condition
 
@@ -29,7 +29,7 @@ def offline_headline(score: Score) -> str:
     with_history = {cell.system for cell in cells if cell.condition != NO_HISTORY}
     lone = [cell for cell in complete if cell.system not in with_history]
     if lone and with_history:
-        listed = ", ".join(f"{display_name(one.system)} {one.error.value:.4f}" for one in lone)
+        listed = ", ".join(f"{display_name(cell.system)} {cell.error.value:.4f}" for cell in lone)
         sentences.append(f"Without history: {listed}.")
     if len(complete) < len(cells):
         sentences.append(f"{len(complete)} of {len(cells)} cells are complete.")
@@ -62,7 +62,7 @@ def _better_without(score: Score, cell: ErrorCell) -> str:
     for contrast in score.contrasts:
         (against, condition), pairs = contrast.against, contrast.pairs
         if (
-            contrast.table in (CHANGES, SYSTEMS)
+            contrast.measure is Measure.ACTION_ERROR
             and (contrast.system, contrast.condition) == (cell.system, cell.condition)
             and condition == NO_HISTORY
             and contrast.complete

@@ -16,14 +16,13 @@ import numpy as np
 
 from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.evaluate.run.log import RunHeader
-from robomme_interference_data.evaluate.score.comparisons import offline
-from robomme_interference_data.evaluate.score.comparisons.contrast import START
 from robomme_interference_data.evaluate.score.config import Expected
 from robomme_interference_data.evaluate.score.outcomes import STATUSES, mean_errors, success
 from robomme_interference_data.evaluate.score.plots.data import FEW
 from robomme_interference_data.evaluate.score.plots.figures import FIGURES
 from robomme_interference_data.evaluate.score.rows.reading import Rows
 from robomme_interference_data.evaluate.score.scoring import Score
+from robomme_interference_data.evaluate.score.tables.contrast import START
 from robomme_interference_data.evaluate.systems import SYSTEMS, display_name
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import in_order, parse_condition
@@ -38,19 +37,19 @@ _LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
 """Libraries that numbers and figures depend on."""
 
 _SHOWN_IN = {
-    "effects": ("lift", "effects"),
+    "effects": ("effects",),
     "success": ("main", "chance", "paper"),
-    "families": ("family", "paper_family"),
-    "heatmap": ("family",),
-    "difficulty": ("difficulty",),
-    "retention": ("lift",),
-    "retrieval": ("effects", "family"),
+    "families": ("parts",),
+    "heatmap": ("parts",),
+    "difficulty": ("parts",),
+    "retention": ("effects",),
+    "retrieval": ("effects", "parts"),
     "kinds": ("main",),
-    "interference": ("interference",),
-    "by_evidence_kept": ("by_evidence_kept", "evidence_effects", "evidence_use"),
-    "ceiling": ("ceiling",),
-    "matrix": ("matrix", "systems", "ranks"),
-    "action_error": ("action_error", offline.CHANGES, offline.SYSTEMS),
+    "interference": ("effects",),
+    "by_evidence_kept": ("evidence_effects", "evidence_use"),
+    "ceiling": ("effects",),
+    "matrix": ("matrix", "main"),
+    "action_error": ("action_error", "action_error_effects"),
 }
 """Figure to the tables with its numbers."""
 
@@ -64,11 +63,11 @@ def write_report(
     score: Score, figures: Mapping[str, Path], out: Path, command: str | None = None
 ) -> None:
     """Write the page: the same bytes for the same rows, options and command."""
-    names = {name for one in score.every for name in one.conditions}
-    conditions = [one.name for one in in_order(names)] if names else []
+    names = {name for outcomes in score.all_outcomes for name in outcomes.conditions}
+    conditions = [condition.name for condition in in_order(names)] if names else []
     values = {
         "headlines": headlines(score),
-        "strongest": {one.simulator: strongest(score, one.simulator) for one in score.every},
+        "strongest": {name: strongest(score, name) for name in _simulators(score)},
         "grids": score.grids,
         "tables": score.tables.values(),
         "systems": _names(score),
@@ -90,13 +89,17 @@ def write_report(
 
 def headlines(score: Score) -> dict[str, str]:
     """Return the main finding of each simulator, and of recordings."""
-    return {one.simulator: headline(score, one.simulator) for one in score.every}
+    return {name: headline(score, name) for name in _simulators(score)}
+
+
+def _simulators(score: Score) -> list[str]:
+    return [outcomes.simulator for outcomes in score.all_outcomes]
 
 
 def _number(text: str) -> str:
     """Return the sort key of a cell of a grid; empty without a rate."""
-    found = re.match(r"\**([0-9.]+)", text)
-    return found[1] if found else ""
+    match = re.match(r"\**([0-9.]+)", text)
+    return match[1] if match else ""
 
 
 def _numbers(table: Table) -> list[str]:
@@ -106,33 +109,34 @@ def _numbers(table: Table) -> list[str]:
 
 def _leader(score: Score) -> str:
     """Return the system that figures highlight initially; none if there are few."""
-    best = [c.system for c in score.cells if c.rank == 1 and not c.part and c.condition == START]
-    return (
-        best[0]
-        if best and max(len(outcomes.systems) for outcomes in score.outcomes.values()) > FEW
-        else ""
-    )
+    best = [
+        cell.system
+        for cell in score.cells
+        if cell.rank == 1 and not cell.part and cell.condition == START
+    ]
+    most = max((len(outcomes.systems) for outcomes in score.outcomes.values()), default=0)
+    return best[0] if best and most > FEW else ""
 
 
 def _inline(figures: Mapping[str, Path]) -> dict[str, str]:
     """Return SVGs for one page: ids are unique, and drawn elements carry their system."""
-    found = {}
+    inlined = {}
     for number, (name, path) in enumerate(figures.items()):
-        kind, _, simulator = name.partition("-")
+        figure, _, simulator = name.partition("-")
         text = path.read_text(encoding="utf-8")
         text = text[text.index("<svg") :]
         text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
         text = re.sub(r'id="system:([^":]*):[0-9]+"', r'data-system="\1"', text)
         text = re.sub(r' id="image[0-9a-f]+"', "", text)  # equal images share one
         text = re.sub(r'( id="|href="#|url\(#)', rf"\g<1>f{number}-", text)
-        label = escape(f"{FIGURES[kind]}, {simulator}")
-        found[name] = text.replace("<svg", f'<svg role="img" aria-label="{label}"', 1)
-    return found
+        label = escape(f"{FIGURES[figure]}, {simulator}")
+        inlined[name] = text.replace("<svg", f'<svg role="img" aria-label="{label}"', 1)
+    return inlined
 
 
 def _names(score: Score) -> dict[str, str]:
     """Return the display names of the systems that have rows."""
-    systems = {one: None for outcomes in score.every for one in outcomes.systems}
+    systems = dict.fromkeys(name for each in score.all_outcomes for name in each.systems)
     return {system: display_name(system) for system in systems}
 
 
@@ -148,7 +152,7 @@ def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
     """
     videos = _videos(score.rows)
     rows = []
-    for outcomes in score.every:
+    for outcomes in score.all_outcomes:
         errors = mean_errors(outcomes.action_l1)
         for place, system in enumerate(outcomes.systems):
             counts = outcomes.counts[place].transpose(1, 0, 2).tolist()
@@ -162,15 +166,18 @@ def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
                         outcomes.conditions, counts[number], measured[number], strict=True
                     )
                 }
-                found = [
+                shown = [
                     videos.get((outcomes.simulator, system, c, str(episode))) for c in conditions
                 ]
                 row = (
-                    *(outcomes.simulator, system, episode.family),
-                    *(f"{episode.split}/{episode.index}", DIFFICULTIES[hard] if hard >= 0 else ""),
+                    outcomes.simulator,
+                    system,
+                    episode.family,
+                    f"{episode.split}/{episode.index}",
+                    DIFFICULTIES[hard] if hard >= 0 else "",
                     [came.get(c, "") for c in conditions],
                     flips(outcomes.conditions, rates[number]),
-                    [_address(one, folder) if one else "" for one in found],
+                    [_address(video, folder) if video else "" for video in shown],
                 )
                 rows.append(row)
     data = {"names": _names(score), "rows": rows}
@@ -204,13 +211,13 @@ def _outcome(counts: Sequence[int], action_l1: float) -> str:
 
 def _videos(rows: Rows) -> dict[tuple[str, ...], Path]:
     """Return the existing videos of the lowest model seeds, by rollout."""
-    found: dict[tuple[str, ...], Path] = {}
-    for row in sorted(rows, key=lambda one: one.model_seed):
+    videos: dict[tuple[str, ...], Path] = {}
+    for row in sorted(rows, key=lambda row: row.model_seed):
         episode = f"{row.family}/{row.split}/{row.episode}"
         key = (row.simulator, row.system, row.condition, episode)
-        if row.video and key not in found and row.video.is_file():
-            found[key] = row.video
-    return found
+        if row.video and key not in videos and row.video.is_file():
+            videos[key] = row.video
+    return videos
 
 
 # --- how it was made ---------------------------------------------------------------------------

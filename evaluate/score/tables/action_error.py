@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robomme_interference_data.evaluate.score.outcomes import Outcomes, mean_errors
+from robomme_interference_data.evaluate.score.outcomes import Flags, Outcomes, mean_errors
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.stats.bootstrap import (
     MIN_EPISODES,
@@ -14,9 +14,10 @@ from robomme_interference_data.stats.bootstrap import (
     bootstrap,
     known_interval,
 )
-from robomme_interference_data.viz.tables import Table
+from robomme_interference_data.viz.tables import Columns, Table
 
-from .cells import NOT_EXPECTED, Coverage, coverage_of
+from .cells import EPISODES, NOT_EXPECTED, Coverage, coverage_of, episodes_record
+from .comparison import record_table
 
 _NOTE = (
     "Mean absolute difference of actions to the recorded ones over the n episodes that count, in "
@@ -37,8 +38,9 @@ class ErrorCell(Coverage):
 def error_cells(outcomes: Outcomes, draws: int) -> list[ErrorCell]:
     """Return the cells of every system and condition, each followed by its families."""
     errors = mean_errors(outcomes.action_l1)
-    every = np.ones(len(outcomes.episodes), bool)
-    parts = {"": every} | {name: outcomes.of_family(name) for name in outcomes.families}
+    everywhere: Flags = np.ones(len(outcomes.episodes), bool)
+    parts = {"": everywhere}
+    parts |= {family: outcomes.of_family(family) for family in outcomes.families}
     places = np.argwhere(outcomes.due).tolist()
     intervals = {
         part: bootstrap(
@@ -65,47 +67,48 @@ def error_cells(outcomes: Outcomes, draws: int) -> list[ErrorCell]:
     return cells
 
 
+_COLUMNS: Columns = {
+    "system": "text",
+    "condition": "text",
+    "family": "text",
+    "n": "count",
+    "action_l1": "number",
+    "low": "number",
+    "high": "number",
+    "errors": "count",
+    "missing": "count",
+    "complete": "flag",
+}
+_COLUMNS |= EPISODES
+
+
 def error_table(cells: Sequence[ErrorCell]) -> Table:
     """Return a row for each cell."""
-    return Table(
-        "action_error",
-        "Action error offline",
-        {
-            "system": "text",
-            "condition": "text",
-            "family": "text",
-            "n": "count",
-            "action_l1": "number",
-            "low": "number",
-            "high": "number",
-            "errors": "count",
-            "missing": "count",
-            "complete": "flag",
-        },
-        [
-            (
-                cell.system,
-                cell.condition,
-                cell.part or "all",
-                cell.n,
-                *cell.error,
-                cell.errors,
-                len(cell.missing),
-                cell.complete,
-            )
-            for cell in cells
-        ],
-        _NOTE,
-    )
+    records = []
+    for cell in cells:
+        record = {
+            "system": cell.system,
+            "condition": cell.condition,
+            "family": cell.part or "all",
+            "n": cell.n,
+            "action_l1": cell.error.value,
+            "low": cell.error.low,
+            "high": cell.error.high,
+            "errors": cell.errors,
+            "missing": len(cell.missing),
+            "complete": cell.complete,
+        }
+        records.append(record | episodes_record(cell, listed=bool(cell.part)))
+    return record_table("action_error", "Action error offline", _COLUMNS, records, _NOTE)
 
 
 def error_grid(outcomes: Outcomes, cells: Sequence[ErrorCell]) -> Table:
     """Return a row for each system and a column for each condition."""
     at = {(cell.system, cell.condition): cell for cell in cells if not cell.part}
-    rows = [
-        (display_name(system), *(_shown(at.get((system, c))) for c in outcomes.conditions))
-        for system in outcomes.systems
-    ]
+    rows = []
+    for system in outcomes.systems:
+        texts = [_shown(at.get((system, condition))) for condition in outcomes.conditions]
+        rows.append([display_name(system), *texts])
     return Table(
         outcomes.simulator,
         f"Action error by system and condition, {outcomes.simulator}",

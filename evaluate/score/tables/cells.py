@@ -10,40 +10,52 @@ from typing import Any
 import numpy as np
 
 from robomme_interference_data.constants import DIFFICULTIES
-from robomme_interference_data.evaluate.score.comparisons.ranks import all_pairs, tied_with_best
-from robomme_interference_data.evaluate.score.comparisons.tables import columns_of
 from robomme_interference_data.evaluate.score.outcomes import (
     STATUSES,
     Flags,
     Outcomes,
-    Rate,
+    SuccessRate,
     rate_of,
 )
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.ids import EpisodeId, format_numbers
 from robomme_interference_data.schema.conditions import in_order
 from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.stats.bootstrap import Interval
 from robomme_interference_data.stats.intervals import wilson
 from robomme_interference_data.stats.strata import stratified_n
-from robomme_interference_data.viz.tables import Table, percent
+from robomme_interference_data.viz.tables import Columns, Table, percent
 
-_FAIL, _ERROR = (np.int8(STATUSES.index(one)) for one in (Status.FAIL, Status.ERROR))
+from .comparison import record_table
+from .ranks import Standing, all_pairs, standings
+
+_FAIL = np.int8(STATUSES.index(Status.FAIL))
+_ERROR = np.int8(STATUSES.index(Status.ERROR))
+
 _NOTE = (
     "Rates with 95% Wilson intervals. n: episodes that count; an error is neither success nor "
     "failure. †: the cell lacks episodes, or has episodes outside the grid, and is not ranked; a "
     "cell without any rollout is missing."
 )
-_ERRORS = (
-    " if errors fail: the rate if every error were a failure, the least that it can be if errors "
-    "depend on the outcome."
-)
 _BEST = (
-    " Best (bold, in text *): above zero, and no other system is significantly better, by p after "
+    "Best (bold, in text *): above zero, and no other system is significantly better, by p after "
     "Holm's correction over all pairs of systems."
 )
-_FIXED = (
-    " fixed low to fixed high: Wilson's interval for other episodes of the same families in the "
-    "same numbers, narrower because the families' rates differ."
+_MAIN_NOTE = (
+    "fixed low to fixed high: Wilson's interval for other episodes of the same families in the "
+    "same numbers, narrower because the families' rates differ. if errors fail: the rate if every "
+    "error were a failure, the least that it can be if errors depend on the outcome. rank low to "
+    "rank high: the ranks that the system can have, from the significant differences of the table "
+    "matrix (p holm below 0.05): 1 + the systems that are better, to the number of systems less "
+    "those that are worse; all of a condition hold at once with 95% confidence. difference: the "
+    "rate minus that of the best system, the highest (the first of equal ones); its interval, "
+    "difference low to difference high, and p holm are corrected over all pairs of systems, since "
+    "the best is chosen by its rate."
+)
+_PARTS_NOTE = (
+    "Rows of families list episodes, by split and index. An episode counts if one of its rollouts "
+    "is not an error. With "
+    "repeats, one that does not count with every model seed of the condition is missing."
 )
 
 NOT_EXPECTED = "n/a"
@@ -68,13 +80,6 @@ class Coverage:
     other: Sequence[EpisodeId] = field(default=(), kw_only=True)  # count without being expected
 
     @property
-    def part_of(self) -> str:
-        """The table of its row: `main`, `family` or `difficulty`."""
-        if self.part in ("", *DIFFICULTIES):
-            return "difficulty" if self.part else "main"
-        return "family"
-
-    @property
     def complete(self) -> bool:
         """Whether exactly the expected episodes count, with every model seed."""
         return self.n > 0 and not self.missing and not self.other
@@ -91,7 +96,7 @@ class Coverage:
 
 
 @dataclass(frozen=True)
-class Cell(Coverage):
+class SuccessCell(Coverage):
     """The success rate of one system under one condition, in all or some of the episodes."""
 
     rate: float  # mean over them of the success of their repeats; NaN if n is 0
@@ -102,11 +107,12 @@ class Cell(Coverage):
     chance: float = math.nan  # mean success of guessing; NaN unless all episodes are questions
     rank: int | None = None  # among complete cells, 1 for the highest rate; None for references
     best: bool = False  # one of several, and no other one is significantly better
+    standing: Standing | None = None  # among the ranked systems; None if there are no others
 
     @property
-    def as_rate(self) -> Rate:
+    def as_rate(self) -> SuccessRate:
         """Its rate, for comparisons."""
-        return Rate(self.n, self.rate, self.trials)
+        return SuccessRate(self.n, self.rate, self.trials)
 
 
 def coverage_of(
@@ -118,149 +124,268 @@ def coverage_of(
         "reference": outcomes.is_reference(outcomes.systems[system]),
         "counts": tuple(counts[here].sum(axis=0).tolist()),
         "expected": int((due & outcomes.expected).sum()),
-        "missing": outcomes.chosen(due & outcomes.missing[system, condition]),
-        "broken": outcomes.chosen(here & (counts[:, _ERROR] > 0)),
-        "other": outcomes.chosen(here & outcomes.other[system, condition]),
+        "missing": outcomes.episodes_of(due & outcomes.missing[system, condition]),
+        "broken": outcomes.episodes_of(here & (counts[:, _ERROR] > 0)),
+        "other": outcomes.episodes_of(here & outcomes.other[system, condition]),
     }
 
 
-def cells_of(every: Iterable[Outcomes]) -> list[Cell]:
+def cells_of(all_outcomes: Iterable[Outcomes]) -> list[SuccessCell]:
     """Return the cells of every system and condition, in the order of tables.
 
     Each cell is followed by its parts by family and by difficulty. An expected episode of unknown
     difficulty is missing in all three difficulties.
     """
-    return [cell for outcomes in every for cell in _cells(outcomes)]
+    return [cell for outcomes in all_outcomes for cell in _cells(outcomes)]
 
 
-def _cells(outcomes: Outcomes) -> list[Cell]:
-    every: Flags = np.ones(len(outcomes.episodes), bool)
-    parts = {"": (every, every)}  # name to its episodes, and to those that are expected in it
-    parts |= {
-        name: (here, here) for name in outcomes.families for here in [outcomes.of_family(name)]
-    }
-    for place, name in enumerate(DIFFICULTIES):
+def _cells(outcomes: Outcomes) -> list[SuccessCell]:
+    everywhere: Flags = np.ones(len(outcomes.episodes), bool)
+    # Name of a part to its episodes, and to those that are expected in it.
+    parts = {"": (everywhere, everywhere)}
+    for family in outcomes.families:
+        here = outcomes.of_family(family)
+        parts[family] = (here, here)
+    for place, difficulty in enumerate(DIFFICULTIES):
         here = outcomes.difficulty == place
-        parts[name] = (here, here | (outcomes.difficulty < 0))
+        parts[difficulty] = (here, here | (outcomes.difficulty < 0))
     cells = []
     for s, c in np.argwhere(outcomes.due).tolist():
-        for name, (here, due) in parts.items():
+        for part, (here, due) in parts.items():
             if not ((here & outcomes.has_episode[s]) | (due & outcomes.expected)).any():
                 continue
             counted = here & outcomes.counted[s, c]
             status = outcomes.status[s, c, here]
             rate = rate_of(status)
-            names = (outcomes.simulator, outcomes.systems[s], outcomes.conditions[c], name)
+            fixed = (math.nan, math.nan) if part else _fixed(outcomes, s, c, rate)
             cells.append(
-                Cell(
-                    *(*names, rate.n, rate.value, rate.interval, rate.trials),
-                    fixed=(math.nan, math.nan) if name else _fixed(outcomes, s, c, rate),
+                SuccessCell(
+                    outcomes.simulator,
+                    outcomes.systems[s],
+                    outcomes.conditions[c],
+                    part,
+                    rate.n,
+                    rate.value,
+                    rate.interval,
+                    rate.trials,
+                    fixed=fixed,
                     if_errors_fail=rate_of(np.where(status == _ERROR, _FAIL, status)).value,
                     chance=float(outcomes.chance[counted].mean()) if rate.n else math.nan,
                     **coverage_of(outcomes, s, c, here, due),
                 )
             )
-    return _ranked(outcomes, cells, {name: here for name, (here, _) in parts.items()})
+    return _ranked(outcomes, cells, {part: here for part, (here, _) in parts.items()})
 
 
-def _fixed(outcomes: Outcomes, system: int, condition: int, rate: Rate) -> tuple[float, float]:
+def _fixed(
+    outcomes: Outcomes, system: int, condition: int, rate: SuccessRate
+) -> tuple[float, float]:
     """Return the interval of a rate for its families as fixed strata; none for one family."""
     status = outcomes.status[system, condition]
-    parts = [rate_of(status[outcomes.of_family(name)]) for name in outcomes.families]
-    parts = [part for part in parts if part.n]
-    if len(parts) < 2:
+    by_family = [rate_of(status[outcomes.of_family(name)]) for name in outcomes.families]
+    by_family = [family for family in by_family if family.n]
+    if len(by_family) < 2:
         return math.nan, math.nan
-    n = np.array([part.n for part in parts], float)
-    trials = stratified_n(n * [part.value for part in parts], n)
+    n = np.array([family.n for family in by_family], float)
+    trials = stratified_n(n * [family.value for family in by_family], n)
     trials *= rate.trials / rate.n
     return wilson(rate.value * trials, trials)
 
 
-def _ranked(outcomes: Outcomes, cells: list[Cell], parts: Mapping[str, Flags]) -> list[Cell]:
+def _ranked(
+    outcomes: Outcomes, cells: list[SuccessCell], parts: Mapping[str, Flags]
+) -> list[SuccessCell]:
+    """Return the cells with their ranks: complete ones, of systems that are no references."""
     groups = defaultdict[tuple[str, str], list[int]](list)
     for place, cell in enumerate(cells):
         if cell.complete and not cell.reference:
             groups[cell.condition, cell.part].append(place)
     for (condition, part), places in groups.items():
-        group = [cells[place] for place in places]
-        systems = [cell.system for cell in group]
-        best = tied_with_best(systems, all_pairs(outcomes, condition, systems, parts[part]))
-        for place, cell in zip(places, group, strict=True):
-            rank = 1 + sum(other.rate > cell.rate for other in group)
-            cells[place] = replace(cell, rank=rank, best=cell.system in best and cell.rate > 0)
+        if len(places) == 1:
+            cells[places[0]] = replace(cells[places[0]], rank=1)
+            continue
+        rates = {cells[place].system: cells[place].rate for place in places}
+        compared = all_pairs(outcomes, condition, [*rates], parts[part])
+        standing_of = standings(rates, compared)
+        for place in places:
+            cell = cells[place]
+            standing = standing_of[cell.system]
+            cells[place] = replace(
+                cell,
+                rank=standing.rank,
+                best=standing.tied_with_best and cell.rate > 0,
+                standing=standing,
+            )
     return cells
 
 
-def rate_table(cells: Sequence[Cell], name: str) -> Table:
-    """Return the table `main`, a row per cell, or of cells with rollouts `family`, `difficulty`."""
-    parts = name in ("family", "difficulty")
-    ran = {(c.simulator, c.system, c.condition) for c in cells if any(c.counts)}
-    rows = []
+_CELL: Columns = {"simulator": "text", "system": "text", "condition": "text"}
+
+_RATE: Columns = {"n": "count", "rate": "rate", "low": "rate", "high": "rate"}
+
+_COUNTS: Columns = {
+    "successes": "count",
+    "fails": "count",
+    "timeouts": "count",
+    "errors": "count",
+    "complete": "flag",
+    "missing": "count",
+    "rank": "count",
+    "best": "flag",
+}
+
+MAIN: Columns = (
+    _CELL
+    | _RATE
+    | {"fixed_low": "rate", "fixed_high": "rate", "if_errors_fail": "rate"}
+    | _COUNTS
+    | {
+        "rank_low": "count",
+        "rank_high": "count",
+        "best_system": "text",
+        "difference": "points",
+        "difference_low": "points",
+        "difference_high": "points",
+        "p_holm": "p",
+    }
+)
+
+EPISODES: Columns = {
+    "expected": "count",
+    "missing_episodes": "text",
+    "error_episodes": "text",
+    "other_episodes": "text",
+}
+"""Which episodes a cell lacks, which have errors, and which it has beyond the expected ones."""
+
+PARTS: Columns = _CELL | {"by": "text", "part": "text"} | _RATE | _COUNTS | EPISODES
+
+
+def main_table(cells: Sequence[SuccessCell]) -> Table:
+    """Return a row for each cell over all episodes."""
+    records = [_record(cell) | _standing(cell) for cell in cells if not cell.part]
+    note = f"{_NOTE} {_BEST} {_MAIN_NOTE}"
+    return record_table("main", "Success by system and condition", MAIN, records, note)
+
+
+def parts_table(cells: Sequence[SuccessCell]) -> Table:
+    """Return a row for each cell over a family, and over a difficulty; families come first."""
+    families, difficulties = list[dict[str, Any]](), list[dict[str, Any]]()
     for cell in cells:
-        key: tuple[str, ...] = (cell.simulator, cell.system, cell.condition)
-        if cell.part_of == name and not (parts and key not in ran):
-            key += (cell.part,) if parts else ()
-            bounds = cell.interval if cell.n else (math.nan, math.nan)
-            fixed = () if parts else (*cell.fixed, cell.if_errors_fail)
-            more = (cell.complete, len(cell.missing), cell.rank, cell.best)
-            rows.append((*key, cell.n, cell.rate, *bounds, *fixed, *cell.counts[:4], *more))
-    return Table(
-        name,
-        f"Success by {name if parts else 'system and condition'}",
-        columns_of(
-            f"simulator system condition {name if parts else ''} n:count rate:rate low:rate "
-            "high:rate "
-            f"{'' if parts else 'fixed_low:rate fixed_high:rate if_errors_fail:rate '}"
-            "successes:count fails:count timeouts:count errors:count complete:flag missing:count "
-            "rank:count best:flag"
-        ),
-        rows,
-        _NOTE + _BEST + (_FIXED + _ERRORS) * (not parts),
-    )
+        if cell.part in DIFFICULTIES:
+            record = _record(cell) | episodes_record(cell, listed=False)
+            difficulties.append(record | {"by": "difficulty"})
+        elif cell.part:
+            record = _record(cell) | episodes_record(cell, listed=True)
+            families.append(record | {"by": "family"})
+    note = f"{_NOTE} {_BEST} {_PARTS_NOTE}"
+    title = "Success by family and by difficulty"
+    return record_table("parts", title, PARTS, families + difficulties, note)
 
 
-def main_grids(cells: Sequence[Cell]) -> list[Table]:
+def _record(cell: SuccessCell) -> dict[str, Any]:
+    # The interval from 0 to 1 of a cell without episodes says nothing.
+    low, high = cell.interval if cell.n else (math.nan, math.nan)
+    successes, fails, timeouts, errors, _ = cell.counts
+    return {
+        "simulator": cell.simulator,
+        "system": cell.system,
+        "condition": cell.condition,
+        "part": cell.part,
+        "n": cell.n,
+        "rate": cell.rate,
+        "low": low,
+        "high": high,
+        "fixed_low": cell.fixed[0],
+        "fixed_high": cell.fixed[1],
+        "if_errors_fail": cell.if_errors_fail,
+        "successes": successes,
+        "fails": fails,
+        "timeouts": timeouts,
+        "errors": errors,
+        "complete": cell.complete,
+        "missing": len(cell.missing),
+        "rank": cell.rank,
+        "best": cell.best,
+    }
+
+
+def _standing(cell: SuccessCell) -> dict[str, Any]:
+    standing = cell.standing
+    behind = Interval(math.nan) if standing is None else standing.behind
+    return {
+        "rank_low": None if standing is None else standing.rank_low,
+        "rank_high": None if standing is None else standing.rank_high,
+        "best_system": "" if standing is None else standing.best_system,
+        "difference": behind.value,
+        "difference_low": behind.low,
+        "difference_high": behind.high,
+        "p_holm": math.nan if standing is None else standing.p_holm,
+    }
+
+
+def episodes_record(cell: Coverage, *, listed: bool) -> dict[str, Any]:
+    """Return the values of the columns `EPISODES`; only a cell of one family can list them."""
+    return {
+        "expected": cell.expected,
+        "missing_episodes": _numbers(cell.missing) if listed else "",
+        "error_episodes": _numbers(cell.broken) if listed else "",
+        "other_episodes": _numbers(cell.other) if listed else "",
+    }
+
+
+def _numbers(episodes: Iterable[EpisodeId]) -> str:
+    """Return episodes of one family as text, such as `test 0-3,7`."""
+    by_split: dict[str, list[int]] = {}
+    for episode in episodes:
+        by_split.setdefault(episode.split, []).append(episode.index)
+    return "; ".join(f"{split} {format_numbers(indices)}" for split, indices in by_split.items())
+
+
+def main_grids(cells: Sequence[SuccessCell]) -> list[Table]:
     """Return the paper's main table of each simulator: a row per system, a column per condition.
 
-    The best of a condition (see `Cell.best`) are bold, between `**`. If all rates have the same n,
-    only the note states it.
+    The best of a condition (see `SuccessCell.best`) are bold, between `**`. If all rates have the
+    same n, only the note states it.
     """
-    grids: list[Table] = []
     whole = [cell for cell in cells if not cell.part]
+    grids: list[Table] = []
     for simulator, group in groupby(whole, lambda cell: cell.simulator):
-        found = list(group)
-        conditions = [one.name for one in in_order({cell.condition for cell in found})]
-        at = {(cell.system, cell.condition): cell for cell in found}
-        episodes = {cell.n for cell in found if cell.n}
-        several = len(episodes) > 1
-        rows = [
-            (display_name(system), *(_shown(at.get((system, c)), several) for c in conditions))
-            for system in dict.fromkeys(cell.system for cell in found)
-        ]
-        errors = sum(cell.errors for cell in found)
-        references = dict.fromkeys(display_name(c.system) for c in found if c.reference)
-        notes = [] if several or not episodes else [f"n = {episodes.pop()} in each cell."]
+        own = list(group)
+        conditions = [condition.name for condition in in_order({cell.condition for cell in own})]
+        at = {(cell.system, cell.condition): cell for cell in own}
+        counts = {cell.n for cell in own if cell.n}
+        rows = []
+        for system in dict.fromkeys(cell.system for cell in own):
+            texts = [_shown(at.get((system, name)), with_n=len(counts) > 1) for name in conditions]
+            rows.append([display_name(system), *texts])
+        notes = []
+        if len(counts) == 1:
+            notes.append(f"n = {counts.pop()} in each cell.")
         if not grids:  # once for all grids
-            notes.append(_NOTE + _BEST * any(cell.best for cell in whole))
+            notes.append(_NOTE)
+            if any(cell.best for cell in whole):
+                notes.append(_BEST)
         if any(NOT_EXPECTED in row for row in rows):
             notes.append(
                 f"{NOT_EXPECTED}: the condition does not apply to the system, or is not expected."
             )
+        references = dict.fromkeys(display_name(cell.system) for cell in own if cell.reference)
         if references:
             notes.append(f"References, not ranked: {', '.join(references)}.")
-        if chances := [cell.chance for cell in found if not math.isnan(cell.chance)]:
-            levels = dict.fromkeys(percent(one(chances)) for one in (min, max))
+        chances = [cell.chance for cell in own if not math.isnan(cell.chance)]
+        if chances:
+            levels = dict.fromkeys([percent(min(chances)), percent(max(chances))])
             notes.append(f"Guessing succeeds in {' to '.join(levels)}: see the table chance.")
+        errors = sum(cell.errors for cell in own)
         notes.append(f"Errors: {errors}." if errors else "No errors.")
-        note = " ".join(notes)
         title = f"Success by system and condition, {simulator}"
-        grids.append(
-            Table(simulator, title, dict.fromkeys(["system", *conditions], "text"), rows, note)
-        )
+        columns: Columns = dict.fromkeys(["system", *conditions], "text")
+        grids.append(Table(simulator, title, columns, rows, " ".join(notes)))
     return grids
 
 
-def _shown(cell: Cell | None, with_n: bool) -> str:
+def _shown(cell: SuccessCell | None, *, with_n: bool) -> str:
     if cell is None:
         return NOT_EXPECTED
     errors = f", errors: {cell.errors}" if cell.errors else ""
@@ -270,44 +395,3 @@ def _shown(cell: Cell | None, with_n: bool) -> str:
     rate = f"**{percent(cell.rate)}**" if cell.best else percent(cell.rate)
     n = f" n={cell.n}" if with_n else ""
     return f"{rate}{cell.mark} [{100 * low:.1f}, {100 * high:.1f}]{n}{errors}"
-
-
-def coverage_table(cells: Iterable[Coverage]) -> Table:
-    """Return which episodes each cell of a family lacks, and which have errors."""
-    rows = [
-        (
-            *(cell.simulator, cell.system, cell.condition, cell.part, cell.expected, cell.n),
-            *(cell.errors, cell.complete),
-            *map(_numbers, (cell.missing, cell.broken, cell.other)),
-        )
-        for cell in cells
-        if cell.part_of == "family"
-    ]
-    return Table(
-        "coverage",
-        "Which episodes count",
-        {
-            "simulator": "text",
-            "system": "text",
-            "condition": "text",
-            "family": "text",
-            "expected": "count",
-            "n": "count",
-            "errors": "count",
-            "complete": "flag",
-            "missing_episodes": "text",
-            "error_episodes": "text",
-            "other_episodes": "text",
-        },
-        rows,
-        "Episodes by split and index. An episode counts if one of its rollouts is not an error. "
-        "With repeats, one that does not count with every model seed of the condition is missing.",
-    )
-
-
-def _numbers(episodes: Iterable[EpisodeId]) -> str:
-    """Return episodes of one family as text, such as `test 0-3,7`."""
-    found: dict[str, list[int]] = {}
-    for one in episodes:
-        found.setdefault(one.split, []).append(one.index)
-    return "; ".join(f"{split} {format_numbers(indices)}" for split, indices in found.items())

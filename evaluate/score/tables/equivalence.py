@@ -4,65 +4,96 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
-from robomme_interference_data.evaluate.score.comparisons.contrast import START, Contrast
-from robomme_interference_data.evaluate.score.comparisons.pairs import Pairs, compare_unpaired
-from robomme_interference_data.evaluate.score.comparisons.tables import (
-    CELLS,
-    TableSpec,
-    comparison_table,
-)
 from robomme_interference_data.evaluate.systems import published_base
-from robomme_interference_data.viz.tables import Table
+from robomme_interference_data.viz.tables import Columns, Table
 
-from .cells import Cell
+from .cells import SuccessCell
+from .comparison import SIDES, ComparisonTable, comparison_table
+from .contrast import START, Contrast, Role
+from .pairs import Pairs, compare_unpaired
 
 EQUIVALENT, BEYOND, OPEN = "equivalent", "beyond", "not shown"
 
 
+_COLUMNS: Columns = SIDES | {
+    "against_rows": "text",
+    "n": "count",
+    "difference": "points",
+    "low_90": "points",
+    "high_90": "points",
+    "margin": "points",
+    "verdict": "text",
+    "p": "p",
+    "p_holm": "p",
+    "complete": "flag",
+}
+
+
 def equivalence_table(
-    contrasts: Iterable[Contrast], cells: Iterable[Cell], published: Sequence[Cell], margin: float
+    contrasts: Iterable[Contrast],
+    cells: Iterable[SuccessCell],
+    published: Sequence[SuccessCell],
+    margin: float,
 ) -> Table:
     """Return which differences are within a margin, in points.
 
     Each k is compared with k0, and a system with retrieval with the one without, under the same
     condition and at k0; if that one has no rows, with its published k0.
     """
-    found = [one for one in contrasts if one.table in ("effects", "equivalence")]
-    paired = {(one.simulator, one.system) for one in found if one.system != one.against[0]}
-    alone = [one for one in cells if (one.simulator, one.system) not in paired]
-    compared = [(one, "rows") for one in found if one.pairs.n]
-    compared += [(one, "published") for one in _with_published(alone, published)]
-    rows = []
-    for one, source in compared:
-        outcome = verdict(one.pairs, margin) + "†" * (not one.complete)
-        more = {"against_rows": source, "margin": margin / 100, "verdict": outcome}
-        pairs = replace(one.pairs, p=tost(one.pairs, margin))
-        rows.append(replace(one, table="equivalence", pairs=pairs, more=more))
-    spec = TableSpec(
-        f"Equivalence within ±{margin:g} points",
-        f"{CELLS} against_rows:text n difference low_90 high_90 margin:points verdict:text p "
-        "p_holm:p complete",
-        f"Two one-sided tests at 5%: {EQUIVALENT} if the 90% interval of the difference is within "
-        f"the margin, {BEYOND} if it is outside, {OPEN} otherwise. p: of a difference as large as "
-        "the margin, the larger of both tests: below 0.05 where the verdict is equivalent; p holm: "
-        "after Holm's correction among the tests of this table in one simulator, which the verdict "
-        "is not corrected for. State the margin before you see the rows. The intervals are of the "
-        "same methods as in the other tables, and unpaired for published rates. †: provisional, "
-        "because a cell is incomplete.",
-        power=False,
+    own = [
+        contrast
+        for contrast in contrasts
+        if contrast.role in (Role.SESSIONS, Role.RETRIEVAL, Role.RETRIEVAL_FALL)
+    ]
+    with_base = {(c.simulator, c.system) for c in own if c.system != c.against[0]}
+    without_base = [cell for cell in cells if (cell.simulator, cell.system) not in with_base]
+    rows = [_compared(contrast, "rows", margin) for contrast in own if contrast.pairs.n]
+    for contrast in _with_published(without_base, published):
+        rows.append(_compared(contrast, "published", margin))
+    spec = ComparisonTable(
+        name="equivalence",
+        title=f"Equivalence within ±{margin:g} points",
+        columns=_COLUMNS,
+        note=f"Two one-sided tests at 5%: {EQUIVALENT} if the 90% interval of the difference is "
+        f"within the margin, {BEYOND} if it is outside, {OPEN} otherwise. p: of a difference as "
+        "large as the margin, the larger of both tests: below 0.05 where the verdict is "
+        "equivalent; the verdict is not corrected for many tests. State the margin before you see "
+        "the rows. The intervals are of the same methods as in the other tables, and unpaired for "
+        "published rates. †: provisional, because a cell is incomplete.",
+        explain=False,
     )
-    return comparison_table("equivalence", rows, spec)
+    return comparison_table(spec, rows)
 
 
-def _with_published(cells: Iterable[Cell], published: Sequence[Cell]) -> Iterator[Contrast]:
-    starts = {(one.simulator, one.system): one for one in published if one.condition == START}
+def _compared(contrast: Contrast, source: str, margin: float) -> Contrast:
+    """Return a comparison with the test of the margin; `source` is that of the second side."""
+    outcome = verdict(contrast.pairs, margin)
+    columns = {
+        "against_rows": source,
+        "margin": margin / 100,
+        "verdict": outcome if contrast.complete else f"{outcome}†",
+    }
+    pairs = replace(contrast.pairs, p=tost(contrast.pairs, margin))
+    return replace(contrast, pairs=pairs, columns=columns)
+
+
+def _with_published(
+    cells: Iterable[SuccessCell], published: Sequence[SuccessCell]
+) -> Iterator[Contrast]:
+    """Yield each cell compared with the published k0 of the same system without retrieval."""
+    starts = {(cell.simulator, cell.system): cell for cell in published if cell.condition == START}
     for cell in cells:
         start = starts.get((cell.simulator, published_base(cell.system) or ""))
         if start is not None and cell.n and not cell.part:
-            pairs = compare_unpaired(start.as_rate, cell.as_rate)
-            against = (start.system, START)
-            names = (cell.simulator, cell.system, cell.condition, against)
-            yield Contrast(*names, "equivalence", pairs, cell.complete)
+            yield Contrast(
+                cell.simulator,
+                cell.system,
+                cell.condition,
+                (start.system, START),
+                Role.RETRIEVAL_FALL,
+                compare_unpaired(start.as_rate, cell.as_rate),
+                cell.complete,
+            )
 
 
 def verdict(pairs: Pairs, margin: float) -> str:

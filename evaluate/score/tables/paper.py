@@ -6,17 +6,16 @@ from dataclasses import replace
 from functools import cache
 from importlib import resources
 from itertools import combinations
-from typing import Any
 
-from robomme_interference_data.evaluate.score.comparisons.pairs import compare_unpaired
-from robomme_interference_data.evaluate.score.comparisons.ranks import tied_with_best
-from robomme_interference_data.evaluate.score.comparisons.tables import columns_of
 from robomme_interference_data.evaluate.score.rows.values import RELEASED_SIMULATOR
-from robomme_interference_data.evaluate.systems import display_name, published_base
+from robomme_interference_data.evaluate.systems import published_base
 from robomme_interference_data.stats.intervals import newcombe, wilson
-from robomme_interference_data.viz.tables import Table
+from robomme_interference_data.viz.tables import Columns, Table
 
-from .cells import Cell
+from .cells import SuccessCell
+from .comparison import record_table
+from .pairs import compare_unpaired
+from .ranks import tied_with_best
 
 _NOTE = (
     "Published: RoboMME-Interference: Benchmarking Robot Memory Under Interference (Rathi, August "
@@ -27,22 +26,28 @@ _NOTE = (
     "proportions after Holm's correction over all pairs. A system that is not "
     "in the paper is listed beside all of them if its cell is complete; this is not a ranking."
 )
-_FAMILIES_NOTE = (
-    "The paper reports no rates by family. These are from its public repository "
-    "(SoumilRathi/robomme-interference, CC BY 4.0), an earlier version, where they add up to the "
-    "paper's rate over all families; those of Retrieval-FrameSamp-Modul are counted from its "
-    "released rows. A system that is not in the paper is listed beside all of "
-    "them, with any number of episodes (n). Families differ in difficulty: this is not a ranking."
-)
-_SIDES = (
-    "published_system n:count rate:rate low:rate high:rate published_n:count published_rate:rate "
-    "published_low:rate published_high:rate"
-)
-_CHANGE = "difference:points difference_low:points difference_high:points complete:flag"
+_COLUMNS: Columns = {
+    "system": "text",
+    "condition": "text",
+    "published_system": "text",
+    "n": "count",
+    "rate": "rate",
+    "low": "rate",
+    "high": "rate",
+    "published_n": "count",
+    "published_rate": "rate",
+    "published_low": "rate",
+    "published_high": "rate",
+    "published_best": "flag",
+    "difference": "points",
+    "difference_low": "points",
+    "difference_high": "points",
+    "complete": "flag",
+}
 
 
 @cache
-def published() -> tuple[Cell, ...]:
+def published() -> tuple[SuccessCell, ...]:
     """Return all published rates, in the paper's order, as complete cells of its simulator.
 
     The paper prints tenths of a percent, which only one count of 450 episodes rounds to.
@@ -58,47 +63,53 @@ def published() -> tuple[Cell, ...]:
     return tuple(replace(cell, best=(cell.system, cell.condition) in best) for cell in cells)
 
 
-def _best(cells: Sequence[Cell]) -> set[tuple[str, str]]:
+def _best(cells: Sequence[SuccessCell]) -> set[tuple[str, str]]:
     """Return system and condition of the published cells that no other one is better than."""
     pairs = {
-        (one.system, other.system): compare_unpaired(other.as_rate, one.as_rate)
-        for one, other in combinations(cells, 2)
+        (cell.system, other.system): compare_unpaired(other.as_rate, cell.as_rate)
+        for cell, other in combinations(cells, 2)
     }
     best = tied_with_best([cell.system for cell in cells], pairs)
     return {(cell.system, cell.condition) for cell in cells if cell.system in best}
 
 
 @cache
-def by_family() -> tuple[Cell, ...]:
+def by_family() -> tuple[SuccessCell, ...]:
     """Return the repository's rates by family, without those that contradict the paper."""
-    others = {*differing()}
-    return tuple(one for one in _repository() if (one.system, one.condition) not in others)
+    contradicting = {*differing()}
+    return tuple(
+        cell for cell in _repository() if (cell.system, cell.condition) not in contradicting
+    )
 
 
 @cache
 def differing() -> tuple[tuple[str, str], ...]:
     """Return the systems and conditions whose rates differ between paper and repository."""
     won: dict[tuple[str, str], int] = {}
-    for one in _repository():
-        key = (one.system, one.condition)
-        won[key] = won.get(key, 0) + round(one.rate * one.n)
-    printed = {(one.system, one.condition): round(one.rate * one.n) for one in published()}
+    for cell in _repository():
+        key = (cell.system, cell.condition)
+        won[key] = won.get(key, 0) + round(cell.rate * cell.n)
+    printed = {(cell.system, cell.condition): round(cell.rate * cell.n) for cell in published()}
     return tuple(key for key in printed if won.get(key, printed[key]) != printed[key])
 
 
 @cache
-def _repository() -> tuple[Cell, ...]:
+def _repository() -> tuple[SuccessCell, ...]:
     return tuple(
         _cell(
-            *(RELEASED_SIMULATOR, row["variant"], row["condition"], row["family"]),
-            *(int(row["successes"]), int(row["n"])),
+            RELEASED_SIMULATOR,
+            row["variant"],
+            row["condition"],
+            row["family"],
+            int(row["successes"]),
+            int(row["n"]),
         )
         for row in _read("repository_by_family.csv")
     )
 
 
-def _cell(simulator: str, system: str, condition: str, part: str, won: int, n: int) -> Cell:
-    return Cell(simulator, system, condition, part, n, won / n, wilson(won, n), n)
+def _cell(simulator: str, system: str, condition: str, part: str, won: int, n: int) -> SuccessCell:
+    return SuccessCell(simulator, system, condition, part, n, won / n, wilson(won, n), n)
 
 
 def _read(name: str) -> Iterator[dict[str, str]]:
@@ -106,63 +117,68 @@ def _read(name: str) -> Iterator[dict[str, str]]:
     return csv.DictReader(file.read_text(encoding="utf-8").splitlines())
 
 
-def _comparable(cells: Iterable[Cell]) -> Iterator[tuple[Cell, Cell]]:
-    """Yield cells with each published cell that they are compared with.
+def _comparable(cells: Iterable[SuccessCell]) -> Iterator[tuple[SuccessCell, SuccessCell]]:
+    """Yield cells over all families with each published cell that they are compared with.
 
     A system of the paper is compared with itself, one with retrieval also with the one without, and
-    any other system with all of them, over all families only if its cell is complete: rates over a
-    few families are not comparable with rates over nine.
+    any other system with all of them, only if its cell is complete: rates over a few families are
+    not comparable with rates over nine.
     """
-    known: dict[tuple[str, str, str], list[Cell]] = {}
-    for one in (*published(), *by_family()):
-        known.setdefault((one.simulator, one.condition, one.part), []).append(one)
-    papers = {one.system for one in published()}
+    known: dict[tuple[str, str], list[SuccessCell]] = {}
+    for rate in published():
+        known.setdefault((rate.simulator, rate.condition), []).append(rate)
+    papers = {rate.system for rate in published()}
     for cell in cells:
+        if cell.part or not cell.n:
+            continue
+        beside = known.get((cell.simulator, cell.condition), [])
         names = [name for name in (cell.system, published_base(cell.system)) if name in papers]
-        beside = known.get((cell.simulator, cell.condition, cell.part), []) if cell.n else []
         if names:
-            beside = [one for name in names for one in beside if one.system == name]
-        elif not (cell.part or cell.complete):
+            beside = [rate for name in names for rate in beside if rate.system == name]
+        elif not cell.complete:
             beside = []
-        for paper in beside:
-            yield cell, paper
+        for rate in beside:
+            yield cell, rate
 
 
-def paper_table(cells: Sequence[Cell], *, by_part: bool = False) -> Table:
-    """Return rates beside the published ones: `paper`, or by family `paper_family`."""
-    cells = [one for one in cells if bool(one.part) == by_part]
-    rows = []
+def paper_table(cells: Sequence[SuccessCell]) -> Table:
+    """Return rates beside the published ones."""
+    cells = [cell for cell in cells if not cell.part]
+    records = []
     for cell, paper in _comparable(cells):
-        won = (cell.rate * cell.trials, cell.trials, round(paper.rate * paper.n), paper.n)
-        row: list[Any] = [cell.system, cell.condition, *[cell.part] * by_part, paper.system]
-        row += [cell.n, cell.rate, *cell.interval, paper.n, paper.rate, *paper.interval]
-        row += [paper.best] * (not by_part)
-        rows.append((*row, cell.rate - paper.rate, *newcombe(*won), cell.complete))
-    if not by_part:
-        columns = f"system condition {_SIDES} published_best:flag {_CHANGE}"
-        note = " ".join([_NOTE, *not_compared(cells)])
-        return Table(
-            "paper", "Comparison with the published rates", columns_of(columns), rows, note
+        won, paper_won = cell.rate * cell.trials, round(paper.rate * paper.n)
+        difference_low, difference_high = newcombe(won, cell.trials, paper_won, paper.n)
+        records.append(
+            {
+                "system": cell.system,
+                "condition": cell.condition,
+                "published_system": paper.system,
+                "n": cell.n,
+                "rate": cell.rate,
+                "low": cell.interval[0],
+                "high": cell.interval[1],
+                "published_n": paper.n,
+                "published_rate": paper.rate,
+                "published_low": paper.interval[0],
+                "published_high": paper.interval[1],
+                "published_best": paper.best,
+                "difference": cell.rate - paper.rate,
+                "difference_low": difference_low,
+                "difference_high": difference_high,
+                "complete": cell.complete,
+            }
         )
-    ours = {name for cell in cells for name in (cell.system, published_base(cell.system))}
-    others: dict[str, list[str]] = {}
-    for system, condition in differing():
-        if system in ours:
-            others.setdefault(display_name(system), []).append(condition)
-    listed = "; ".join(f"{name} {', '.join(conditions)}" for name, conditions in others.items())
-    note = _FAMILIES_NOTE + f" They do not for: {listed}." * bool(others)
-    columns = f"system condition family {_SIDES} {_CHANGE}"
-    title = "Comparison with the published rates by family"
-    return Table("paper_family", title, columns_of(columns), rows, note)
+    note = " ".join([_NOTE, *not_compared(cells)])
+    return record_table("paper", "Comparison with the published rates", _COLUMNS, records, note)
 
 
-def not_compared(cells: Sequence[Cell]) -> list[str]:
+def not_compared(cells: Sequence[SuccessCell]) -> list[str]:
     """Return sentences about what has no published counterpart, if anything."""
-    simulators = {one.simulator for one in published()}
+    simulators = {cell.simulator for cell in published()}
     sentences = []
     if others := sorted({cell.simulator for cell in cells} - simulators):
         sentences.append(f"Rows of {', '.join(others)} are not compared with the paper's RoboMME.")
-    compared = {cell.system for cell, _ in _comparable(c for c in cells if not c.part)}
+    compared = {cell.system for cell, _ in _comparable(cells)}
     ours = dict.fromkeys(cell.system for cell in cells if cell.simulator in simulators)
     if alone := [system for system in ours if system not in compared]:
         sentences.append(f"Not in the paper under these conditions: {', '.join(alone)}.")

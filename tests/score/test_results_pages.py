@@ -1,6 +1,7 @@
-"""What docs/results/robomme-ceilings.md tells is what its rows say."""
+"""What the pages of docs/results state is what their rows say."""
 
 import json
+import re
 from collections import Counter
 from functools import cache
 from typing import Any
@@ -8,24 +9,30 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from support import scoring as made
 from support.pages import RESULTS, table
 
 from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.evaluate.score.compare import compare
+from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.paper import by_family
 from robomme_interference_data.evaluate.shortcuts import Cues, Shortcut, shortcuts
 from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.schema.sampling import Memory
+from robomme_interference_data.schema.shifts import NO_SHIFT
 from robomme_interference_data.simulators.robomme.scenes import OfficialScene, read_scene
-from robomme_interference_data.stats.intervals import wilson
+from robomme_interference_data.stats.intervals import newcombe, wilson
 
-PAGE = (RESULTS / "robomme-ceilings.md").read_text(encoding="utf-8")
+CEILINGS = (RESULTS / "robomme-ceilings.md").read_text(encoding="utf-8")
+ROBOMME = (RESULTS / "robomme.md").read_text(encoding="utf-8")
+TRAINING = (RESULTS / "training.md").read_text(encoding="utf-8")
 LESSONS: list[dict[str, Any]] = pq.read_table(RESULTS / "robomme/lessons.parquet").to_pylist()
 ROLLOUTS: list[dict[str, Any]] = pq.read_table(RESULTS / "robomme/rollouts.parquet").to_pylist()
 
 
 def rows(head: str) -> list[list[str]]:
     """The rows of the page's table with a column."""
-    return [[*row.values()] for row in table(PAGE, head)]
+    return [[*row.values()] for row in table(CEILINGS, head)]
 
 
 def family_of(lesson: dict[str, Any]) -> str:
@@ -100,7 +107,7 @@ def test_frames_of_the_least_shown_part() -> None:
             spans = (range(span["start"], span["stop"]) for span in one["evidence"])
             fewest.append(min(len(kept.intersection(span)) for span in spans))
         means.append(sum(fewest) / len(fewest))
-    assert f"has {means[0]:.1f} of them on average at k0, and {means[1]:.1f} at k7" in PAGE
+    assert f"has {means[0]:.1f} of them on average at k0, and {means[1]:.1f} at k7" in CEILINGS
 
 
 def test_rollouts_are_counted() -> None:
@@ -212,3 +219,172 @@ def test_what_else_reveals_the_answer() -> None:
     for one in LESSONS:
         if family_of(one) == "InsertPeg":
             assert json.loads(one["scene"])["answer"][0] == 0
+
+
+# --- robomme.md ---
+
+FILES = sorted(RESULTS.glob("*.csv"))
+
+
+@pytest.fixture(scope="module")
+def robomme() -> Score:
+    return made.score(*FILES, paper=True)
+
+
+def test_successes_are_those_of_the_rows(robomme: Score) -> None:
+    cells = {(cell.system, cell.condition, cell.part): cell for cell in robomme.cells if cell.n}
+    told = set()
+    for row in table(ROBOMME, "system"):
+        system, condition = row.pop("system").strip("`"), row.pop("condition")
+        for family, text in row.items():
+            if text == "–":
+                continue
+            cell = cells[system, condition, family]
+            low, high = (round(100 * end) for end in cell.interval)
+            assert text == f"{cell.counts[0]} of {cell.n}, {low} to {high}%", (
+                system,
+                condition,
+                family,
+            )
+            told.add((system, condition, family))
+    assert told == {key for key in cells if key[2] in FAMILIES}
+    assert all(row.counts[3] == 0 for row in robomme.cells)  # no error
+
+
+def test_published_rates_are_of_the_same_kind_of_memory(robomme: Score) -> None:
+    ours = {(cell.system, cell.condition, cell.part): cell for cell in robomme.cells if cell.n}
+    theirs = {(cell.system, cell.condition, cell.part): cell for cell in by_family()}
+    rows = table(ROBOMME, "family")
+    for row in rows:
+        system, released = (row[name].strip("`") for name in ("ours", "released"))
+        kept = (
+            "retrieval-framesamp-modul" if "retrieval" in system else "perceptual-framesamp-modul"
+        )
+        assert released == kept and "framesamp" in system
+        own = ours[system, row["condition"], row["family"]]
+        published = theirs[released, row["condition"], row["family"]]
+        won = round(published.rate * published.n)
+        ends = (own.rate - published.rate, *newcombe(own.counts[0], own.n, won, published.n))
+        change, low, high = (f"{100 * end:+.0f}" for end in ends)
+        assert (row["n"], row["rate"], row["rate of 50"], row["difference"]) == (
+            str(own.n),
+            f"{100 * own.rate:.0f}%",
+            f"{100 * published.rate:.0f}%",
+            f"{change} ({low} to {high})",
+        )
+    assert len(rows) == 12
+
+
+def test_changes_by_family_are_those_of_the_score() -> None:
+    path = RESULTS / "replay-framesamp-robomme_rollouts.csv"
+    changes = {row["family"]: row for row in compare(path, conditions=("k0", "k7")).table.records()}
+    rows = table(ROBOMME, "lesson's family")
+    for row in rows:
+        change = changes[row["lesson's family"]]
+        ends = (change["difference"], change["low"], change["high"])
+        difference, low, high = (f"{100 * end:+.0f}" for end in ends)
+        assert [*row.values()][1:] == [
+            str(change["n"]),
+            str(change["gained"]),
+            str(change["lost"]),
+            f"{difference} ({low} to {high})",
+            f"{change['p_holm']:.2g}",
+        ]
+    assert len(rows) == 3
+
+
+def test_every_failure_is_told_and_who_solves_it(robomme: Score) -> None:
+    """Those of MoveCube in a sentence; of the others every episode."""
+    solved = {
+        (row.system, row.condition, row.family, row.episode): row.status == "success"
+        for row in robomme.rows
+        if row.family != "MoveCube"
+    }
+    told = []
+    for row in table(ROBOMME, "system | condition | solved by"):
+        by, *here = (row[name].strip("`") for name in ("solved by", "system", "condition"))
+        for family, numbers in re.findall(r"([A-Z]\w+) ([\d, ]+)", row["episodes"]):
+            for number in map(int, numbers.strip(", ").split(",")):
+                told.append((*here, family, number))
+                system = "replay-full" if by == "none" else by
+                assert solved[system, here[1], family, number] == (by != "none"), (by, *told[-1])
+    assert sorted(told) == sorted(key for key, well in solved.items() if not well)
+
+
+# --- training.md ---
+
+Outcomes = dict[tuple[str, str, str, int], list[bool]]
+
+
+@pytest.fixture(scope="module")
+def trained() -> Outcomes:
+    """Outcomes by system, condition (with the shift, if there is one), family and model seed."""
+    outcomes: Outcomes = {}
+    for path in sorted((RESULTS / "training").glob("*.parquet")):
+        for row in pq.read_table(path).to_pylist():
+            shift = "" if row["shift"] == NO_SHIFT else f" {row['shift']}"
+            key = row["system"], row["condition"] + shift, row["family"], row["model_seed"]
+            outcomes.setdefault(key, []).append(row["success"])
+    return outcomes
+
+
+def percent(
+    trained: Outcomes,
+    system: str,
+    condition: str,
+    family: str | None = None,
+    seed: int | None = None,
+) -> str:
+    """Return the rate of successes as the page prints it; empty without rows."""
+    chosen = [
+        one
+        for (name, under, of, weights), outcomes in trained.items()
+        if (name, under) == (system, condition) and family in (None, of) and seed in (None, weights)
+        for one in outcomes
+    ]
+    return f"{100 * sum(chosen) / len(chosen):.1f}" if chosen else ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "first", ["system", "policy", "further conditions", "under shifts", "carried out"]
+)
+def test_rates_by_condition(trained: Outcomes, first: str) -> None:
+    listed = table(TRAINING, first)
+    assert listed
+    for line in listed:
+        system = line.pop(first).strip("`")
+        line.pop("seeds", None)
+        for condition, rate in line.items():
+            assert rate == percent(trained, system, condition), (system, condition)
+
+
+def test_rates_by_training_seed(trained: Outcomes) -> None:
+    for line in table(TRAINING, "by seed"):
+        system, seed = line.pop("by seed").split()
+        for condition, rate in line.items():
+            found = percent(trained, system.strip("`"), condition, seed=int(seed))
+            assert rate == found, (system, seed, condition)
+
+
+@pytest.mark.parametrize("first", ["family", "acting in"])
+def test_rates_by_family(trained: Outcomes, first: str) -> None:
+    for line in table(TRAINING, first):
+        family = line.pop(first)
+        for title, rate in line.items():
+            system, condition = title.split()
+            assert rate == percent(trained, system.strip("`"), condition, family), (title, family)
+
+
+@pytest.mark.parametrize(("first", "learner"), [("condition", "learned"), ("under", "acts")])
+def test_what_training_with_interference_changes(
+    trained: Outcomes, first: str, learner: str
+) -> None:
+    for line in table(TRAINING, first):
+        with_, without = (
+            float(percent(trained, f"{learner}-{mixture}", line[first]))
+            for mixture in ("mixture", "k0")
+        )
+        assert float(line["mixture − k0"].split()[0].replace("−", "-")) == pytest.approx(
+            with_ - without, abs=0.11
+        )

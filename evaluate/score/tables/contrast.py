@@ -1,8 +1,9 @@
-"""One comparison, and which kinds of conditions are compared with which."""
+"""One comparison, what it is for, and which kinds of conditions are compared with which."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Any, NamedTuple
 
 from robomme_interference_data.schema.conditions import KINDS, NO_HISTORY, parse_condition
@@ -12,6 +13,27 @@ from .pairs import Pairs
 
 START = "k0"
 """The condition that changes and retention are measured from."""
+
+
+class Role(StrEnum):
+    """What a comparison measures; in tables, the value of the column `effect`."""
+
+    HISTORY = "history"  # against no history: the lift
+    SESSIONS = "sessions"  # `k<n>` against k0 of the same system
+    RETRIEVAL = "retrieval"  # with retrieval against without, under the same condition
+    INTERFERENCE = "interference"  # two kinds of conditions, see `COMPARISONS`
+    CEILING = "ideal observer"  # against the ideal observer with the same memory
+    RETRIEVAL_FALL = "retrieval against k0"  # with retrieval against k0 without, for equivalence
+    SYSTEMS = "systems"  # two systems under one condition
+    SLOPES = "slopes"  # the falls of two systems over k
+    RUNS = "runs"  # two runs, or two conditions of a run: the command `compare`
+
+
+class Measure(StrEnum):
+    """What a comparison compares."""
+
+    SUCCESS = "success"
+    ACTION_ERROR = "action error"  # along recordings; lower is better
 
 
 class Comparison(NamedTuple):
@@ -46,19 +68,21 @@ class Contrast:
     system: str
     condition: str
     against: tuple[str, str]  # system and condition of the first side
-    table: str  # the table that lists it, see `tables.SPECS`
+    role: Role
     pairs: Pairs
     complete: bool  # whether both cells are
+    measure: Measure = Measure.SUCCESS
     family: str = ""  # the only family whose episodes are compared; empty for all
     retention: Interval = NO_RETENTION  # of a lift: the share of the lift at k0 that is left
     retention_n: int | None = None  # episodes that count under all three conditions
-    more: Mapping[str, Any] = field(default_factory=dict)  # columns of a single table
+    columns: Mapping[str, Any] = field(default_factory=dict)  # values that a single table adds
 
     @property
     def asks(self) -> str:
         """What a comparison between kinds of conditions measures; empty for any other."""
-        kind = parse_condition(self.condition).kind.name
-        return COMPARISONS[kind].asks if self.table == "interference" else ""
+        if self.role is not Role.INTERFERENCE:
+            return ""
+        return COMPARISONS[parse_condition(self.condition).kind.name].asks
 
 
 def comparable(
@@ -69,10 +93,14 @@ def comparable(
     `floor` is the system and condition that serve as the system's `no-history`, if there are any.
     """
     parsed = [parse_condition(name) for name in conditions]
-    cells = {(one.kind.name, one.k): (system, one.name) for one in parsed}
-    cells |= {(NO_HISTORY, 0): floor} if floor else {}
-    for one in parsed:
-        if comparison := COMPARISONS.get(one.kind.name):
-            k = one.k if KINDS[comparison.reference].counted else 0
-            if against := cells.get((comparison.reference, k)):
-                yield one.name, against
+    cells = {(condition.kind.name, condition.k): (system, condition.name) for condition in parsed}
+    if floor:
+        cells[NO_HISTORY, 0] = floor
+    for condition in parsed:
+        comparison = COMPARISONS.get(condition.kind.name)
+        if comparison is None:
+            continue
+        k = condition.k if KINDS[comparison.reference].counted else 0
+        against = cells.get((comparison.reference, k))
+        if against:
+            yield condition.name, against

@@ -8,8 +8,8 @@ from functools import cached_property, partial
 import numpy as np
 
 from robomme_interference_data.evaluate.score.outcomes import (
-    Rate,
     Statuses,
+    SuccessRate,
     counting,
     rate_of,
     success,
@@ -40,12 +40,11 @@ class Pairs:
     first: float  # mean success over them on the first side
     second: float
     at: Callable[[float], Interval]  # second − first, with its interval of any level
-    interval: str  # its method: `newcombe`, with repeats `clusters`, `unpaired`, or `sign-flip`
+    method: str  # of interval and p: `newcombe`, with repeats `clusters`, `unpaired`, `sign-flip`
     pairs: int  # pairs of rollouts, one per episode: of the lowest shared model seed
     gained: int  # pairs that succeed on the second side alone
     lost: int  # pairs that succeed on the first side alone
     p: float  # two-sided: McNemar's or sign-flip; unpaired, of two proportions
-    p_mid: float  # its mid-p, of exact tests
 
     @cached_property
     def change(self) -> Interval:
@@ -60,7 +59,7 @@ class Pairs:
     @property
     def paired(self) -> bool:
         """Whether both sides had the same histories."""
-        return self.interval != "unpaired"
+        return self.method != "unpaired"
 
     @property
     def flips(self) -> float:
@@ -69,7 +68,15 @@ class Pairs:
 
 
 NO_PAIRS = Pairs(
-    *(0, math.nan, math.nan, lambda level: Interval(math.nan), "", 0, 0, 0, math.nan, math.nan)
+    n=0,
+    first=math.nan,
+    second=math.nan,
+    at=lambda level: Interval(math.nan),
+    method="",
+    pairs=0,
+    gained=0,
+    lost=0,
+    p=math.nan,
 )
 """The comparison over no episode."""
 
@@ -89,18 +96,25 @@ def pair(
     if n == counting(first).sum() == counting(second).sum():
         return _of_single(before, after)
     at = partial(_clusters, first, second)
-    tests = sign_flip(after - before)
-    rate, other_rate = float(before.mean()), float(after.mean())
+    p, _ = sign_flip(after - before)
     if matched is not None:
-        one, other = zip(*matched, strict=True)
-        first, second = first[:, one], second[:, other]
+        first_seeds, second_seeds = zip(*matched, strict=True)
+        first, second = first[:, first_seeds], second[:, second_seeds]
     both = counting(first) & counting(second)
     episodes = np.flatnonzero(both.any(-1))
     seed = both[episodes].argmax(-1)
     old, new = (side[episodes, seed] == 0 for side in (first, second))
-    gained, lost = int((new & ~old).sum()), int((old & ~new).sum())
-    counts = (len(episodes), gained, lost)
-    return Pairs(n, rate, other_rate, at, "clusters", *counts, *tests)
+    return Pairs(
+        n=n,
+        first=float(before.mean()),
+        second=float(after.mean()),
+        at=at,
+        method="clusters",
+        pairs=len(episodes),
+        gained=int((new & ~old).sum()),
+        lost=int((old & ~new).sum()),
+        p=p,
+    )
 
 
 def _of_single(before: Floats, after: Floats) -> Pairs:
@@ -108,15 +122,26 @@ def _of_single(before: Floats, after: Floats) -> Pairs:
     n = len(before)
     if not n:
         return NO_PAIRS
-    one, other, both = (int(part) for part in (before.sum(), after.sum(), before @ after))
-    gained, lost = other - both, one - both
-    gap, neither = round((other - one) / n, 12), n - both - gained - lost
+    won_before, won_after, both = int(before.sum()), int(after.sum()), int(before @ after)
+    gained, lost = won_after - both, won_before - both
+    neither = n - both - gained - lost
+    change = round((won_after - won_before) / n, 12)
 
     def at(level: float) -> Interval:
-        return Interval(gap, *newcombe_paired(both, gained, lost, neither, level))
+        return Interval(change, *newcombe_paired(both, gained, lost, neither, level))
 
-    counts = (n, gained, lost)
-    return Pairs(n, one / n, other / n, at, "newcombe", *counts, *mcnemar(gained, lost))
+    p, _ = mcnemar(gained, lost)
+    return Pairs(
+        n=n,
+        first=won_before / n,
+        second=won_after / n,
+        at=at,
+        method="newcombe",
+        pairs=n,
+        gained=gained,
+        lost=lost,
+        p=p,
+    )
 
 
 def _clusters(first: Statuses, second: Statuses, level: float) -> Interval:
@@ -140,19 +165,35 @@ def pair_errors(before: Floats, after: Floats, test: SignFlips) -> Pairs:
     n = int(known.sum())
     if not n:
         return NO_PAIRS
-    gained, lost = int((after < before).sum()), int((after > before).sum())
-    rates = float(before[known].mean()), float(after[known].mean())
-    return Pairs(n, *rates, test.at, "sign-flip", n, gained, lost, test.p, math.nan)
+    return Pairs(
+        n=n,
+        first=float(before[known].mean()),
+        second=float(after[known].mean()),
+        at=test.at,
+        method="sign-flip",
+        pairs=n,
+        gained=int((after < before).sum()),
+        lost=int((after > before).sum()),
+        p=test.p,
+    )
 
 
-def compare_unpaired(first: Rate, second: Rate) -> Pairs:
+def compare_unpaired(first: SuccessRate, second: SuccessRate) -> Pairs:
     """Compare two sides that cannot be paired."""
-    won = second.value * second.trials, first.value * first.trials
-    counts = (won[0], second.trials, won[1], first.trials)
-    gap, p = round(second.value - first.value, 12), two_proportions(*counts)
+    counts = (second.value * second.trials, second.trials, first.value * first.trials, first.trials)
+    change = round(second.value - first.value, 12)
 
     def at(level: float) -> Interval:
-        return Interval(gap, *newcombe(*counts, level))
+        return Interval(change, *newcombe(*counts, level))
 
-    n, rates = min(first.n, second.n), (first.value, second.value)
-    return Pairs(n, *rates, at, "unpaired", 0, 0, 0, p, math.nan)
+    return Pairs(
+        n=min(first.n, second.n),
+        first=first.value,
+        second=second.value,
+        at=at,
+        method="unpaired",
+        pairs=0,
+        gained=0,
+        lost=0,
+        p=two_proportions(*counts),
+    )

@@ -1,0 +1,250 @@
+"""Compare two runs, or two conditions of one, paired over shared episodes."""
+
+import shlex
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.schema.conditions import parse_condition
+from robomme_interference_data.simulators.registry import RECORDINGS
+from robomme_interference_data.stats.sequential import look_levels
+from robomme_interference_data.stats.significance import ALPHA
+from robomme_interference_data.stats.signs import sign_flips
+from robomme_interference_data.viz.tables import Table
+
+from .outcomes import mean_errors
+from .rows.reading import Rows, read_rows
+from .sides import (
+    Side,
+    check_scenes,
+    differing,
+    left_out,
+    matched_sides,
+    noise_floor,
+    sides_of,
+    stopped_early,
+)
+from .tables.comparison import (
+    ACTION_ERRORS,
+    ACTION_ERRORS_NOTE,
+    COMPLETE,
+    RATES,
+    SIDES,
+    ComparisonTable,
+    comparison_table,
+    detectable,
+)
+from .tables.contrast import START, Contrast, Measure, Role
+from .tables.pairs import Pairs, pair, pair_errors
+
+
+@dataclass(frozen=True)
+class RunComparison:
+    """Two runs, compared.
+
+    Attributes:
+        table: A row per condition, or for the two compared conditions, then the same by family.
+        notes: Warnings, the share of flips between two runs of one system, and what is left out.
+        runs: The rows of the runs.
+    """
+
+    table: Table
+    notes: tuple[str, ...]
+    runs: tuple[Rows, ...]
+
+
+def compare(
+    first: Path,
+    second: Path | None = None,
+    systems: tuple[str | None, str | None] = (None, None),
+    lenient: bool = False,
+    conditions: Sequence[str] = (),
+    look: tuple[int, int] = (1, 1),
+) -> RunComparison:
+    """Compare two runs of one simulator over shared conditions and episodes.
+
+    Systems of both runs are compared with themselves. If the runs share no system and hold one
+    each, these two are compared. Runs under different shifts can be compared, because their scenes
+    are the same. Differences are the second's rate − the first's. Without a second run, two
+    `conditions` of the first are compared. `look` is the number of this look at the data and of all
+    planned ones; with several, intervals and levels spend 5% over all looks.
+    """
+    _check_arguments(first, second, conditions, systems[0], lenient=lenient)
+    alpha = look_levels(look[1])[look[0] - 1] if look[1] > 1 else ALPHA
+    a_rows = read_rows([first], systems[0], lenient)
+    b_rows = a_rows if second is None else read_rows([second], systems[1], lenient)
+    runs = (a_rows,) if second is None else (a_rows, b_rows)
+    measure = _measure(runs)
+    check_scenes(a_rows, b_rows)
+    a_sides, b_sides = sides_of(a_rows), sides_of(b_rows)
+    matched = list(matched_sides((a_rows, b_rows), (a_sides, b_sides)))
+    notes = list(differing(a_rows, b_rows, matched))
+    contrasts = list[Contrast]()
+    for a, b in matched:
+        own = list(_contrasts(a, b, conditions, measure, alpha))
+        contrasts += own
+        repeated = a.repeats(b, a_rows, b_rows) and not conditions
+        if repeated and measure is Measure.SUCCESS:
+            overall = {one.condition: one.pairs for one in own if not one.family}
+            notes += noise_floor(a, b, overall)
+    if not contrasts:
+        paths = " and ".join(str(path) for path in (first, second) if path)
+        under = " and ".join(conditions) or "a common condition"
+        held = [
+            "; ".join(f"{side.system}: {', '.join(side.conditions)}" for side in sides.values())
+            for sides in (a_sides, b_sides)
+        ]
+        raise InvalidOptionError(
+            f"no episode of {paths} counts on both sides under {under}",
+            f"They hold {' and '.join(dict.fromkeys(held))}. Compare the same episodes.",
+        )
+    notes += stopped_early("a", a_sides.values())
+    if second is not None:
+        notes += stopped_early("b", b_sides.values())
+    notes += left_out("a", a_sides.values(), dict(matched), conditions)
+    notes += left_out("b", b_sides.values(), {b: a for a, b in matched}, conditions[::-1])
+    table = _table(
+        contrasts, measure, alpha, "Two runs compared" if second else "Two conditions compared"
+    )
+    note = [f"a: {first}; b: {second or first}.", table.note]
+    if look[1] > 1:
+        note.append(
+            f"Look {look[0]} of {look[1]} (alpha spending like O'Brien and Fleming's boundaries): "
+            f"a difference is significant if p holm is below {alpha:.2g}, and intervals have the "
+            f"level {1 - alpha:.4%}."
+        )
+    unplanned = dict.fromkeys(
+        str(path) for rows in runs for path, run in rows.sources.items() if not run
+    )
+    if unplanned:
+        note.append(
+            "Without the record of a run, complete means all episodes that occur: "
+            f"{', '.join(unplanned)}."
+        )
+    return RunComparison(replace(table, note=" ".join(note)), tuple(notes), runs)
+
+
+def _measure(runs: Sequence[Rows]) -> Measure:
+    """Return what is compared; the rows of all runs must be of one kind."""
+    offline = {row.simulator == RECORDINGS for rows in runs for row in rows}
+    if len(offline) > 1:
+        raise InvalidOptionError(
+            "the rows are of rollouts and of offline runs",
+            "Compare runs of one kind: a success rate has no counterpart in an action error.",
+        )
+    return Measure.ACTION_ERROR if True in offline else Measure.SUCCESS
+
+
+def _contrasts(
+    a: Side, b: Side, conditions: Sequence[str], measure: Measure, alpha: float
+) -> Iterator[Contrast]:
+    """Compare two sides under each condition, over all families and in each."""
+    both = [(conditions[0], conditions[1])] if conditions else [(c, c) for c in a.conditions]
+    both = [(before, after) for before, after in both if before in a.conditions]
+    both = [(before, after) for before, after in both if after in b.conditions]
+    for family in ("", *a.outcomes.families):
+        for before, after in both:
+            pairs = _pairs(a, b, (before, after), family)
+            if pairs.n:
+                bounds = pairs.at(1 - alpha)
+                yield Contrast(
+                    a.outcomes.simulator,
+                    b.system,
+                    after,
+                    (a.system, before),
+                    Role.RUNS,
+                    pairs,
+                    a.complete(before) and b.complete(after),
+                    measure=measure,
+                    family=family,
+                    columns={"low": bounds.low, "high": bounds.high},
+                )
+
+
+def _table(contrasts: Sequence[Contrast], measure: Measure, alpha: float, title: str) -> Table:
+    """Return the comparisons with the columns of the tables of effects, and the family."""
+    success = measure is Measure.SUCCESS
+    spec = ComparisonTable(
+        name="compare",
+        title=title,
+        columns=SIDES | {"family": "text"} | (RATES if success else ACTION_ERRORS) | COMPLETE,
+        group=_group,
+        corrected="the rows of all families, and among those of single families, of a simulator",
+        note=(
+            "system and condition are of b, those against are of a. Over the n episodes that count "
+            "in both; difference is b − a, and gained and lost are changes from a to b."
+        ),
+        explain=success,
+        alpha=alpha,
+    )
+    table = comparison_table(spec, contrasts)
+    if success:
+        more = detectable(contrasts, _group)
+    else:
+        more = f"A negative difference is better. {ACTION_ERRORS_NOTE}"
+    return replace(table, note=f"{table.note} {more}".strip())
+
+
+def _group(contrast: Contrast) -> tuple[str, bool]:
+    return contrast.simulator, bool(contrast.family)
+
+
+def _check_arguments(
+    first: Path,
+    second: Path | None,
+    conditions: Sequence[str],
+    system: str | None,
+    *,
+    lenient: bool,
+) -> None:
+    for name in conditions:
+        parse_condition(name)
+    if len(conditions) not in (0, 2) or (second is None and len({*conditions}) < 2):
+        hint, command = _two_conditions(first, read_rows([first], system, lenient))
+        raise InvalidOptionError(
+            f"conditions to compare: {' '.join(conditions) or 'none'}; expected two different "
+            "ones, or two runs",
+            hint,
+            command,
+        )
+    if second is not None and first.exists() and second.exists() and first.samefile(second):
+        hint, command = _two_conditions(first, read_rows([first], system, lenient))
+        raise InvalidOptionError(f"{first} is given twice", hint, command)
+
+
+def _two_conditions(path: Path, rows: Rows) -> tuple[str, str | None]:
+    """Return a hint and a command that compare two conditions of a run, if it holds two."""
+    held = sorted(rows.names("condition"), key=lambda name: parse_condition(name).sort_key)
+    names = ", ".join(held) or "no rows"
+    if len(held) < 2:
+        return f"{path} holds {names}: give another run.", None
+    # As in the tables: against k0, or else the first condition.
+    before = START if START in held[:-1] else held[0]
+    command = f"compare {shlex.quote(str(path))} --conditions {before},{held[-1]}"
+    return f"{path} holds {names}. Compare two of them, such as:", command
+
+
+def _pairs(a: Side, b: Side, conditions: tuple[str, str], family: str) -> Pairs:
+    """Compare two sides over shared episodes, all or those of a family."""
+    a_places, b_places = (
+        {episode: place for place, episode in enumerate(side.outcomes.episodes)} for side in (a, b)
+    )
+    shared = [
+        episode for episode in a_places if episode in b_places and family in ("", episode.family)
+    ]
+    a_cell = a.outcomes.cell(a.system, conditions[0])
+    b_cell = b.outcomes.cell(b.system, conditions[1])
+    a_shared = [a_places[episode] for episode in shared]
+    b_shared = [b_places[episode] for episode in shared]
+    if a.outcomes.simulator == RECORDINGS:
+        before = mean_errors(a.outcomes.action_l1)[a_cell][a_shared]
+        after = mean_errors(b.outcomes.action_l1)[b_cell][b_shared]
+        [test] = sign_flips((after - before).round(12)[:, None], RECORDINGS)
+        return pair_errors(before, after, test)
+    # Shared model seeds are paired; without any, the lowest with the lowest, and so on.
+    seeds, others = a.outcomes.model_seeds, b.outcomes.model_seeds
+    matched = [(seeds.index(seed), others.index(seed)) for seed in seeds if seed in others]
+    if not matched:
+        matched = [(place, place) for place in range(min(len(seeds), len(others)))]
+    return pair(a.outcomes.status[a_cell][a_shared], b.outcomes.status[b_cell][b_shared], matched)
