@@ -21,7 +21,7 @@ from multiprocessing import AuthenticationError
 from multiprocessing.connection import Client, Connection, Listener
 from pathlib import Path
 
-from robomme_interference_data.errors import ServerDiedError, WorkerError
+from robomme_interference_data.errors import ServerDiedError, WorkerError, named
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.lazy import load_extra
 from robomme_interference_data.runtime.executor import (
@@ -58,7 +58,7 @@ def policy_processes(config: RunConfig) -> Iterator[Sequence[Address]]:
         WorkerError: The processes cannot start.
     """
     if config.on_cluster:
-        what = 'executor="ray"'
+        what = named("executor", "ray")
         run = load_extra("robomme_interference_data.runtime.ray_actors", "actors", what, "cluster")
         resources = Resources.parse("policy_resources", config.policy_resources)
         hosts = [partial(PolicyHost, config, number) for number in range(config.policies or 0)]
