@@ -40,12 +40,9 @@ from common import positive, print_machine, print_table
 
 from robomme_interference_data.evaluate import BatchPolicy, Observation, RolloutInfo, RunConfig
 from robomme_interference_data.evaluate.policies.policy import Policy
-from robomme_interference_data.evaluate.policies.process import (
-    SharedPolicy,
-    connect,
-    policy_processes,
-)
+from robomme_interference_data.evaluate.policies.process import policy_processes
 from robomme_interference_data.evaluate.policies.registry import make_policy
+from robomme_interference_data.evaluate.policies.shared import SharedPolicy
 from robomme_interference_data.runtime.executor import Processes, Worker
 
 FIRST_S, FURTHER_S = 0.050, 0.005
@@ -137,7 +134,7 @@ class Rollouts:
         """Wait until all workers are ready, and act for some seconds."""
         number, count, seconds = task
         policy = (
-            SharedPolicy(connect(self._addresses[0]))
+            SharedPolicy.open(self._addresses[0], number)
             if self._addresses
             else make_policy(self._config.policy, self._config.policy_options)
         )

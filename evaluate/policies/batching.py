@@ -37,6 +37,10 @@ class Batcher[K: Hashable]:
     def _policy(self) -> BatchPolicy:
         return self._make()
 
+    def __contains__(self, key: K) -> bool:
+        """Whether a session is open under a key."""
+        return key in self._sessions
+
     def open(self, key: K) -> Policy:
         """Open a session under a key, and return it."""
         self._sessions[key] = self._policy.session()

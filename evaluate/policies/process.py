@@ -1,186 +1,53 @@
-"""Policies in processes of their own, which workers share (`policies`).
+"""The processes of shared policies, on this machine or a cluster; see `shared.py`.
 
-A worker has a `SharedPolicy`: it forwards every call over a socket to its session in a policy's
-process, in which one thread answers all workers. A process that dies is started again: rollouts
-that it served are repeated, and those that ask next wait until it has loaded the policy.
+A process that dies is started again: rollouts that it served are repeated, and those that ask next
+wait until it has loaded the policy.
 """
 
 import logging
 import os
-import pickle
+import secrets
+import shutil
 import sys
+import tempfile
 import threading
 import time
-import traceback
-from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from concurrent.futures import CancelledError, ThreadPoolExecutor
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
 from multiprocessing import AuthenticationError
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Client, Connection, Listener
 from pathlib import Path
-from typing import Any, cast, get_type_hints
 
-import numpy as np
-from numpy.typing import NDArray
-
-from robomme_interference_data.errors import (
-    InterferenceError,
-    PolicyError,
-    ServerDiedError,
-    WorkerError,
-)
+from robomme_interference_data.errors import ServerDiedError, WorkerError, named
 from robomme_interference_data.evaluate.run.config import RunConfig
-from robomme_interference_data.runtime.executor import Session, Worker, make_executor
+from robomme_interference_data.lazy import load_extra
+from robomme_interference_data.runtime.executor import (
+    Resources,
+    Session,
+    Worker,
+    make_executor,
+    ray_address,
+)
 from robomme_interference_data.runtime.process import CLOSE_S
-from robomme_interference_data.simulators.base import Observation
 
-from .batching import Answer, Batcher, attempt
-from .policy import Frames, Policy, RolloutInfo
-from .registry import check_members, make_policy
-from .sockets import Address, Directory, accept
+from .shared import Address, Channel, PolicyHost, SharedPolicy, ended
 
 logger = logging.getLogger(__name__)
 
-_OPEN = "open"
-"""The first message of a session; others name a method."""
+_KEY_BYTES = 32
 
+_PAUSE_S = 0.1
+"""Seconds between tries to connect to a process that does not listen yet."""
 
-class SharedPolicy(Policy):
-    """A session of a policy in another process; it waits until that has loaded the policy.
-
-    Every call raises what the policy's method raises, or `ServerDiedError` if the process ends.
-
-    Args:
-        connection: A connection that `connect` made.
-    """
-
-    def __init__(self, connection: Connection):
-        self._connection = connection
-        try:
-            vars(self).update(self._answer())  # the attributes of a policy
-        except BaseException:
-            self.close()
-            raise
-
-    def reset(self, info: RolloutInfo) -> None:
-        """Prepare the session for a rollout."""
-        self._call("reset", info)
-
-    def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
-        """Add the next chunk of the history to the session's memory."""
-        self._call("add_history", dict(frames), states, exec_start_idx)
-
-    def observe(self, frames: Frames, states: NDArray[np.float32]) -> None:
-        """Add live observations to the session's memory."""
-        self._call("observe", dict(frames), states)
-
-    def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
-        """Return the next actions, which the policy may compute in a batch with others."""
-        return cast("NDArray[np.float32]", self._call("act", observation, goal))
-
-    def metadata(self) -> dict[str, Any]:
-        """Return the session's metadata."""
-        return cast("dict[str, Any]", self._call("metadata"))
-
-    def close(self) -> None:
-        """Close the session."""
-        self._connection.close()
-
-    def _call(self, method: str, *arguments: Any) -> Any:
-        with _death():
-            _send(self._connection, (method, arguments))
-        return self._answer()
-
-    def _answer(self) -> Any:
-        with _death():
-            value, error = _receive(self._connection)
-        if error is not None:
-            raise error
-        return value
-
-
-def connect(address: Address) -> Connection:
-    """Request a session from a policy's process."""
-    with _death():
-        connection = address.connect()
-        _send(connection, (_OPEN, ()))
-        return connection
-
-
-@dataclass(frozen=True)
-class ServePolicy:
-    """What a policy's process does: a task of an executor, its address.
-
-    The first session makes the policy. If that fails, its connection gets the error, and the next
-    session makes it again.
-    """
-
-    config: RunConfig
-
-    def __call__(self, task: Address, worker: Worker) -> None:
-        """Answer all connections until the run ends."""
-        config, number = self.config, task.number
-        if not config.on_cluster and config.policies != 1:
-            choose_gpu(number)  # on a cluster Ray does it
-        batcher: Batcher[Connection] = Batcher(
-            lambda: make_policy(config.policy, config.policy_options, worker=number),  # type: ignore[arg-type, return-value]
-            config.max_batch_size,
-            config.batch_wait_timeout_s,
-        )
-        clients: list[Connection] = []
-        with closing(batcher), task.listen() as (listener, ended):
-            while True:
-                ready: list[Any] = wait(
-                    [ended, listener, *clients], batcher.due_s(time.monotonic())
-                )
-                if ended in ready:
-                    return
-                with worker.limit(config.rollout_timeout_s, "a call of the policy"):
-                    for client in ready:
-                        if client is listener:
-                            if (new := accept(listener, task.key)) is not None:
-                                clients.append(new)
-                            continue
-                        request, end = attempt(_receive, client)
-                        if end is not None:  # its worker ended, or closed it
-                            clients.remove(client)
-                            batcher.drop(client)
-                        elif request[0] == _OPEN:
-                            _reply(client, attempt(self._open, batcher, client))
-                        elif answer := batcher.call(client, request):
-                            _reply(client, answer)
-                    if batcher.due_s(time.monotonic()) == 0:
-                        for client, answer in batcher.act().items():
-                            _reply(client, answer)
-
-    def _open(self, batcher: Batcher[Connection], client: Connection) -> dict[str, Any]:
-        """Open a session; return its attributes."""
-        text = f"policy {self.config.policy!r}"
-        try:
-            session = batcher.open(client)
-        except InterferenceError:
-            raise
-        except Exception as error:
-            problem = f"{text}: its session() raised {type(error).__name__}: {error}"
-            raise PolicyError(problem, traceback.format_exc().rstrip()) from error
-        check_members(f"{text}, session()", session)
-        return {name: getattr(session, name) for name in get_type_hints(Policy)}
-
-
-def choose_gpu(number: int) -> None:
-    """Let this process use one of the machine's GPUs; before it imports torch.
-
-    The processes share the GPUs evenly.
-    """
-    chosen = os.environ.get("CUDA_VISIBLE_DEVICES")
-    found = sorted(Path("/proc/driver/nvidia/gpus").glob("*")) if chosen is None else []
-    gpus = chosen.split(",") if chosen else [*map(str, range(len(found)))]
-    if len(gpus) > 1:
-        os.environ["CUDA_VISIBLE_DEVICES"] = gpus[number % len(gpus)]
+_CONNECTIONS = 64
+"""Connections that may wait to be accepted."""
 
 
 @contextmanager
-def policy_processes(config: RunConfig) -> Iterator[tuple[Address, ...]]:
+def policy_processes(config: RunConfig) -> Iterator[Sequence[Address]]:
     """Run the policy's processes in the block, where workers run; yield their addresses.
 
     When the block begins, each has loaded the policy.
@@ -188,14 +55,132 @@ def policy_processes(config: RunConfig) -> Iterator[tuple[Address, ...]]:
     Raises:
         PolicyError: The policy cannot be made.
         ServerDiedError: A process died while it made it.
+        WorkerError: The processes cannot start.
     """
-    failures = list[WorkerError]()
+    if config.on_cluster:
+        what = named("executor", "ray")
+        run = load_extra("robomme_interference_data.runtime.ray_actors", "actors", what, "cluster")
+        resources = Resources.parse("policy_resources", config.policy_resources)
+        hosts = [partial(PolicyHost, config, number) for number in range(config.policies or 0)]
+        with run(hosts, ray_address(config), resources, workers=config.workers) as addresses:
+            _load(addresses)
+            yield addresses
+    else:
+        with _local_processes(config) as addresses:
+            yield addresses
+
+
+def _load(addresses: Sequence[Address]) -> None:
+    """Wait until all processes have loaded the policy, which they do at the same time."""
+    # Workers have numbers from 0, so this session is none of theirs.
+    with ThreadPoolExecutor(len(addresses)) as pool:
+        for policy in pool.map(lambda address: SharedPolicy.open(address, -1), addresses):
+            policy.close()
+
+
+@dataclass(frozen=True)
+class SocketAddress:
+    """The address of a policy's process on this machine: a socket in a folder of the run.
+
+    When the run ends, the folder goes: processes end, and who waits for one gets an error.
+    """
+
+    path: Path
+    key: bytes = field(repr=False)
+    number: int
+
+    def connect(self, worker: int) -> Channel:
+        """Connect a worker; wait until the process listens."""
+        while self.path.parent.exists():
+            # Missing or refused: it has not begun, or died and is started again.
+            with suppress(FileNotFoundError, ConnectionError, EOFError):
+                connection = Client(str(self.path), "AF_UNIX", self.key)
+                connection.send(worker)
+                return _Socket(connection)
+            time.sleep(_PAUSE_S)
+        raise ServerDiedError("the policy's process ended", "Its output is above.")
+
+
+class _Socket:
+    """A worker's connection to a process."""
+
+    def __init__(self, connection: Connection):
+        self._connection = connection
+
+    def ask(self, request: bytes) -> bytes:
+        try:
+            self._connection.send_bytes(request)
+            return self._connection.recv_bytes()
+        except (EOFError, OSError) as error:
+            raise ended(error) from error
+
+    def close(self) -> None:
+        self._connection.close()
+
+
+@dataclass(frozen=True)
+class ServePolicy:
+    """What a policy's process does: a task of an executor, its address."""
+
+    config: RunConfig
+
+    def __call__(self, task: SocketAddress, worker: Worker) -> None:
+        """Answer all workers until the run ends."""
+        if self.config.policies != 1:
+            choose_gpu(task.number)
+        if task.path.exists():
+            logger.warning("The policy's process %d was started again", task.number)
+            task.path.unlink()
+        host = PolicyHost(self.config, task.number)
+        # At the end of the run the folder is gone, and with it what the listener would remove.
+        with (
+            suppress(FileNotFoundError),
+            Listener(str(task.path), "AF_UNIX", _CONNECTIONS, task.key) as listener,
+        ):
+            threading.Thread(target=_accept, args=(listener, host), daemon=True).start()
+            host.run(ended=lambda: not task.path.exists())
+
+
+def _accept(listener: Listener, host: PolicyHost) -> None:
+    """Answer each connection in a thread, until this process ends."""
+    while True:
+        # A stranger, or a worker that was killed meanwhile.
+        with suppress(AuthenticationError, EOFError, ConnectionError):
+            connection = listener.accept()
+            threading.Thread(target=_answer, args=(connection, host), daemon=True).start()
+
+
+def _answer(connection: Connection, host: PolicyHost) -> None:
+    """Answer the calls of a worker, until it closes the connection."""
+    with closing(connection), suppress(EOFError, OSError, CancelledError):
+        worker: int = connection.recv()
+        while True:
+            connection.send_bytes(host.answer(worker, connection.recv_bytes()))
+
+
+def choose_gpu(number: int) -> None:
+    """Let this process use one of the machine's GPUs; before it imports torch.
+
+    The processes share the GPUs evenly. On a cluster Ray does it.
+    """
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if visible is None:
+        gpus = [str(index) for index, _ in enumerate(Path("/proc/driver/nvidia/gpus").glob("*"))]
+    else:
+        gpus = visible.split(",")
+    if len(gpus) > 1:
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpus[number % len(gpus)]
+
+
+@contextmanager
+def _local_processes(config: RunConfig) -> Iterator[Sequence[Address]]:
+    """Run the processes on this machine in the block."""
     count = config.policies or 0
-    executor = make_executor(replace(config, workers=count, resources=config.policy_resources))
-    with ExitStack() as stack:
-        session = stack.enter_context(executor.session(ServePolicy(config)))
-        directory = Directory(executor.host)
-        addresses = tuple(map(directory.address, range(count)))
+    failures = list[WorkerError]()
+    folder = Path(tempfile.mkdtemp(prefix="policies-"))  # which other users cannot enter
+    key = secrets.token_bytes(_KEY_BYTES)
+    addresses = tuple(SocketAddress(folder / str(n), key, n) for n in range(count))
+    with make_executor(replace(config, workers=count)).session(ServePolicy(config)) as session:
 
         def supervise() -> None:
             try:
@@ -205,70 +190,24 @@ def policy_processes(config: RunConfig) -> Iterator[tuple[Address, ...]]:
                         break
             except WorkerError as error:  # a process cannot start
                 failures.append(error)
-            directory.close()  # whoever waits gets an error
+            shutil.rmtree(folder, ignore_errors=True)  # whoever waits gets an error
 
         thread = threading.Thread(target=supervise, daemon=True)
         thread.start()
-        stack.callback(_join, thread, session)
-        stack.callback(directory.close)
-        with ExitStack() as first:
-            try:  # connect to all before waiting for one: they load at the same time
-                connections = [first.enter_context(connect(address)) for address in addresses]
-                for connection in connections:
-                    SharedPolicy(connection)
+        try:
+            try:
+                _load(addresses)
             except ServerDiedError as error:
                 raise (failures[0] if failures else error) from None
-        yield addresses
+            yield addresses
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+            _join(thread, session)
 
 
 def _join(thread: threading.Thread, session: Session) -> None:
     """Wait for processes that end; kill those that do not in time, such as in a long call."""
     thread.join(CLOSE_S)
     while thread.is_alive():
-        session.kill()  # those that replace them find no directory, and end
+        session.kill()  # those that replace them find no folder, and end
         thread.join(CLOSE_S)
-
-
-@contextmanager
-def _death() -> Iterator[None]:
-    """Convert the end of a connection into the error of a process that ended."""
-    try:
-        yield
-    except (AuthenticationError, EOFError, OSError) as error:
-        reason = f": {error}" if str(error) else ""
-        problem = f"the policy's process ended{reason}"
-        raise ServerDiedError(problem, "Its output is above.") from error
-
-
-def _reply(client: Connection, answer: Answer) -> None:
-    """Send an answer; an exception with its traceback, and as text if it cannot be pickled."""
-    value, error = answer
-    if error is None:
-        _, error = attempt(_send, client, (value, None))
-        if error is None or isinstance(error, OSError):  # its worker ended
-            return
-    trace = "".join(traceback.format_exception(error))
-    copied, _ = attempt(lambda: pickle.loads(pickle.dumps(error)))
-    if not isinstance(copied, Exception):
-        copied = RuntimeError(f"{type(error).__name__}: {error}")
-    copied.add_note(f"In the policy's process:\n{trace}")
-    attempt(_send, client, (None, copied))
-
-
-def _send(connection: Connection, value: Any) -> None:
-    """Send a value, and then the bytes of its arrays, which are not copied into its pickle."""
-    buffers: list[pickle.PickleBuffer] = []
-    data = pickle.dumps(value, protocol=5, buffer_callback=buffers.append)
-    views = [one.raw() for one in buffers]
-    connection.send_bytes(pickle.dumps((data, [len(view) for view in views])))
-    for view in views:
-        connection.send_bytes(view)
-
-
-def _receive(connection: Connection) -> Any:
-    """Receive a value; its arrays can be written to."""
-    data, sizes = pickle.loads(connection.recv_bytes())
-    buffers = [bytearray(size) for size in sizes]
-    for one in buffers:
-        connection.recv_bytes_into(one)
-    return pickle.loads(data, buffers=buffers)

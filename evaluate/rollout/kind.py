@@ -40,7 +40,7 @@ from robomme_interference_data.evaluate.policies.registry import (
     policy_options,
     with_server,
 )
-from robomme_interference_data.evaluate.policies.sockets import Address
+from robomme_interference_data.evaluate.policies.shared import Address
 from robomme_interference_data.evaluate.run.config import RunConfig, check_unused
 from robomme_interference_data.evaluate.run.kind import Run, RunKind, retrieval_text, short_digest
 from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
@@ -66,7 +66,7 @@ class Rollouts(RunKind[RunConfig]):
         config = dataclasses.replace(config, policy=policy)
         self.system = config.system or default_system(config)
         self._answers: Answers | None = None
-        self._addresses: tuple[Address, ...] = ()
+        self._addresses: Sequence[Address] = ()
         # The commit of a model is the same for all workers.
         policy, subgoals = POLICIES.pin(policy), pin_subgoals(config.subgoals)
         super().__init__(dataclasses.replace(config, policy=policy, subgoals=subgoals), buffer_set)

@@ -21,7 +21,7 @@ from robomme_interference_data.evaluate.language.subgoal_writers import make_wri
 from robomme_interference_data.evaluate.policies.answers import Answers
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import make_policy
-from robomme_interference_data.evaluate.policies.sockets import Address
+from robomme_interference_data.evaluate.policies.shared import Address, SharedPolicy
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.kind import Job, Run, RunTask
 from robomme_interference_data.evaluate.run.plan import WorkItem
@@ -141,9 +141,8 @@ class RolloutTask(RunTask[RunConfig]):
             return self._given
         if not self._addresses:
             return make_policy(config.policy, config.policy_options, worker=worker.number)
-        from robomme_interference_data.evaluate.policies.process import SharedPolicy, connect
-
-        return SharedPolicy(connect(self._addresses[worker.number % len(self._addresses)]))
+        address = self._addresses[worker.number % len(self._addresses)]
+        return SharedPolicy.open(address, worker.number)
 
     def _open_simulator(self, policy: Policy, worker: Worker) -> Simulator:
         config = self.run.config

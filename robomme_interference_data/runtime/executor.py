@@ -81,13 +81,15 @@ class Resources:
         Raises:
             InvalidOptionError: A resource is unknown, or its number cannot be reserved.
         """
-        resources = cls(**bind_options(f"`{setting}`", cls, {}, texts))
+        resources = cls(**bind_options(named(setting), cls, {}, texts))
         if not 0 <= resources.cpus < math.inf:
-            raise InvalidOptionError.expected(f"`{setting}`: cpus", resources.cpus, "0 or more")
+            raise InvalidOptionError.expected(
+                f"{named(setting)}: cpus", resources.cpus, "0 or more"
+            )
         whole = resources.gpus <= 1 or resources.gpus % 1 == 0  # Ray shares one GPU, not several
         if not (0 <= resources.gpus < math.inf and whole):
             expected = "0 to 1, or a whole number"
-            raise InvalidOptionError.expected(f"`{setting}`: gpus", resources.gpus, expected)
+            raise InvalidOptionError.expected(f"{named(setting)}: gpus", resources.gpus, expected)
         return resources
 
 
@@ -100,23 +102,32 @@ def make_executor(config: WorkersConfig) -> "Executor":
                 f"Set {named('executor', 'ray')}, or leave it out.",
             )
         return Processes(config.workers)
+    address, resources = ray_address(config), Resources.parse("resources", config.resources)
+    make = load_extra(
+        f"{__package__}.ray_cluster", "RayWorkers", named("executor", "ray"), "cluster"
+    )
+    executor: Executor = make(config.workers, address, resources)
+    return executor
+
+
+def ray_address(config: WorkersConfig) -> str:
+    """Return the address of the Ray cluster that the settings name."""
     name, colon, address = config.executor.partition(":")
     if name != "ray":
         known = ("processes", "ray", "ray:HOST:PORT", "ray:local")
         raise InvalidOptionError.one_of("executor", config.executor, known)
-    resources = Resources.parse("resources", config.resources)
-    make = load_extra(
-        f"{__package__}.ray_cluster", "RayWorkers", named("executor", "ray"), "cluster"
-    )
-    executor: Executor = make(config.workers, address if colon else "auto", resources)
-    return executor
+    return address if colon else "auto"
 
 
 def describe(function: Task) -> dict[str, str]:
     """Return what must be equal on all machines: versions, and the result of `Task.describe`."""
+    return own_versions() | getattr(function, "describe", dict)()
+
+
+def own_versions() -> dict[str, str]:
+    """Return the versions of Python and of this package."""
     package = "robomme-interference-data"
-    versions = {"python": platform.python_version(), package: metadata.version(package)}
-    return versions | getattr(function, "describe", dict)()
+    return {"python": platform.python_version(), package: metadata.version(package)}
 
 
 Session = Scheduler[Any]
@@ -131,11 +142,6 @@ class Executor(ABC):
     """
 
     workers: int
-
-    @property
-    def host(self) -> str:
-        """The address under which workers reach this machine, in a session."""
-        return "127.0.0.1"
 
     @abstractmethod
     def session(self, function: Task) -> AbstractContextManager[Session]:

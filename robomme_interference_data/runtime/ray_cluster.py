@@ -1,4 +1,4 @@
-"""Workers on a Ray cluster. This is the only module that imports Ray (extra `cluster`).
+"""Workers on a Ray cluster. Only this module and `ray_actors` import Ray (extra `cluster`).
 
 A worker is an actor: Ray places it on a node with enough resources and ends it with the job. A
 worker that dies, or is lost with its node, is replaced. Only the caller writes files.
@@ -13,7 +13,7 @@ import signal
 import socket
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import chdir, closing, contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -77,17 +77,11 @@ class RayWorkers(Executor):
             expected = "ray, ray:local or ray:HOST:PORT"
             raise InvalidOptionError.expected("executor", f"ray:{self.address}", expected)
 
-    @property
-    def host(self) -> str:
-        """The address under which the cluster's nodes reach this machine, in a session."""
-        util: Any = ray.util
-        return str(util.get_node_ip_address())
-
     @contextmanager
     def session(self, function: Task) -> Iterator[Session]:
         """Keep workers on nodes of a cluster in the block; see `Executor.session`."""
         end_if_starting()
-        with _connected(self.address), closing(_RayScheduler(function, self)) as scheduler:
+        with connected(self.address), closing(_RayScheduler(function, self)) as scheduler:
             yield scheduler
 
 
@@ -155,20 +149,7 @@ class _RayWorker:
                 raise WorkerError(f"a worker cannot start: {_cause(error)}") from None
             self._begin()
             return
-        expected = self._scheduler.versions
-        if versions != expected:
-            differences = versions
-            if isinstance(versions, dict):
-                differences = "; ".join(
-                    f"{key} is {versions.get(key, 'missing')} there, "
-                    f"{expected.get(key, 'missing')} here"
-                    for key in sorted({*versions, *expected})
-                    if versions.get(key) != expected.get(key)
-                )
-            raise WorkerError(
-                f"node {_name(self._node)} of the cluster differs from this process: {differences}",
-                "Install the same packages on all nodes, and use a buffer set that all can read.",
-            )
+        check_node(self._node, versions, self._scheduler.versions)
         self.ready = True
 
     def send(self, task: Any, time_limit: float | None) -> None:
@@ -244,8 +225,25 @@ class _RayScheduler(Scheduler[_RayWorker]):
             worker.stop()
 
 
+def check_node(node: str, versions: Mapping[str, str] | str, expected: Mapping[str, str]) -> None:
+    """Compare what `describe` returned on a node, or its error, with this process's."""
+    if versions == expected:
+        return
+    differences = versions
+    if not isinstance(versions, str):
+        differences = "; ".join(
+            f"{key} is {versions.get(key, 'missing')} there, {expected.get(key, 'missing')} here"
+            for key in sorted({*versions, *expected})
+            if versions.get(key) != expected.get(key)
+        )
+    raise WorkerError(
+        f"node {_name(node)} of the cluster differs from this process: {differences}",
+        "Install the same packages on all nodes, and use a buffer set that all can read.",
+    )
+
+
 @contextmanager
-def _connected(address: str) -> Iterator[None]:
+def connected(address: str) -> Iterator[None]:
     """Connect to a cluster in the block, unless this process is connected already."""
     if ray.is_initialized():
         yield

@@ -17,11 +17,8 @@ from support.worker_calls import wait_until_gone
 
 from robomme_interference_data.errors import InvalidOptionError, PolicyError, ServerDiedError
 from robomme_interference_data.evaluate import run_evaluation
-from robomme_interference_data.evaluate.policies.process import (
-    SharedPolicy,
-    connect,
-    policy_processes,
-)
+from robomme_interference_data.evaluate.policies.process import policy_processes
+from robomme_interference_data.evaluate.policies.shared import SharedPolicy
 from robomme_interference_data.runtime.executor import Processes
 
 pytestmark = pytest.mark.usefixtures("world")
@@ -157,7 +154,7 @@ def test_a_shared_act_returns_the_same_bits(tmp_path: Path) -> None:
             policy=f"lerobot:{folder}", policy_options=("device=cpu",), policies=1, max_batch_size=1
         )
         with policy_processes(config) as (address,):
-            shared = SharedPolicy(connect(address))
+            shared = SharedPolicy.open(address, 0)
             assert (shared.cameras, shared.every_frame) == (own.cameras, own.every_frame)
             assert shared.metadata() == own.metadata()
             for _ in range(2):
