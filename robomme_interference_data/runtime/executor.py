@@ -81,13 +81,15 @@ class Resources:
         Raises:
             InvalidOptionError: A resource is unknown, or its number cannot be reserved.
         """
-        resources = cls(**bind_options(f"`{setting}`", cls, {}, texts))
+        resources = cls(**bind_options(named(setting), cls, {}, texts))
         if not 0 <= resources.cpus < math.inf:
-            raise InvalidOptionError.expected(f"`{setting}`: cpus", resources.cpus, "0 or more")
+            raise InvalidOptionError.expected(
+                f"{named(setting)}: cpus", resources.cpus, "0 or more"
+            )
         whole = resources.gpus <= 1 or resources.gpus % 1 == 0  # Ray shares one GPU, not several
         if not (0 <= resources.gpus < math.inf and whole):
             expected = "0 to 1, or a whole number"
-            raise InvalidOptionError.expected(f"`{setting}`: gpus", resources.gpus, expected)
+            raise InvalidOptionError.expected(f"{named(setting)}: gpus", resources.gpus, expected)
         return resources
 
 
