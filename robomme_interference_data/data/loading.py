@@ -144,7 +144,7 @@ def open_dataset(buffer_set: BufferSet, name: str, more: str = "") -> Dataset:
         command = f"build {buffer_set.location} --only manifests"
     elif buffer_set.is_own:
         hint = "Build them from the source of its demonstrations, then plan the buffers again."
-        command = f"build {name} {buffer_set.location} --source KIND:PATH"
+        command = f"build {buffer_set.location} --only {name} --source KIND:PATH"
     raise MissingFileError(
         f"{buffer_set.location} has no {name}", f"{hint} {more}".strip(), command
     )

@@ -86,7 +86,7 @@ class SessionSource:
             raise SourceError(
                 f"{dataset.files.describe()} lacks {episode}, which a buffer needs",
                 "Build it from the same episodes.",
-                f"build {name}",
+                f"build BUFFER_SET --only {name} --source KIND:PATH",
             )
         return session
 

@@ -13,7 +13,7 @@ from support.worlds import World
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.dataset.build import build_dataset
-from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan
+from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan, PlannedEpisode
 from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
 from robomme_interference_data.build_dataset.plan.episodes import choose_episodes
 from robomme_interference_data.build_dataset.plan.planned import datasets_in
@@ -84,8 +84,10 @@ def test_every_condition_needs_its_embeddings(tmp_path: Path) -> None:
     listed = choose_episodes(
         (source,), split="test", families=[one.split("/")[0] for one in QUERIES]
     )
-    tasks = tuple((number, source.contradict(one)) for number, one in listed)
-    plan = DatasetPlan(CONTRADICTIONS, (source,), tasks)
+    episodes = tuple(
+        PlannedEpisode(number, source.contradict(episode)) for number, episode in listed
+    )
+    plan = DatasetPlan(CONTRADICTIONS, (source,), episodes)
     build_dataset(plan, buffer_set / CONTRADICTIONS, Serial(), QUIET)
     sum(write_manifests(plan_manifests(datasets_in(buffer_set), ("k0", "stale-k0")), buffer_set))
     make_index(buffer_set)

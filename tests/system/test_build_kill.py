@@ -31,7 +31,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[BuildServer]:
 def command(out: Path, workers: int = 2) -> list[str]:
     """Build six units and one that is too short, of small cameras."""
     options = f"--source sample:MoveCube,PatternLock --cameras front --workers {workers}"
-    return ["build", "distractors", str(out.parent), *options.split()]
+    return ["build", str(out.parent), "--only", "distractors", *options.split()]
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ from support.shared_policies import FAULT
 from support.worker_calls import Marked, behave, wait_until_gone
 
 from robomme_interference_data.build_dataset.dataset.build import build_dataset
-from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan
+from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan, PlannedEpisode
 from robomme_interference_data.errors import WorkerError
 from robomme_interference_data.evaluate.run.log import read_record
 from robomme_interference_data.runtime.executor import Executor, Serial
@@ -196,7 +196,7 @@ def test_a_token_that_is_missing(cluster: Any, tmp_path: Path) -> None:
 
 def test_a_build_has_the_bytes_of_one_process(cluster: Any, tmp_path: Path) -> None:
     source = MadeUpSource({f"MoveCube/test/{number}": (40, 20) for number in range(4)})
-    tasks = tuple((0, episode) for episode in source.episodes())
+    tasks = tuple(PlannedEpisode(0, episode) for episode in source.episodes())
     plan = DatasetPlan("demonstrations", (source,), tasks)
 
     def built(name: str, executor: Executor) -> dict[str, bytes]:
