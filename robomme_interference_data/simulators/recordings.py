@@ -57,9 +57,11 @@ class Recordings(Simulator):
         weight. The current episode is left out, since a policy cannot know its actions either.
         """
         episodes = self._executions.records()
-        others = [one for one in episodes if one.episode_id != self._current.episode_id]
+        others = [record for record in episodes if record.episode_id != self._current.episode_id]
         others = [
-            one for one in others if one.episode_id.family == self._current.episode_id.family
+            record
+            for record in others
+            if record.episode_id.family == self._current.episode_id.family
         ] or others
         if not others:
             raise SimulatorError(
@@ -67,8 +69,8 @@ class Recordings(Simulator):
                 "others",
                 "Build the executions of more episodes, or run another policy.",
             )
-        total = sum(self._sum_of(one.episode_index) for one in others)
-        return np.asarray(total / sum(one.length for one in others), np.float32)
+        total = sum(self._sum_of(record.episode_index) for record in others)
+        return np.asarray(total / sum(record.length for record in others), np.float32)
 
     def _sum_of(self, index: int) -> NDArray[np.float64]:
         """Return the sum of the recorded actions of an episode, `(A,) float64`."""

@@ -65,7 +65,7 @@ def mantel_haenszel(successes: Floats, trials: Floats, level: float = LEVEL) -> 
     total = of.sum(axis=0)
     sizes = of.prod(axis=0) / total
     weights = sizes / sizes.sum()
-    rates = [float(weights @ one) for one in won / of]
+    rates = [float(weights @ share) for share in won / of]
     worth = [stratified_n(*side, weights) for side in zip(won, of, strict=True)]
     bounds = [wilson(rate * n, n, level) for rate, n in zip(rates, worth, strict=True)]
     (first, second), pooled = rates, won.sum(axis=0) / total

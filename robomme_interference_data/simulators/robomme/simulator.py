@@ -165,7 +165,7 @@ class RoboMMESimulator(Simulator):
                 f"{episode}: RoboMME cannot combine a scene with another answer",
                 f"Use the episode {episode.scene}, or the simulator tabletop.",
             )
-        families = [one for one in self._process.families if one in FAMILIES]
+        families = [family for family in self._process.families if family in FAMILIES]
         if episode.family not in families:
             raise UnknownNameError.among("family", episode.family, self.name, families)
         most = EPISODES if self._cameras or self._subgoals else 5 * EPISODES

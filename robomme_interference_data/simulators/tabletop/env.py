@@ -238,10 +238,10 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         self._rest()
         return Demonstration(
             {
-                name: np.stack([one.images[name] for one in seen[:: self.every]])
+                name: np.stack([observation.images[name] for observation in seen[:: self.every]])
                 for name in seen[0].images
             },
-            np.stack([one.state for one in seen]),
+            np.stack([observation.state for observation in seen]),
             np.stack(actions),
             spans_of_parts(shown, self.episode.parts(self.answer)),
         )
