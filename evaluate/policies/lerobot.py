@@ -31,7 +31,7 @@ from robomme_interference_data.errors import (
     MissingFileError,
     PolicyError,
 )
-from robomme_interference_data.simulators.base import ACTION_SIZE, Observation
+from robomme_interference_data.simulators.episode import ACTION_SIZE, Observation
 from robomme_interference_data.storage.hub import locate
 from robomme_interference_data.storage.weights import digest_weights
 

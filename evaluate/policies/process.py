@@ -32,7 +32,7 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.runtime.executor import Session, Worker, make_executor
 from robomme_interference_data.runtime.process import CLOSE_S
-from robomme_interference_data.simulators.base import Observation
+from robomme_interference_data.simulators.episode import Observation
 
 from .batching import Answer, Batcher, attempt
 from .policy import Frames, Policy, RolloutInfo

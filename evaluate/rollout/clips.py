@@ -20,7 +20,7 @@ from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.sampling import spread
 from robomme_interference_data.schema.subgoal import Subgoal
-from robomme_interference_data.simulators.base import EpisodeInfo, Observation
+from robomme_interference_data.simulators.episode import EpisodeInfo, Observation
 from robomme_interference_data.storage.encode import CLIP, VideoEncoder
 from robomme_interference_data.viz.figure import Hue
 from robomme_interference_data.viz.filmstrip import session_colors
