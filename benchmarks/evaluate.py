@@ -30,7 +30,7 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Executor
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.rollouts import Status
-from robomme_interference_data.simulators.base import Observation
+from robomme_interference_data.simulators.episode import Observation
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
 
 CAMERAS = ("front", "wrist")

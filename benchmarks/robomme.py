@@ -14,7 +14,7 @@ import time
 import numpy as np
 from common import positive, print_machine, print_table
 
-from robomme_interference_data.simulators.base import Status
+from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.robomme.simulator import RoboMMESimulator
 
 FAMILIES = ("VideoUnmask", "PatternLock")

@@ -24,6 +24,7 @@ from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.query import Query
+from robomme_interference_data.data.query_sessions import buffer_manifest
 from robomme_interference_data.data.questions import Question
 from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
@@ -58,7 +59,7 @@ def demonstrations_facts(dataset: Dataset) -> Facts:
     if not records:
         raise FormatError.damaged(dataset.files.describe(), "no episodes")
     query, lesson = Query(dataset, records[0]), dataset.session("lesson", records[0])
-    manifest = query.manifest(parse_condition("k0"), (lesson,), exact=records[0].exact)
+    manifest = buffer_manifest(query, parse_condition("k0"), (lesson,), exact=records[0].exact)
     frames, skipped = sum(record.length for record in records), _skipped([dataset])
     limits = []
     if skipped:

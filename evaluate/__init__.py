@@ -18,7 +18,8 @@ from robomme_interference_data.lazy import lazy_exports
 if TYPE_CHECKING:
     from robomme_interference_data.schema.evidence import Evidence
     from robomme_interference_data.schema.subgoal import Subgoal
-    from robomme_interference_data.simulators.base import Observation, Simulator
+    from robomme_interference_data.simulators.base import Simulator
+    from robomme_interference_data.simulators.episode import Observation
 
     from .policies.policy import BatchPolicy, Frames, Policy, RolloutInfo
     from .run.config import AskConfig, RunConfig
@@ -53,6 +54,7 @@ __getattr__ = lazy_exports(
         ".run.merge": "Merged merge_runs",
         "robomme_interference_data.schema.evidence": "Evidence",
         "robomme_interference_data.schema.subgoal": "Subgoal",
-        "robomme_interference_data.simulators.base": "Observation Simulator",
+        "robomme_interference_data.simulators.base": "Simulator",
+        "robomme_interference_data.simulators.episode": "Observation",
     },
 )

@@ -8,6 +8,7 @@ buffer.frames("front")  # (T, H, W, 3) uint8
 ```
 """
 
+import sys
 from typing import TYPE_CHECKING
 
 from .lazy import lazy_exports
@@ -47,6 +48,11 @@ __all__ = [
     # errors (all of them: robomme_interference_data.errors)
     "InterferenceError",
 ]
+
+if "IPython" in sys.modules:
+    from .notebooks import register
+
+    register()
 
 __getattr__ = lazy_exports(
     __name__,

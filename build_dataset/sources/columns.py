@@ -12,7 +12,7 @@ from robomme_interference_data.errors import (
     named,
     nearest,
 )
-from robomme_interference_data.simulators.base import CAMERAS
+from robomme_interference_data.simulators.episode import CAMERAS
 from robomme_interference_data.storage.lerobot import LeRobotFiles
 
 from .base import Robot

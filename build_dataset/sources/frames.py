@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, SourceError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.simulators.base import choose_cameras
+from robomme_interference_data.simulators.episode import choose_cameras
 from robomme_interference_data.storage.parquet import RowSpan
 from robomme_interference_data.storage.video import iter_frames
 

@@ -18,7 +18,7 @@ import numpy as np
 from robomme_interference_data.errors import InterferenceError, SourceError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.evidence import spans_of_texts
-from robomme_interference_data.simulators.base import choose_cameras
+from robomme_interference_data.simulators.episode import choose_cameras
 from robomme_interference_data.simulators.registry import OFFICIAL
 
 from .base import Frame, Recording, Robot, Source, SourceEpisode, demonstration_length, file_state

@@ -18,7 +18,7 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import from_dict
 from robomme_interference_data.schema.evidence import spans_of_texts
 from robomme_interference_data.schema.records import EvidenceSpan
-from robomme_interference_data.simulators.base import choose_cameras
+from robomme_interference_data.simulators.episode import choose_cameras
 from robomme_interference_data.simulators.registry import OFFICIAL
 from robomme_interference_data.storage.encode import is_png
 from robomme_interference_data.storage.hub import HubFiles, locate

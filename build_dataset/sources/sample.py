@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EvidenceSpan
-from robomme_interference_data.simulators.base import choose_cameras
+from robomme_interference_data.simulators.episode import choose_cameras
 
 from .base import Frame, Recording, Source, SourceEpisode
 from .robomme_families import ROBOT

@@ -38,7 +38,12 @@ from robomme_interference_data.constants import (
     Unit,
 )
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.data.embeddings import IndexHeader, index_folder, normalized
+from robomme_interference_data.data.embeddings import (
+    IndexHeader,
+    index_folder,
+    normalized,
+    open_index,
+)
 from robomme_interference_data.data.fetched_copy import FetchedCopy
 from robomme_interference_data.errors import InterferenceError, visible
 from robomme_interference_data.retrieval.segment import typical_cosine
@@ -276,7 +281,7 @@ def _index(
         return
     lengths = {record.episode_index: record.length for record in dataset.records()}
     held = [index for index in lengths if copy is None or copy.holds(dataset, index)]
-    index = dataset.index(encoder, camera)
+    index = open_index(dataset, encoder, camera)
     index.check(lengths, units=name == DISTRACTORS, held=held)
     if header.encoder.sha256 != digest_json([header.encoder.fingerprint]):
         yield Violation(where, "the encoder's fingerprint does not have its SHA-256")
@@ -291,6 +296,6 @@ def _index(
             what = f"the typical cosine is {header.typical_cosine}; the embeddings give {typical}"
             yield Violation(where, what)
     with suppress(InterferenceError):  # reported where the units are checked
-        made = dataset.index(encoder, camera).key
-        if units is not None and units.index(encoder, camera).key != made:
+        made = open_index(dataset, encoder, camera).key
+        if units is not None and open_index(units, encoder, camera).key != made:
             yield Violation(where, f"was made with another encoder than that of the {DISTRACTORS}")

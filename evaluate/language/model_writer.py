@@ -11,7 +11,8 @@ from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.schema.sampling import spread
 from robomme_interference_data.schema.subgoal import Subgoal
-from robomme_interference_data.simulators.base import Observation, Simulator
+from robomme_interference_data.simulators.base import Simulator
+from robomme_interference_data.simulators.episode import Observation
 
 from .model import ChatModel, Message, Part, Reply
 from .prompt_files import as_text

@@ -12,7 +12,8 @@ from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.evaluate.run.history import HistoryReader
 from robomme_interference_data.schema.subgoal import Subgoal
-from robomme_interference_data.simulators.base import Observation, Simulator
+from robomme_interference_data.simulators.base import Simulator
+from robomme_interference_data.simulators.episode import Observation
 
 from .model import Video
 

@@ -19,6 +19,7 @@ from robomme_interference_data.errors import (
     ModelError,
     first_line,
 )
+from robomme_interference_data.runtime.device import choose_device
 from robomme_interference_data.storage.hub import HubFiles, locate
 from robomme_interference_data.storage.weights import digest_weights
 
@@ -56,12 +57,7 @@ class TransformersModel(ChatModel):
                 f"max_tokens {max_tokens}, images {images}; expected at least 1"
             )
         self._max_tokens, self.images = max_tokens, images
-        try:
-            self._device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-            torch.empty(0, device=self._device)
-        except (RuntimeError, AssertionError) as error:
-            what = f"device {device!r} cannot be used: {first_line(error)}"
-            raise InvalidOptionError(what, "Set device=cpu.") from None
+        self._device = choose_device(device)
         files = locate(path, "model")
         self._path, self._folder = path, files.snapshot(*_FILES)
         self._metadata: dict[str, Any] = {"sha256": digest_weights(self._folder, _FILES)}

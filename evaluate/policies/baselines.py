@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import ACTION_CHUNK
 from robomme_interference_data.errors import InvalidOptionError, PolicyError, named
-from robomme_interference_data.simulators.base import Observation
+from robomme_interference_data.simulators.episode import Observation
 from robomme_interference_data.simulators.recordings import Recordings
 
 from .policy import Policy, RolloutInfo

@@ -10,7 +10,8 @@ from robomme_interference_data.errors import PolicyError
 from robomme_interference_data.schema.evidence import known_parts
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.schema.subgoal import Subgoal
-from robomme_interference_data.simulators.base import Observation, Simulator
+from robomme_interference_data.simulators.base import Simulator
+from robomme_interference_data.simulators.episode import Observation
 
 from .policy import Frames, Policy, RolloutInfo
 

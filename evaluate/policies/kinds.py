@@ -6,7 +6,7 @@ name. What only the policy's object knows, because it depends on weights or on a
 """
 
 from robomme_interference_data.schema.sampling import Memory
-from robomme_interference_data.simulators.base import ACTION_SIZE
+from robomme_interference_data.simulators.episode import ACTION_SIZE
 
 from .capabilities import PolicyKind, Role, Server
 

@@ -25,13 +25,9 @@ from robomme_interference_data.constants import (
     STATE,
     WRIST,
 )
-from robomme_interference_data.errors import (
-    InvalidOptionError,
-    MissingExtraError,
-    MissingFileError,
-    PolicyError,
-)
-from robomme_interference_data.simulators.base import ACTION_SIZE, Observation
+from robomme_interference_data.errors import MissingExtraError, MissingFileError, PolicyError
+from robomme_interference_data.runtime.device import choose_device
+from robomme_interference_data.simulators.episode import ACTION_SIZE, Observation
 from robomme_interference_data.storage.hub import locate
 from robomme_interference_data.storage.weights import digest_weights
 
@@ -66,7 +62,7 @@ class LeRobotPolicy(BatchPolicy):
     """
 
     def __init__(self, path: str, *, device: str | None = None):
-        self._device = _choose_device(device)
+        self._device = str(choose_device(device))
         self._folder, self._source = find_policy(path)
         with _explained(path):
             self._config = PreTrainedConfig.from_pretrained(self._folder)
@@ -262,15 +258,6 @@ def _stacked(items: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
         else:
             batch[name] = first
     return batch
-
-
-def _choose_device(device: str | None) -> str:
-    """Return the device; for None the first GPU, or `cpu` without one."""
-    gpus = [f"cuda:{number}" for number in range(torch.cuda.device_count())]
-    known = ["cpu", *gpus, *(["cuda"] if gpus else [])]
-    if device is not None and device not in known:
-        raise InvalidOptionError.one_of("device", device, known)
-    return device or known[-1]
 
 
 def find_policy(path: str) -> tuple[Path, str]:

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.schema.evidence import Evidence
-from robomme_interference_data.simulators.base import Observation, Simulator
+from robomme_interference_data.simulators.base import Simulator
+from robomme_interference_data.simulators.episode import Observation
 
 Frames = Mapping[str, NDArray[np.uint8]]
 """Camera name (`front`, `wrist`) to `(T, H, W, 3) uint8` RGB; both simulators draw 256 × 256."""

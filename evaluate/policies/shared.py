@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import InterferenceError, PolicyError, ServerDiedError
 from robomme_interference_data.evaluate.run.config import RunConfig
-from robomme_interference_data.simulators.base import Observation
+from robomme_interference_data.simulators.episode import Observation
 
 from .batching import Answer, Batcher, attempt
 from .policy import Frames, Policy, RolloutInfo

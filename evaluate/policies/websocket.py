@@ -27,7 +27,7 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.runtime import guard
 from robomme_interference_data.runtime.safe_path import user_environment
-from robomme_interference_data.simulators.base import ACTION_SIZE, Observation
+from robomme_interference_data.simulators.episode import ACTION_SIZE, Observation
 
 from .connection import OpenpiConnection, check_server_options
 from .policy import Frames, Policy, RolloutInfo

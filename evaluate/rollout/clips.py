@@ -18,7 +18,7 @@ from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.sampling import spread
 from robomme_interference_data.schema.subgoal import Pixel, Subgoal
-from robomme_interference_data.simulators.base import EpisodeInfo, Observation
+from robomme_interference_data.simulators.episode import EpisodeInfo, Observation
 from robomme_interference_data.viz.episode_video import VIEW, EpisodeVideo
 from robomme_interference_data.viz.filmstrip import session_colors
 

@@ -7,7 +7,7 @@ import numpy as np
 from robomme_interference_data.constants import STATE
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.errors import RunError, SimulatorError
-from robomme_interference_data.simulators.base import Demonstration, EpisodeInfo, Observation
+from robomme_interference_data.simulators.episode import Demonstration, EpisodeInfo, Observation
 
 STATE_TOLERANCE = 0.01
 """Maximum distance, rad or m, of the first live state from the recorded one: between machines only

@@ -30,12 +30,8 @@ from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.schema.shifts import NO_SHIFT
 from robomme_interference_data.schema.subgoal import Subgoal
-from robomme_interference_data.simulators.base import (
-    ACTION_SIZE,
-    Observation,
-    Simulator,
-    action_array,
-)
+from robomme_interference_data.simulators.base import Simulator
+from robomme_interference_data.simulators.episode import ACTION_SIZE, Observation, action_array
 
 from .recording_check import check_episode, check_lesson
 

@@ -27,7 +27,7 @@ from robomme_interference_data.ids import EpisodeId, count_numbers, nth_number
 from robomme_interference_data.runtime.worker import Worker
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import NO_HISTORY
-from robomme_interference_data.simulators.base import Observation
+from robomme_interference_data.simulators.episode import Observation
 
 from .configuration import check_label
 from .observations import ACTION_SPEC, CAMERAS, OBSERVATION_SPEC, ObservingPolicy

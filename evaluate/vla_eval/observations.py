@@ -11,7 +11,7 @@ from vla_eval.protocol.image_codec import encode_image
 from vla_eval.specs import IMAGE_RGB, LANGUAGE, DimSpec
 
 from robomme_interference_data.evaluate.policies.policy import Frames, Policy, RolloutInfo
-from robomme_interference_data.simulators.base import Observation
+from robomme_interference_data.simulators.episode import Observation
 
 CAMERAS = {"front": "agentview", "wrist": "wrist"}
 """Camera to its name in an observation's `images`, and in an observation spec."""

@@ -12,7 +12,7 @@ from vla_eval.specs import GRIPPER_CLOSE_NEG, IMAGE_RGB, LANGUAGE, DimSpec
 from robomme_interference_data.errors import PolicyServerError
 from robomme_interference_data.evaluate.policies.connection import check_server_options
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
-from robomme_interference_data.simulators.base import ACTION_SIZE, Observation
+from robomme_interference_data.simulators.episode import ACTION_SIZE, Observation
 
 from .connection import VlaEvalConnection
 from .observations import ACTIONS, CAMERAS, HISTORIES, STATE, STATE_HISTORY, ObservingPolicy

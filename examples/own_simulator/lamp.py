@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators import Demonstration, EpisodeInfo, Observation, Simulator
-from robomme_interference_data.simulators.base import Begun
+from robomme_interference_data.simulators.episode import Begun
 
 SIDE, CUE, SPEED, REACH = 64, 10, 0.05, 0.12
 COLORS = {

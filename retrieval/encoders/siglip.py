@@ -10,13 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import PAPER_ENCODER
-from robomme_interference_data.errors import (
-    FormatError,
-    InvalidOptionError,
-    MissingExtraError,
-    first_line,
-    named,
-)
+from robomme_interference_data.errors import FormatError, MissingExtraError, first_line
+from robomme_interference_data.runtime.device import choose_device
 from robomme_interference_data.storage.hub import HubFiles, locate
 from robomme_interference_data.storage.weights import digest_weights
 
@@ -62,12 +57,7 @@ class Siglip:
         self._folder = files.snapshot(*_FILES)
         if isinstance(files, HubFiles):
             origin = {"model": files.name, "revision": files.commit}
-        try:
-            self._device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-            torch.empty(0, device=self._device)
-        except (RuntimeError, AssertionError) as error:
-            message = f"device {device!r} cannot be used: {first_line(error)}"
-            raise InvalidOptionError(message, f"Try {named('device', 'cpu')}.") from None
+        self._device = choose_device(device)
         self._dtype = torch.float32
         if self._device.type == "cuda":
             self._dtype = torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float16

@@ -25,10 +25,9 @@ from robomme_interference_data.evaluate import commands as evaluating
 from robomme_interference_data.evaluate.score import commands as scoring
 from robomme_interference_data.evaluate.vla_eval import commands as vla_eval
 from robomme_interference_data.retrieval import commands as retrieving
-from robomme_interference_data.simulators import commands as simulating
 from robomme_interference_data.storage.hub import check_endpoint
 
-from . import commands, show_command, verify_command
+from . import commands, show_command, simulate_command, verify_command
 from .console import echo, log_to_stderr, print_status
 
 PROGRAM = "robomme-interference"
@@ -115,7 +114,7 @@ _GROUPS: dict[str, tuple[tuple[str, Callable[..., None]], ...]] = {
         ("conditions", commands.list_conditions),
         ("list", commands.list_buffers),
         ("show", show_command.show),
-        ("simulate", simulating.simulate),
+        ("simulate", simulate_command.simulate),
     ),
     "Retrieval": (
         ("index", retrieving.index),

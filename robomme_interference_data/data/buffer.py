@@ -1,6 +1,5 @@
 """A history buffer: its sessions in order, and their frames, decoded on demand."""
 
-import logging
 from bisect import bisect_right
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,12 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import DISTRACTORS, STATE
-from robomme_interference_data.errors import (
-    HashMismatchError,
-    InvalidOptionError,
-    MissingExtraError,
-    UnknownNameError,
-)
+from robomme_interference_data.errors import HashMismatchError, InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId, whole_number
 from robomme_interference_data.schema.manifest import BufferManifest, SessionEntry, layout_sessions
 from robomme_interference_data.storage.arrays import combine
@@ -30,7 +24,6 @@ if TYPE_CHECKING:
     from robomme_interference_data.storage.cache import DecodedCache
 
     from .embeddings import BufferSetIndex
-    from .query_sessions import SessionSource
 
 
 @dataclass(frozen=True)
@@ -70,12 +63,12 @@ class Buffer:
         *,
         cache: "DecodedCache | None" = None,
         threads: int | None = None,
-        source: "SessionSource | None" = None,
+        check_rules: Callable[[], None] | None = None,
     ):
         self.manifest = manifest
         self.query = query
         self.sessions = layout_sessions(manifest.sessions)
-        self._datasets, self._source = datasets, source
+        self._datasets, self._check_rules = datasets, check_rules
         self._reader = FrameReader(self.sessions, datasets, cache, threads)
 
     def __repr__(self) -> str:
@@ -83,16 +76,6 @@ class Buffer:
             f"Buffer({self.episode_id}, {self.condition}, frames={len(self)}, "
             f"sessions={len(self.sessions)}, cameras={list(self.cameras)})"
         )
-
-    def _repr_png_(self) -> bytes | None:
-        """Return the film strip for notebooks; without matplotlib they show the text."""
-        from robomme_interference_data.viz.filmstrip import strip_png
-
-        try:
-            return strip_png(self)
-        except MissingExtraError as error:
-            logging.getLogger(__name__).warning("%s", error)
-            return None
 
     def __len__(self) -> int:
         """Return the number of history frames, without the first live observation."""
@@ -151,7 +134,8 @@ class Buffer:
             `(T, …)`, in the buffer's order; a new array.
         """
         sessions = self.manifest.sessions
-        return np.concatenate([empty, *(np.repeat(read(one), one.repeat, 0) for one in sessions)])
+        values = (np.repeat(read(entry), entry.repeat, 0) for entry in sessions)
+        return np.concatenate([empty, *values])
 
     @cached_property
     def evidence(self) -> "tuple[Evidence, ...] | None":
@@ -199,7 +183,7 @@ class Buffer:
             record = self.query.record
             episodes_of.setdefault(self.query.dataset, []).append((record.episode_index, query))
         for dataset, episodes in episodes_of.items():  # lazily: local datasets need no paths
-            dataset.files.fetch(path for one in episodes for path in dataset.files_of(*one))
+            dataset.files.fetch(path for held in episodes for path in dataset.files_of(*held))
 
     def frames(self, camera: str | None = None) -> NDArray[np.uint8]:
         """Decode all frames of a camera, on several threads.
@@ -315,7 +299,7 @@ class Buffer:
         """
         index = self.index(encoder, camera)
         return self.gather(
-            lambda one: index.span(one.dataset, one.episode_index, one.start, one.stop),
+            lambda entry: index.span(entry.dataset, entry.episode_index, entry.start, entry.stop),
             np.empty((0, index.size), np.float32),
         )
 
@@ -342,8 +326,8 @@ class Buffer:
         query, manifest = self.query, self.manifest
         for dataset in {query.dataset, *(self._datasets[e.dataset] for e in manifest.sessions)}:
             dataset.check_records()
-        if self._source is not None:  # else no rule made the buffer
-            self._source.check(manifest)
+        if self._check_rules is not None:  # else no rule made the buffer
+            self._check_rules()
         for entry in manifest.sessions:
             span = entry.start, entry.stop
             what = f"{entry.role} {entry.source}"

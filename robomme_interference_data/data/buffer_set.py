@@ -3,43 +3,46 @@
 import logging
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import DATASETS, DEMONSTRATIONS, DISTRACTORS, MANIFEST_PATH
+from robomme_interference_data.constants import (
+    DATASETS,
+    DEMONSTRATIONS,
+    DISTRACTORS,
+    FETCH_RECORD,
+    MANIFEST_PATH,
+)
 from robomme_interference_data.errors import (
-    BuildError,
     FormatError,
     InvalidOptionError,
     UnknownNameError,
     counted,
 )
 from robomme_interference_data.ids import EpisodeId, whole_number
-from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_pandas
+from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import Condition, datasets_of, parse_condition
-from robomme_interference_data.schema.draw import UnitPool, check_units
 from robomme_interference_data.schema.manifest import BufferManifest, ManifestHeader
-from robomme_interference_data.storage.files import LocalFiles, digest_json, read_header
-from robomme_interference_data.storage.hub import HubFiles
+from robomme_interference_data.storage.files import Files, LocalFiles, digest_json, read_header
 
 from .buffer import Buffer
 from .dataset import Dataset
-from .fetched_copy import FetchedCopy, read_fetch_record
 from .manifest_table import ManifestTable
 from .query import Query
-from .query_sessions import SessionSource
 from .set_datasets import SetDatasets, dataset_files
 
 if TYPE_CHECKING:
     import pandas
 
     from robomme_interference_data.storage.cache import DecodedCache
+    from robomme_interference_data.storage.hub import HubFiles
+
+    from .fetched_copy import FetchedCopy
 
 logger = logging.getLogger(__name__)
 _LOCATION = re.compile(r"\.|[\w.-]+(?:/[\w.-]+)+@[0-9a-f]{40}")
@@ -57,12 +60,14 @@ class BufferSet:
     """
 
     def __init__(
-        self, files: LocalFiles | HubFiles, cache: "DecodedCache | None", threads: int | None
+        self, files: "LocalFiles | HubFiles", cache: "DecodedCache | None", threads: int | None
     ):
         self.files = files
         self.copy: FetchedCopy | None = None
-        if isinstance(files, LocalFiles) and (record := read_fetch_record(files.root)) is not None:
-            self.copy = FetchedCopy(files.root, record)
+        if isinstance(files, LocalFiles) and (files.root / FETCH_RECORD).is_file():
+            from .fetched_copy import open_copy
+
+            self.copy = open_copy(files.root)
             self.files = files = replace(files, refetch=self.copy.refetch)
         self._cache = cache
         self._threads = threads
@@ -81,25 +86,13 @@ class BufferSet:
     def __repr__(self) -> str:
         return f"BufferSet({self.name}, buffers={len(self)}, conditions={list(self.conditions)})"
 
-    def _repr_html_(self) -> str:
-        """Return the table of its buffers by family, for notebooks."""
-        from robomme_interference_data.viz.tables import Columns, Table
-
-        counts = Counter(zip(self._present["family"], self._present["condition"], strict=True))
-        columns: Columns = {"family": "text"}
-        columns |= dict.fromkeys(self.conditions, "count")
-        return Table(
-            "buffers",
-            f"{self.name}: {counted(len(self), 'buffer')} of "
-            f"{counted(len(self.episode_ids), 'query episode')}",
-            columns,
-            [(one, *(counts[one, name] for name in self.conditions)) for one in self.families],
-            f"Buffers by family and condition. Cameras: {', '.join(self.cameras)}.",
-        ).html()
-
     def __len__(self) -> int:
         """Return the number of buffers."""
         return len(self._present["episode_id"])
+
+    def counts(self) -> Counter[tuple[str | None, str | None]]:
+        """Return the number of buffers by family and condition."""
+        return Counter(zip(self._present["family"], self._present["condition"], strict=True))
 
     @property
     def planned_buffers(self) -> int:
@@ -110,7 +103,7 @@ class BufferSet:
     def name(self) -> str:
         """Name of its folder or repository."""
         files = self.files
-        return files.repo_id if isinstance(files, HubFiles) else files.root.resolve().name
+        return files.root.resolve().name if isinstance(files, LocalFiles) else files.repo_id
 
     @property
     def location(self) -> str:
@@ -129,7 +122,9 @@ class BufferSet:
         It depends neither on where the datasets are stored nor on the questions, which a run that
         asks them records by itself.
         """
-        bare = {name: replace(one, location=None) for name, one in self.header.datasets.items()}
+        bare = {
+            name: replace(dataset, location=None) for name, dataset in self.header.datasets.items()
+        }
         return digest_json([to_dict(replace(self.header, datasets=bare, questions=None))])
 
     @property
@@ -147,9 +142,15 @@ class BufferSet:
         Raises:
             HashMismatchError: On access, if the manifests were made for another revision.
         """
-        return SetDatasets(self)
+        names = [
+            name
+            for name in self.header.datasets
+            if self.copy is None or self.copy.has_dataset(self.dataset_files(name))
+        ]
+        command = f"build {self.location} --only manifests" if self.is_own else None
+        return SetDatasets(names, self.dataset_files, self.header, (self.fix, command))
 
-    def dataset_files(self, name: str) -> LocalFiles | HubFiles:
+    def dataset_files(self, name: str) -> Files:
         """Return access to a dataset's files; see `set_datasets.dataset_files`."""
         return dataset_files(self.files, self.header, name)
 
@@ -202,25 +203,15 @@ class BufferSet:
         if parsed.name not in self.conditions:
             what = f"condition {parsed.name!r} is not in {self.location}"
             there = f"Planned there: {' '.join(self.conditions)}."
-            if (lacking := self._lacking(parsed)) is None:
+            lacking = None
+            if isinstance(self.files, LocalFiles) and self.is_own:
+                from .query_sessions import lacking_for
+
+                lacking = lacking_for(parsed, self.files.root, self.episode_ids)
+            if lacking is None:
                 raise UnknownNameError(what, there, self.planning(parsed.name))
             raise UnknownNameError(what, f"{there} {lacking}")
         return parsed
-
-    def _lacking(self, condition: Condition) -> str | None:
-        """Return what its folder lacks for buffers under a condition; None if nothing."""
-        if not self.is_own or isinstance(self.files, HubFiles):
-            return None
-        names = [name for name in condition.kind.needs if not (self.files.root / name).is_dir()]
-        if names:
-            return f"For {condition}, build the {' and '.join(names)} first."
-        # Without the check of its revision: the next plan draws from the units that are there now.
-        units = Dataset(self.dataset_files(DISTRACTORS)).records()
-        try:
-            check_units(UnitPool(one.episode_id for one in units), self.episode_ids, [condition])
-        except BuildError as error:
-            return f"For {condition}, {error.message}."
-        return None
 
     def planning(self, *conditions: str) -> str:
         """Return the command that plans buffers under these conditions too."""
@@ -234,8 +225,8 @@ class BufferSet:
     @property
     def fix(self) -> str:
         """Hint for errors about manifests and data that do not match."""
-        if isinstance(self.files, HubFiles):
-            locations = [one.location or "." for one in self.header.datasets.values()]
+        if not isinstance(self.files, LocalFiles):
+            locations = [dataset.location or "." for dataset in self.header.datasets.values()]
             others = {location.split("@")[0] for location in locations} - {"."}
             cached = " ".join(f"dataset/{name}" for name in sorted({self.files.repo_id, *others}))
             return (
@@ -256,7 +247,7 @@ class BufferSet:
         Raises:
             MissingFileError: This is a copy that lacks some.
         """
-        if self.copy is not None and not self.copy.is_whole(self):
+        if self.copy is not None and not self.copy.is_whole(self.datasets, self.header):
             raise self.copy.not_fetched("some files")
 
     def query(self, episode_id: EpisodeId | str) -> Query:
@@ -326,9 +317,7 @@ class BufferSet:
             MissingExtraError: pandas is not installed.
             UnknownNameError: No buffer has this family, condition or difficulty.
         """
-        tables = [*self._table.tables(self._matching(family, condition, k, difficulty))]
-        none = arrow_schema(BufferManifest).empty_table()
-        return to_pandas(pa.concat_tables(tables) if tables else none)
+        return self._table.to_pandas(self._matching(family, condition, k, difficulty))
 
     def _matching(
         self,
@@ -338,23 +327,19 @@ class BufferSet:
         difficulty: str | None,
     ) -> NDArray[np.bool_]:
         """Return whether each row has all the given properties."""
-        given = (condition,) if isinstance(condition, Condition | str) else tuple(condition or ())
+        conditions: Sequence[Condition | str] = ()
+        if isinstance(condition, Condition | str):
+            conditions = (condition,)
+        elif condition is not None:
+            conditions = tuple(condition)
         if k is not None:
-            given = (self.planned(given[0] if given else None, k),)
+            conditions = (self.planned(conditions[0] if conditions else None, k),)
         allowed = {
             "family": (family,) if isinstance(family, str) else family or (),
-            "condition": [self.planned(one).name for one in given],
+            "condition": [self.planned(name).name for name in conditions],
             "difficulty": () if difficulty is None else (difficulty,),
         }
-        keep = self._is_present.copy()
-        for column, values in allowed.items():
-            known = {one for one in self._present[column] if one is not None}
-            for value in values:
-                if value not in known:
-                    raise UnknownNameError.among(column, value, self.location, known)
-            if values:
-                keep &= np.array([one in values for one in self._table.keys[column]])
-        return keep
+        return self._table.matching(allowed, self._is_present, self.location)
 
     def planned_manifests(self) -> Iterator[BufferManifest]:
         """Yield the manifests of all buffers, including those that a partial copy lacks."""
@@ -391,18 +376,20 @@ class BufferSet:
             HashMismatchError: A table differs.
             FormatError: The rows follow rules of an unknown version.
         """
-        parsed = [parse_condition(one) for one in conditions]
+        parsed = [parse_condition(condition) for condition in conditions]
         for name in datasets_of(parsed):
             self.datasets[name].check_records()
         if planned:
             self._table.check(self.fix)
             for manifest in self.manifests(condition=parsed):
-                self._source.check(manifest)
+                self._check_rules(manifest)
 
     @cached_property
-    def _source(self) -> SessionSource:
-        """What the rules depend on."""
-        return SessionSource(self.datasets, self.header.seed)
+    def _check_rules(self) -> Callable[[BufferManifest], None]:
+        """Checks that a manifest is the one that the rules give; see `SessionSource.check`."""
+        from .query_sessions import SessionSource
+
+        return SessionSource(self.datasets, self.header.seed).check
 
     def buffers(self, **properties: Any) -> Iterator[Buffer]:
         """Yield all buffers, or those with all the given properties; see `manifests`."""
@@ -419,7 +406,7 @@ class BufferSet:
             self.datasets,
             cache=self._cache,
             threads=self._threads,
-            source=self._source,
+            check_rules=lambda: self._check_rules(manifest),
         )
 
     def _check_episode(self, episode: EpisodeId) -> None:
@@ -441,7 +428,9 @@ class BufferSet:
         """Whether the buffer of each row can be loaded; all but in a partial copy."""
         if self.copy is None:
             return np.ones(self.planned_buffers, bool)
-        present = [self.copy.holds_buffer(self, one) for one in self.planned_manifests()]
+        present = [
+            self.copy.holds_buffer(self.datasets, manifest) for manifest in self.planned_manifests()
+        ]
         if not all(present):
             logger.info(
                 "%s holds %d of the %s of %s; for more: robomme-interference %s",

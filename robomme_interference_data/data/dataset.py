@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,9 +45,6 @@ from robomme_interference_data.storage.files import (
     sha256_file,
 )
 from robomme_interference_data.storage.lerobot import LeRobotFiles
-
-if TYPE_CHECKING:
-    from .embeddings import EmbeddingIndex
 
 
 def camera_feature(camera: str) -> str:
@@ -108,7 +105,6 @@ class Dataset:
             ) from None
         self.identity = read_header(path, DatasetIdentity)
         self._name = files.describe()
-        self._indexes: dict[tuple[str, str], EmbeddingIndex] = {}
         self._records: dict[int, EpisodeRecord] = {}
         self._checked = False
 
@@ -276,28 +272,6 @@ class Dataset:
         """
         path, first = self.lerobot.locate(episode_index).videos[self._feature(camera)]
         return self.files.path(path), first
-
-    def index(self, encoder: str, camera: str | None = None) -> "EmbeddingIndex":
-        """Return the embeddings of the stored frames, opened once.
-
-        Args:
-            encoder: Name of the encoder, such as `thumbnail`.
-            camera: Name of the camera; None for the first.
-
-        Raises:
-            UnknownNameError: There is no such camera.
-            MissingFileError: The dataset has no embeddings of this encoder and camera, or they
-                were made of other data or with another encoder.
-            FormatError: They are of an unknown version, or damaged.
-        """
-        from .embeddings import EmbeddingIndex
-
-        if not isinstance(encoder, str):
-            raise InvalidOptionError.expected("encoder", encoder, "its name, such as 'thumbnail'")
-        key = encoder, self.camera(camera)
-        if key not in self._indexes:
-            self._indexes[key] = EmbeddingIndex(self.files, self.revision, *key)
-        return self._indexes[key]
 
     def iter_frames(
         self, episode_index: int, camera: str | None, start: int, stop: int

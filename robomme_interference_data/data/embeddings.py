@@ -10,7 +10,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any
+from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,8 +41,7 @@ from robomme_interference_data.storage.files import (
     sha256_file,
 )
 
-if TYPE_CHECKING:
-    from .dataset import Dataset
+from .dataset import Dataset
 
 CENTER_FILE = "centre.npy"
 INDEX_SUMS = "SHA256SUMS"
@@ -100,7 +100,7 @@ class IndexHeader:
 
     def digest(self) -> str:
         """Return the correct value of `sha256`."""
-        return digest_json([{k: one for k, one in to_dict(self).items() if k != "sha256"}])
+        return digest_json([{k: value for k, value in to_dict(self).items() if k != "sha256"}])
 
 
 def episode_file(episode_index: int) -> str:
@@ -137,7 +137,7 @@ def index_folder(encoder: str, camera: str) -> str:
     return f"{INDEX_DIR}/{'@'.join(re.sub(r'[^A-Za-z0-9._-]+', '-', part) for part in parts)}"
 
 
-def indexed_encoders(dataset: "Dataset", camera: str) -> list[str]:
+def indexed_encoders(dataset: Dataset, camera: str) -> list[str]:
     """Return the names of the encoders of which a dataset has embeddings of a camera, sorted."""
     names = []
     for path in dataset.files.list(INDEX_DIR, INDEX_HEADER):
@@ -302,6 +302,33 @@ class EmbeddingIndex:
         return FormatError(f"{self._path_shown}: {what}", *self.remedy)
 
 
+_opened: WeakKeyDictionary[Dataset, dict[tuple[str, str], EmbeddingIndex]] = WeakKeyDictionary()
+"""The indexes that were opened: a file that was checked is not hashed again."""
+
+
+def open_index(dataset: Dataset, encoder: str, camera: str | None = None) -> EmbeddingIndex:
+    """Return the embeddings of a dataset's stored frames, opened once.
+
+    Args:
+        dataset: The dataset.
+        encoder: Name of the encoder, such as `thumbnail`.
+        camera: Name of the camera; None for the first.
+
+    Raises:
+        UnknownNameError: There is no such camera.
+        MissingFileError: The dataset has no embeddings of this encoder and camera, or they were
+            made of other data or with another encoder.
+        FormatError: They are of an unknown version, or damaged.
+    """
+    if not isinstance(encoder, str):
+        raise InvalidOptionError.expected("encoder", encoder, "its name, such as 'thumbnail'")
+    key = encoder, dataset.camera(camera)
+    indexes = _opened.setdefault(dataset, {})
+    if key not in indexes:
+        indexes[key] = EmbeddingIndex(dataset.files, dataset.revision, *key)
+    return indexes[key]
+
+
 class BufferSetIndex:
     """The indexes of a buffer set's datasets, for one encoder and camera.
 
@@ -312,14 +339,16 @@ class BufferSetIndex:
         camera: Name of the camera; None for the first.
     """
 
-    def __init__(self, datasets: Mapping[str, "Dataset"], encoder: str, camera: str | None):
+    def __init__(self, datasets: Mapping[str, Dataset], encoder: str, camera: str | None):
         if DISTRACTORS not in datasets:
             raise MissingFileError(f"embeddings need the {DISTRACTORS}, which are missing")
-        self._indexes = {name: one.index(encoder, camera) for name, one in datasets.items()}
+        self._indexes = {
+            name: open_index(dataset, encoder, camera) for name, dataset in datasets.items()
+        }
         self.units = self._indexes[DISTRACTORS]
         for name, index in self._indexes.items():
             if index.key != self.units.key:
-                locations = (datasets[one].files.describe() for one in (name, DISTRACTORS))
+                locations = (datasets[kind].files.describe() for kind in (name, DISTRACTORS))
                 raise MissingFileError(
                     f"the embeddings of encoder {encoder!r} were made differently in "
                     f"{' and in '.join(locations)}",

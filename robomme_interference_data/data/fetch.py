@@ -220,7 +220,7 @@ def _earlier_files(to: Path, location: str, header: Path) -> tuple[str, ...]:
     # Not at the top: commands load this module for its settings, and that loads pyarrow.
     from .fetched_copy import fetch_command, read_fetch_record
 
-    record = read_fetch_record(to) if to.is_dir() else None
+    record = read_fetch_record(to) if (to / FETCH_RECORD).is_file() else None
     if record is None:
         raise InvalidOptionError(
             f"{to} exists, and is no copy of a buffer set",

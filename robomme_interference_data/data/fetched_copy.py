@@ -1,27 +1,28 @@
 """What a copy of a published buffer set holds: `fetch --to` may have copied a part of it."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from robomme_interference_data.constants import FETCH_RECORD, INFO_PATH, QUESTIONS_PATH
 from robomme_interference_data.errors import MissingFileError
-from robomme_interference_data.schema.manifest import BufferManifest, FetchRecord
+from robomme_interference_data.schema.manifest import BufferManifest, FetchRecord, ManifestHeader
 from robomme_interference_data.storage.files import Files, LocalFiles, read_header
 
 from .dataset import Dataset
 
-if TYPE_CHECKING:
-    from .buffer_set import BufferSet
 
-
-def read_fetch_record(root: Path) -> FetchRecord | None:
-    """Return what a folder records of the fetch that made it; None if it is no copy.
+def read_fetch_record(root: Path) -> FetchRecord:
+    """Return what a copy records of the fetch that made it.
 
     Raises:
         FormatError: The record is damaged, or of an unknown version.
     """
-    path = root / FETCH_RECORD
-    return read_header(path, FetchRecord) if path.is_file() else None
+    return read_header(root / FETCH_RECORD, FetchRecord)
+
+
+def open_copy(root: Path) -> "FetchedCopy":
+    """Return the copy in a folder with a record of the fetch; see `read_fetch_record`."""
+    return FetchedCopy(root, read_fetch_record(root))
 
 
 def fetch_command(root: Path, record: FetchRecord) -> str:
@@ -83,24 +84,19 @@ class FetchedCopy:
         held = self._episodes(dataset).values()
         return tuple(name for name in dataset.cameras if all(name in names for names in held))
 
-    def holds_buffer(self, buffer_set: "BufferSet", manifest: BufferManifest) -> bool:
+    def holds_buffer(self, datasets: Mapping[str, Dataset], manifest: BufferManifest) -> bool:
         """Whether the query and all sessions of a buffer are here."""
         episodes = {(manifest.query.dataset, manifest.query.episode_index)}
         episodes |= {(entry.dataset, entry.episode_index) for entry in manifest.sessions}
         return all(
-            name in buffer_set.datasets and self.holds(buffer_set.datasets[name], index)
-            for name, index in episodes
+            name in datasets and self.holds(datasets[name], index) for name, index in episodes
         )
 
-    def is_whole(self, buffer_set: "BufferSet") -> bool:
-        """Whether all files of all datasets are here, and the questions."""
-        header = buffer_set.header
+    def is_whole(self, datasets: Mapping[str, Dataset], header: ManifestHeader) -> bool:
+        """Whether all files of all planned datasets are here, and the questions."""
         if header.questions is not None and not self.lists(self.root, QUESTIONS_PATH):
             return False
-        return all(
-            name in buffer_set.datasets and self._is_whole(buffer_set.datasets[name])
-            for name in header.datasets
-        )
+        return all(name in datasets and self._is_whole(datasets[name]) for name in header.datasets)
 
     def _is_whole(self, dataset: Dataset) -> bool:
         files = dataset.files

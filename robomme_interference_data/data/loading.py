@@ -5,21 +5,25 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robomme_interference_data.constants import DATASETS, EXECUTIONS, IDENTITY_PATH, MANIFEST_PATH
+from robomme_interference_data.constants import (
+    DATASETS,
+    EXECUTIONS,
+    FETCH_RECORD,
+    IDENTITY_PATH,
+    MANIFEST_PATH,
+)
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.ids import EpisodeId, whole_number
 from robomme_interference_data.schema.conditions import Condition
 from robomme_interference_data.storage.files import LocalFiles
-from robomme_interference_data.storage.hub import locate
-from robomme_interference_data.storage.staging import staging_path
 
 from .buffer import Buffer
 from .buffer_set import BufferSet
 from .dataset import Dataset
-from .fetched_copy import fetch_command, read_fetch_record
 
 if TYPE_CHECKING:
     from robomme_interference_data.storage.cache import DecodedCache
+    from robomme_interference_data.storage.hub import HubFiles
 
 
 def load_buffer_set(
@@ -46,33 +50,45 @@ def load_buffer_set(
         HubError: The repository is unknown, needs permission, or cannot be reached.
     """
     _check_location("buffer_set", buffer_set, "a folder, or namespace/name")
-    files = locate(buffer_set, revision=revision)
+    files: LocalFiles | HubFiles
+    folder = Path(buffer_set).expanduser()
+    if folder.is_dir() and revision is None:
+        files = LocalFiles(folder)
+    else:
+        from robomme_interference_data.storage.hub import locate
+
+        files = locate(buffer_set, revision=revision)
     if threads is not None:
         threads = whole_number("threads", threads, "an integer from 1, or None", 1)
     try:
         return BufferSet(files, _cache(cache), threads)
     except MissingFileError as error:
-        if isinstance(files, LocalFiles) and (record := read_fetch_record(files.root)) is not None:
-            raise MissingFileError(
-                f"{files.root} is an incomplete copy of {record.location}: the fetch was "
-                "interrupted",
-                "Resume it.",
-                fetch_command(files.root, record),
-            ) from error
-        hint = "Give a folder with demonstrations/, distractors/ and manifests/, or build one."
-        command: str | None = "build BUFFER_SET --source KIND:PATH"
-        if isinstance(files, LocalFiles) and _is_unfinished(files.root):
+        raise _no_buffer_set(files) from error
+
+
+def _no_buffer_set(files: "LocalFiles | HubFiles") -> MissingFileError:
+    """Return the error about files that are no buffer set, or not yet a complete one."""
+    from robomme_interference_data.storage.staging import staging_path
+
+    from .fetched_copy import fetch_command, read_fetch_record
+
+    if isinstance(files, LocalFiles) and (files.root / FETCH_RECORD).is_file():
+        record = read_fetch_record(files.root)
+        return MissingFileError(
+            f"{files.root} is an incomplete copy of {record.location}: the fetch was interrupted",
+            "Resume it.",
+            fetch_command(files.root, record),
+        )
+    hint = "Give a folder with demonstrations/, distractors/ and manifests/, or build one."
+    command: str | None = "build BUFFER_SET --source KIND:PATH"
+    if isinstance(files, LocalFiles):
+        folders = [files.root / name for name in DATASETS]
+        if any(path.is_dir() or staging_path(path).is_dir() for path in folders):
             hint = "Its build has not finished: run the same build command again to resume it."
             command = None
-        raise MissingFileError(
-            f"{files.describe()} is not a buffer set: {MANIFEST_PATH} is missing", hint, command
-        ) from error
-
-
-def _is_unfinished(root: Path) -> bool:
-    """Return whether a folder holds what a build has finished, or has begun."""
-    folders = [root / name for name in DATASETS]
-    return any(path.is_dir() or staging_path(path).is_dir() for path in folders)
+    return MissingFileError(
+        f"{files.describe()} is not a buffer set: {MANIFEST_PATH} is missing", hint, command
+    )
 
 
 def load_buffer(

@@ -1,10 +1,11 @@
 """The table of a buffer set's manifests: a row for each buffer."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from functools import cached_property
-from itertools import chain
+from itertools import chain, compress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
@@ -16,12 +17,15 @@ from robomme_interference_data.constants import (
     MANIFESTS,
     RULE_VERSION,
 )
-from robomme_interference_data.errors import FormatError, HashMismatchError
+from robomme_interference_data.errors import FormatError, HashMismatchError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.schema.codec import from_table
+from robomme_interference_data.schema.codec import arrow_schema, from_table, to_pandas
 from robomme_interference_data.schema.manifest import BufferManifest, ManifestHeader
 from robomme_interference_data.storage.files import Files, LocalFiles, sha256_file
 from robomme_interference_data.storage.parquet import RowSpan
+
+if TYPE_CHECKING:
+    import pandas
 
 _BATCH_ROWS = 1024
 _KEYS = ("episode_id", "condition", "difficulty")
@@ -90,6 +94,35 @@ class ManifestTable:
             mask = keep[first : first + _BATCH_ROWS]
             if mask.any():
                 yield self._rows.part(first, first + len(mask)).table().filter(mask)
+
+    def matching(
+        self, allowed: Mapping[str, Collection[str]], among: NDArray[np.bool_], where: str
+    ) -> NDArray[np.bool_]:
+        """Return whether each row has all the wanted properties.
+
+        Args:
+            allowed: Allowed values by column of `keys`; none for all values.
+            among: The rows to choose from, a truth value for each.
+            where: Location of the buffer set, for errors.
+
+        Raises:
+            UnknownNameError: No row of those has one of the values.
+        """
+        keep = among.copy()
+        for column, values in allowed.items():
+            known = {value for value in compress(self.keys[column], among) if value is not None}
+            for value in values:
+                if value not in known:
+                    raise UnknownNameError.among(column, value, where, known)
+            if values:
+                keep &= np.array([value in values for value in self.keys[column]])
+        return keep
+
+    def to_pandas(self, keep: NDArray[np.bool_]) -> "pandas.DataFrame":
+        """Return some rows as a pandas `DataFrame`; `keep` has a truth value for each row."""
+        tables = [*self.tables(keep)]
+        none = arrow_schema(BufferManifest).empty_table()
+        return to_pandas(pa.concat_tables(tables) if tables else none)
 
     def check(self, fix: str) -> None:
         """Check the file against its hash in the header.

@@ -8,15 +8,8 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import STATE
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.schema.conditions import Condition
-from robomme_interference_data.schema.manifest import (
-    BufferManifest,
-    QueryFrame,
-    SessionEntry,
-    layout_sessions,
-)
+from robomme_interference_data.schema.manifest import QueryFrame
 from robomme_interference_data.schema.records import EpisodeRecord
-from robomme_interference_data.schema.sampling import lesson_frames, lesson_share
 
 from .dataset import Dataset
 
@@ -75,34 +68,6 @@ class Query:
         """Where the first live observation is stored."""
         dataset, index = self.dataset, self.record.episode_index
         return QueryFrame(dataset.kind, dataset.revision, index, self.lesson_frames)
-
-    def manifest(
-        self, condition: Condition, sessions: tuple[SessionEntry, ...], *, exact: bool
-    ) -> BufferManifest:
-        """Return the manifest of a buffer of the query.
-
-        Args:
-            condition: The condition.
-            sessions: The buffer's sessions in order.
-            exact: Whether all frames equal the recorded ones bit for bit.
-        """
-        record, lessons = self.record, layout_sessions(sessions, "lesson")
-        frames = sum(one.num_frames for one in sessions)
-        return BufferManifest(
-            episode_id=record.episode_id,
-            condition=condition.name,
-            k=condition.k,
-            goals=record.goals,
-            seed=record.seed,
-            difficulty=record.difficulty,
-            simulator=record.simulator,
-            exact=exact,
-            lesson_frames=lesson_frames(lessons, range(frames)),
-            history_frames=frames,
-            lesson_share=lesson_share(lessons, range(frames)),
-            query=self.first_frame,
-            sessions=sessions,
-        )
 
     def frame(self, camera: str | None = None) -> NDArray[np.uint8]:
         """Decode the first live observation, `(H, W, 3) uint8` RGB; of the first camera by default.

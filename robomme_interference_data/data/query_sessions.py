@@ -3,9 +3,10 @@
 The draw of distractor units is in `schema/draw.py`.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
@@ -13,12 +14,14 @@ from robomme_interference_data.constants import (
     DISTRACTORS,
     RAW_DISTRACTORS,
 )
-from robomme_interference_data.errors import FormatError, HashMismatchError, SourceError
+from robomme_interference_data.errors import BuildError, FormatError, HashMismatchError, SourceError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import Condition, parse_condition
-from robomme_interference_data.schema.draw import UnitPool
-from robomme_interference_data.schema.manifest import BufferManifest, SessionEntry
+from robomme_interference_data.schema.draw import UnitPool, check_units
+from robomme_interference_data.schema.manifest import BufferManifest, SessionEntry, layout_sessions
 from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.schema.sampling import lesson_frames, lesson_share
+from robomme_interference_data.storage.files import LocalFiles
 
 from .dataset import Dataset
 from .query import Query
@@ -112,9 +115,10 @@ class QuerySessions:
         datasets, record = self._source.datasets, self._record
         sessions = condition.sessions(self)
         exact = record.exact and all(
-            datasets[one.dataset].record(one.episode_index).exact for one in sessions
+            datasets[entry.dataset].record(entry.episode_index).exact for entry in sessions
         )
-        return Query(datasets[DEMONSTRATIONS], record).manifest(condition, sessions, exact=exact)
+        query = Query(datasets[DEMONSTRATIONS], record)
+        return buffer_manifest(query, condition, sessions, exact=exact)
 
     def lesson(self, part: str = "lesson") -> SessionEntry:
         """Return the lesson, or a part of it."""
@@ -151,3 +155,53 @@ class QuerySessions:
             draw = self._source.pool.draw_own if same_family else self._source.pool.draw
             self._drawn[same_family] = draw(self._record.episode_id, k)
         return self._drawn[same_family][:k]
+
+
+def buffer_manifest(
+    query: Query, condition: Condition, sessions: tuple[SessionEntry, ...], *, exact: bool
+) -> BufferManifest:
+    """Return the manifest of a query's buffer.
+
+    Args:
+        query: The query.
+        condition: The condition.
+        sessions: The buffer's sessions in order.
+        exact: Whether all frames equal the recorded ones bit for bit.
+    """
+    record, lessons = query.record, layout_sessions(sessions, "lesson")
+    frames = sum(entry.num_frames for entry in sessions)
+    return BufferManifest(
+        episode_id=record.episode_id,
+        condition=condition.name,
+        k=condition.k,
+        goals=record.goals,
+        seed=record.seed,
+        difficulty=record.difficulty,
+        simulator=record.simulator,
+        exact=exact,
+        lesson_frames=lesson_frames(lessons, range(frames)),
+        history_frames=frames,
+        lesson_share=lesson_share(lessons, range(frames)),
+        query=query.first_frame,
+        sessions=sessions,
+    )
+
+
+def lacking_for(condition: Condition, root: Path, queries: Iterable[EpisodeId]) -> str | None:
+    """Return what the folder of a buffer set lacks for buffers under a condition; None if nothing.
+
+    Args:
+        condition: The condition.
+        root: The folder.
+        queries: The query episodes.
+    """
+    names = [name for name in condition.kind.needs if not (root / name).is_dir()]
+    if names:
+        return f"For {condition}, build the {' and '.join(names)} first."
+    # Without the check of its revision: the next plan draws from the units that are there now.
+    units = Dataset(LocalFiles(root / DISTRACTORS)).records()
+    try:
+        check_units(UnitPool(unit.episode_id for unit in units), queries, [condition])
+    except BuildError as error:
+        return f"For {condition}, {error.message}."
+    return None

@@ -1,19 +1,13 @@
 """The datasets of a buffer set: where each is stored, opened on first access."""
 
-from collections.abc import Iterator, Mapping
-from functools import cached_property
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from robomme_interference_data.constants import OPTIONAL_DATASETS
 from robomme_interference_data.errors import FormatError, HashMismatchError, MissingFileError
 from robomme_interference_data.schema.manifest import ManifestHeader
 from robomme_interference_data.storage.files import Files, LocalFiles
-from robomme_interference_data.storage.hub import HubFiles
 
 from .dataset import Dataset
-
-if TYPE_CHECKING:
-    from .buffer_set import BufferSet
 
 
 def dataset_files(files: Files, header: ManifestHeader, name: str) -> Files:
@@ -40,36 +34,50 @@ def dataset_files(files: Files, header: ManifestHeader, name: str) -> Files:
                 "Replace the link by the folder.",
             )
         return LocalFiles(folder, files.refetch)
-    if location is None and isinstance(files, HubFiles) and name in OPTIONAL_DATASETS:
-        return files.inside(name)
-    if location is None:
+    if location == ".":
+        return files
+    from robomme_interference_data.storage.hub import HubFiles
+
+    if location is not None:
+        return HubFiles.parse(location)
+    if not isinstance(files, HubFiles) or name not in OPTIONAL_DATASETS:
         raise MissingFileError(
             f"the manifests of {files.location} do not record the location of its {name}",
             "Those of a published buffer set do.",
             "publish BUFFER_SET --repo-id NAMESPACE/NAME",
         )
-    return files if location == "." else HubFiles.parse(location)
+    return files.inside(name)
 
 
 class SetDatasets(Mapping[str, Dataset]):
-    """The datasets of a buffer set, each opened on first access."""
+    """The datasets of a buffer set, each opened on first access.
 
-    def __init__(self, buffer_set: "BufferSet"):
-        self._buffer_set = buffer_set
+    Args:
+        names: The planned ones; in a partial copy, those that are there.
+        files_of: Returns access to the files of one.
+        header: The buffer set's header.
+        fix: Hint and command of the error about a dataset of another revision.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        files_of: Callable[[str], Files],
+        header: ManifestHeader,
+        fix: tuple[str, str | None],
+    ):
+        self._names, self._files_of, self._header, self._fix = names, files_of, header, fix
         self._opened: dict[str, Dataset] = {}
 
     def __getitem__(self, name: str) -> Dataset:
         if name not in self._opened:
-            recorded = self._buffer_set.header.datasets[name]
-            dataset = Dataset(self._buffer_set.dataset_files(name))
+            recorded = self._header.datasets[name]
+            dataset = Dataset(self._files_of(name))
             if dataset.revision != recorded.revision:
                 raise HashMismatchError(
                     f"{dataset.files.describe()} has revision {dataset.revision[:12]}…; the "
                     f"manifests were made for {recorded.revision[:12]}…",
-                    self._buffer_set.fix,
-                    f"build {self._buffer_set.location} --only manifests"
-                    if self._buffer_set.is_own
-                    else None,
+                    *self._fix,
                 )
             self._opened[name] = dataset
         return self._opened[name]
@@ -82,13 +90,3 @@ class SetDatasets(Mapping[str, Dataset]):
 
     def __len__(self) -> int:
         return len(self._names)
-
-    @cached_property
-    def _names(self) -> tuple[str, ...]:
-        """All that are planned; in a partial copy, those that are there."""
-        buffer_set, copy = self._buffer_set, self._buffer_set.copy
-        return tuple(
-            name
-            for name in buffer_set.header.datasets
-            if copy is None or copy.has_dataset(buffer_set.dataset_files(name))
-        )

@@ -17,7 +17,8 @@ from robomme_interference_data.lazy import lazy_exports
 if TYPE_CHECKING:
     from robomme_interference_data.schema.rollouts import Status
 
-    from .base import Demonstration, EpisodeInfo, Observation, Simulator
+    from .base import Simulator
+    from .episode import Demonstration, EpisodeInfo, Observation
     from .registry import SIMULATORS, make_simulator
 
 __all__ = [
@@ -36,7 +37,8 @@ __getattr__ = lazy_exports(
     __name__,
     {
         ".registry": "make_simulator SIMULATORS",
-        ".base": "Simulator Demonstration EpisodeInfo Observation",
+        ".base": "Simulator",
+        ".episode": "Demonstration EpisodeInfo Observation",
         "robomme_interference_data.schema.rollouts": "Status",
     },
 )

@@ -2,11 +2,10 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from robomme_interference_data.constants import FPS, MAX_STEPS
 from robomme_interference_data.errors import (
@@ -15,99 +14,19 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.shifts import Shift
 from robomme_interference_data.schema.subgoal import Subgoal
 
+from .checks import check_begun
+from .episode import ACTION_SIZE, CAMERAS, Begun, Observation, action_array
 from .scene import Scene
-
-CAMERAS = ("front", "wrist")
-"""The cameras of RoboMME and of simulators that declare no others, in canonical order."""
 
 ACTED = ("oracle", "guess", "recall", "answer")
 """Built-in policies of `Simulator.act`."""
 
 BUILT_IN = (*ACTED, "follow-subgoals")
 """All built-in policies of a simulator."""
-
-ACTION_SIZE = 8
-"""Length of RoboMME's actions and states, and where none is declared: 7 joints, the gripper."""
-
-
-@dataclass(frozen=True)
-class Observation:
-    """What a policy sees at one time step. Shapes and units are RoboMME's.
-
-    Attributes:
-        images: Camera name (`front`, `wrist`) to image, `(256, 256, 3) uint8` RGB. Only the
-            cameras that the simulator renders; empty if no images were requested.
-        state: `(8,) float32`: 7 joint positions in rad, then the opening of one finger, 0 closed
-            to 0.04 m open.
-        subgoal: The next subgoal for the policy, if a subgoal writer provides one.
-    """
-
-    images: dict[str, NDArray[np.uint8]]
-    state: NDArray[np.float32]
-    subgoal: Subgoal | None = None
-
-
-@dataclass(frozen=True)
-class Demonstration:
-    """The lesson of an episode: T time steps, without the first live observation.
-
-    It may be a demonstration that was played separately, or the first phase of the episode itself,
-    such as a cue: the history of a buffer is given to the policy between it and the live part.
-
-    Attributes:
-        images: Camera name to frames, `(T, H, W, 3) uint8` RGB; only every n-th frame if these were
-            requested, empty if none were.
-        states: `(T, 8) float32`, as `Observation.state`; `states[t]` belongs to frame t.
-        actions: `(T, 8) float32`, executed after frame t: 7 absolute joint targets in rad, then
-            the gripper, −1 closed to 1 open. `(0, 8)` if unknown.
-        evidence: Which frames show each part of the hidden answer; None if unknown. Policies never
-            receive it.
-        scene: What the scene allows and hides, as JSON that `Simulator.scene` reads; None if it
-            follows from the seed, or is unknown. Policies never receive it.
-    """
-
-    images: dict[str, NDArray[np.uint8]]
-    states: NDArray[np.float32]
-    actions: NDArray[np.float32]
-    evidence: tuple[EvidenceSpan, ...] | None = None
-    scene: str | None = None
-
-    def __len__(self) -> int:
-        return len(self.states)
-
-    def __repr__(self) -> str:
-        cameras = {name: frames.shape for name, frames in self.images.items()}
-        return f"Demonstration(frames={len(self)}, images={cameras})"
-
-
-@dataclass(frozen=True)
-class EpisodeInfo:
-    """Public facts about an episode, without the hidden answer.
-
-    Attributes:
-        goals: All wordings of the goal, at least one.
-        difficulty: `easy`, `medium` or `hard`; None if a recording names none.
-        seed: Seed of the scene; None if a recording names none.
-        simulator: Registered name of the simulator.
-    """
-
-    goals: tuple[str, ...]
-    difficulty: str | None
-    seed: int | None
-    simulator: str
-
-    @property
-    def goal(self) -> str:
-        """The first wording of the goal."""
-        return self.goals[0]
-
-
-Begun = tuple[Demonstration, Observation, EpisodeInfo]
 
 
 class Simulator(ABC):
@@ -255,8 +174,6 @@ class Simulator(ABC):
             SimulatorError: What the subclass returned has other shapes or types.
             SimulatorCrashError: The simulator failed, or is closed.
         """
-        from .checks import check_begun
-
         self._check_open()
         self._episode = None
         episode = EpisodeId.parse(str(episode_id))
@@ -264,7 +181,7 @@ class Simulator(ABC):
             expected = "True, False, or n for every n-th frame"
             raise InvalidOptionError.expected("demonstration", demonstration, expected)
         begun = self._begin(episode, int(demonstration))
-        check_begun(self, begun)
+        check_begun(begun, type(self).__name__, self.cameras, self.action_size)
         self._episode, self._steps = episode, 0
         return begun
 
@@ -400,37 +317,3 @@ class Simulator(ABC):
         self, episode: EpisodeId, action: NDArray[np.float32], observe: bool
     ) -> tuple[Observation, Status]:
         """Execute one action in the running episode; see `step`."""
-
-
-def choose_cameras(
-    names: Sequence[str] | None, available: Sequence[str] = CAMERAS
-) -> tuple[str, ...]:
-    """Return the named cameras, all by default, sorted; raise for one that is not available."""
-    for name in names or ():
-        if name not in available:
-            raise InvalidOptionError.one_of("camera", name, available)
-    return tuple(sorted(available if names is None else set(names)))
-
-
-def action_array(
-    action: ArrayLike, *, chunk: bool = False, size: int = ACTION_SIZE
-) -> NDArray[np.float32]:
-    """Check an action, and return it as `(size,) float32`; a chunk of n ≥ 1 as `(n, size)`."""
-    try:
-        array = np.asarray(action)
-    except ValueError:  # rows of several lengths
-        array = np.empty(0)
-    shape = array.shape[1:] if chunk else array.shape
-    if shape == (size,) and array.dtype.kind in "fiu":
-        with np.errstate(over="ignore"):
-            converted = array.astype(np.float32)
-        if len(converted) and np.isfinite(converted).all():
-            return converted
-    expected = f"(n, {size}) actions, n at least 1" if chunk else f"({size},) action"
-    raise InvalidOptionError(
-        f"got {array.dtype} {array.shape} {np.array2string(array, threshold=2 * size)}; "
-        f"expected {expected}, of finite numbers",
-        "An action is 7 absolute joint targets in rad, then the gripper, −1 closed to 1 open."
-        if size == ACTION_SIZE
-        else "The simulator, or the recordings, have actions of this size.",
-    )

@@ -1,13 +1,13 @@
 """Check what a simulator returns for a new episode, so that a mistake shows at the first reset."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
 from robomme_interference_data.errors import SimulatorError
 
-from .base import Demonstration, EpisodeInfo, Observation, Simulator
+from .episode import Demonstration, EpisodeInfo, Observation
 
 _HINT = (
     "Return (Demonstration, Observation, EpisodeInfo): states (T, S) and (S,) float32, actions "
@@ -15,33 +15,44 @@ _HINT = (
 )
 
 
-def check_begun(simulator: Simulator, begun: Any) -> None:
-    """Compare the beginning of an episode with what the simulator's class declares."""
+def check_begun(begun: Any, name: str, cameras: Sequence[str], action_size: int) -> None:
+    """Compare the beginning of an episode with what a simulator declares.
+
+    Args:
+        begun: What `_begin` returned.
+        name: Name of the simulator's class, for errors.
+        cameras: Its cameras.
+        action_size: Length of its actions.
+    """
     kinds = (Demonstration, Observation, EpisodeInfo)
     parts = begun if isinstance(begun, tuple) else (begun,)
     if len(parts) != len(kinds) or not all(map(isinstance, parts, kinds)):
-        _refuse(simulator, [f"`_begin` returned {', '.join(type(one).__name__ for one in parts)}"])
+        returned = ", ".join(type(part).__name__ for part in parts)
+        raise _wrong(name, [f"`_begin` returned {returned}"])
     lesson, first, _ = parts
     state, states, actions = map(np.asarray, (first.state, lesson.states, lesson.actions))
-    wrong, size = [], simulator.action_size
+    wrong: list[str] = []
     if state.ndim != 1 or not len(state) or state.dtype != np.float32:
         wrong.append(f"the first live state is {state.dtype} {state.shape}")
     elif states.shape != (len(states), *state.shape) or states.dtype != np.float32:
         wrong.append(
             f"the lesson's states are {states.dtype} {states.shape}, a live one {state.shape}"
         )
-    if actions.shape not in ((0, size), (len(states), size)) or actions.dtype != np.float32:
+    if (
+        actions.shape not in ((0, action_size), (len(states), action_size))
+        or actions.dtype != np.float32
+    ):
         wrong.append(
             f"the lesson's actions are {actions.dtype} {actions.shape}; expected "
-            f"{(len(states), size)}, or {(0, size)} if they are unknown"
+            f"{(len(states), action_size)}, or {(0, action_size)} if they are unknown"
         )
-    for name, image in first.images.items():
-        if name not in simulator.cameras:
-            wrong.append(f"the camera {name!r} is none of {', '.join(simulator.cameras)}")
+    for camera, image in first.images.items():
+        if camera not in cameras:
+            wrong.append(f"the camera {camera!r} is none of {', '.join(cameras)}")
         elif image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
-            wrong.append(f"the image of {name!r} is {image.dtype} {image.shape}")
+            wrong.append(f"the image of {camera!r} is {image.dtype} {image.shape}")
     if wrong:
-        _refuse(simulator, wrong)
+        raise _wrong(name, wrong)
 
 
 def check_drawn(
@@ -60,5 +71,5 @@ def check_drawn(
             )
 
 
-def _refuse(simulator: Simulator, wrong: list[str]) -> None:
-    raise SimulatorError(f"simulator {type(simulator).__name__}: {'; '.join(wrong)}", _HINT)
+def _wrong(name: str, wrong: list[str]) -> SimulatorError:
+    return SimulatorError(f"simulator {name}: {'; '.join(wrong)}", _HINT)

@@ -15,7 +15,8 @@ from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.storage.arrays import FeatureDigests
 
-from .base import Begun, Demonstration, EpisodeInfo, Observation, Simulator, choose_cameras
+from .base import Simulator
+from .episode import Begun, Demonstration, EpisodeInfo, Observation, choose_cameras
 from .registry import RECORDINGS
 
 

@@ -6,17 +6,15 @@ import json
 import math
 import os
 import tempfile
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 from robomme_interference_data.constants import FORMAT_VERSION
 from robomme_interference_data.errors import FormatError, MissingFileError
-
-if TYPE_CHECKING:
-    from .hub import HubFiles
 
 _MAX_JSON_BYTES = 16 << 20
 """Our files have some thousand bytes, and Python takes forty times as many for some values."""
@@ -28,13 +26,48 @@ _MAX_DEPTH = 64
 """Nesting of JSON: Python can read more than it can always print, compare or write."""
 
 
-@dataclass(frozen=True)
-class LocalFiles:
-    """Files in a folder on this machine.
+class Files(ABC):
+    """Access to the files of a dataset or buffer set: `LocalFiles`, or `hub.HubFiles`.
 
-    This and `hub.HubFiles` are the only way in which this package accesses the files of a dataset
-    or buffer set. A path is always relative, with `/`, such as `meta/info.json`. Paths come from
-    data files that are not trusted: no path leaves the dataset, and no link does.
+    It is the only way in which this package accesses them. A path is always relative, with `/`,
+    such as `meta/info.json`. Paths come from data files that are not trusted: no path leaves the
+    dataset, and no link does.
+    """
+
+    @abstractmethod
+    def path(self, relative: str) -> Path:
+        """Return where the file is on this machine.
+
+        Raises:
+            MissingFileError: There is no such file.
+            FormatError: The path leads out of the dataset.
+        """
+
+    @abstractmethod
+    def list(self, folder: str, suffix: str = "") -> list[str]:
+        """Return the sorted relative paths of all files under a folder; empty if none."""
+
+    @abstractmethod
+    def fetch(self, paths: Iterable[str]) -> None:
+        """Download files that are not on this machine."""
+
+    @abstractmethod
+    def snapshot(self, *patterns: str) -> Path:
+        """Return the folder that holds all files that match a pattern, such as `meta/*`."""
+
+    @property
+    @abstractmethod
+    def location(self) -> str:
+        """The argument of `hub.locate` for the same files."""
+
+    @abstractmethod
+    def describe(self) -> str:
+        """Return the location for messages."""
+
+
+@dataclass(frozen=True)
+class LocalFiles(Files):
+    """Files in a folder on this machine.
 
     Attributes:
         root: The folder.
@@ -46,13 +79,13 @@ class LocalFiles:
     refetch: str | None = None
 
     def path(self, relative: str) -> Path:
-        """Return where the file is on this machine."""
+        """See `Files.path`."""
         path = self.root / check_relative(relative, self.describe())
         # A link may lead inside the folder. In a snapshot of the Hub's cache, or a folder of one,
         # it may also lead to the cache's `blobs`.
         root = self.root.resolve()
-        snapshots = (one for one in (root, root.parent) if one.parent.name == "snapshots")
-        blobs = next((one.parent.parent / "blobs" for one in snapshots), root)
+        snapshots = (path for path in (root, root.parent) if path.parent.name == "snapshots")
+        blobs = next((path.parent.parent / "blobs" for path in snapshots), root)
         target = Path(os.path.realpath(path))  # unlike `Path.resolve`, it accepts circular links
         if not (target.is_relative_to(root) or target.is_relative_to(blobs)):
             raise FormatError(
@@ -73,7 +106,7 @@ class LocalFiles:
         return path
 
     def list(self, folder: str, suffix: str = "") -> list[str]:
-        """Return the sorted relative paths of all files under a folder; empty if none."""
+        """See `Files.list`."""
         matches = (self.root / folder).rglob(f"*{suffix}")
         return sorted(p.relative_to(self.root).as_posix() for p in matches if p.is_file())
 
@@ -86,15 +119,12 @@ class LocalFiles:
 
     @property
     def location(self) -> str:
-        """The argument of `locate` for the same files."""
+        """The folder."""
         return str(self.root)
 
     def describe(self) -> str:
-        """Return the location for messages."""
+        """Return the folder."""
         return str(self.root)
-
-
-type Files = LocalFiles | HubFiles
 
 
 def all_files(root: Path) -> list[str]:

@@ -15,7 +15,7 @@ from typing import Any, Self
 
 from robomme_interference_data.errors import HashMismatchError, InvalidOptionError, MissingFileError
 
-from .files import LocalFiles, all_files, check_relative, sha256_file
+from .files import Files, LocalFiles, all_files, check_relative, sha256_file
 from .hub_call import HubCall
 
 _NAME = r"[A-Za-z0-9][\w.-]*"
@@ -59,7 +59,7 @@ def check_endpoint() -> None:
         raise InvalidOptionError.expected("HF_ENDPOINT", endpoint, expected, hint)
 
 
-class HubFiles:
+class HubFiles(Files):
     """Files of a `dataset` or `model` repository at one commit, downloaded on use.
 
     The revision (a branch, tag or commit hash) is resolved once, at the first use; pickled copies

@@ -26,7 +26,8 @@ from robomme_interference_data.schema.manifest import SessionEntry, layout_sessi
 from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.schema.sampling import MEMORIES, Memory
 from robomme_interference_data.schema.subgoal import Subgoal
-from robomme_interference_data.simulators.base import Observation, Simulator
+from robomme_interference_data.simulators.base import Simulator
+from robomme_interference_data.simulators.episode import Observation
 
 Vector = NDArray[np.float32]
 

@@ -37,7 +37,7 @@ from robomme_interference_data.evaluate.rollout.checks import (
 from robomme_interference_data.evaluate.run.history import HistoryReader
 from robomme_interference_data.runtime.executor import Executor, Processes, Serial
 from robomme_interference_data.schema.subgoal import Subgoal
-from robomme_interference_data.simulators.base import Observation
+from robomme_interference_data.simulators.episode import Observation
 
 pytestmark = pytest.mark.usefixtures("world", "fast_retries")
 

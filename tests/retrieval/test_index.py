@@ -14,7 +14,7 @@ from support.buffer_sets import QUERIES, UNITS
 from support.retrieval import FRAMES, QUIET, Interrupted, TwoSums, files_of, make_index, remade
 
 from robomme_interference_data import load_buffer, load_buffer_set
-from robomme_interference_data.data.embeddings import EmbeddingIndex, normalized
+from robomme_interference_data.data.embeddings import EmbeddingIndex, normalized, open_index
 from robomme_interference_data.errors import BuildError, MissingFileError
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
@@ -26,7 +26,7 @@ GOLDEN = Path(__file__).parents[1] / "golden" / "index"
 
 
 def units_index(buffer_set: Path, camera: str = "front") -> EmbeddingIndex:
-    return load_buffer_set(buffer_set).datasets["distractors"].index("thumbnail", camera)
+    return open_index(load_buffer_set(buffer_set).datasets["distractors"], "thumbnail", camera)
 
 
 def test_a_buffers_embeddings_are_those_of_its_frames(indexed: Path) -> None:
@@ -62,12 +62,12 @@ def test_centre_and_typical_cosine_are_of_the_units_alone(indexed: Path) -> None
     for episode in range(UNITS):
         units.read_frames(episode, "front", 0, images[episode])
     features = Thumbnail().prepare(images.reshape(-1, 32, 32, 3)).astype(np.float16)
-    index = units.index("thumbnail")
+    index = open_index(units, "thumbnail")
     assert index.center == pytest.approx(features.mean(axis=0, dtype=np.float64), abs=1e-7)
     pool = normalized(features, index.center).reshape(UNITS, 32, -1)
     assert index.typical_cosine == typical_cosine(UNITS, pool.__getitem__)
     assert np.array_equal(index.span(3, 0, 32), features.reshape(UNITS, 32, -1)[3])
-    other = datasets["demonstrations"].index("thumbnail")
+    other = open_index(datasets["demonstrations"], "thumbnail")
     assert (other.center, other.header.typical_cosine) == (None, None)
 
 

@@ -12,7 +12,7 @@ from support.damage import flipped_bits
 from support.retrieval import change_header, make_index
 
 from robomme_interference_data import load_buffer, load_buffer_set
-from robomme_interference_data.data.embeddings import BufferSetIndex, episode_file
+from robomme_interference_data.data.embeddings import BufferSetIndex, episode_file, open_index
 from robomme_interference_data.errors import FormatError, InterferenceError, MissingFileError
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.select import measure
@@ -36,7 +36,7 @@ def check(buffer_set: Path) -> None:
     """Read all of both indexes."""
     for dataset in load_buffer_set(buffer_set).datasets.values():
         lengths = {record.episode_index: record.length for record in dataset.records()}
-        dataset.index("thumbnail").check(lengths, units=dataset.kind == "distractors")
+        open_index(dataset, "thumbnail").check(lengths, units=dataset.kind == "distractors")
 
 
 def test_without_an_index(tiny_buffers: Path) -> None:

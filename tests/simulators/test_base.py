@@ -19,7 +19,7 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.simulators import Status, make_simulator
-from robomme_interference_data.simulators.base import action_array
+from robomme_interference_data.simulators.episode import action_array
 
 DOUBLE = "support.simulator_doubles:make"
 ACTION = np.zeros(8, np.float32)

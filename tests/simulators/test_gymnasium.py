@@ -38,7 +38,7 @@ def run(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
 def test_the_package_registers_the_families_and_imports_nothing_heavy() -> None:
     code = """
 import sys
-import robomme_interference_data.simulators.commands
+import robomme_interference_data.cli.simulate_command
 assert "gymnasium" not in sys.modules
 import robomme_interference_data.simulators.tabletop
 assert not {"sapien", "torch", "mani_skill"} & set(sys.modules)

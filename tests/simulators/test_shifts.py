@@ -14,7 +14,7 @@ from robomme_interference_data.simulators import Status
 
 pytest.importorskip("mani_skill", reason="needs the extra sim")
 
-from robomme_interference_data.simulators.base import Observation
+from robomme_interference_data.simulators.episode import Observation
 from robomme_interference_data.simulators.tabletop.drawing import PANDA
 from robomme_interference_data.simulators.tabletop.scene_shift import POSITIONS, TALL, WIDE
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator

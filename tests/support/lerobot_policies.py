@@ -13,7 +13,7 @@ from lerobot.policies.factory import get_policy_class, make_policy_config, make_
 
 from robomme_interference_data.constants import ACTION, FRONT, STATE, WRIST
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
-from robomme_interference_data.simulators.base import Observation
+from robomme_interference_data.simulators.episode import Observation
 
 SIZE = 256
 SEED = 5

@@ -27,7 +27,7 @@ from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
 from robomme_interference_data.schema.records import EpisodeRecord, EvidenceSpan, SpanDigests
-from robomme_interference_data.simulators.base import choose_cameras
+from robomme_interference_data.simulators.episode import choose_cameras
 from robomme_interference_data.storage.files import LocalFiles, write_json
 
 SHAPES = {"observation.images.front": (4, 6, 3), "observation.state": (8,)}

@@ -9,12 +9,12 @@ from support.worlds import World
 
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.rollouts import Status
-from robomme_interference_data.simulators.base import (
+from robomme_interference_data.simulators.base import Simulator
+from robomme_interference_data.simulators.episode import (
     Begun,
     Demonstration,
     EpisodeInfo,
     Observation,
-    Simulator,
 )
 
 

@@ -9,7 +9,7 @@ from support.policy_server import PolicyServer
 
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.evaluate.policies.websocket import WebsocketPolicy
-from robomme_interference_data.simulators.base import Observation
+from robomme_interference_data.simulators.episode import Observation
 
 SIZE = 8
 RESET = {"call": "reset"}

@@ -9,12 +9,12 @@ from robomme_interference_data.errors import UnknownNameError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.shifts import Shift
-from robomme_interference_data.simulators.base import (
+from robomme_interference_data.simulators.base import Simulator
+from robomme_interference_data.simulators.episode import (
     Begun,
     Demonstration,
     EpisodeInfo,
     Observation,
-    Simulator,
 )
 
 STEPS = 3

@@ -20,7 +20,7 @@ from robomme_interference_data.evaluate.policies.policy import Frames, RolloutIn
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.subgoal import Subgoal
-from robomme_interference_data.simulators.base import Demonstration, EpisodeInfo, Observation
+from robomme_interference_data.simulators.episode import Demonstration, EpisodeInfo, Observation
 
 BUFFER_SET = "WORLDS_DATA"
 TROUBLE = "WORLDS_TROUBLE"

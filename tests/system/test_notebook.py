@@ -9,13 +9,16 @@ from IPython.core.interactiveshell import InteractiveShell
 from support.buffer_sets import GOLDEN
 
 from robomme_interference_data import load_buffer
+from robomme_interference_data.notebooks import register
 
 NOTEBOOK = Path(__file__).parents[2] / "examples" / "buffers.ipynb"
 
 
 @pytest.fixture
 def shell() -> InteractiveShell:
-    return InteractiveShell.instance()
+    shell = InteractiveShell.instance()
+    register()  # as importing the package in a notebook does
+    return shell
 
 
 def test_the_example_runs(shell: InteractiveShell, monkeypatch: pytest.MonkeyPatch) -> None:

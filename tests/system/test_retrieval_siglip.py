@@ -12,7 +12,7 @@ from support.buffer_sets import QUERIES
 from support.retrieval import make_index
 
 from robomme_interference_data import load_buffer, load_buffer_set
-from robomme_interference_data.data.embeddings import normalized
+from robomme_interference_data.data.embeddings import normalized, open_index
 from robomme_interference_data.errors import FormatError, HubError, InvalidOptionError
 from robomme_interference_data.retrieval.encoders import make_encoder
 from robomme_interference_data.retrieval.select import measure
@@ -75,9 +75,9 @@ def test_siglip_makes_an_index(own_buffers: Path, model: str) -> None:
     demonstrations, length = datasets["demonstrations"], datasets["demonstrations"].record(0).length
     images = np.empty((length, *demonstrations.shape("front")), np.uint8)
     demonstrations.read_frames(0, "front", 0, images)
-    found, expected = demonstrations.index(model).span(0, 0, length), encoder.prepare(images)
+    found, expected = open_index(demonstrations, model).span(0, 0, length), encoder.prepare(images)
     assert found == pytest.approx(encoder.features(expected), rel=2e-3, abs=2e-3)
-    assert datasets["distractors"].index(model).center is None
+    assert open_index(datasets["distractors"], model).center is None
     buffer = load_buffer(QUERIES[0], "k1", buffer_set=own_buffers)
     selector = Selector(model, device="cpu")
     assert selector.label(buffer) == "siglip-tiny/max/adaptive"

@@ -14,14 +14,14 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.subgoal import Subgoal, read_grounded
-from robomme_interference_data.simulators.base import (
+from robomme_interference_data.simulators.base import Simulator
+from robomme_interference_data.simulators.episode import (
     ACTION_SIZE,
     CAMERAS,
     Begun,
     Demonstration,
     EpisodeInfo,
     Observation,
-    Simulator,
     choose_cameras,
 )
 from robomme_interference_data.simulators.tabletop.episodes import episode_ids

@@ -41,6 +41,9 @@ CUBE = 0.04
 SIDE = 0.036
 """Half the width of a container."""
 
+UPRIGHT = (math.sqrt(0.5), 0, math.sqrt(0.5), 0)
+"""The rotation, as a quaternion, that stands up sapien's cylinders, which lie along x."""
+
 _HIDDEN_Z = -0.5  # inside the table's block, where lamps wait until they are lit
 
 
@@ -246,8 +249,6 @@ class SceneBuilder:
         """Build a body of boxes and of discs; discs are drawn but not solid."""
         import sapien
 
-        from .drawing import UPRIGHT, material
-
         builder = self._scene.create_actor_builder()
         for middle, half, color in boxes:
             pose = sapien.Pose(middle)
@@ -273,3 +274,12 @@ class SceneBuilder:
 def _dark(color: Color, part: float) -> Color:
     red, green, blue = color
     return red * part, green * part, blue * part
+
+
+def material(color: Color, roughness: float = 0.9, specular: float = 0.1) -> Any:
+    """Return a plain material of a color, matte by default."""
+    import sapien
+
+    return sapien.render.RenderMaterial(
+        base_color=[*color, 1.0], roughness=roughness, specular=specular
+    )

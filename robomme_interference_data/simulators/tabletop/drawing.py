@@ -20,12 +20,9 @@ from mani_skill.agents.robots import PandaWristCam
 from mani_skill.render.shaders import ShaderConfig
 from mani_skill.sensors.camera import CameraConfig
 
-from .bodies import Color
+from .bodies import UPRIGHT, material
 from .motion import ROD
 from .renderer import SHADERS
-
-UPRIGHT = (math.sqrt(0.5), 0, math.sqrt(0.5), 0)
-"""The rotation, as a quaternion, that stands up sapien's cylinders, which lie along x."""
 
 SHADER = ShaderConfig(
     shader_pack=str(SHADERS),
@@ -119,10 +116,3 @@ def _smooth(vertices: Any, normals: Any) -> Any:
         smooth[group] = near @ normals[group]
     smooth /= np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12)
     return smooth.astype(np.float32)
-
-
-def material(color: Color, roughness: float = 0.9, specular: float = 0.1) -> Any:
-    """Return a plain material of a color, matte by default."""
-    return sapien.render.RenderMaterial(
-        base_color=[*color, 1.0], roughness=roughness, specular=specular
-    )

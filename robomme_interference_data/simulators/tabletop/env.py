@@ -18,7 +18,7 @@ from robomme_interference_data.schema.evidence import spans_of_parts
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.shifts import Shift
 from robomme_interference_data.schema.subgoal import Pixel, Subgoal
-from robomme_interference_data.simulators.base import CAMERAS, Demonstration, Observation
+from robomme_interference_data.simulators.episode import CAMERAS, Demonstration, Observation
 
 from .bodies import SceneBuilder
 from .camera import FRONT_EYE, FRONT_TARGET, FRONT_VIEW, SIZE, to_pixels

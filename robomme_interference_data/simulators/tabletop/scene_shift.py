@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.schema.shifts import KINDS, Shift
 
-from .bodies import Color, Placement
+from .bodies import UPRIGHT, Color, Placement, material
 from .camera import FRONT_EYE, FRONT_TARGET
-from .drawing import UPRIGHT, material
 
 DIMMER, BRIGHTER, TINT = 0.20, 0.12, 0.12  # fractions of the light, and of its color
 MOVED, TURNED = 0.045, math.radians(1.5)  # m, rad

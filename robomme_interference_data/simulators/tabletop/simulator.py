@@ -12,12 +12,12 @@ from robomme_interference_data.lazy import load_extra
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.shifts import NO_SHIFT, Shift, parse_shift
 from robomme_interference_data.schema.subgoal import Subgoal
-from robomme_interference_data.simulators.base import (
+from robomme_interference_data.simulators.base import Simulator
+from robomme_interference_data.simulators.episode import (
     CAMERAS,
     Begun,
     EpisodeInfo,
     Observation,
-    Simulator,
     choose_cameras,
 )
 

@@ -6,10 +6,11 @@ from typing import Annotated, Any
 
 import typer
 
-from robomme_interference_data.cli.console import check_output, echo, print_json
-from robomme_interference_data.cli.options import AsJson
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP
+
+from .console import check_output, echo, print_json
+from .options import AsJson
 
 
 def _option(panel: str, text: str, **more: Any) -> Any:
@@ -57,9 +58,13 @@ def simulate(
     ```
     """
     from robomme_interference_data.ids import EpisodeId
-
-    from .play import NO_POLICY, play
-    from .registry import accepted_settings, check_shift, make_simulator, simulator_class
+    from robomme_interference_data.simulators.play import NO_POLICY, play
+    from robomme_interference_data.simulators.registry import (
+        accepted_settings,
+        check_shift,
+        make_simulator,
+        simulator_class,
+    )
 
     check_shift(simulator, shift)
     supported = simulator_class(simulator)
