@@ -35,7 +35,7 @@ _ROBOMME_REPOS = ("lerobot/robomme", "Yinpei/robomme_data_lerobot")
 _CORRECT = "Correct the dataset, or leave the episode out."
 _NAME_FAMILIES = (
     "Name the family of every episode in a CSV file, `families_file`, with the first line "
-    "episode_index,family."
+    "episode_index,family. docs/how-to/your-own-recordings.md shows one."
 )
 
 
