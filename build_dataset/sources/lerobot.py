@@ -38,7 +38,7 @@ _CORRECT = "Correct the dataset, or leave the episode out."
 def _families_advice() -> str:
     return (
         f"Name the family of every episode in a CSV file, {named('families_file')}, with the first "
-        "line episode_index,family."
+        "line episode_index,family. docs/how-to/your-own-recordings.md shows one."
     )
 
 

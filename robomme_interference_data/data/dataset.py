@@ -301,8 +301,12 @@ class Dataset:
         """Read states or actions of frames `start` to `stop` (excluded), `(T, D) float32`.
 
         Raises:
+            UnknownNameError: The dataset has no such states or actions.
             MissingFileError, FormatError: See `LeRobotFiles.vectors`.
         """
+        vectors = [name for name in self.features if not name.startswith(CAMERA_PREFIX)]
+        if feature not in vectors:
+            raise UnknownNameError.among("feature", feature, self._name, vectors)
         self.lerobot.check_span(episode_index, start, stop)
         return self.lerobot.vectors(episode_index, feature)[start:stop]
 
