@@ -55,7 +55,7 @@ class Published:
         own = f"Or set {named('system')} to a name of your own: see docs/how-to/paper-systems.md."
         command = (
             f"evaluate BUFFER_SET --system {name} --policy websocket://HOST:PORT --out RUN "
-            f"--subgoals openai:URL#MODEL --subgoal-prompt CLONE/{FOLDER}/{self.file}"
+            f"--subgoals openai:URL#MODEL --set subgoal_prompt=CLONE/{FOLDER}/{self.file}"
         )
         if prompt.sha256 != self.sha256:
             raise InvalidOptionError(
