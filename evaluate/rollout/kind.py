@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.constants import EXECUTIONS
+from robomme_interference_data.constants import EXECUTIONS, ORACLE, RECORDINGS
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import open_dataset
 from robomme_interference_data.errors import (
@@ -46,13 +46,8 @@ from robomme_interference_data.evaluate.run.kind import Run, RunKind, retrieval_
 from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
 from robomme_interference_data.evaluate.systems import SystemFacts, name_system
 from robomme_interference_data.runtime.executor import Session
-from robomme_interference_data.schema.subgoal import ORACLE
 from robomme_interference_data.simulators.base import Simulator
-from robomme_interference_data.simulators.registry import (
-    RECORDINGS,
-    simulator_class,
-    simulator_versions,
-)
+from robomme_interference_data.simulators.registry import simulator_class, simulator_versions
 
 from .checks import check_plan, check_settings, check_system, condition_refusal, default_system
 from .worker import Opening, RolloutTask

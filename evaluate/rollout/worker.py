@@ -6,7 +6,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from typing import Any, cast
 
-from robomme_interference_data.constants import DEMONSTRATIONS
+from robomme_interference_data.constants import DEMONSTRATIONS, ORACLE
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import (
     PolicyError,
@@ -31,7 +31,6 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.rollouts import Status
-from robomme_interference_data.schema.subgoal import ORACLE
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.checks import check_drawn
 from robomme_interference_data.simulators.registry import (
