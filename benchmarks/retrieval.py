@@ -61,7 +61,7 @@ class MadeUp:
     """An encoder of nothing: every episode gets a direction of its own, every frame some noise."""
 
     name = "made-up"
-    centred = False
+    centered = False
     batch = 2**30  # an episode at a time
     computed_in = "numpy"
     fingerprint: ClassVar[dict[str, Any]] = {"name": "made-up"}

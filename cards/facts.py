@@ -5,12 +5,12 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-from robomme_interference_data.constants import FAMILIES, IDENTITY_PATH
+from robomme_interference_data.constants import FAMILIES, IDENTITY_PATH, RECORDINGS
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import InvalidOptionError, counted
 from robomme_interference_data.evaluate.score.outcomes import TEST_EPISODES
 from robomme_interference_data.schema.records import EpisodeRecord
-from robomme_interference_data.simulators.registry import RECORDINGS, SIMULATORS, simulator_class
+from robomme_interference_data.simulators.registry import SIMULATORS, simulator_class
 from robomme_interference_data.storage.files import sha256_file
 
 from .markdown import code, escape

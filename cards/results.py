@@ -6,9 +6,15 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from robomme_interference_data.constants import PROTOCOL_VERSION, RUN_HEADER, RUN_RECORD, RUN_TABLES
+from robomme_interference_data.constants import (
+    PROTOCOL_VERSION,
+    RECORDINGS,
+    RUN_HEADER,
+    RUN_RECORD,
+    RUN_TABLES,
+)
 from robomme_interference_data.errors import InvalidOptionError, PublishError
-from robomme_interference_data.evaluate.run.log import RunHeader
+from robomme_interference_data.evaluate.run.header import RunHeader
 from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.score.config import Expected, Settings
 from robomme_interference_data.evaluate.score.outcomes import STATUSES
@@ -20,7 +26,6 @@ from robomme_interference_data.evaluate.score.tables.cells import Coverage
 from robomme_interference_data.evaluate.score.writing import write_score
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.schema.rollouts import Status
-from robomme_interference_data.simulators.registry import RECORDINGS
 from robomme_interference_data.storage.files import sha256_file
 from robomme_interference_data.viz.figure import open_figure, save_figure
 from robomme_interference_data.viz.tables import Columns, Table

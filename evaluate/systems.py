@@ -10,10 +10,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Annotated
 
-from robomme_interference_data.constants import MAX_STEPS, POSITION_LIMIT
+from robomme_interference_data.constants import MAX_STEPS, ORACLE, POSITION_LIMIT
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError
 from robomme_interference_data.schema.conditions import NO_HISTORY
-from robomme_interference_data.schema.subgoal import ORACLE
 
 _FREE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 

@@ -130,7 +130,7 @@ def calibrate(
     cuts, lowest = _true_cosines(measured)
     return Calibration(
         rule=str(rule),
-        in_use=rule.threshold(measured[0].typical),
+        in_use=rule.cosine(measured[0].typical),
         threshold=threshold,
         cuts=tuple(cuts),
         lowest=tuple(lowest),
@@ -142,21 +142,21 @@ def calibrate(
             if len(families) > 1
         ),
         sweep=tuple(
-            _trial(measured, cut, condition=name) for cut in thresholds for name in conditions
+            _trial(measured, swept, condition=name) for swept in thresholds for name in conditions
         ),
     )
 
 
 def _trial(
-    measured: Sequence[Similarities], cut: float, *, family: str = ALL, condition: str = ALL
+    measured: Sequence[Similarities], threshold: float, *, family: str = ALL, condition: str = ALL
 ) -> Trial:
     grades = [
-        grade(one, Rule(boundary=cut))
+        grade(one, Rule(threshold=threshold))
         for one in measured
         if family in (ALL, one.episode_id.family) and condition in (ALL, one.condition)
     ]
     purity, coverage = np.array([(g.purity, g.coverage) for g in grades], float).mean(axis=0)
-    return Trial(cut, family, condition, float(purity), float(coverage))
+    return Trial(threshold, family, condition, float(purity), float(coverage))
 
 
 def _fit(

@@ -204,9 +204,9 @@ def retrieval_score(
     rules: Annotated[
         list[str],
         typer.Option(
-            help="Rules METHOD or METHOD/CUT, or all. METHOD is max (released rule), latest, "
-            "joined, mean, last, random, top32 or oracle; CUT is a cosine or adaptive, by default "
-            "the one published for the encoder.",
+            help="Rules METHOD or METHOD/THRESHOLD, or all. METHOD is max (released rule), latest, "
+            "joined, mean, last, random, top32 or oracle; THRESHOLD is a cosine or adaptive, by "
+            "default the one published for the encoder.",
             metavar="RULE,…",
             rich_help_panel=_RETRIEVAL,
         ),

@@ -77,7 +77,9 @@ class Explanation:
 def frames_text(spans: Sequence[Span]) -> str:
     """Return the first and last frames of spans, of three at most."""
     parts = [f"{start} to {stop - 1}" for start, stop in spans[:3]]
-    return " and ".join(parts) + f" and {len(spans) - 3} more parts" * (len(spans) > 3)
+    if len(spans) > len(parts):
+        parts.append(f"{len(spans) - len(parts)} more parts")
+    return " and ".join(parts)
 
 
 def explain(

@@ -33,7 +33,7 @@ class Grade:
     """How well one rule chose for one buffer.
 
     Attributes:
-        rule: The rule with its cut.
+        rule: The rule with its threshold.
         threshold: Cosine below which it cut.
         episode_id: The query episode.
         condition: Name of the condition.

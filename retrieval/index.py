@@ -240,16 +240,16 @@ class _IndexBuilder:
 
     def write(self) -> IndexHeader:
         """Write the rest of the index, and rename it."""
-        made, encoder, typical, centre = self.made, self.encoder, None, None
+        made, encoder, typical, center = self.made, self.encoder, None, None
         names = [episode_file(episode) for episode in range(len(self.lengths))]
         if self.units:
-            if encoder.centred:
-                centre = center_of(map(np.load, self.features))
-                write_array(made / CENTER_FILE, centre)
+            if encoder.centered:
+                center = center_of(map(np.load, self.features))
+                write_array(made / CENTER_FILE, center)
             typical = typical_cosine(
-                len(names), lambda episode: normalized(np.load(self.features[episode]), centre)
+                len(names), lambda episode: normalized(np.load(self.features[episode]), center)
             )
-        written = names if centre is None else [*names, CENTER_FILE]
+        written = names if center is None else [*names, CENTER_FILE]
         write_text(made / INDEX_SUMS, format_sums(made, written))
         header = IndexHeader(
             format_version=FORMAT_VERSION,

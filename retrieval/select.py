@@ -55,61 +55,64 @@ _SCORES: dict[str, Callable[[NDArray[np.float32]], float]] = {
 
 @dataclass(frozen=True)
 class Rule:
-    """A method of choosing, and the boundary of segments; validates itself.
+    """A method of choosing, and the threshold of segments; validates itself.
 
     Attributes:
         method: One of `METHODS`.
-        boundary: Cosine of adjacent frames below which a history is cut, or `adaptive` (ours): the
+        threshold: Cosine of adjacent frames below which a history is cut, or `adaptive` (ours): the
             middle between the cosine of unrelated frames and 1. It has no free parameter, and uses
             the train pool but no test episode.
     """
 
     method: str = "max"
-    boundary: float | Literal["adaptive"] = ADAPTIVE
+    threshold: float | Literal["adaptive"] = ADAPTIVE
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise UnknownNameError.none("method", self.method, METHODS)
-        cosine = isinstance(self.boundary, float | int) and -1 <= self.boundary <= 1
-        if self.boundary != ADAPTIVE and not cosine:
+        cosine = isinstance(self.threshold, float | int) and -1 <= self.threshold <= 1
+        if self.threshold != ADAPTIVE and not cosine:
             expected = f"a cosine, from −1 to 1, or {ADAPTIVE}, such as max/0.923"
-            raise InvalidOptionError.expected(f"the cut of {self.method}", self.boundary, expected)
+            raise InvalidOptionError.expected(
+                f"the threshold of {self.method}", self.threshold, expected
+            )
 
     @classmethod
     def parse(cls, text: str, published: float | None = None) -> Self:
-        """Read `METHOD` or `METHOD/CUT`, such as `max`, `mean/0.9` or `max/adaptive`.
+        """Read `METHOD` or `METHOD/THRESHOLD`, such as `max`, `mean/0.9` or `max/adaptive`.
 
-        Without a cut it is `published`, the one published for the encoder, or else adaptive.
+        Without a threshold it is `published`, the one published for the encoder, or else adaptive.
         """
         method, slash, text = text.partition("/")
         if not slash:
             return cls(method, ADAPTIVE if published is None else published)
         try:
-            cut: Any = float(text)
+            threshold: Any = float(text)
         except ValueError:
-            cut = text
-        return cls(method, cut)
+            threshold = text
+        return cls(method, threshold)
 
-    def threshold(self, typical: float) -> float:
+    def cosine(self, typical: float) -> float:
         """Return the cosine below which it cuts; unrelated frames have the cosine `typical`."""
-        return (1 + typical) / 2 if self.boundary == ADAPTIVE else float(self.boundary)
+        return (1 + typical) / 2 if self.threshold == ADAPTIVE else float(self.threshold)
 
     def __str__(self) -> str:
-        """Return the text that `parse` reads, with every digit of the cut."""
-        adaptive = self.boundary == ADAPTIVE
-        at = ADAPTIVE if adaptive else repr(float(self.boundary)).removesuffix(".0")
-        return f"{self.method}/{at}"
+        """Return the text that `parse` reads, with every digit of the threshold."""
+        if self.threshold == ADAPTIVE:
+            return f"{self.method}/{ADAPTIVE}"
+        return f"{self.method}/{float(self.threshold)!r}".removesuffix(".0")
 
 
 def parse_rules(texts: Sequence[str], published: float | None) -> list[Rule]:
     """Read rules as `Rule.parse` does, without duplicates.
 
-    A text may hold several, separated by commas; `all` is every method, and `max` with both cuts.
+    A text may hold several, separated by commas; `all` is every method, and `max` with both
+    thresholds.
     """
-    every = [*METHODS, f"max/{ADAPTIVE}"]
-    given = (name for text in texts for name in text.split(","))
-    named = (name for text in given for name in (every if text == "all" else [text]))
-    return list(dict.fromkeys(Rule.parse(name, published) for name in named))
+    names: list[str] = []
+    for name in (name for text in texts for name in text.split(",")):
+        names += [*METHODS, f"max/{ADAPTIVE}"] if name == "all" else [name]
+    return list(dict.fromkeys(Rule.parse(name, published) for name in names))
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +143,9 @@ class Similarities:
     @property
     def lesson(self) -> tuple[Span, ...]:
         """The parts of the true lesson, in the buffer's order; none where it is absent."""
-        return tuple((one.start, one.stop) for one in self.sessions if one.role == "lesson")
+        return tuple(
+            (session.start, session.stop) for session in self.sessions if session.role == "lesson"
+        )
 
 
 def measure(
@@ -197,7 +202,7 @@ def choose(measured: Similarities, rule: Rule) -> Choice:
             f"{name}: the history is empty",
             "Retrieval needs a condition with a history, such as k0; leave out no-history.",
         )
-    threshold = rule.threshold(measured.typical)
+    threshold = rule.cosine(measured.typical)
     spans = segments(measured.adjacent, threshold)
     # If all segments are short, all may be chosen (ours).
     candidates = [(a, b) for a, b in spans if b - a >= MIN_FRAMES] or list(spans)

@@ -91,7 +91,7 @@ class Selector(RetrievalStep):
 
         Returns:
             `encoder`, the name; `fingerprint`, the SHA-256 over everything that determines the
-            features; `camera`; `method`; `boundary`; and `threshold`, the resulting cosine.
+            features; `camera`; `method`; `threshold`; and `cosine`, the number that it is here.
         """
         index = self._index(buffer)
         return {
@@ -99,8 +99,8 @@ class Selector(RetrievalStep):
             "fingerprint": index.units.header.encoder.sha256,
             "camera": index.units.header.camera,
             "method": self.rule.method,
-            "boundary": self.rule.boundary,
-            "threshold": self.rule.threshold(index.units.typical_cosine),
+            "threshold": self.rule.threshold,
+            "cosine": self.rule.cosine(index.units.typical_cosine),
         }
 
     def select(self, buffer: Buffer, image: NDArray[np.uint8]) -> NDArray[np.int64]:

@@ -164,11 +164,24 @@ MANIFEST_PATH = f"{MANIFESTS}/{MANIFEST_HEADER}"
 FETCH_RECORD = f"{MANIFESTS}/fetched.json"
 """What a copy of a published buffer set holds."""
 
+# --- names in rows -------------------------------------------------------------------------------
+
+OFFICIAL = "robomme"
+"""The benchmark's own simulator, the source of the published recordings and results."""
+
+RECORDINGS = "recordings"
+"""Plays back executions for offline evaluation; a simulator in rows only, not one to choose."""
+
+ORACLE = "oracle"
+"""Name of the writer of subgoals that reads the simulator, which knows the answer."""
+
 # --- files of a run -----------------------------------------------------------------------------
 
 RUN_HEADER = "run.json"
 RUN_RECORD = "rollouts.jsonl"
 RUN_TABLES = ("rollouts.parquet", "rollouts.csv")
 """Exported from the record at the end of a run."""
+MOST_ROW_BYTES = 2 << 30
+"""Maximum bytes of a file of rows: two million rollouts have fewer."""
 RUN_METRICS = "metrics.csv"
 """Written while a run proceeds, with `--track csv`."""

@@ -1,7 +1,10 @@
 """Sources of recorded episodes, opened by a specification such as `robomme-h5:recordings/`."""
 
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
+from robomme_interference_data.constants import INFO_PATH
 from robomme_interference_data.errors import InvalidOptionError, nearest
 from robomme_interference_data.runtime.specs import (
     OWN,
@@ -14,6 +17,7 @@ from robomme_interference_data.runtime.specs import (
 from robomme_interference_data.simulators.registry import SIMULATORS, simulator_class
 
 from .base import Frame, Recording, Robot, Source, SourceEpisode
+from .frames_table import TABLE
 
 __all__ = [
     "SOURCES",
@@ -80,9 +84,22 @@ def takes(specification: str, option: str) -> bool:
     return option in signature_of(SOURCES.factory(_parse(specification))).parameters
 
 
+def _kind_of_folder(path: str) -> str | None:
+    """Return the kind of source that reads an existing folder, by the files in it."""
+    signs = {"lerobot": INFO_PATH, "frames": TABLE, "robomme-h5": "record_dataset_*.h5"}
+    with suppress(OSError, ValueError):  # it is no path
+        return next((kind for kind, sign in signs.items() if any(Path(path).glob(sign))), None)
+    return None
+
+
 def _parse(specification: str) -> Spec:
     """Parse the text of a source; a simulator of the user is one like the embedded one."""
     module = specification.partition(":")[0]
+    if module not in SOURCES.kinds and (kind := _kind_of_folder(specification)):
+        raise InvalidOptionError(
+            f"the source {specification!r} names a folder, but not what it holds",
+            f"Write {kind}:{specification}",
+        )
     if module in SOURCES.kinds or not OWN.fullmatch(specification):
         return SOURCES.parse(specification)
     try:

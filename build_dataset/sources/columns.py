@@ -53,7 +53,7 @@ def find_columns(
         if name in columns:
             raise SourceError(
                 f"{where}: the columns {columns[name]!r} and {column!r} are both camera {name!r}",
-                f"Name one of them differently in `columns`: NAME={column}",
+                f"Name one of them differently in {named('columns')}: NAME={column}",
             )
         columns[name] = column
     for name, column in columns.items():

@@ -12,7 +12,7 @@ from typing import Any, override
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, SourceError
+from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, SourceError, named
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators.episode import choose_cameras
 from robomme_interference_data.storage.parquet import RowSpan
@@ -87,7 +87,7 @@ class FramesSource(Source):
                 f"{self._folder} has neither videos nor images",
                 f"Add {self._folder}/videos/CAMERA/{episode.id}.mkv or "
                 f"{self._folder}/images/CAMERA/{episode.id}/000000.png and so on, with the name of "
-                "the camera, or set `cameras` to none, to store states alone.",
+                f"the camera, or set {named('cameras')} to none, to store states alone.",
             )
         chosen = choose_cameras(cameras, tuple(key.images))
         if self._state(key.images) != key.state:

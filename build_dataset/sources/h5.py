@@ -15,11 +15,11 @@ from typing import Any, override
 import h5py
 import numpy as np
 
+from robomme_interference_data.constants import OFFICIAL
 from robomme_interference_data.errors import InterferenceError, SourceError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.evidence import spans_of_texts
 from robomme_interference_data.simulators.episode import choose_cameras
-from robomme_interference_data.simulators.registry import OFFICIAL
 
 from .base import Frame, Recording, Robot, Source, SourceEpisode, demonstration_length, file_state
 from .robomme_families import ROBOMME, ROBOT

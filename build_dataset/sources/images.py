@@ -17,8 +17,19 @@ from robomme_interference_data.storage.encode import decode_image, is_png
 from robomme_interference_data.storage.video import open_video
 
 _RGB_FORMATS = (
-    *("rgb24", "bgr24", "rgb0", "bgr0", "0rgb", "0bgr", "gbrp"),
-    *("rgba", "bgra", "argb", "abgr", "gbrap"),
+    "rgb24",
+    "bgr24",
+    "rgb0",
+    "bgr0",
+    "0rgb",
+    "0bgr",
+    "gbrp",
+    # with transparency
+    "rgba",
+    "bgra",
+    "argb",
+    "abgr",
+    "gbrap",
 )
 _LOSSLESS_CODECS = ("ffv1", "png", "rawvideo", "huffyuv", "ffvhuff", "utvideo", "qtrle")
 _TRUE = ("1", "true", "yes")

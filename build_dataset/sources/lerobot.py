@@ -12,14 +12,13 @@ from typing import Any, override
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import ACTION, STATE, VALUE_NAMES
+from robomme_interference_data.constants import ACTION, OFFICIAL, STATE, VALUE_NAMES
 from robomme_interference_data.errors import FormatError, SourceError, named
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import from_dict
 from robomme_interference_data.schema.evidence import spans_of_texts
 from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.simulators.episode import choose_cameras
-from robomme_interference_data.simulators.registry import OFFICIAL
 from robomme_interference_data.storage.encode import is_png
 from robomme_interference_data.storage.hub import HubFiles, locate
 from robomme_interference_data.storage.lerobot import LeRobotFiles
@@ -38,7 +37,7 @@ _CORRECT = "Correct the dataset, or leave the episode out."
 def _families_advice() -> str:
     return (
         f"Name the family of every episode in a CSV file, {named('families_file')}, with the first "
-        "line episode_index,family."
+        "line episode_index,family. docs/how-to/your-own-recordings.md shows one."
     )
 
 

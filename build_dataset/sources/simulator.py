@@ -41,7 +41,9 @@ class SimulatorSource(Source):
         self.time_limit_s = self._class.episode_s
         # Another version of the suite has other episodes.
         version = self._class.suite_version
-        self.provenance = {"kind": name, **({} if version is None else {"suite_version": version})}
+        self.provenance = {"kind": name}
+        if version is not None:
+            self.provenance["suite_version"] = version
         self._settings = {"python": robomme_python, "subgoals": False}
         self._simulator: Simulator | None = None
         self._cameras: tuple[str, ...] = ()
@@ -58,9 +60,9 @@ class SimulatorSource(Source):
                 "Define the class method `episodes`, and name the class as MODULE:CLASS, or a "
                 "function with it as return annotation: see docs/how-to/another-benchmark.md.",
             )
-        listed = [SourceEpisode(one, self.provenance) for one in usual]
-        listed += [SourceEpisode(one, self.provenance, further=True) for one in further]
-        return sorted(listed, key=lambda one: one.id)
+        listed = [SourceEpisode(episode, self.provenance) for episode in usual]
+        listed += [SourceEpisode(episode, self.provenance, further=True) for episode in further]
+        return sorted(listed, key=lambda episode: episode.id)
 
     @override
     def contradict(self, episode: SourceEpisode) -> SourceEpisode:

@@ -53,8 +53,8 @@ def verify_buffer_set(
     """Check a buffer set, yielding violations as they are found.
 
     Checked are: the SHA-256 of every file, and that none is missing or unlisted; with `decode`,
-    every frame and vector of every episode against its recorded hashes; LeRobot's columns and
-    statistics; the hashes of embeddings, which are not recomputed; every manifest row and question,
+    every frame and vector of every episode against its recorded hashes; LeRobot's columns;
+    the hashes of embeddings, which are not recomputed; every manifest row and question,
     which are planned again from the datasets, rules and seed and compared; with `decode`, the first
     frame of every execution against the query frame, and the questions' pictures, if Pillow is
     installed.

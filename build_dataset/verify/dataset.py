@@ -1,11 +1,9 @@
 """Recompute every hash and every rule of one of a buffer set's datasets."""
 
-from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +14,7 @@ from robomme_interference_data.build_dataset.dataset.identity import (
     listed_files,
     report_of,
 )
-from robomme_interference_data.build_dataset.dataset.image_stats import (
-    ImageStats,
-    Statistics,
-    episode_statistics,
-)
 from robomme_interference_data.constants import (
-    CAMERA_PREFIX,
     DISTRACTORS,
     EXECUTIONS,
     IDENTITY_PATH,
@@ -60,7 +52,6 @@ from robomme_interference_data.storage.files import (
     read_json,
     sha256_file,
 )
-from robomme_interference_data.storage.lerobot import LeRobotFiles
 from robomme_interference_data.storage.video import open_video
 
 from .lerobot_files import lerobot_violations
@@ -120,12 +111,11 @@ def dataset_violations(
         yield from _record(f"{name} {record.episode_id}", name, record, unit)
     if progress is None:
         return
-    statistics = episode_statistics(LeRobotFiles(dataset.files, statistics=True).table)
-    for record, stored in zip(records, statistics, strict=True):
+    for record in records:
         where = f"{name} {record.episode_id}"
         if copy is not None and not copy.holds_all(dataset, record.episode_index):
             continue  # hashes of what it holds of the episode need all of its cameras
-        yield from caught(where, _episode(where, dataset, record, stored))
+        yield from caught(where, _episode(where, dataset, record))
         progress.advance(record.length)
 
 
@@ -207,9 +197,7 @@ def _record(where: str, name: str, record: EpisodeRecord, unit: Unit) -> Iterato
         yield Violation(where, f"holds {record.length} frames, not {expected[-1]}")
 
 
-def _episode(
-    where: str, dataset: Dataset, record: EpisodeRecord, statistics: Statistics
-) -> Iterator[Violation]:
+def _episode(where: str, dataset: Dataset, record: EpisodeRecord) -> Iterator[Violation]:
     recorded, spans = record.feature_sha256, record.spans
     formats = _pixel_formats(dataset, record)
     exact = formats <= {codec.pix_fmt for codec in CODECS.values() if codec.exact}
@@ -218,22 +206,7 @@ def _episode(
         yield Violation(where, f"has videos in {', '.join(sorted(formats))}, not {stated.name}")
     if record.exact and not exact:
         yield Violation(where, "is exact, but its videos are lossy")
-    images: defaultdict[str, ImageStats] = defaultdict(ImageStats)
-
-    def count(feature: str, value: NDArray[Any]) -> None:
-        if feature.startswith(CAMERA_PREFIX):
-            images[feature].add(value)
-
-    session, *parts = dataset.digests(
-        record.episode_index, [record.session, *spans.values()], count
-    )
-    # By the video itself: statistics of lossy ones are those of the frames before encoding.
-    for feature, counted in images.items() if exact else ():
-        for name, value in counted.result().items():
-            stored = statistics.get(feature, {}).get(name, np.empty(0))
-            # Compared as LeRobot scales them: different means can become one number.
-            if not np.array_equal(stored, value if name == "count" else value / 255):
-                yield Violation(where, f"stats/{feature}/{name} is not that of its frames")
+    session, *parts = dataset.digests(record.episode_index, [record.session, *spans.values()])
     for feature in sorted(session.keys() | recorded.keys()):
         if session.get(feature) != recorded.get(feature):
             yield Violation(where, f"{feature} does not have the recorded SHA-256")

@@ -1,26 +1,21 @@
 """Check LeRobot's own files in a dataset against its episodes and its data.
 
-A file with the recorded SHA-256 can still hold wrong values, if it was written so.
+A file with the recorded SHA-256 can still hold wrong values, if it was written so. LeRobot's
+statistics are not recomputed: no buffer depends on them, and their files have recorded digests.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from robomme_interference_data.build_dataset.dataset.image_stats import (
-    QUANTILES,
-    STATISTICS,
-    Statistics,
-    episode_statistics,
-)
+from robomme_interference_data.build_dataset.dataset.image_stats import STATISTICS
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     EPISODES_DIR,
     INFO_PATH,
     RECORDS_PATH,
-    STATS_PATH,
     TASKS_PATH,
 )
 from robomme_interference_data.data.dataset import Dataset
@@ -28,7 +23,6 @@ from robomme_interference_data.data.fetched_copy import FetchedCopy
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.schema.codec import arrow_schema
 from robomme_interference_data.schema.records import EpisodeRecord
-from robomme_interference_data.storage.files import read_json
 from robomme_interference_data.storage.lerobot import LeRobotFiles
 
 _TOLERANCE_S = 1e-4
@@ -46,8 +40,6 @@ def lerobot_violations(dataset: Dataset, copy: FetchedCopy | None) -> Iterator[t
     yield from _info(dataset)
     table = LeRobotFiles(dataset.files, statistics=True).table
     yield from _columns(dataset, table)
-    statistics = episode_statistics(table)
-    yield from _total_statistics(dataset, statistics)
     tasks = dataset.lerobot.tasks
     if list(tasks.values()) != list(range(len(tasks))):
         yield TASKS_PATH, f"task_index is {list(tasks.values())[:5]}; expected 0, 1, …"
@@ -75,16 +67,15 @@ def lerobot_violations(dataset: Dataset, copy: FetchedCopy | None) -> Iterator[t
                 what = f"{name} of {record.episode_id} is {row.get(name)}; expected {value}"
                 yield EPISODES_DIR, what
         location = dataset.lerobot.locate(record.episode_index)
-        for path in (location.data, *(path for path, _ in location.videos.values())):
-            other = users.setdefault(path, record.episode_index)
-            if other != record.episode_index:
-                yield path, f"is shared by episodes {other} and {record.episode_index}"
+        for path in [location.data, *(path for path, _ in location.videos.values())]:
+            user = users.setdefault(path, record.episode_index)
+            if user != record.episode_index:
+                yield path, f"is shared by episodes {user} and {record.episode_index}"
         if copy is None or copy.holds_all(dataset, record.episode_index):
-            task, stored = tasks.get(record.goal), statistics[record.episode_index]
             try:
                 for path, _ in location.videos.values():
                     dataset.files.path(path)
-                yield from _rows(dataset, record.episode_index, first, task, stored)
+                yield from _rows(dataset, record.episode_index, first, tasks.get(record.goal))
             except InterferenceError as error:
                 yield location.data, error.message
         first += record.length
@@ -95,12 +86,17 @@ def _columns(dataset: Dataset, table: pa.Table) -> Iterator[tuple[str, str]]:
     videos = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
     records = arrow_schema(EpisodeRecord, sorted(dataset.features))
     lean = {
-        *("tasks", "data/chunk_index", "data/file_index"),
-        *("dataset_from_index", "dataset_to_index"),
-        *(f"videos/{CAMERA_PREFIX}{camera}/{one}" for camera in dataset.cameras for one in videos),
-        *("meta/episodes/chunk_index", "meta/episodes/file_index"),
-        *records.names,
+        "tasks",
+        "data/chunk_index",
+        "data/file_index",
+        "dataset_from_index",
+        "dataset_to_index",
+        "meta/episodes/chunk_index",
+        "meta/episodes/file_index",
     }
+    lean |= {*records.names}
+    for camera in dataset.cameras:
+        lean |= {f"videos/{CAMERA_PREFIX}{camera}/{name}" for name in videos}
     features = (*dataset.features, *_FRAME_COLUMNS)
     statistics = {f"stats/{feature}/{name}" for feature in features for name in STATISTICS}
     copy = dataset.lerobot.table
@@ -133,90 +129,23 @@ def _info(dataset: Dataset) -> Iterator[tuple[str, str]]:
     yield from _names(INFO_PATH, [*dataset.lerobot.features], {*dataset.features, *_FRAME_COLUMNS})
 
 
-def _total_statistics(dataset: Dataset, episodes: list[Statistics]) -> Iterator[tuple[str, str]]:
-    """Check that the statistics of the dataset follow from those of its episodes."""
-    stats = read_json(dataset.files.path(STATS_PATH))
-    features = {*dataset.features, *_FRAME_COLUMNS}
-    yield from _names(STATS_PATH, [*stats], features)
-    for name in features & stats.keys():
-        try:
-            expected = _aggregated([one[name] for one in episodes])
-            same = stats[name].keys() == expected.keys() and all(
-                np.allclose(np.ravel(stats[name][one]), value, 1e-6, 1e-8)
-                for one, value in expected.items()
-            )
-        except (AttributeError, KeyError, TypeError, ValueError):
-            same = False
-        if not same:
-            yield STATS_PATH, f"{name} does not follow from the statistics of the episodes"
-
-
-def _aggregated(episodes: list[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the statistics of all episodes, like LeRobot, which is not needed to verify."""
-    values = {name: np.stack([one[name] for one in episodes]) for name in STATISTICS}
-    weights = values["count"] / values["count"].sum(axis=0)
-    total = {name: (values[name] * weights).sum(axis=0) for name in STATISTICS}
-    variances = values["std"] ** 2 + (values["mean"] - total["mean"]) ** 2
-    return total | {
-        "min": values["min"].min(axis=0),
-        "max": values["max"].max(axis=0),
-        "std": np.sqrt((variances * weights).sum(axis=0)),
-        "count": values["count"].sum(axis=0),
-    }
-
-
-def differing_statistics(stored: Mapping[str, Any], values: Any) -> Iterator[str]:
-    """Yield the names of stored statistics that are not those of values, `(T, D)`.
-
-    LeRobot computes them in 32 bits, and quantiles from a histogram of 5,000 bins. A sum of n
-    values in 32 bits is off by up to n · 2⁻²⁴ of the largest.
-    """
-    lowest, highest = values.min(axis=0), values.max(axis=0)
-    largest = 1 + np.abs(values).max(axis=0)
-    fine, binned = 1e-6 * largest, 1e-6 * largest + 1e-3 * (highest - lowest)
-    expected = {
-        "min": (lowest, fine),
-        "max": (highest, fine),
-        "mean": (values.mean(axis=0), fine + len(values) * 2.0**-24 * largest),
-        "std": (values.std(axis=0), 1e-3 * largest),
-        "count": (np.array([len(values)]), 0),
-    }
-    for name, quantile in QUANTILES.items():
-        expected[name] = np.quantile(values, quantile, axis=0, method="inverted_cdf"), binned
-    for name, (value, tolerance) in expected.items():
-        found = stored.get(name, np.empty(0))
-        if found.shape != value.shape or not (np.abs(found - value) <= tolerance).all():
-            yield name
-
-
-def _rows(
-    dataset: Dataset, index: int, first: int, task: int | None, statistics: Statistics
-) -> Iterator[tuple[str, str]]:
-    """Check the columns that LeRobot adds to every frame, and the statistics of all columns."""
+def _rows(dataset: Dataset, index: int, first: int, task: int | None) -> Iterator[tuple[str, str]]:
+    """Check the columns that LeRobot adds to every frame."""
     rows = dataset.lerobot.rows(index)
     path = dataset.lerobot.locate(index).data
-    frames = np.arange(len(rows))
-    vectors = [name for name in dataset.features if not name.startswith(CAMERA_PREFIX)]
-    yield from _names(path, rows.names, {*vectors, *_FRAME_COLUMNS})
-    values = {name: dataset.lerobot.vectors(index, name).astype(float) for name in vectors}
-    values["index"] = (first + frames)[:, None]
-    if task is not None:  # else the list of tasks is a violation
-        values["task_index"] = np.full((len(rows), 1), task)
-    for name in ("index", "task_index"):
-        if name in values and not np.array_equal(rows.scalars(name), values[name][:, 0]):
-            start, stop = values[name][0, 0], values[name][-1, 0]
-            expected = f"{start} to {stop}" if name == "index" else f"{start} in all frames"
-            yield path, f"{name} of episode {index} is not {expected}"
+    vectors = {name for name in dataset.features if not name.startswith(CAMERA_PREFIX)}
+    yield from _names(path, rows.names, vectors | {*_FRAME_COLUMNS})
+    count = len(rows)
+    if not np.array_equal(rows.scalars("index"), first + np.arange(count)):
+        yield path, f"index of episode {index} is not {first} to {first + count - 1}"
+    # Without a task, the list of tasks is a violation.
+    if task is not None and not np.array_equal(rows.scalars("task_index"), np.full(count, task)):
+        yield path, f"task_index of episode {index} is not {task} in all frames"
     times = rows.table(["timestamp"])["timestamp"]
     if not pa.types.is_floating(times.type):
         yield path, f"timestamp of episode {index} is of type {times.type}"
-    elif not np.allclose(times.to_numpy(), frames / dataset.lerobot.fps, 0, _TOLERANCE_S):
-        yield path, f"timestamp of episode {index} is not frame_index / {dataset.lerobot.fps:g}"
-    values |= {"frame_index": frames[:, None], "episode_index": np.full((len(rows), 1), index)}
-    values["timestamp"] = frames[:, None] / dataset.lerobot.fps
-    for name, value in values.items():
-        for one in differing_statistics(statistics.get(name, {}), value):
-            yield EPISODES_DIR, f"stats/{name}/{one} of episode {index} is not that of its data"
+    elif not np.allclose(times.to_numpy(), np.arange(count) / dataset.fps, 0, _TOLERANCE_S):
+        yield path, f"timestamp of episode {index} is not frame_index / {dataset.fps:g}"
 
 
 def _equal(stored: Any, expected: Any) -> bool:

@@ -6,11 +6,14 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from robomme_interference_data.data.buffer import Buffer
+from robomme_interference_data.evaluate.run.history import HistoryReader
 from robomme_interference_data.schema.sampling import spread
 from robomme_interference_data.storage.encode import CLIP, MODEL_VIDEO, VideoEncoder
 
-from .model import Message, Part, Video
+from .models import Message, Part, Video
 
 
 def within(messages: Iterable[Message], images: int | None) -> list[Message]:
@@ -26,7 +29,10 @@ def within(messages: Iterable[Message], images: int | None) -> list[Message]:
     left = max(0, images - sum(isinstance(part, np.ndarray) for part in parts))
     shares = iter(_shares(lengths, left))
     return [
-        Message(message.role, tuple(one for part in message.parts for one in _thin(part, shares)))
+        Message(
+            message.role,
+            tuple(thinned for part in message.parts for thinned in _thin(part, shares)),
+        )
         for message in messages
     ]
 
@@ -58,6 +64,34 @@ def mp4(video: Video) -> bytes:
         return path.read_bytes()
 
 
-def data_url(kind: str, data: bytes) -> str:
-    """Return bytes as a `data:` URL; `kind` is a media type such as `image/png`."""
-    return f"data:{kind};base64,{base64.b64encode(data).decode()}"
+def data_url(media_type: str, data: bytes) -> str:
+    """Return bytes as a `data:` URL of a media type such as `image/png`."""
+    return f"data:{media_type};base64,{base64.b64encode(data).decode()}"
+
+
+class HistoryFrames:
+    """The history frames that a policy gets, of the first camera; decoded on request."""
+
+    def __init__(self, buffer: Buffer, indices: Sequence[int], reader: HistoryReader):
+        self._buffer, self._indices, self._reader = buffer, indices, reader
+
+    @property
+    def camera(self) -> str:
+        """The camera of the frames; subgoals' points are in its live images."""
+        return self._buffer.query.dataset.camera()
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def frames(self, places: Sequence[int]) -> NDArray[np.uint8]:
+        """Decode frames by their ascending places, `(n, H, W, 3) uint8` RGB."""
+        chosen = [self._indices[place] for place in places]
+        chunks = self._reader.stream(self._buffer, 64, (self.camera,), chosen)
+        return np.concatenate([chunk.frames[self.camera] for chunk in chunks])
+
+    def video(self, places: Sequence[int], fps: float | None = None) -> Video:
+        """Decode frames as a video of `fps` frames per second; None for the recorded pace."""
+        if fps is None:
+            fps, steps = self._buffer.query.dataset.fps, places[-1] - places[0]
+            fps *= (len(places) - 1) / steps if steps else 1
+        return Video(self.frames(places), fps)

@@ -14,10 +14,11 @@ from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.episode import Observation
 
-from .model import ChatModel, Message, Part, Reply
+from .images import HistoryFrames
+from .models import ChatModel, Message, Part, Reply
 from .prompt_files import as_text
-from .subgoal_prompt import Answer, Prompt, merge_near
-from .subgoal_writer import History, SubgoalWriter, Turn
+from .subgoal_prompt import NextSubgoal, SubgoalPrompt, merge_near
+from .subgoal_writer import SubgoalWriter, Turn
 
 
 class ModelWriter(SubgoalWriter):
@@ -40,7 +41,7 @@ class ModelWriter(SubgoalWriter):
     def __init__(
         self,
         model: ChatModel,
-        prompt: Prompt,
+        prompt: SubgoalPrompt,
         *,
         frames: int = 32,
         fps: float | None = None,
@@ -63,7 +64,7 @@ class ModelWriter(SubgoalWriter):
         self._recent, self._stride = recent, stride
         self._seen: deque[NDArray[np.uint8]] = deque(maxlen=(recent - 1) * stride + 1)
 
-    def start(self, history: History, info: RolloutInfo, simulator: Simulator) -> None:
+    def start(self, history: HistoryFrames, info: RolloutInfo, simulator: Simulator) -> None:
         """Decode the history frames that the model sees."""
         super().start(history, info, simulator)
         self._camera = history.camera
@@ -78,8 +79,8 @@ class ModelWriter(SubgoalWriter):
 
     def watch(self, observations: Sequence[Observation]) -> None:
         """Keep the last live frames, if the prompt shows them."""
-        for one in observations:
-            self._seen.append(one.images[self._camera])
+        for observation in observations:
+            self._seen.append(observation.images[self._camera])
             self._count += 1
 
     def next(self, observation: Observation, step: int) -> Subgoal:
@@ -101,8 +102,9 @@ class ModelWriter(SubgoalWriter):
         answer, fault = self._read(reply, size, len(recent))
         if answer is not None:
             self._subgoal = answer.subgoal
-            if answer.subgoal.text not in [one.text for one in self._earlier[-1:]]:
-                self._earlier.append(answer.subgoal)  # not if only its points moved
+            # A subgoal of which only the points moved is still the same one.
+            if not self._earlier or answer.subgoal.text != self._earlier[-1].text:
+                self._earlier.append(answer.subgoal)
             self._keep(images, [recent[place] for place in answer.keyframes])
         self.turns.append(
             Turn(
@@ -129,7 +131,7 @@ class ModelWriter(SubgoalWriter):
 
     def _read(
         self, reply: Reply, size: tuple[int, int], shown: int
-    ) -> tuple[Answer | None, str | None]:
+    ) -> tuple[NextSubgoal | None, str | None]:
         if not reply.text.strip():
             return None, "an empty answer"
         try:
@@ -144,6 +146,6 @@ class ModelWriter(SubgoalWriter):
         first = self._count - len(self._seen)
         return list(range(self._count - 1, first - 1, -self._stride))[: self._recent][::-1]
 
-    def _keep(self, images: dict[int, NDArray[np.uint8]], chosen: Sequence[int]) -> None:
-        frames = self._kept | {number: images[number] for number in chosen}
+    def _keep(self, images: dict[int, NDArray[np.uint8]], numbers: Sequence[int]) -> None:
+        frames = self._kept | {number: images[number] for number in numbers}
         self._kept = {number: frames[number] for number in merge_near([*frames], self._near)}

@@ -14,7 +14,7 @@ from robomme_interference_data.storage.encode import png
 
 from .bounded_http import AnswerTooLongError, BoundedClient
 from .images import data_url, mp4, within
-from .model import ChatModel, Message, Part, Reply, Video
+from .models import ChatModel, Message, Part, Reply, Video
 
 _WAITS = "Re-run the same command to resume."
 

@@ -1,17 +1,17 @@
-"""Prompts as files: text with placeholders for images and text."""
+"""Prompts: text with placeholders for images and text, of this package or a TOML file."""
 
-import hashlib
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Self
 
 from robomme_interference_data.errors import FormatError, UnknownNameError, counted, nearest
+from robomme_interference_data.storage.files import digest_json
 
-from .model import Part, Video
+from .models import Part, Video
 
 _MOST_BYTES = 1 << 16
 
@@ -45,9 +45,9 @@ def fill(
 
 def check_places(name: str, text: str, places: Sequence[str]) -> None:
     """Reject misspelled placeholders; others are special tokens of models, such as `<think>`."""
-    for found in re.findall(r"<\w+>|\{\w+\}", text):
-        if found not in places and (hint := nearest(found, places, more="")):
-            raise ValueError(f"its {name} has the unknown placeholder {found}. {hint}")
+    for place in re.findall(r"<\w+>|\{\w+\}", text):
+        if place not in places and (hint := nearest(place, places, more="")):
+            raise ValueError(f"its {name} has the unknown placeholder {place}. {hint}")
 
 
 def _add(parts: list[Part], part: Part) -> None:
@@ -69,33 +69,55 @@ def as_text(parts: Sequence[Part]) -> str:
     return "".join(texts)
 
 
-def read_prompt[T](record: type[T], names: Sequence[str], name: str, page: str) -> tuple[T, str]:
-    """Read a prompt of the package by name, or a TOML file; return it with its SHA-256.
+@dataclass(frozen=True)
+class Prompt:
+    """A prompt, as its TOML file has it; subclasses have its fields, text and integers.
 
-    `record` is its dataclass, of text and integers, `page` the documentation for messages.
+    Attributes:
+        packaged: Names of the prompts of this package.
     """
-    path: Any = Path(name)
-    if name in names:
-        path = resources.files(__package__) / "prompts" / f"{name}.toml"
-    elif not path.is_file():
-        raise UnknownNameError(
-            f"there is no prompt or file {name!r}",
-            f"Expected {', '.join(names)}, or the path of a TOML file ({page}).",
-        )
-    data = path.read_bytes()
-    known = {one.name: one for one in fields(record)}  # type: ignore[arg-type]
-    try:
-        if len(data) > _MOST_BYTES:
-            raise ValueError(f"{len(data)} bytes; expected at most {_MOST_BYTES}")
-        values = tomllib.loads(data.decode())
+
+    packaged: ClassVar[tuple[str, ...]]
+
+    @property
+    def sha256(self) -> str:
+        """What identifies it: SHA-256 of its content, keys and values, defaults included."""
+        return digest_json([asdict(self)])
+
+    @classmethod
+    def load(cls, name: str) -> Self:
+        """Read a prompt of this package by its name, or a TOML file by its path.
+
+        Raises:
+            UnknownNameError: There is neither.
+            FormatError: The file is no prompt of this class.
+        """
+        page = "docs/reference/prompts.md"
+        path: Any = Path(name)
+        if name in cls.packaged:
+            path = resources.files(__package__) / "prompts" / f"{name}.toml"
+        elif not path.is_file():
+            raise UnknownNameError(
+                f"there is no prompt or file {name!r}",
+                f"Expected {', '.join(cls.packaged)}, or the path of a TOML file ({page}).",
+            )
+        data = path.read_bytes()
+        try:
+            if len(data) > _MOST_BYTES:
+                raise ValueError(f"{len(data)} bytes; expected at most {_MOST_BYTES}")
+            return cls._of(tomllib.loads(data.decode()))
+        except (ValueError, RecursionError) as error:
+            raise FormatError(f"{name} is no prompt: {error}", f"See {page}.") from None
+
+    @classmethod
+    def _of(cls, values: Mapping[str, Any]) -> Self:
+        known = {field.name: field for field in fields(cls)}
         for key, value in values.items():
             if key not in known:
                 raise ValueError(f"it has {key!r}; expected {', '.join(known)}")
             if type(value) is not known[key].type:
                 raise ValueError(f"{key} is {value!r}")
-        required = (key for key, one in known.items() if one.default is MISSING)
+        required = [key for key, field in known.items() if field.default is MISSING]
         if missing := [key for key in required if key not in values]:
             raise ValueError(f"it lacks {', '.join(missing)}")
-        return record(**values), hashlib.sha256(data).hexdigest()
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"{name} is no prompt: {error}", f"See {page}.") from None
+        return cls(**values)

@@ -13,7 +13,7 @@ from typing import Any
 from robomme_interference_data.constants import POSITION_LIMIT
 from robomme_interference_data.errors import FormatError, InvalidOptionError, named
 
-from .subgoal_prompt import Prompt, load_prompt
+from .subgoal_prompt import SubgoalPrompt
 
 CLIENT = "RoboMME/robomme_policy_learning@3507f80ddc47a6c6363d4af9a51afaa1a3992944"
 """The released client."""
@@ -39,7 +39,7 @@ class Published:
     Attributes:
         file: File of the client that has its prompt.
         number: Which prompt of that file it is, from 0.
-        sha256: `Prompt.sha256`.
+        sha256: `SubgoalPrompt.sha256`.
         form: Keys of its prompt that are not in the client's texts.
         options: Options of subgoals and model.
     """
@@ -50,12 +50,12 @@ class Published:
     form: Mapping[str, Any]
     options: Mapping[str, Any]
 
-    def check(self, name: str, prompt: Prompt, options: Mapping[str, Any]) -> None:
+    def check(self, name: str, prompt: SubgoalPrompt, options: Mapping[str, Any]) -> None:
         """Raise an `InvalidOptionError` if a prompt, or one of all options, is another one."""
         own = f"Or set {named('system')} to a name of your own: see docs/how-to/paper-systems.md."
         command = (
             f"evaluate BUFFER_SET --system {name} --policy websocket://HOST:PORT --out RUN "
-            f"--subgoals openai:URL#MODEL --subgoal-prompt CLONE/{FOLDER}/{self.file}"
+            f"--subgoals openai:URL#MODEL --set subgoal_prompt=CLONE/{FOLDER}/{self.file}"
         )
         if prompt.sha256 != self.sha256:
             raise InvalidOptionError(
@@ -90,26 +90,35 @@ _OPTIONS = {
 
 PUBLISHED: Mapping[str, Published] = {
     "symbolic-simplesg": Published(
-        *("api.py", 0, "c440b8a178cb83811dea9e0790e9b774fbf2fedcca8bfb40af2a16cdcf6a03c0"),
-        *(_FORM, _OPTIONS),
+        file="api.py",
+        number=0,
+        sha256="c440b8a178cb83811dea9e0790e9b774fbf2fedcca8bfb40af2a16cdcf6a03c0",
+        form=_FORM,
+        options=_OPTIONS,
     ),
     "symbolic-groundsg": Published(
-        *("api.py", 1, "7bc8c70a505c11db5344a36767955b85b54389c5e6618c0a0a491370002403cc"),
-        *(_FORM, _OPTIONS),
+        file="api.py",
+        number=1,
+        sha256="7bc8c70a505c11db5344a36767955b85b54389c5e6618c0a0a491370002403cc",
+        form=_FORM,
+        options=_OPTIONS,
     ),
     "memer": Published(
-        *("api_memer.py", 0, "27034c2257e44cd0b32519d1064f0ab8f23406306604af37e37dde71f7ec4b86"),
-        *(_FORM | _MEMER, _OPTIONS | {"recent": 8, "stride": 2, "near": 8}),
+        file="api_memer.py",
+        number=0,
+        sha256="27034c2257e44cd0b32519d1064f0ab8f23406306604af37e37dde71f7ec4b86",
+        form=_FORM | _MEMER,
+        options=_OPTIONS | {"recent": 8, "stride": 2, "near": 8},
     ),
 }
 """The published systems with a model in front of the policy."""
 
 
-def load_published(name: str, system: str | None) -> Prompt:
-    """Read a prompt, see `load_prompt`; from a file of the client, that of a published system."""
+def load_published(name: str, system: str | None) -> SubgoalPrompt:
+    """Read a prompt, see `Prompt.load`; from a file of the client, that of a published system."""
     published = PUBLISHED.get(system or "")
     if published is None or not name.endswith(".py"):
-        return load_prompt(name)
+        return SubgoalPrompt.load(name)
     try:
         return read_client(Path(name).read_text(encoding="utf-8"), published)
     except (ValueError, SyntaxError, OSError) as error:
@@ -119,7 +128,7 @@ def load_published(name: str, system: str | None) -> Prompt:
         ) from None
 
 
-def read_client(code: str, published: Published) -> Prompt:
+def read_client(code: str, published: Published) -> SubgoalPrompt:
     """Read the prompt of a system from the client's code, which is not run."""
     texts: dict[str, list[str]] = {"self.system_prompt": [], "user_prompt": [], "video_prefix": []}
     for name, value in _assignments(ast.parse(code)):
@@ -130,7 +139,7 @@ def read_client(code: str, published: Published) -> Prompt:
     first = published.number * of_each
     if not videos or not of_each or published.number >= len(systems):
         raise ValueError("it has no prompts")
-    return Prompt(
+    return SubgoalPrompt(
         system=systems[published.number],
         first=questions[first],
         then=questions[first + of_each - 1],
@@ -141,9 +150,9 @@ def read_client(code: str, published: Published) -> Prompt:
 
 def _assignments(tree: ast.AST) -> Iterator[tuple[str, ast.expr]]:
     """Yield all assignments to one name, in their order in the text."""
-    found = [one for one in ast.walk(tree) if isinstance(one, ast.Assign)]
-    for one in sorted(found, key=lambda one: one.lineno):
-        yield ast.unparse(one.targets[0]), one.value
+    assignments = [node for node in ast.walk(tree) if isinstance(node, ast.Assign)]
+    for node in sorted(assignments, key=lambda node: node.lineno):
+        yield ast.unparse(node.targets[0]), node.value
 
 
 def _text(value: ast.expr) -> str:

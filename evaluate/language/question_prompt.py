@@ -6,11 +6,8 @@ from dataclasses import dataclass
 
 from robomme_interference_data.data.questions import Question
 
-from .model import Message, Part
-from .prompt_files import fill, read_prompt
-
-PROMPTS = ("choice",)
-"""The prompts of the package."""
+from .models import Message, Part
+from .prompt_files import Prompt, fill
 
 _ONE = r"\b(?!\s*(?:[,/]|or\b|and\b)\s*[A-H]\b)"
 """After a letter: not the first of several."""
@@ -25,7 +22,7 @@ _ALONE = re.compile(r"\b([B-H]|A(?!['’ ](?!or\b|and\b|is\b)[a-z]))\b")
 
 
 @dataclass(frozen=True)
-class QuestionPrompt:
+class QuestionPrompt(Prompt):
     """A prompt, as its TOML file has it.
 
     Attributes:
@@ -33,6 +30,8 @@ class QuestionPrompt:
         question: The question, with `<history>`, `<picture>`, `{question}`, `{options}` and,
             optionally, `{goal}`.
     """
+
+    packaged = ("choice",)
 
     system: str
     question: str
@@ -68,8 +67,3 @@ def read_letter(text: str, letters: str) -> str | None:
     ways += [pattern.findall(answer) for pattern in (_FIRST, _OPTION, _ALONE)]
     named = {letter.upper() for letter in next(filter(None, ways), ())}
     return named.pop() if len(named) == 1 and named <= {*letters} else None
-
-
-def load_prompt(name: str) -> tuple[QuestionPrompt, str]:
-    """Read a prompt: `choice`, or a TOML file by its path; and the SHA-256 of its file."""
-    return read_prompt(QuestionPrompt, PROMPTS, name, "docs/reference/prompts.md")

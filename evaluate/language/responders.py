@@ -14,11 +14,10 @@ from robomme_interference_data.evaluate.run.config import AskConfig
 from robomme_interference_data.simulators.registry import recorded_scene
 from robomme_interference_data.storage.encode import decode_image
 
-from .model import Reply, Video
-from .models import MODELS
+from .images import HistoryFrames
+from .models import MODELS, Reply, Video
 from .prompt_files import as_text
-from .question_prompt import load_prompt, read_letter
-from .subgoal_writer import History
+from .question_prompt import QuestionPrompt, read_letter
 
 CONTROLS = ("none", "blank", "text")
 """What a model does not see: nothing; the content of the history frames; all images."""
@@ -32,7 +31,7 @@ class Prompted:
     query: Query
     seed: int
     known: Mapping[int, str] | None
-    history: History
+    history: HistoryFrames
 
     def draw(self, letters: str) -> str:
         """Draw one of some letters, a function of episode and seed."""
@@ -56,7 +55,9 @@ def recall(prompted: Prompted) -> str:
     agreeing = {scene.choice(answer) for answer in scene.agreeing(prompted.known or {})}
     choices = [scene.choice(scene.answers[number]) for number in question.answers]
     fits = [
-        one for one, choice in zip(question.letters, choices, strict=True) if choice in agreeing
+        letter
+        for letter, choice in zip(question.letters, choices, strict=True)
+        if choice in agreeing
     ]
     return prompted.draw("".join(fits) or question.letters)
 
@@ -72,7 +73,7 @@ class ModelResponder:
         self._model = MODELS.make(config.model, config.model_options)
         self._control = config.control
         self.images = None if config.control == "text" else self._model.images
-        self._prompt, self._sha256 = load_prompt(config.prompt)
+        self._prompt = QuestionPrompt.load(config.prompt)
 
     def answer(self, prompted: Prompted) -> tuple[str | None, str, Reply]:
         """Ask the model; return the letter that it names, if any, the prompt, and the reply."""
@@ -93,8 +94,8 @@ class ModelResponder:
         return letter, as_text(messages[-1].parts), reply
 
     def metadata(self) -> dict[str, Any]:
-        """Return the model's metadata, and the SHA-256 of the prompt's file."""
-        return {"model": self._model.metadata(), "prompt_sha256": self._sha256}
+        """Return the model's metadata, and the SHA-256 of the prompt."""
+        return {"model": self._model.metadata(), "prompt_sha256": self._prompt.sha256}
 
     def close(self) -> None:
         """Close the model."""

@@ -3,19 +3,15 @@
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.schema.subgoal import Pixel, Subgoal, read_points, write_points
-from robomme_interference_data.storage.files import digest_json
 
-from .model import Part
-from .prompt_files import check_places, fill, read_prompt
-
-PROMPTS = ("simple", "grounded", "memer")
-"""The prompts of this package, for policies as those of SimpleSG, GroundSG and MemER."""
+from .models import Part
+from .prompt_files import Prompt, check_places, fill
 
 DEFAULT_PROMPT = "grounded"
 
@@ -30,15 +26,15 @@ _SPECIAL = re.compile(r"<\|\w+\|>")
 
 
 @dataclass(frozen=True)
-class Answer:
-    """A parsed answer: the subgoal, and the numbers of the recent frames to keep, from 0."""
+class NextSubgoal:
+    """What a model answers: the subgoal, and the numbers of the recent frames to keep, from 0."""
 
     subgoal: Subgoal
     keyframes: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
-class Prompt:
+class SubgoalPrompt(Prompt):
     """A prompt, as its TOML file has it.
 
     Attributes:
@@ -56,6 +52,8 @@ class Prompt:
         separator: Text between the images of a placeholder.
         no_images: What another placeholder of images becomes without any.
     """
+
+    packaged = ("simple", "grounded", "memer")  # as those of SimpleSG, GroundSG and MemER
 
     system: str
     first: str
@@ -90,11 +88,6 @@ class Prompt:
                 raise InvalidOptionError.expected(name, text, f"{needed}, each once")
 
     @property
-    def sha256(self) -> str:
-        """SHA-256 of its content: the keys and values, defaults included."""
-        return digest_json([asdict(self)])
-
-    @property
     def watches(self) -> bool:
         """Whether it shows the last live frames, of which the model may keep some."""
         return any("<recent>" in text for text in (self.first, self.then))
@@ -126,7 +119,7 @@ class Prompt:
             points.append(self.point.replace("{y}", str(y)).replace("{x}", str(x)))
         return write_points(subgoal.text, points)
 
-    def read(self, text: str, size: tuple[int, int], shown: int = 0) -> Answer:
+    def read(self, text: str, size: tuple[int, int], shown: int = 0) -> NextSubgoal:
         """Parse an answer about an image of `size`, (H, W) px, and `shown` recent frames."""
         keyframes: tuple[int, ...] = ()
         if self.answer == "json":
@@ -142,7 +135,9 @@ class Prompt:
                 "the answer", words[:60], f"a subgoal of up to {_MOST_LETTERS} letters in one line"
             )
         plain, numbers = read_points(words, self._pattern)
-        return Answer(Subgoal(plain, tuple(self._pixel(one, size) for one in numbers)), keyframes)
+        return NextSubgoal(
+            Subgoal(plain, tuple(self._pixel(point, size) for point in numbers)), keyframes
+        )
 
     @cached_property
     def _pattern(self) -> re.Pattern[str]:
@@ -152,7 +147,8 @@ class Prompt:
             parts = re.split(r"(\{\w+\})|\s+", _SPECIAL.sub("", form))
             words = [re.escape(word) for word in parts if word]
             text = r"\s*".join(words)
-            forms += [re.sub(r"\\\{(\w+)\\\}", rf"(?P<{name}_\1>\\d{{1,5}})", text)] * bool(text)
+            if text:
+                forms.append(re.sub(r"\\\{(\w+)\\\}", rf"(?P<{name}_\1>\\d{{1,5}})", text))
         return re.compile("|".join(forms))
 
     def _pixel(self, numbers: Mapping[str, int], size: tuple[int, int]) -> Pixel:
@@ -214,8 +210,3 @@ def merge_near(frames: Sequence[int], distance: int) -> list[int]:
         else:
             groups.append([frame])
     return [group[len(group) // 2] for group in groups]
-
-
-def load_prompt(name: str) -> Prompt:
-    """Read one of `PROMPTS`, or a TOML file."""
-    return read_prompt(Prompt, PROMPTS, name, "docs/reference/prompts.md")[0]

@@ -5,45 +5,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
-from robomme_interference_data.evaluate.run.history import HistoryReader
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.episode import Observation
 
-from .model import Video
-
-
-class History:
-    """The history frames that a policy gets, of the first camera; decoded on request."""
-
-    def __init__(self, buffer: Buffer, given: Sequence[int], reader: HistoryReader):
-        self._buffer, self._given, self._reader = buffer, given, reader
-
-    @property
-    def camera(self) -> str:
-        """The camera of the frames; subgoals' points are in its live images."""
-        return self._buffer.query.dataset.camera()
-
-    def __len__(self) -> int:
-        return len(self._given)
-
-    def frames(self, places: Sequence[int]) -> NDArray[np.uint8]:
-        """Decode frames by their ascending places, `(n, H, W, 3) uint8` RGB."""
-        indices = [self._given[place] for place in places]
-        chunks = self._reader.stream(self._buffer, 64, (self.camera,), indices)
-        return np.concatenate([chunk.frames[self.camera] for chunk in chunks])
-
-    def video(self, places: Sequence[int], fps: float | None = None) -> Video:
-        """Decode frames as a video of `fps` frames per second; None for the recorded pace."""
-        if fps is None:
-            fps, steps = self._buffer.query.dataset.fps, places[-1] - places[0]
-            fps *= (len(places) - 1) / steps if steps else 1
-        return Video(self.frames(places), fps)
+from .images import HistoryFrames
 
 
 @dataclass(frozen=True)
@@ -90,7 +57,7 @@ class SubgoalWriter(ABC):
     def __init__(self) -> None:
         self.turns: list[Turn] = []
 
-    def start(self, history: History, info: RolloutInfo, simulator: Simulator) -> None:
+    def start(self, history: HistoryFrames, info: RolloutInfo, simulator: Simulator) -> None:
         """Clear the state and prepare for a rollout; only `oracle` may use the simulator."""
         self.turns = []
 
@@ -117,7 +84,7 @@ class SubgoalWriter(ABC):
 class OracleWriter(SubgoalWriter):
     """`oracle`: the simulator's own current subgoal, which knows the hidden answer."""
 
-    def start(self, history: History, info: RolloutInfo, simulator: Simulator) -> None:
+    def start(self, history: HistoryFrames, info: RolloutInfo, simulator: Simulator) -> None:
         """Keep the simulator."""
         super().start(history, info, simulator)
         self._simulator = simulator

@@ -6,12 +6,12 @@ from contextlib import closing
 from dataclasses import replace
 from typing import Any
 
+from robomme_interference_data.constants import ORACLE
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.policies.registry import policy_options
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.kind import short_digest
 from robomme_interference_data.runtime.specs import bind_options
-from robomme_interference_data.schema.subgoal import ORACLE
 
 from .model_writer import ModelWriter
 from .models import MODELS, model_identity

@@ -24,7 +24,7 @@ from robomme_interference_data.storage.hub import HubFiles, locate
 from robomme_interference_data.storage.weights import digest_weights
 
 from .images import within
-from .model import ChatModel, Message, Reply
+from .models import ChatModel, Message, Reply
 
 _FILES = ("*.json", "*.safetensors", "*.jinja", "*.txt", "*.model")
 

@@ -5,6 +5,8 @@ name. What only the policy's object knows, because it depends on weights or on a
 `wants_history`, whether it can batch), are attributes and methods of `Policy`.
 """
 
+import shlex
+
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.simulators.episode import ACTION_SIZE
 
@@ -30,6 +32,15 @@ def addresses(target: str) -> tuple[tuple[str, int], ...]:
 def _valid_addresses(target: str) -> bool:
     servers = addresses(target)
     return len({*servers}) == len(servers) and all(0 < port < 65536 for _, port in servers)
+
+
+def _valid_command(target: str) -> bool:
+    """Whether a target without addresses is a command with `{port}` in one of its words."""
+    try:
+        words = shlex.split(target)
+    except ValueError:  # an unclosed quote
+        return False
+    return bool(addresses(target)) or any("{port}" in word for word in words)
 
 
 def _memory(target: str) -> str:
@@ -183,13 +194,13 @@ KINDS: dict[str, PolicyKind] = {
         packages=(),
     ),
     "websocket": PolicyKind(
-        form="websocket://host:port, with commas between several servers, each once, or websocket "
-        'with serve="COMMAND with {port}"',
+        form="websocket://host:port, with commas between several servers, each once, or "
+        "websocket:COMMAND with {port}, which each worker starts",
         factory=f"{_HERE}.websocket:WebsocketPolicy",
         target=rf"//{_SERVER}(?:,{_SERVER})*|(?!//).*\{{port\}}.*",
         extra="evaluate",
         no_effect=_SERVER_OPTIONS,
-        valid=_valid_addresses,
+        valid=lambda target: _valid_addresses(target) and _valid_command(target),
         role=Role.LEARNED,
         identified=False,
         published=True,

@@ -1,7 +1,6 @@
 """Policies by their text, such as `replay:window`; each is imported when it is made."""
 
 import inspect
-import shlex
 import traceback
 from collections.abc import Sequence
 from typing import Any, get_type_hints
@@ -56,7 +55,7 @@ def check_workers(text: str, workers: int) -> None:
     if 0 < len(servers) < workers:
         server = policy_kind(text).server
         startable = server is not None and server.starter is not None
-        own = ", or let each worker start its own (serve)" if startable else ""
+        own = ", or let each worker start its own (websocket:COMMAND)" if startable else ""
         raise InvalidOptionError(
             f"{workers} workers need {workers} policy servers, as each holds one memory; {text} "
             f"names {len(servers)}",
@@ -86,34 +85,6 @@ def policy_options(text: str, options: Sequence[str] = ()) -> dict[str, Any]:
     """Return all options that a policy is made with, defaults included."""
     factory, given = _factory(text, 0)
     return bind_options(f"policy {text!r}", factory, given, options)
-
-
-def with_server(text: str, serve: str | None) -> str:
-    """Return a policy's text, with the command with which each worker starts its server."""
-    startable = [
-        name
-        for name, kind in POLICIES.kinds.items()
-        if kind.server is not None and kind.server.starter is not None
-    ]
-    if serve is None:
-        # The command has a setting of its own, with checks: it is no part of the text.
-        if starts_server(text):
-            raise InvalidOptionError.expected("policy", text, policy_kind(text).form)
-        return text
-    if text not in startable:
-        raise InvalidOptionError(
-            f"serve starts the server of a policy, but {text} has no server to start",
-            f'Set policy="{startable[0]}" with it, or leave it out.',
-        )
-    try:
-        words = shlex.split(serve)
-    except ValueError:  # an unclosed quote
-        words = []
-    if not any("{port}" in word for word in words):
-        raise InvalidOptionError.expected(
-            "serve", serve, "a command with {port}, the port that the server must listen at"
-        )
-    return f"{text}:{serve}"
 
 
 def _factory(text: str, worker: int) -> tuple[Factory, dict[str, Any]]:

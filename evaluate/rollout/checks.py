@@ -4,7 +4,14 @@ import math
 import re
 from collections.abc import Sequence
 
-from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, EXECUTIONS, STATE
+from robomme_interference_data.constants import (
+    ACTION,
+    DEMONSTRATIONS,
+    EXECUTIONS,
+    ORACLE,
+    RECORDINGS,
+    STATE,
+)
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import (
@@ -39,13 +46,7 @@ from robomme_interference_data.retrieval.select import Rule
 from robomme_interference_data.runtime.executor import Resources
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.sampling import Memory
-from robomme_interference_data.schema.subgoal import ORACLE
-from robomme_interference_data.simulators.registry import (
-    RECORDINGS,
-    SIMULATORS,
-    check_shift,
-    simulator_class,
-)
+from robomme_interference_data.simulators.registry import SIMULATORS, check_shift, simulator_class
 
 from .worker import used_cameras
 

@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.constants import EXECUTIONS
+from robomme_interference_data.constants import EXECUTIONS, ORACLE, RECORDINGS
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import open_dataset
 from robomme_interference_data.errors import (
@@ -38,7 +38,7 @@ from robomme_interference_data.evaluate.policies.registry import (
     policy_kind,
     policy_memory,
     policy_options,
-    with_server,
+    starts_server,
 )
 from robomme_interference_data.evaluate.policies.shared import Address
 from robomme_interference_data.evaluate.run.config import RunConfig, check_unused
@@ -46,13 +46,8 @@ from robomme_interference_data.evaluate.run.kind import Run, RunKind, retrieval_
 from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
 from robomme_interference_data.evaluate.systems import SystemFacts, name_system
 from robomme_interference_data.runtime.executor import Session
-from robomme_interference_data.schema.subgoal import ORACLE
 from robomme_interference_data.simulators.base import Simulator
-from robomme_interference_data.simulators.registry import (
-    RECORDINGS,
-    simulator_class,
-    simulator_versions,
-)
+from robomme_interference_data.simulators.registry import simulator_class, simulator_versions
 
 from .checks import check_plan, check_settings, check_system, condition_refusal, default_system
 from .worker import Opening, RolloutTask
@@ -62,13 +57,11 @@ class Rollouts(RunKind[RunConfig]):
     """Rollouts of a policy in a simulator."""
 
     def __init__(self, config: RunConfig, buffer_set: BufferSet):
-        policy = with_server(config.policy, config.serve)
-        config = dataclasses.replace(config, policy=policy)
         self.system = config.system or default_system(config)
         self._answers: Answers | None = None
         self._addresses: Sequence[Address] = ()
         # The commit of a model is the same for all workers.
-        policy, subgoals = POLICIES.pin(policy), pin_subgoals(config.subgoals)
+        policy, subgoals = POLICIES.pin(config.policy), pin_subgoals(config.subgoals)
         super().__init__(dataclasses.replace(config, policy=policy, subgoals=subgoals), buffer_set)
 
     def lock(self, folder: Path) -> AbstractContextManager[None]:
@@ -133,12 +126,12 @@ class Rollouts(RunKind[RunConfig]):
 
     def needs_session(self, todo: Sequence[WorkItem]) -> bool:
         """Whether there is work, or a server that only workers start must be identified."""
-        return bool(todo) or self.config.serve is not None
+        return bool(todo) or starts_server(self.config.policy)
 
     def open(self, session: Session, todo: Sequence[WorkItem]) -> None:
         """Let a worker start the policy's server, and the simulator, before the first rollout."""
         config = self.config
-        if config.serve is not None:
+        if starts_server(config.policy):
             self._policy_metadata, keeps = _opened(session, Opening("server"), None)
             options = policy_options(config.policy, config.policy_options)
             check_metadata([self._policy_metadata], options["checkpoint"])

@@ -16,7 +16,8 @@ from robomme_interference_data.data.buffer import Buffer, Chunk
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import InvalidOptionError, PolicyError, RunError
 from robomme_interference_data.evaluate.language.columns import model_columns
-from robomme_interference_data.evaluate.language.subgoal_writer import History, SubgoalWriter
+from robomme_interference_data.evaluate.language.images import HistoryFrames
+from robomme_interference_data.evaluate.language.subgoal_writer import SubgoalWriter
 from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.history import HistoryReader
@@ -114,7 +115,7 @@ def run_rollout(
                 policy.add_history(chunk.frames, chunk.states, len(given))
         if writer is not None:
             with clock.part("model_s"):
-                writer.start(History(buffer, given, reader), rollout_info, simulator)
+                writer.start(HistoryFrames(buffer, given, reader), rollout_info, simulator)
     live = _Live(run.config, policy, simulator, writer, clock, clip, worker)
     try:
         status = live.run(first, info.goal)

@@ -6,7 +6,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from typing import Any, cast
 
-from robomme_interference_data.constants import DEMONSTRATIONS
+from robomme_interference_data.constants import DEMONSTRATIONS, ORACLE
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import (
     PolicyError,
@@ -20,7 +20,7 @@ from robomme_interference_data.evaluate.language.subgoal_writer import SubgoalWr
 from robomme_interference_data.evaluate.language.subgoal_writers import make_writer
 from robomme_interference_data.evaluate.policies.answers import Answers
 from robomme_interference_data.evaluate.policies.policy import Policy
-from robomme_interference_data.evaluate.policies.registry import make_policy
+from robomme_interference_data.evaluate.policies.registry import make_policy, starts_server
 from robomme_interference_data.evaluate.policies.shared import Address, SharedPolicy
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.kind import Job, Run, RunTask
@@ -31,7 +31,6 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.rollouts import Status
-from robomme_interference_data.schema.subgoal import ORACLE
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.checks import check_drawn
 from robomme_interference_data.simulators.registry import (
@@ -118,7 +117,7 @@ class RolloutTask(RunTask[RunConfig]):
             self._send_files(item, worker, clip, Status.ERROR, what)
             if isinstance(error, ServerKeepaliveError):
                 logger.warning("%s: %s. It is started again, once.", item, error.message)
-            if isinstance(error, PolicyServerError) and config.serve is None:
+            if isinstance(error, PolicyServerError) and not starts_server(config.policy):
                 self.close()
                 self._check_reachable(worker)
             raise
@@ -231,7 +230,7 @@ class RolloutTask(RunTask[RunConfig]):
         Logs of earlier attempts are sent again, because the files of an attempt may be lost.
         """
         server: Any = self._policy
-        if self.run.config.serve is not None and server is not None:
+        if server is not None and starts_server(self.run.config.policy):
             self._logs[f"servers/{server.started}-{worker.number}.log"] = server.log()
         for log in self._logs.items():
             worker.send_file(*log)

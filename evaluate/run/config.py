@@ -29,10 +29,14 @@ class RetrievalConfig:
         None, group=_RETRIEVAL, help="Encoder of a retrieval step: thumbnail, siglip or siglip:ID."
     )
     retrieval_rule: str = setting(
-        "max", group=_RETRIEVAL, help="METHOD or METHOD/CUT, as for retrieval-score."
+        "max", group=_RETRIEVAL, help="METHOD or METHOD/THRESHOLD, as for retrieval-score."
     )
     retrieval_camera: str | None = setting(
-        None, group=_RETRIEVAL, help="Camera whose frames are compared.", shown="the first"
+        None,
+        group=_RETRIEVAL,
+        help="Camera whose frames are compared.",
+        shown="the first",
+        rare=True,
     )
 
 
@@ -47,7 +51,7 @@ class WorkConfig(WorkersConfig, RetrievalConfig):
     episodes: str | None = setting(
         None, group=_EPISODES, help="Episode numbers, such as 0-49 or 0,3,10-12; default: all."
     )
-    split: str = setting("test", group=_EPISODES, help="train, val or test.")
+    split: str = setting("test", group=_EPISODES, help="train, val or test.", rare=True)
     shard: str = setting(
         "1/1", group=_EPISODES, help="Part of the plan to run, such as 2/8; see merge."
     )
@@ -56,22 +60,23 @@ class WorkConfig(WorkersConfig, RetrievalConfig):
     )
     model_seed: int = setting(0, group=_EXECUTION, help="Seed for all random draws.")
     rollout_timeout_s: float = setting(
-        3600.0, group=_EXECUTION, help="Maximum seconds of a rollout or question."
+        3600.0, group=_EXECUTION, help="Maximum seconds of a rollout or question.", rare=True
     )
     cache: bool = setting(
-        False, group=_EXECUTION, help="Keep decoded frames on disk for later runs."
+        False, group=_EXECUTION, help="Keep decoded frames on disk for later runs.", rare=True
     )
     max_errors: int = setting(
-        10, group=_EXECUTION, metavar="N", help="Stop after N errors in a row."
+        10, group=_EXECUTION, metavar="N", help="Stop after N errors in a row.", rare=True
     )
     track: str | None = setting(
         None,
         group=_EXECUTION,
         metavar="TRACKER",
         help="Send success rates to wandb, trackio or csv (OUT/metrics.csv) as rollouts end.",
+        rare=True,
     )
     no_resume: bool = setting(
-        False, group=_EXECUTION, help="Fail if the folder already holds a run."
+        False, group=_EXECUTION, help="Fail if the folder already holds a run.", rare=True
     )
 
 
@@ -103,12 +108,6 @@ class RunConfig(WorkConfig):
     )
     simulator: str = setting("tabletop", group=_SIMULATOR, help="tabletop, robomme or module:name.")
     shift: str = setting(NO_SHIFT, group=_SIMULATOR, help=SHIFT_HELP)
-    serve: str | None = setting(
-        None,
-        metavar="COMMAND",
-        group=_POLICY,
-        help="Command with {port} that starts a server for each worker of --policy websocket.",
-    )
     policies: int | None = setting(
         None,
         metavar="N",
@@ -145,6 +144,7 @@ class RunConfig(WorkConfig):
         group=_SUBGOALS,
         help="Prompt of a model: simple, grounded, memer or a file; see docs/reference/prompts.md.",
         shown="grounded",
+        rare=True,
     )
     subgoal_options: tuple[str, ...] = setting(
         (),
@@ -155,19 +155,28 @@ class RunConfig(WorkConfig):
         help="Options of the writer, such as frames=32 or response_s=60.",
     )
     robomme_python: str | None = setting(
-        None, group=_SIMULATOR, help="Python interpreter with RoboMME.", env="ROBOMME_PYTHON"
+        None,
+        group=_SIMULATOR,
+        help="Python interpreter with RoboMME.",
+        env="ROBOMME_PYTHON",
+        rare=True,
     )
     videos: bool = setting(False, group=_EXECUTION, help="Write a video of each rollout.")
     check_lesson: bool = setting(
         False,
         group=_SIMULATOR,
         help="Compare each lesson with the simulator's playback, bit for bit.",
+        rare=True,
     )
     simulator_timeout_s: float = setting(
-        1800.0, group=_SIMULATOR, help="Maximum seconds of a reset, or of 16 steps."
+        1800.0, group=_SIMULATOR, help="Maximum seconds of a reset, or of 16 steps.", rare=True
     )
     history_chunk: int = setting(
-        64, group=_EXECUTION, metavar="N", help="History frames that the policy gets at a time."
+        64,
+        group=_EXECUTION,
+        metavar="N",
+        help="History frames that the policy gets at a time.",
+        rare=True,
     )
 
 

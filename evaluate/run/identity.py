@@ -16,8 +16,8 @@ import numpy as np
 from robomme_interference_data.constants import PROTOCOL_VERSION
 from robomme_interference_data.schema.codec import to_dict
 
+from .header import Invocation
 from .kind import RunKind, make_selector, package_versions
-from .log import Invocation
 from .plan import Plan
 
 _DEEPEST = 20

@@ -9,7 +9,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,93 +24,26 @@ from robomme_interference_data.storage.files import (
     atomic_path,
     canonical_json,
     parse_json,
-    read_bytes,
     read_header,
     write_json,
 )
 from robomme_interference_data.storage.parquet import writing
 from robomme_interference_data.storage.staging import file_lock
 
-from .plan import Plan, WorkItem
+from .header import Invocation, RunHeader, whole_lines
+from .plan import WorkItem
 from .row import Rollout
 
 ERRORS_LOG = "errors.log"
 
-MOST_BYTES = 2 << 30
-"""Maximum bytes of a file of rows: two million rollouts have fewer."""
 
-_MOST_ROLLOUTS = 1 << 20
-"""Maximum rollouts of all plans of a run: the paper's grid has 25,200."""
-
-
-@dataclass(frozen=True)
-class Invocation:
-    """One invocation of the command: its settings, its plan, and where it ran.
-
-    Attributes:
-        command: The command line; empty from Python.
-        versions: Of Python, this package, what it used, and the simulator.
-        git: Commit of the source tree, with `-dirty` if it was changed; None if there is none.
-        policy: Metadata of the policy.
-        started: When, UTC, `2026-01-31T12:00:00Z`.
-        ended: When; None while it runs, or if it was killed.
-        stopped: Why it ended early, or None.
-    """
-
-    command: tuple[str, ...]
-    settings: dict[str, Any]
-    plan: Plan
-    versions: dict[str, str]
-    git: str | None
-    machine: str
-    policy: dict[str, Any]
-    started: str
-    ended: str | None = None
-    stopped: str | None = None
-
-
-@dataclass(frozen=True)
-class RunHeader:
-    """`run.json`.
-
-    Attributes:
-        identity: What can change a result: it identifies the run.
-        buffer_set: Label of the buffer set in all rows.
-        plans: The plans of all invocations, each once.
-        status: `running`, `complete`, or, if something is missing or broke, `incomplete`.
-        planned: Rollouts of all plans together.
-        counts: Rows by status.
-        starts: The invocations.
-        merged: Names of the folders that a merged run is made of.
-    """
-
-    format_version: int
-    identity: dict[str, Any]
-    buffer_set: str
-    plans: tuple[Plan, ...] = ()
-    status: str = "running"
-    planned: int = 0
-    counts: dict[str, int] = field(default_factory=dict)
-    starts: tuple[Invocation, ...] = ()
-    merged: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        planned = sum(plan.most for plan in self.plans)
-        if planned > _MOST_ROLLOUTS:
-            raise FormatError(f"plans of {planned} rollouts; expected at most {_MOST_ROLLOUTS}")
-
-    @property
-    def items(self) -> tuple[WorkItem, ...]:
-        """All planned rollouts, each once, in canonical order."""
-        return tuple(sorted({item for plan in self.plans for item in plan.items()}))
-
-    def standing(self, rows: Mapping[WorkItem, Rollout], status: str = "") -> "RunHeader":
-        """Return the header with status and counts for these rows, over all of its plans."""
-        items = self.items
-        whole = all(item in rows and is_done(rows[item]) for item in items)
-        status = status or ("complete" if whole else "incomplete")
-        counts = count_statuses(rows.values())
-        return replace(self, status=status, planned=len(items), counts=counts)
+def with_counts(header: RunHeader, rows: Mapping[WorkItem, Rollout], status: str = "") -> RunHeader:
+    """Return a header with status and counts for these rows, over all of its plans."""
+    items = header.items
+    whole = all(item in rows and is_done(rows[item]) for item in items)
+    status = status or ("complete" if whole else "incomplete")
+    counts = count_statuses(rows.values())
+    return replace(header, status=status, planned=len(items), counts=counts)
 
 
 class RunLog:
@@ -124,7 +57,7 @@ class RunLog:
         plans = self.header.plans
         plans += () if start.plan in plans else (start.plan,)
         header = replace(self.header, plans=plans, starts=(*self.header.starts, start))
-        self._write_header(header.standing(self.rows, "running"))
+        self._write_header(with_counts(header, self.rows, "running"))
 
     def append(self, row: Rollout, trace: str | None = None) -> None:
         """Write a row to the disk, and the traceback of an error."""
@@ -157,7 +90,7 @@ class RunLog:
             pq.write_table(table, file, compression="zstd")
         with writing(text) as file:
             pa_csv.write_csv(table, file)
-        self._write_header(header.standing(self.rows))
+        self._write_header(with_counts(header, self.rows))
 
     def _write_header(self, header: RunHeader) -> None:
         write_json(self.folder / RUN_HEADER, to_dict(header))
@@ -206,7 +139,7 @@ def read_run(folder: Path) -> tuple[RunHeader, dict[WorkItem, Rollout]]:
                 f"{folder} holds no run: {name} is missing", "Give a complete folder of a run."
             )
     header, rows = read_header(folder / RUN_HEADER, RunHeader), read_record(folder)
-    return header.standing(rows), rows
+    return with_counts(header, rows), rows
 
 
 def read_record(folder: Path) -> dict[WorkItem, Rollout]:
@@ -243,12 +176,6 @@ def row_of(line: bytes) -> Rollout:
 def row_line(row: Rollout) -> bytes:
     """Return a row's line in a record."""
     return (canonical_json(to_dict(row)) + "\n").encode()
-
-
-def whole_lines(record: Path) -> bytes:
-    """Return the bytes of `rollouts.jsonl`, without a last line that a crash cut short."""
-    data = read_bytes(record, MOST_BYTES)
-    return data[: data.rfind(b"\n") + 1]
 
 
 def check_same_run(folder: Path, existing: Mapping[str, Any], expected: Mapping[str, Any]) -> None:

@@ -9,9 +9,8 @@ from typing import Any, Self
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, named
 from robomme_interference_data.ids import EpisodeId, count_numbers, format_numbers, parse_numbers
 from robomme_interference_data.schema.conditions import in_order, parse_condition
+from robomme_interference_data.schema.rollouts import RolloutKey
 from robomme_interference_data.storage.files import canonical_json
-
-from .row import Rollout
 
 _SHARD = re.compile(r"(\d{1,6})/(\d{1,6})")
 
@@ -27,7 +26,7 @@ class WorkItem:
         parse_condition(self.condition)
 
     @classmethod
-    def of(cls, row: Rollout) -> Self:
+    def of(cls, row: RolloutKey) -> Self:
         """Return the work item of a row."""
         return cls(row.condition, row.episode_id)
 

@@ -1,4 +1,4 @@
-"""Send the results of a run to an experiment tracker while it proceeds: `--track wandb`.
+"""Send the results of a run to an experiment tracker while it proceeds: `--set track=wandb`.
 
 A tracker never ends a run: if one of its calls fails, it is left out from then on.
 """

@@ -5,9 +5,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from robomme_interference_data.constants import RECORDINGS
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.schema.conditions import parse_condition
-from robomme_interference_data.simulators.registry import RECORDINGS
 from robomme_interference_data.stats.sequential import look_levels
 from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.stats.signs import sign_flips

@@ -11,12 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
+from robomme_interference_data.constants import DIFFICULTIES, FAMILIES, RECORDINGS
 from robomme_interference_data.evaluate.systems import FACT_COLUMNS, SYSTEMS, SystemFacts
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, in_order
 from robomme_interference_data.schema.rollouts import Status
-from robomme_interference_data.simulators.registry import RECORDINGS
 from robomme_interference_data.stats.intervals import effective_n, wilson
 
 from .config import Expected

@@ -3,8 +3,8 @@
 from collections.abc import Iterator
 from dataclasses import replace
 
+from robomme_interference_data.constants import ORACLE
 from robomme_interference_data.evaluate.systems import SystemFacts
-from robomme_interference_data.schema.subgoal import ORACLE
 
 from .outcomes import Outcomes
 

@@ -39,7 +39,8 @@ def vla_eval_config(
     from .configuration import configuration
 
     text = configuration(
-        *(buffer_set, system),
+        buffer_set,
+        system,
         conditions=conditions,
         families=families,
         episodes=episodes,

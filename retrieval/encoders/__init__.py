@@ -26,7 +26,7 @@ ENCODERS = Registry(
 )
 
 _PAPER_CUT = 0.923
-"""The paper's cut (section "Adding Retrieval"), for its encoder only."""
+"""The paper's threshold (section "Adding Retrieval"), for its encoder only."""
 
 
 class Encoder(Protocol):
@@ -37,7 +37,7 @@ class Encoder(Protocol):
 
     Attributes:
         name: Its name, see `make_encoder`.
-        centred: Whether the mean over the distractor units is subtracted before normalization.
+        centered: Whether the mean over the distractor units is subtracted before normalization.
         batch: Images per batch.
         computed_in: Device and precision, such as `cpu, float32`.
         fingerprint: What determines the features up to that precision, as plain values: model,
@@ -45,7 +45,7 @@ class Encoder(Protocol):
     """
 
     name: str
-    centred: bool
+    centered: bool
     batch: int
     computed_in: str
     fingerprint: dict[str, Any]
@@ -85,7 +85,7 @@ def encoder_name(name: str) -> str:
 
 
 def published_threshold(name: str) -> float | None:
-    """Return the cut that was published for an encoder at any revision; None for others.
+    """Return the threshold that was published for an encoder at any revision; None for others.
 
     It is None for a folder too, which may hold other weights.
     """

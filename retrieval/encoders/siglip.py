@@ -40,7 +40,7 @@ class Siglip:
         batch: Images per batch; None for 32 on a GPU and 8 on a CPU.
     """
 
-    centred = False
+    centered = False
 
     def __init__(self, model: str, device: str | None = None, batch: int | None = None):
         files = locate(model, "model")  # a missing folder is reported before the slow imports

@@ -24,7 +24,7 @@ class Thumbnail:
     """
 
     name = "thumbnail"
-    centred = True
+    centered = True
     batch = KEY_FRAMES  # frames between key frames, which threads decode separately
     computed_in = "numpy"
 

@@ -14,7 +14,8 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
 
-from robomme_interference_data.errors import with_addresses
+from robomme_interference_data.errors import naming_options, option_names, with_addresses
+from robomme_interference_data.runtime.specs import bind_options
 from robomme_interference_data.schema.settings import SETTING
 
 
@@ -58,32 +59,72 @@ Picture = Annotated[Path | None, typer.Option(help="Image to write, .png or .svg
 def with_settings[**P, R](function: Callable[P, R]) -> Callable[..., R]:
     """Replace a command's parameters that are dataclasses of settings by their options.
 
-    A tuple becomes a list option, a bool a flag.
+    A tuple becomes a list option, a bool a flag. Settings that are rarely used share `--set`.
     """
     signature = inspect.signature(function, eval_str=True)
     parameters: list[inspect.Parameter] = []
     configs: dict[str, tuple[type, list[str]]] = {}
+    rare: dict[str, type] = {}
     for parameter in signature.parameters.values():
         kind = parameter.annotation
         if dataclasses.is_dataclass(kind) and isinstance(kind, type):
             options = _options(kind)
             configs[parameter.name] = kind, [option.name for option in options]
             parameters += options
+            if (further := _rare_settings(kind)) is not None:
+                rare[parameter.name] = further
+                parameters.append(_set_option(further))
         else:
             parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
     parameters.sort(key=lambda parameter: parameter.default is not inspect.Parameter.empty)
 
     @wraps(function)
     def command(**values: Any) -> R:
-        settings = {
-            name: config(**{field: _as_tuple(values.pop(field)) for field in fields})
-            for name, (config, fields) in configs.items()
+        texts, settings = values.pop(_SET, []), {}
+        for name, (config, fields) in configs.items():
+            given = {field: _as_tuple(values.pop(field)) for field in fields}
+            if name in rare:
+                given |= bind_options("--set", rare[name], {}, texts)
+            settings[name] = config(**given)
+        rare_names = {
+            field.name: f"--{_SET} {field.name}"
+            for further in rare.values()
+            for field in dataclasses.fields(further)  # type: ignore[arg-type]
         }
-        return function(**settings, **values)  # type: ignore[call-arg]
+        with naming_options({**option_names(), **rare_names}):
+            return function(**settings, **values)  # type: ignore[call-arg]
 
     command.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return command
+
+
+_SET = "set"
+
+
+def _rare_settings(config: Any) -> type | None:
+    """Return a dataclass of the settings without an option of their own; None without any."""
+    hints = get_type_hints(config)
+    fields: list[Any] = [
+        (field.name, hints[field.name], dataclasses.field(default=field.default))
+        for field in dataclasses.fields(config)
+        if SETTING in field.metadata and field.metadata[SETTING]["rare"]
+    ]
+    return dataclasses.make_dataclass("Rare", fields) if fields else None
+
+
+def _set_option(rare: Any) -> inspect.Parameter:
+    names = ", ".join(field.name for field in dataclasses.fields(rare))
+    option: Any = typer.Option(
+        f"--{_SET}",
+        metavar="NAME=VALUE",
+        help=f"Rarely used settings: {names}.",
+        show_default=False,
+    )
+    annotation = Annotated[list[str], option]
+    return inspect.Parameter(
+        _SET, inspect.Parameter.KEYWORD_ONLY, default=[], annotation=annotation
+    )
 
 
 def _as_tuple(value: Any) -> Any:
@@ -93,7 +134,11 @@ def _as_tuple(value: Any) -> Any:
 def _options(config: Any) -> list[inspect.Parameter]:
     """Return a parameter for each setting of a dataclass, keyword-only fields last."""
     hints = get_type_hints(config)
-    fields = [field for field in dataclasses.fields(config) if SETTING in field.metadata]
+    fields = [
+        field
+        for field in dataclasses.fields(config)
+        if SETTING in field.metadata and not field.metadata[SETTING]["rare"]
+    ]
     fields.sort(key=lambda field: field.kw_only is True)
     return [_option(field, hints[field.name]) for field in fields]
 

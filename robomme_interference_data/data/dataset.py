@@ -5,7 +5,7 @@ It is a LeRobot dataset in which every episode has its own files, with our colum
 `meta/interference.json`.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
@@ -301,28 +301,24 @@ class Dataset:
         """Read states or actions of frames `start` to `stop` (excluded), `(T, D) float32`.
 
         Raises:
+            UnknownNameError: The dataset has no such states or actions.
             MissingFileError, FormatError: See `LeRobotFiles.vectors`.
         """
+        vectors = [name for name in self.features if not name.startswith(CAMERA_PREFIX)]
+        if feature not in vectors:
+            raise UnknownNameError.among("feature", feature, self._name, vectors)
         self.lerobot.check_span(episode_index, start, stop)
         return self.lerobot.vectors(episode_index, feature)[start:stop]
 
-    def digests(
-        self,
-        episode_index: int,
-        spans: Sequence[tuple[int, int]],
-        watch: Callable[[str, NDArray[Any]], None] | None = None,
-    ) -> list[dict[str, str]]:
-        """Decode an episode once and return the digests by feature of its spans, ends excluded.
-
-        `watch` is called with each feature and value on the way.
-        """
+    def digests(self, episode_index: int, spans: Sequence[tuple[int, int]]) -> list[dict[str, str]]:
+        """Decode an episode once and return the digests by feature of its spans, ends excluded."""
         first, last = min(start for start, _ in spans), max(stop for _, stop in spans)
 
         def values(name: str) -> Iterable[NDArray[Any]]:
             read = self.iter_frames if name.startswith(CAMERA_PREFIX) else self.read_vectors
             return read(episode_index, name, first, last)
 
-        return digest_spans(spans, ((name, values(name)) for name in self.features), first, watch)
+        return digest_spans(spans, ((name, values(name)) for name in self.features), first)
 
     def sums(self) -> dict[str, str]:
         """Return the recorded SHA-256 by relative path of every file except embedding indexes.

@@ -43,7 +43,7 @@ from robomme_interference_data.storage.files import (
 
 from .dataset import Dataset
 
-CENTER_FILE = "centre.npy"
+CENTER_FILE = "center.npy"
 INDEX_SUMS = "SHA256SUMS"
 
 _MAX_SIZE = 1 << 14

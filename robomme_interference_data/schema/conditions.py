@@ -9,7 +9,7 @@ only. All kinds are nested in n.
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
@@ -21,7 +21,8 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError
 
-from .manifest import SessionEntry
+if TYPE_CHECKING:  # conditions are known wherever rows are, manifests only where buffers are
+    from .manifest import SessionEntry
 
 NO_HISTORY = "no-history"
 """The condition with an empty buffer (paper)."""
@@ -33,7 +34,7 @@ DEFAULT_CONDITIONS = (NO_HISTORY, "k0", "k1", "k3", "k7")
 class SessionProvider(Protocol):
     """The sessions from which rules compose the history of one query."""
 
-    def lesson(self, part: str = "lesson") -> SessionEntry:
+    def lesson(self, part: str = "lesson") -> "SessionEntry":
         """Return the query's own demonstration, or a part of it.
 
         Args:
@@ -42,20 +43,20 @@ class SessionProvider(Protocol):
         """
         ...
 
-    def units(self, k: int, dataset: str = DISTRACTORS) -> Sequence[SessionEntry]:
+    def units(self, k: int, dataset: str = DISTRACTORS) -> "Sequence[SessionEntry]":
         """Return `k` units of other families, nested in `k`; the same episodes in any dataset."""
         ...
 
-    def own_units(self, k: int) -> Sequence[SessionEntry]:
+    def own_units(self, k: int) -> "Sequence[SessionEntry]":
         """Return `k` units of the query's own family, from other scenes; nested in `k`."""
         ...
 
-    def contradiction(self) -> SessionEntry:
+    def contradiction(self) -> "SessionEntry":
         """Return a demonstration in the query's scene with another answer."""
         ...
 
 
-Sessions = tuple[SessionEntry, ...]
+type Sessions = tuple[SessionEntry, ...]
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ def setting(
     shown: str | None = None,
     whole: bool = False,
     group: str | None = None,
+    rare: bool = False,
 ) -> Any:
     """Declare a field that is also a command-line option.
 
@@ -39,8 +40,16 @@ def setting(
         shown: Default to show in the help instead of the value.
         whole: Whether values of a list may contain commas, which do not separate them then.
         group: Title of the help section that lists it.
+        rare: Whether it has no option of its own: a command sets it with `--set NAME=VALUE`.
     """
     declared = dict(
-        help=help, name=name, metavar=metavar, env=env, shown=shown, whole=whole, group=group
+        help=help,
+        name=name,
+        metavar=metavar,
+        env=env,
+        shown=shown,
+        whole=whole,
+        group=group,
+        rare=rare,
     )
     return dataclasses.field(default=default, metadata={SETTING: declared})

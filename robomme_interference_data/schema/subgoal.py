@@ -6,9 +6,6 @@ from dataclasses import dataclass
 
 from robomme_interference_data.errors import InvalidOptionError
 
-ORACLE = "oracle"
-"""Name of the writer of subgoals that reads the simulator, which knows the answer."""
-
 POINT = "<point>"
 """Placeholder for a point in a subgoal's text."""
 

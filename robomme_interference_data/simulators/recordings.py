@@ -6,7 +6,7 @@ from typing import Any, override
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import ACTION, EXECUTIONS, MAX_STEPS, STATE
+from robomme_interference_data.constants import ACTION, EXECUTIONS, MAX_STEPS, RECORDINGS, STATE
 from robomme_interference_data.data.dataset import camera_feature
 from robomme_interference_data.data.loading import load_buffer_set, open_dataset
 from robomme_interference_data.errors import HashMismatchError, SimulatorError
@@ -17,7 +17,6 @@ from robomme_interference_data.storage.arrays import FeatureDigests
 
 from .base import Simulator
 from .episode import Begun, Demonstration, EpisodeInfo, Observation, choose_cameras
-from .registry import RECORDINGS
 
 
 class Recordings(Simulator):

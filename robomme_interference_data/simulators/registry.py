@@ -4,6 +4,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, get_type_hints
 
+from robomme_interference_data.constants import RECORDINGS
 from robomme_interference_data.errors import (
     InterferenceError,
     InvalidOptionError,
@@ -18,12 +19,6 @@ from .scene import Scene
 
 if TYPE_CHECKING:
     from robomme_interference_data.data.query import Query
-
-OFFICIAL = "robomme"
-"""The benchmark's own simulator, the source of the published recordings and results."""
-
-RECORDINGS = "recordings"
-"""Plays back executions for offline evaluation; a simulator in rows only, not one to choose."""
 
 SIMULATORS: dict[str, str | Callable[..., Simulator]] = {
     "tabletop": f"{__package__}.tabletop.simulator:TabletopSimulator",

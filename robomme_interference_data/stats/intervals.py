@@ -7,6 +7,8 @@ takes seconds. The tests compare them with SciPy's.
 import math
 from statistics import NormalDist
 
+from .bootstrap import Floats
+
 LEVEL = 0.95
 """Default level of intervals."""
 
@@ -163,3 +165,22 @@ def cohens_h(rate: float, other: float) -> float:
     Source: Cohen (1988), Statistical Power Analysis for the Behavioral Sciences, chapter 6.
     """
     return 2 * math.asin(math.sqrt(rate)) - 2 * math.asin(math.sqrt(other))
+
+
+def stratified_n(successes: Floats, trials: Floats, weights: Floats | None = None) -> float:
+    """Return the number of independent trials that a weighted rate over fixed strata is worth.
+
+    Strata with xᶠ of nᶠ successes and weights λᶠ (by default nᶠ / n) that sum to 1 have the rate p
+    = Σ λᶠ xᶠ / nᶠ with the variance v = Σ λᶠ² p̃ᶠ (1 − p̃ᶠ) / nᶠ, p̃ᶠ = (xᶠ + 1) / (nᶠ + 2). The
+    trials are p (1 − p) / v, and at least 1 / Σ (λᶠ² / nᶠ), which is n for the default weights.
+    Wilson's interval then is for these strata alone. All arrays are `(F,) float64`, without empty
+    strata.
+
+    Source: effective sample size, Kish (1965), Survey Sampling, chapter 8; Wilson's interval over
+    strata, Yan and Su (2010), Statistics in Biopharmaceutical Research 2, 329–335.
+    """
+    weights = trials / trials.sum() if weights is None else weights
+    rate = float(weights @ (successes / trials))
+    near = (successes + 1) / (trials + 2)
+    variance = float((weights**2) @ (near * (1 - near) / trials))
+    return max(1 / float((weights**2) @ (1 / trials)), rate * (1 - rate) / variance)

@@ -10,7 +10,7 @@ import hashlib
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -127,7 +127,6 @@ def digest_spans(
     spans: Sequence[tuple[int, int]],
     features: Iterable[tuple[str, Iterable[NDArray[Any]]]],
     first: int = 0,
-    watch: Callable[[str, NDArray[Any]], None] | None = None,
 ) -> list[dict[str, str]]:
     """Return the digests by feature of spans `(start, stop)` of an episode, which may overlap.
 
@@ -135,7 +134,6 @@ def digest_spans(
         spans: The spans.
         features: Each feature and its values, one after the other.
         first: The frame of the first value.
-        watch: Called with each feature and value on the way.
     """
     running = [FeatureDigests() for _ in spans]
     for name, values in features:
@@ -143,6 +141,4 @@ def digest_spans(
             for (start, stop), digests in zip(spans, running, strict=True):
                 if start <= index < stop:
                     digests.update(name, value)
-            if watch is not None:
-                watch(name, value)
     return [digests.current() for digests in running]

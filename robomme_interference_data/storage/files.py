@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, NoReturn
 
 from robomme_interference_data.constants import FORMAT_VERSION
-from robomme_interference_data.errors import FormatError, MissingFileError
+from robomme_interference_data.errors import FormatError, InterferenceError, MissingFileError
 
 _MAX_JSON_BYTES = 16 << 20
 """Our files have some thousand bytes, and Python takes forty times as many for some values."""
@@ -326,3 +326,17 @@ def read_sums(path: Path) -> dict[str, str]:
             raise FormatError.damaged(path, f"{line[:80]!r} is not a SHA-256 and a path")
         sums[check_relative(name, str(path))] = digest
     return sums
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn pyarrow's errors on a damaged file into `FormatError`."""
+    import pyarrow as pa  # not to load or list a file
+
+    try:
+        yield
+    except (InterferenceError, MemoryError):  # of pyarrow's, one is an `ArrowException`, too
+        raise
+    except (pa.ArrowException, OSError, ValueError, OverflowError, RecursionError) as error:
+        text = str(error).partition("\n")[0]
+        raise FormatError.damaged(path, f"cannot be read: {text}") from None

@@ -19,8 +19,8 @@ from robomme_interference_data.constants import EPISODES_DIR, INFO_PATH, TASKS_P
 from robomme_interference_data.errors import FormatError, MissingFileError, UnknownNameError
 
 from . import video
-from .files import Files, parse_json, read_bytes, read_json
-from .parquet import RowSpan, is_plain, open_parquet, read_table, reading
+from .files import Files, parse_json, read_bytes, read_json, reading
+from .parquet import RowSpan, is_plain, open_parquet, read_table
 
 VERSIONS = ("v3.0", "v2.1")
 

@@ -17,9 +17,9 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import FormatError, InterferenceError
+from robomme_interference_data.errors import FormatError
 
-from .files import atomic_path
+from .files import atomic_path, reading
 from .parquet_pages import decoded_size
 
 _IMAGES_AT_ONCE = 8
@@ -35,18 +35,6 @@ _MAX_VALUES = 1 << 26
 
 _MAX_BYTES = 2 << 30
 """Decoded bytes of a read, or of the images of a row group."""
-
-
-@contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """Turn pyarrow's errors on a damaged file into `FormatError`."""
-    try:
-        yield
-    except (InterferenceError, MemoryError):  # of pyarrow's, one is an `ArrowException`, too
-        raise
-    except (pa.ArrowException, OSError, ValueError, OverflowError, RecursionError) as error:
-        text = str(error).partition("\n")[0]
-        raise FormatError.damaged(path, f"cannot be read: {text}") from None
 
 
 def open_parquet(path: Path) -> pq.ParquetFile:

@@ -40,7 +40,7 @@ def needed_datasets(
 def check_size(buffer_set: BufferSet, cameras: Sequence[str], size: int | None) -> int | None:
     """Check that the frames of cameras can be resized to squares of a size."""
     demonstrations = buffer_set.datasets[DEMONSTRATIONS]
-    shapes = {camera: demonstrations.shape(camera) for camera in cameras}
+    shapes = {one: demonstrations.shape(demonstrations.camera(one, "cameras")) for one in cameras}
     if size is None:
         return None
     size = whole_number("image_size", size, "an integer from 1, or None", 1)

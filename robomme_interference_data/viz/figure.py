@@ -88,7 +88,8 @@ def save_figure(figure: Any, out: Path) -> None:
             figure.savefig(partial, format=suffix[1:], dpi=_DPI, metadata=_METADATA[suffix])
     except OSError as error:
         raise InvalidOptionError(
-            f"{out} cannot be written: {error.strerror or error}", "Choose another file."
+            f"{out} cannot be written: {error.strerror or error}",
+            "Check the path, its permissions and the free disk space, or choose another file.",
         ) from error
 
 

@@ -27,7 +27,7 @@ from robomme_interference_data.constants import (
     IDENTITY_PATH,
     STATE,
 )
-from robomme_interference_data.errors import InvalidOptionError, SourceError
+from robomme_interference_data.errors import InvalidOptionError, SourceError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.storage.files import read_json
 
@@ -116,6 +116,8 @@ def test_a_buffer_set_with_executions(tmp_path: Path) -> None:
     assert np.array_equal(first, opened.query(QUERY).frame("front")) and len(others) == 3
     assert np.array_equal(others[2], source.frame(QUERY, 8, 5).images["front"])
     assert made.read_vectors(index, "action", 0, 4)[:, 0].tolist() == [-5, -6, -7, -8]
+    with pytest.raises(UnknownNameError, match=r"'actoin' is not in(.|\n)*'action'"):
+        made.read_vectors(index, "actoin", 0, 4)
     (root / EXECUTIONS / IDENTITY_PATH).unlink()  # buffers do not need them
     assert len(load_buffer(QUERY, "k1", buffer_set=root, verify=True)) == 5 + 32
 

@@ -137,6 +137,15 @@ def test_unknown_source(text: str, expected: str) -> None:
     assert repr(text) in caught.value.message and expected in str(caught.value)
 
 
+def test_a_folder_without_the_kind_of_its_content(source: Source, tmp_path: Path) -> None:
+    text = str(tmp_path / "made")
+    with pytest.raises(InvalidOptionError) as caught:
+        open_source(text)
+    assert caught.value.hint == f"Write {source.provenance['kind']}:{text}"
+    with pytest.raises(UnknownNameError, match="there is no source"):
+        open_source(str(tmp_path))
+
+
 def test_the_docs_know_all_kinds() -> None:
     table = (Path(__file__).parents[2] / "docs" / "reference" / "sources.md").read_text()
     for kind in SOURCES.kinds.values():

@@ -212,12 +212,12 @@ def test_only_text_can_name_a_repository(hub: HubServer, run: Any) -> None:
     assert code == 1 and f"{BASE}@" in error  # the command reads it as a repository
 
 
-@pytest.mark.parametrize("centred", [True, False])
+@pytest.mark.parametrize("centered", [True, False])
 def test_a_part_comes_with_its_embeddings(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Any, centred: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Any, centered: bool
 ) -> None:
     root, out, encoder = copy_buffer_set(tmp_path / "units"), tmp_path / "part", Thumbnail()
-    encoder.centred = centred
+    encoder.centered = centered
     make_index(root, encoder)
     with running_hub(tmp_path / "cache", monkeypatch) as server:
         push_buffer_set(server, root, tmp_path / "work")

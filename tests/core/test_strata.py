@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robomme_interference_data.stats.bootstrap import Floats
-from robomme_interference_data.stats.intervals import mover_interval, wilson
-from robomme_interference_data.stats.strata import Stratified, mantel_haenszel, stratified_n
+from robomme_interference_data.stats.intervals import mover_interval, stratified_n, wilson
+from robomme_interference_data.stats.significance import Stratified, mantel_haenszel
 
 
 def floats(*values: float) -> Floats:

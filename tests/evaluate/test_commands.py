@@ -84,7 +84,7 @@ def test_errors_are_printed_with_the_command_to_resume(
 ) -> None:
     (trouble / "MoveCube-0").write_text("raise")
     line = f"evaluate {tiny_buffers} --policy noop {USUAL} --families MoveCube"
-    done = type_in(f"{line} --conditions no-history --out {tmp_path / 'run'} --max-errors 1")
+    done = type_in(f"{line} --conditions no-history --out {tmp_path / 'run'} --set max_errors=1")
     assert done.exit_code == 1
     assert "1 rollout broke (see" in done.stderr
     assert "Stopped: 1 in a row broke" in done.stderr

@@ -46,7 +46,7 @@ FREE = {
     },
     RunConfig: {
         *("out", "robomme_python", "videos", "check_lesson", "simulator_timeout_s"),
-        *("history_chunk", "serve"),
+        "history_chunk",
         *("policies", "max_batch_size", "batch_wait_timeout_s", "policy_resources"),
     },
     AskConfig: {"out"},

@@ -32,8 +32,12 @@ from support.chat_server import (
 from robomme_interference_data.errors import InvalidOptionError, ModelError
 from robomme_interference_data.evaluate.language import bounded_http
 from robomme_interference_data.evaluate.language.images import within
-from robomme_interference_data.evaluate.language.model import Message, Video
-from robomme_interference_data.evaluate.language.models import MODELS, model_identity
+from robomme_interference_data.evaluate.language.models import (
+    MODELS,
+    Message,
+    Video,
+    model_identity,
+)
 
 pytestmark = pytest.mark.usefixtures("fast_retries")
 

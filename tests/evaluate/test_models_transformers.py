@@ -11,8 +11,12 @@ from support.asking import ask
 from support.lazy import lazy
 
 from robomme_interference_data.errors import InvalidOptionError, ModelError
-from robomme_interference_data.evaluate.language.model import Message, Video
-from robomme_interference_data.evaluate.language.models import MODELS, model_identity
+from robomme_interference_data.evaluate.language.models import (
+    MODELS,
+    Message,
+    Video,
+    model_identity,
+)
 from robomme_interference_data.storage import weights
 
 _, tiny_models = lazy("transformers"), lazy("support.vision_language")

@@ -13,12 +13,10 @@ from hypothesis import strategies as st
 
 from robomme_interference_data.data.questions import LETTERS, Question
 from robomme_interference_data.errors import FormatError, InvalidOptionError, UnknownNameError
-from robomme_interference_data.evaluate.language import question_prompt as questions
-from robomme_interference_data.evaluate.language import subgoal_prompt as subgoals
-from robomme_interference_data.evaluate.language.model import Video
+from robomme_interference_data.evaluate.language.models import Video
 from robomme_interference_data.evaluate.language.prompt_files import as_text
 from robomme_interference_data.evaluate.language.question_prompt import QuestionPrompt, read_letter
-from robomme_interference_data.evaluate.language.subgoal_prompt import Prompt, merge_near
+from robomme_interference_data.evaluate.language.subgoal_prompt import SubgoalPrompt, merge_near
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.subgoal import Subgoal
 
@@ -33,9 +31,9 @@ def question(*options: str) -> Question:
     return Question(episode, "r", "Which one?", options, answers, 0, ("",) * len(options), b"")
 
 
-def prompt(**changes: object) -> Prompt:
+def prompt(**changes: object) -> SubgoalPrompt:
     usual = {"system": "s", "first": "<history>{goal}<image>", "then": "{subgoals}"}
-    return Prompt(**usual | changes)  # type: ignore[arg-type]
+    return SubgoalPrompt(**usual | changes)  # type: ignore[arg-type]
 
 
 # --- answers to questions ----------------------------------------------------------------------
@@ -265,9 +263,9 @@ def test_lists_of_images_and_a_sentence_about_the_history() -> None:
 
 
 def test_the_questions_prompt_of_the_package() -> None:
-    [name] = questions.PROMPTS
-    loaded, digest = questions.load_prompt(name)
-    assert len(digest) == 64 and "letter" in loaded.system
+    [name] = QuestionPrompt.packaged
+    loaded = QuestionPrompt.load(name)
+    assert len(loaded.sha256) == 64 and "letter" in loaded.system
     views: Any = {"<history>": [Video(IMAGE[None], 10.0)], "<picture>": [IMAGE]}
     _, user = loaded.fill("g", question("x", "y"), views)
     assert [type(part).__name__ for part in user.parts] == ["str", "Video", "str", "ndarray", "str"]
@@ -275,9 +273,9 @@ def test_the_questions_prompt_of_the_package() -> None:
     assert not {"<", "{"} & {*as_text(user.parts)}
 
 
-@pytest.mark.parametrize("name", subgoals.PROMPTS)
+@pytest.mark.parametrize("name", SubgoalPrompt.packaged)
 def test_subgoal_prompts_of_the_package_parse_their_own_examples(name: str) -> None:
-    loaded = subgoals.load_prompt(name)
+    loaded = SubgoalPrompt.load(name)
     assert len(loaded.sha256) == 64
     now = "<recent>" if name == "memer" else "<image>"
     for text in (loaded.first, loaded.then):
@@ -296,26 +294,26 @@ SUBGOAL = "system = 'a'\nfirst = 'b'\nthen = 'c'"
 @pytest.mark.parametrize(
     ("load", "text", "words"),
     [
-        (questions.load_prompt, "system = 's'", "lacks question"),
-        (questions.load_prompt, QUESTION.replace("<history>", ""), "lacks <history>"),
-        (questions.load_prompt, QUESTION.replace("<picture>", ""), "lacks <picture>"),
-        (questions.load_prompt, QUESTION.replace("{question}", ""), "lacks {question}"),
-        (questions.load_prompt, QUESTION.replace("{options}", ""), "lacks {options}"),
-        (questions.load_prompt, QUESTION.replace("'s'", "' '"), "system is empty"),
-        (questions.load_prompt, "a = " + "[" * 5000, "no prompt"),
-        (subgoals.load_prompt, f"{SUBGOAL}\ncolor = 'red'", "'color'"),
-        (subgoals.load_prompt, "system = 'a'\nfirst = 'b'\nthen = 3", "then is 3"),
-        (subgoals.load_prompt, f"{SUBGOAL}\ngrid = true", "grid is True"),
-        (subgoals.load_prompt, f"{SUBGOAL}\ngrid = -1", "grid"),
-        (subgoals.load_prompt, f"{SUBGOAL}\nanswer = 'xml'", "answer"),
-        (subgoals.load_prompt, f"{SUBGOAL}\npoint = '{{y}}'", "{x}"),
-        (subgoals.load_prompt, SUBGOAL.replace("'a'", "' '"), "system is empty"),
-        (subgoals.load_prompt, SUBGOAL.replace("'b'", "'<histroy>'"), "mean '<history>'?"),
-        (subgoals.load_prompt, f"{SUBGOAL}\nhistory = 'x'", "<history> once"),
-        (subgoals.load_prompt, SUBGOAL.replace("'c'", "'{goals}'"), "placeholder {goals}"),
-        (subgoals.load_prompt, "nonsense", "no prompt"),
-        (subgoals.load_prompt, "\udcff\udcfe", "no prompt"),  # no UTF-8
-        (subgoals.load_prompt, "# " + "x" * (1 << 16), "at most"),
+        (QuestionPrompt.load, "system = 's'", "lacks question"),
+        (QuestionPrompt.load, QUESTION.replace("<history>", ""), "lacks <history>"),
+        (QuestionPrompt.load, QUESTION.replace("<picture>", ""), "lacks <picture>"),
+        (QuestionPrompt.load, QUESTION.replace("{question}", ""), "lacks {question}"),
+        (QuestionPrompt.load, QUESTION.replace("{options}", ""), "lacks {options}"),
+        (QuestionPrompt.load, QUESTION.replace("'s'", "' '"), "system is empty"),
+        (QuestionPrompt.load, "a = " + "[" * 5000, "no prompt"),
+        (SubgoalPrompt.load, f"{SUBGOAL}\ncolor = 'red'", "'color'"),
+        (SubgoalPrompt.load, "system = 'a'\nfirst = 'b'\nthen = 3", "then is 3"),
+        (SubgoalPrompt.load, f"{SUBGOAL}\ngrid = true", "grid is True"),
+        (SubgoalPrompt.load, f"{SUBGOAL}\ngrid = -1", "grid"),
+        (SubgoalPrompt.load, f"{SUBGOAL}\nanswer = 'xml'", "answer"),
+        (SubgoalPrompt.load, f"{SUBGOAL}\npoint = '{{y}}'", "{x}"),
+        (SubgoalPrompt.load, SUBGOAL.replace("'a'", "' '"), "system is empty"),
+        (SubgoalPrompt.load, SUBGOAL.replace("'b'", "'<histroy>'"), "mean '<history>'?"),
+        (SubgoalPrompt.load, f"{SUBGOAL}\nhistory = 'x'", "<history> once"),
+        (SubgoalPrompt.load, SUBGOAL.replace("'c'", "'{goals}'"), "placeholder {goals}"),
+        (SubgoalPrompt.load, "nonsense", "no prompt"),
+        (SubgoalPrompt.load, "\udcff\udcfe", "no prompt"),  # no UTF-8
+        (SubgoalPrompt.load, "# " + "x" * (1 << 16), "at most"),
     ],
 )
 def test_invalid_files_are_errors(
@@ -336,4 +334,4 @@ def test_special_tokens_of_models_are_no_placeholders() -> None:
 
 def test_no_such_prompt() -> None:
     with pytest.raises(UnknownNameError, match="no prompt or file 'grouded'"):
-        subgoals.load_prompt("grouded")
+        SubgoalPrompt.load("grouded")

@@ -279,7 +279,9 @@ def test_the_command_prints_results_and_how_to_resume(
     monkeypatch.setattr(evaluation, "make_executor", lambda config: Serial())
     with ChatServer(look, faults=[BROKEN] * 9) as server:
         line = f"ask {TABLETOP} --model openai:{server.url}#tiny --system tiny --families MoveCube"
-        line += f" --out {tmp_path / 'run'} --conditions k0 --max-errors 1 --model-option repeats=0"
+        line += (
+            f" --out {tmp_path / 'run'} --conditions k0 --set max_errors=1 --model-option repeats=0"
+        )
         code, _, err = run(*line.split())
         assert code == 1 and "Stopped: 1 in a row broke" in err and "1 question broke" in err
         resume = err.rstrip().splitlines()[-1]

@@ -191,7 +191,7 @@ def test_a_run_works_without_a_folder_for_locks(
 def serve(out: Path, *words: object, **changes: Any) -> Any:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
-        return run(out, policy="websocket", serve=command(*words), **changes)
+        return run(out, policy=f"websocket:{command(*words)}", **changes)
 
 
 def test_a_worker_starts_its_server_and_ends_it(tmp_path: Path) -> None:
@@ -204,7 +204,8 @@ def test_a_worker_starts_its_server_and_ends_it(tmp_path: Path) -> None:
     assert log.name.endswith("-0.log") and log.read_text().startswith("serving at 18")
     (start,) = header(tmp_path / "run")["starts"]
     line = command("--pids", tmp_path / "pids")
-    assert start["settings"]["serve"] == start["policy"]["server"] == line
+    assert start["settings"]["policy"] == f"websocket:{line}"
+    assert start["policy"]["server"] == line
     identity = header(tmp_path / "run")["identity"]
     assert identity["policy"] == "websocket"  # the command is no part of the identity
     assert identity["policy_metadata"]["server_metadata"] == {"checkpoint": "tiny/1"}
@@ -227,9 +228,9 @@ def test_a_server_that_cannot_start_is_an_error_with_the_end_of_its_log(tmp_path
 
 def test_a_server_that_does_not_listen_is_an_error_with_the_end_of_its_log(tmp_path: Path) -> None:
     code = "print('loading {port}'); __import__('time').sleep(99)"
-    served = {"serve": shlex.join([sys.executable, "-uc", code])}
+    served = {"policy": f"websocket:{shlex.join([sys.executable, '-uc', code])}"}
     with pytest.raises(PolicyServerError, match="cannot be reached") as raised:
-        run(tmp_path / "run", policy="websocket", policy_options=("connect_s=1.5",), **served)
+        run(tmp_path / "run", policy_options=("connect_s=1.5",), **served)
     hint = str(raised.value.hint)
     assert "listen at {port}" in hint and "connect_s" in hint and "loading 18" in hint
 
@@ -237,12 +238,10 @@ def test_a_server_that_does_not_listen_is_an_error_with_the_end_of_its_log(tmp_p
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"policy": "websocket"}, "websocket with serve="),
-        ({"policy": "replay", "serve": "serve {port}"}, "has no server to start"),
-        ({"policy": "websocket:serve {port}"}, "websocket with serve="),
-        ({"policy": "websocket", "serve": "serve 8000"}, "a command with {port}"),
-        ({"policy": "websocket", "serve": "serve '{port}"}, "a command with {port}"),
-        ({"policy": "websocket", "serve": "no-such-program {port}"}, "cannot be run"),
+        ({"policy": "websocket"}, "websocket:COMMAND with {port}"),
+        ({"policy": "websocket:serve 8000"}, "websocket:COMMAND with {port}"),
+        ({"policy": "websocket:serve '{port}"}, "websocket:COMMAND with {port}"),
+        ({"policy": "websocket:no-such-program {port}"}, "cannot be run"),
     ],
 )
 def test_invalid_commands_are_errors(tmp_path: Path, changes: dict[str, Any], words: str) -> None:

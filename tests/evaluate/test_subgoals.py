@@ -22,10 +22,17 @@ from robomme_interference_data.errors import (
     ModelError,
     RunError,
 )
-from robomme_interference_data.evaluate.language.model import ChatModel, Message, Part, Reply, Video
+from robomme_interference_data.evaluate.language.images import HistoryFrames
 from robomme_interference_data.evaluate.language.model_writer import ModelWriter
-from robomme_interference_data.evaluate.language.subgoal_prompt import load_prompt
-from robomme_interference_data.evaluate.language.subgoal_writer import History, OracleWriter
+from robomme_interference_data.evaluate.language.models import (
+    ChatModel,
+    Message,
+    Part,
+    Reply,
+    Video,
+)
+from robomme_interference_data.evaluate.language.subgoal_prompt import SubgoalPrompt
+from robomme_interference_data.evaluate.language.subgoal_writer import OracleWriter
 from robomme_interference_data.evaluate.language.subgoal_writers import make_writer
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.evaluate.policies.registry import make_policy
@@ -70,8 +77,8 @@ def seen(number: int) -> Observation:
 
 def begun(model: ChatModel, condition: str = "k0", prompt: str = "grounded", **o: int) -> Any:
     buffer = buffer_set_here().load("MoveCube/test/0", condition)
-    history = History(buffer, range(len(buffer)), HistoryReader(buffer_set_here().datasets))
-    writer = ModelWriter(model, load_prompt(prompt), **o)
+    history = HistoryFrames(buffer, range(len(buffer)), HistoryReader(buffer_set_here().datasets))
+    writer = ModelWriter(model, SubgoalPrompt.load(prompt), **o)
     writer.start(history, RolloutInfo("move it", len(buffer), 0), None)  # type: ignore[arg-type]
     return writer
 

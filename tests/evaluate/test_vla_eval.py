@@ -157,7 +157,6 @@ def test_a_run_resumes_with_the_same_checkpoint_only(tmp_path: Path) -> None:
             ({"policy_options": NAMED, "system": None}, "need a name"),
             ({"policy_options": NAMED, "system": "perceptual-framesamp-modul"}, "paper's system"),
             ({"policy_options": NAMED, "subgoals": "oracle"}, "reads no subgoals"),
-            ({"policy_options": NAMED, "serve": "serve {port}"}, "no server to start"),
             ({"policy_options": NAMED, "workers": 2, "policies": 1}, "cannot be shared"),
         ):
             with pytest.raises(InvalidOptionError, match=words):

@@ -34,9 +34,9 @@ def test_a_buffers_embeddings_are_those_of_its_frames(indexed: Path) -> None:
     found = buffer.embeddings("thumbnail")
     assert found.dtype == np.float32 and found.shape == (48 + 3 * 32, 528)
     assert np.linalg.norm(found, axis=1) == pytest.approx(1, abs=1e-6)
-    encoder, centre = Thumbnail(), units_index(indexed).center
-    assert np.array_equal(found, normalized(encoder.prepare(buffer.frames()), centre))
-    query = normalized(encoder.prepare(buffer.query.frame()[None]), centre)[0]
+    encoder, center = Thumbnail(), units_index(indexed).center
+    assert np.array_equal(found, normalized(encoder.prepare(buffer.frames()), center))
+    query = normalized(encoder.prepare(buffer.query.frame()[None]), center)[0]
     assert np.array_equal(buffer.query_embedding("thumbnail"), query)
     lesson, unit, *_ = buffer.manifest.sessions
     turned = remade(indexed, [unit, lesson]).embeddings("thumbnail")
@@ -81,12 +81,12 @@ def test_a_live_frame_has_the_embedding_of_the_stored_one(indexed: Path) -> None
 
 
 @given(arrays(np.float32, (3, 4), elements=st.floats(-999, 999, width=32)), st.booleans())
-def test_normalising(features: np.ndarray, centred: bool) -> None:
-    centre = np.array([3, 0, -1, 0.5], np.float32) if centred else None
-    found = normalized(features, centre)
+def test_normalising(features: np.ndarray, centered: bool) -> None:
+    center = np.array([3, 0, -1, 0.5], np.float32) if centered else None
+    found = normalized(features, center)
     assert found.dtype == np.float32
-    assert np.array_equal(found, normalized(features.astype(np.float16), centre))
-    exact = features.astype(np.float16).astype(np.float64) - (0 if centre is None else centre)
+    assert np.array_equal(found, normalized(features.astype(np.float16), center))
+    exact = features.astype(np.float16).astype(np.float64) - (0 if center is None else center)
     lengths = np.linalg.norm(exact, axis=1, keepdims=True)
     assert found * lengths == pytest.approx(exact, rel=1e-5, abs=1e-5)
 
@@ -108,11 +108,11 @@ def test_each_camera_has_an_index_of_its_own(indexed: Path, own_buffers: Path) -
     both = files_of(own_buffers)
     assert {name: both[name] for name in once} == once and len(both) == 2 * len(once)
     buffer = load_buffer(QUERIES[0], "k1", buffer_set=own_buffers)
-    centre = units_index(own_buffers, "wrist").center
-    expected = normalized(Thumbnail().prepare(buffer.frames("wrist")), centre)
+    center = units_index(own_buffers, "wrist").center
+    expected = normalized(Thumbnail().prepare(buffer.frames("wrist")), center)
     found = buffer.embeddings("thumbnail", "observation.images.wrist")
     assert np.array_equal(found, expected)
-    live = normalized(Thumbnail().prepare(buffer.query.frame("wrist")[None]), centre)[0]
+    live = normalized(Thumbnail().prepare(buffer.query.frame("wrist")[None]), center)[0]
     measured = measure(buffer, "thumbnail", "wrist")
     assert np.array_equal(measured.alike, measure(buffer, "thumbnail", "wrist", live).alike)
 

@@ -80,7 +80,7 @@ def test_any_flipped_bit_is_an_error_or_does_no_harm(whole: Path) -> None:
     assert refused > 30
 
 
-@pytest.mark.parametrize("name", ["chunk-000/episode-000000.npy", "centre.npy", "SHA256SUMS"])
+@pytest.mark.parametrize("name", ["chunk-000/episode-000000.npy", "center.npy", "SHA256SUMS"])
 def test_a_damaged_file_is_named(whole: Path, name: str) -> None:
     path = whole / OF_UNITS / name
     content = path.read_bytes()
@@ -148,15 +148,15 @@ def test_pool_statistics_are_only_in_the_index_of_units(whole: Path) -> None:
     with pytest.raises(FormatError, match="typical cosine"):
         check(whole)
     change_header(whole / FOLDER / "index.json", typical_cosine=None)
-    centre = np.load(whole / OF_UNITS / "centre.npy")
+    center = np.load(whole / OF_UNITS / "center.npy")
     for folder, message in ((OF_UNITS, "not the mean"), (FOLDER, "too many")):
         before = read_sums(whole / folder / "SHA256SUMS")
-        np.save(whole / folder / "centre.npy", centre + (folder == OF_UNITS))
-        sums = format_sums(whole / folder, sorted({*before, "centre.npy"}))
+        np.save(whole / folder / "center.npy", center + (folder == OF_UNITS))
+        sums = format_sums(whole / folder, sorted({*before, "center.npy"}))
         (whole / folder / "SHA256SUMS").write_text(sums)
         digest = sha256_file(whole / folder / "SHA256SUMS")
         change_header(whole / folder / "index.json", sums=digest)
-        with pytest.raises(FormatError, match=f"centre.npy is .*{message}"):
+        with pytest.raises(FormatError, match=f"center.npy is .*{message}"):
             check(whole)
         make_index(whole)
         check(whole)

@@ -73,9 +73,9 @@ def test_the_cut_is_the_encoders_own_unless_given() -> None:
     assert str(Rule.parse("mean/0.5", 0.923)) == "mean/0.5"
     assert str(Rule.parse("max/0.9234567")) == "max/0.9234567"  # not the same as max/0.923457
     # 0.846 is what would give the paper's threshold.
-    assert Rule("max", 0.923).threshold(0.1) == 0.923
-    assert Rule("max", "adaptive").threshold(0.0) == 0.5
-    assert Rule("max", "adaptive").threshold(0.846) == pytest.approx(0.923)
+    assert Rule("max", 0.923).cosine(0.1) == 0.923
+    assert Rule("max", "adaptive").cosine(0.0) == 0.5
+    assert Rule("max", "adaptive").cosine(0.846) == pytest.approx(0.923)
 
 
 def test_all_rules() -> None:

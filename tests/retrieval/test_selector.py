@@ -15,9 +15,12 @@ from robomme_interference_data.retrieval.selector import Selector, StoredSelecto
 def test_it_chooses_what_stored_embeddings_choose(indexed: Path) -> None:
     selector = Selector("thumbnail")
     for buffer in load_buffer_set(indexed).buffers(condition="k3"):
-        assert selector.label(buffer) == "thumbnail/max/adaptive"
+        assert selector.label(buffer.query.dataset) == "thumbnail/max/adaptive"
         for step in (Selector, StoredSelector):
-            assert step("thumbnail", rule="mean/0.9").label(buffer) == "thumbnail/mean/0.9"
+            assert (
+                step("thumbnail", rule="mean/0.9").label(buffer.query.dataset)
+                == "thumbnail/mean/0.9"
+            )
         stored = choose(measure(buffer, "thumbnail"), selector.rule)
         assert selector.select(buffer, buffer.query.frame()).tolist() == stored.frames.tolist()
         chosen = StoredSelector("thumbnail").select(load_buffer_set(indexed), buffer)
@@ -33,11 +36,11 @@ def test_what_identifies_a_selector(indexed: Path) -> None:
             "fingerprint": index.units.header.encoder.sha256,
             "camera": "front",
             "method": "max",
-            "boundary": "adaptive",
-            "threshold": (1 + index.units.typical_cosine) / 2,
+            "threshold": "adaptive",
+            "cosine": (1 + index.units.typical_cosine) / 2,
         }
     fixed = Selector("thumbnail", rule="mean/0.5").identity(buffer)
-    assert (fixed["method"], fixed["boundary"], fixed["threshold"]) == ("mean", 0.5, 0.5)
+    assert (fixed["method"], fixed["threshold"], fixed["cosine"]) == ("mean", 0.5, 0.5)
 
 
 def test_what_it_cannot_choose_from(indexed: Path, tiny_buffers: Path) -> None:

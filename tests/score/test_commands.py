@@ -260,3 +260,31 @@ def test_rows_of_a_stranger_cannot_take_all_memory(tmp_path: Path, command: list
     assert int(most) < 900
     assert restored == "True"
     assert not (tmp_path / "out").exists()
+
+
+_COUNT_MODULES = """
+import sys
+from pathlib import Path
+from robomme_interference_data.evaluate.score.config import Expected, Settings
+from robomme_interference_data.evaluate.score.scoring import score
+
+score(Settings((Path("run"),), expected=Expected.OBSERVED), draws=50)
+package = "robomme_interference_data"
+print(*(name for name in sys.modules if name == package or name.startswith(f"{package}.")))
+"""
+
+
+def test_a_score_of_a_run_imports_few_modules(tmp_path: Path) -> None:
+    """Those of other kinds of rows, of policies and of simulators are not among them."""
+    made.write_run(tmp_path / "run", made.changed(made.rows(), evidence_kept=1.0))
+    done = subprocess.run(
+        [sys.executable, "-c", _COUNT_MODULES],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    modules = done.stdout.split()
+    assert "robomme_interference_data.evaluate.score.tables.evidence_kept" in modules
+    assert len(modules) <= 45, sorted(modules)

@@ -20,12 +20,17 @@ from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.outcomes import Outcomes
 from robomme_interference_data.evaluate.score.plots import figures
 from robomme_interference_data.evaluate.score.tables import slopes
-from robomme_interference_data.evaluate.score.tables.cells import cells_of, main_table
 from robomme_interference_data.evaluate.score.tables.equivalence import tost
 from robomme_interference_data.evaluate.score.tables.evidence_kept import evidence_tables
 from robomme_interference_data.evaluate.score.tables.families import over_families
 from robomme_interference_data.evaluate.score.tables.pairs import pair
-from robomme_interference_data.evaluate.score.tables.ranks import matrix_table, system_pairs
+from robomme_interference_data.evaluate.score.tables.ranks import (
+    all_pairs,
+    matrix_table,
+    standings,
+    system_pairs,
+)
+from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.stats.bootstrap import generator_of
@@ -67,6 +72,7 @@ def made_up(
         expected=np.ones(len(EPISODES), bool),
         due=np.ones((systems, len(conditions)), bool),
         without_revision=np.zeros(systems, bool),
+        facts=(frozenset({SystemFacts()}),) * systems,
     )
 
 
@@ -98,16 +104,15 @@ def simulated(case: str) -> dict[str, float]:
             counts[f"{name}, pointwise"] += [row["low"] <= 0 <= row["high"] for row in records]
             joint = [row["joint_low"] <= 0 <= row["joint_high"] for row in records]
             counts[f"{name}, joint"].append(all(joint))
-        main = [
-            row for row in main_table(cells_of([outcomes])).records() if row["condition"] == "k0"
-        ]
-        counts["best"].append(found_any(main))
-        behind = [row for row in main if row["difference"] is not None]
-        counts["best, joint"].append(
-            all(row["difference_low"] <= 0 <= row["difference_high"] for row in behind)
-        )
+        everywhere = np.ones(len(EPISODES), bool)
+        won = (outcomes.status[:, 0, :, 0] == 0).mean(axis=1)  # 0 is success
+        rates = dict(zip(outcomes.systems, won.tolist(), strict=True))
+        stands = standings(rates, all_pairs(outcomes, "k0", outcomes.systems, everywhere)).values()
+        counts["best"].append(any(one.p_holm < 0.05 for one in stands))
+        behind = [one.behind for one in stands if not math.isnan(one.behind.value)]
+        counts["best, joint"].append(all(one.low <= 0 <= one.high for one in behind))
         counts["ranks"].append(
-            all((row["rank_low"], row["rank_high"]) == (1, len(main)) for row in main)
+            all((one.rank_low, one.rank_high) == (1, len(stands)) for one in stands)
         )
         leader = outcomes.status[:, 0, :, 0].mean(axis=1).argmin()  # 0 is success
         change = pair(*outcomes.status[leader, [0, 3]]).at(simultaneous(len(outcomes.systems)))

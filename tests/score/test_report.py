@@ -15,7 +15,7 @@ from support import scoring as made
 from support.browser import open_page
 from support.scoring import BASE, OWN, RETRIEVAL, cells
 
-from robomme_interference_data.evaluate.run.log import Invocation
+from robomme_interference_data.evaluate.run.header import Invocation
 from robomme_interference_data.evaluate.run.plan import Plan
 from robomme_interference_data.evaluate.score.plots.data import Data
 from robomme_interference_data.evaluate.score.plots.figures import (
@@ -117,13 +117,14 @@ def test_the_report_works_in_a_browser(report: Path, small: Score) -> None:
 
         # Filtering a table by words.
         page.type("#table-parts input", "retrieval insertpeg")
-        assert texts("#table-parts .count") == ["2 of 18 rows"]
+        assert texts("#table-parts .count") == ["4 of 70 rows"]
         # An id of the CSVs finds what its name finds; a system and a condition can be chosen.
         page.run("document.querySelector('#table-parts input').value = ''")
         page.type("#table-parts input", RETRIEVAL)
-        assert texts("#table-parts .count") == ["4 of 18 rows"]
+        assert texts("#table-parts .count") == ["20 of 70 rows"]
         page.choose("#table-effects select[name=system]", BASE)
         page.choose("#table-effects select[name=condition]", "k7")
+        page.choose("#table-effects select[name=effect]", "sessions")
         assert texts("#table-effects tbody td:nth-child(2)") == ["FrameSamp-Modul"]
 
         # The table of a figure is a link away, and one system is set apart from the others.

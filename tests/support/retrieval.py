@@ -42,7 +42,7 @@ class TwoSums:
     """An encoder whose arithmetic is exact everywhere: sums of red and green, and a constant."""
 
     name = "thumbnail"
-    centred = True
+    centered = True
     batch = 8
     computed_in = "whole numbers"
     fingerprint: ClassVar[dict[str, Any]] = {"name": "two-sums", "version": 1}

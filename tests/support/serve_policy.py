@@ -1,4 +1,4 @@
-"""A program that serves a policy, for --serve."""
+"""A program that serves a policy, for `websocket:COMMAND`."""
 
 import argparse
 import asyncio
@@ -13,7 +13,7 @@ from support.policy_server import Memory, PolicyServer
 
 
 def command(*words: object) -> str:
-    """What --serve is given; the tests' modules have to be on PYTHONPATH."""
+    """The command; the tests' modules have to be on PYTHONPATH."""
     program = [sys.executable, "-m", "support.serve_policy", "--port", "{port}"]
     return shlex.join([*program, *map(str, words)])
 

@@ -95,7 +95,7 @@ def test_unknown_cameras_are_errors_that_name_the_option(
 ) -> None:
     picture = ("--out", tmp_path / "x.png")
     watcher = ("--policy", WATCHER, "--out", tmp_path / "run")
-    step = ("--retrieval", "thumbnail", "--retrieval-camera", "nope", "--system", "x")
+    step = ("--retrieval", "thumbnail", "--set", "retrieval_camera=nope", "--system", "x")
     for words, option in (
         (("show", arm, DRAWER, "k1", "--camera", "nope", *picture), "--camera"),
         (("show", arm, DRAWER, "k1", "--camera", "hand"), "--camera"),  # without a picture
@@ -103,8 +103,8 @@ def test_unknown_cameras_are_errors_that_name_the_option(
         (("retrieve", arm, DRAWER, "k1", "--camera", "nope"), "--camera"),
         (("retrieval-score", arm, "--camera", "nope"), "--camera"),
         (("retrieval-score", arm, "--calibrate", "--camera", "nope"), "--camera"),
-        (("ceiling", arm, *step[:4]), "--retrieval-camera"),
-        (("evaluate", arm, *watcher, *step, "--offline"), "--retrieval-camera"),
+        (("ceiling", arm, *step[:4]), "--set retrieval_camera"),
+        (("evaluate", arm, *watcher, *step, "--offline"), "--set retrieval_camera"),
         (("evaluate", arm, *watcher), "--offline"),  # the live views are the simulator's
     ):
         code, _, err = run(*words)

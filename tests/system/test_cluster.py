@@ -127,7 +127,7 @@ def test_ctrl_c_gives_all_workers_back(cluster: Any, tmp_path: Path) -> None:
 
 
 def test_each_worker_of_a_node_starts_its_server(cluster: Any, tmp_path: Path) -> None:
-    served = {"policy": "websocket", "serve": command("--pids", tmp_path / "pids")}
+    served = {"policy": f"websocket:{command('--pids', tmp_path / 'pids')}"}
     there = ray_workers.RayWorkers(2, cluster.address)
     result = runs.run(tmp_path / "run", there, conditions=CONDITIONS, videos=True, **served)
     assert result.counts["fail"] == ROLLOUTS

@@ -30,9 +30,10 @@ ROLLOUTS = 10  # two episodes, five conditions
 def start(
     out: Path, pause: float = 0.0, policy: str = runs.CHEAT, words: Sequence[str] = ()
 ) -> subprocess.Popen[str]:
-    usual = f"evaluate {os.environ[worlds.BUFFER_SET]} --policy {policy} --simulator {runs.WORLD}"
+    usual = f"evaluate {os.environ[worlds.BUFFER_SET]} --simulator {runs.WORLD}"
     usual += " --system mine --workers 2 --families VideoRepick,MoveCube --json"
-    called = [sys.executable, "-m", "robomme_interference_data.cli.main", *usual.split(), *words]
+    called = [sys.executable, "-m", "robomme_interference_data.cli.main", *usual.split()]
+    called += ["--policy", policy, *words]
     return subprocess.Popen(
         [*called, "--out", str(out)],
         env=os.environ | {worlds.PAUSE: str(pause)},
@@ -174,8 +175,8 @@ def test_servers_that_go_away_cost_no_rollout(tmp_path: Path, monkeypatch: Any) 
 def test_servers_that_workers_start_end_with_the_command(
     tmp_path: Path, sent: signal.Signals
 ) -> None:
-    words = ["--serve", command("--pids", tmp_path / "pids")]
-    running = start(tmp_path / "run", 0.05, policy="websocket", words=words)
+    policy = f"websocket:{command('--pids', tmp_path / 'pids')}"
+    running = start(tmp_path / "run", 0.05, policy=policy)
     runs.wait_for_rows(tmp_path / "run", 2, running)
     pids = [int(line) for line in (tmp_path / "pids").read_text().split()]
     assert len(pids) == 2  # one beside each worker

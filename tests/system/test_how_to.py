@@ -154,7 +154,7 @@ def stand_ins(hub: Any, login: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator
             "openai:http://localhost:8000/v1#Qwen/Qwen3-VL-4B-Instruct": f"openai:{chat.url}#tiny",
             "localhost:8013": f"localhost:{servers[0].port}",
             "localhost:8014": f"localhost:{servers[1].port}",
-            "'python serve.py --port {port}'": shlex.quote(server),
+            "'websocket:python serve.py --port {port}'": shlex.quote(f"websocket:{server}"),
         }
 
 

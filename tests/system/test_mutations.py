@@ -27,6 +27,9 @@ UNREAD = {
 }
 """Values that nothing reads, by file, with the reason."""
 
+STATISTICS = "stats"
+"""Prefix of LeRobot's statistics, which only the digests of their files cover."""
+
 SEEN = 61
 """In fast tests, one of so many values is changed."""
 
@@ -38,6 +41,7 @@ def files_of(root: Path) -> list[str]:
         str(path)
         for path in paths
         if path.suffix in (".json", ".parquet")
+        and path.stem != STATISTICS
         and ("data" not in path.parts or path.name == "file-001.parquet")
     )
 
@@ -48,6 +52,7 @@ ALL = [
     for path in files_of(root)
     if root == GOLDEN or path == "questions.parquet"
     for place in places(root / path)
+    if not str(place[0]).startswith(f"{STATISTICS}/")
 ]
 
 

@@ -34,7 +34,9 @@ def run(out: Path, policy: str = "Remembering", **changes: Any) -> Any:
 
 
 @pytest.mark.slow
-def test_rows_are_those_of_policies_that_are_not_shared(tmp_path: Path) -> None:
+def test_rows_are_those_of_policies_that_are_not_shared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     runs.run(tmp_path / "own", policy=f"{SHARED}Remembering", conditions=CONDITIONS)
     expected = runs.finished_rows(tmp_path / "own")
     assert {(row["condition"], row["status"]) for row in expected} == {
@@ -45,6 +47,8 @@ def test_rows_are_those_of_policies_that_are_not_shared(tmp_path: Path) -> None:
     run(tmp_path / "run", max_batch_size=1)
     assert runs.finished_rows(tmp_path / "run") == expected
     assert not (tmp_path / "batches").exists()
+    # Rollouts last until both workers have started.
+    monkeypatch.setenv(worlds.PAUSE, "0.5")
     run(tmp_path / "batched", batch_wait_timeout_s=1.0)
     assert runs.finished_rows(tmp_path / "batched") == expected
     assert {*(tmp_path / "batches").read_text().split()} == {"2"}

@@ -43,19 +43,19 @@ def episodes(shared_data: Path) -> Features:
 
 
 def test_the_lesson_is_chosen_among_eight_sessions(episodes: Features) -> None:
-    # Without true boundaries; centre and adaptive cut come from the other families' units.
+    # Without true boundaries; center and adaptive cut come from the other families' units.
     purities, coverages = [], []
     for family, own in episodes.items():
         # What a distractor unit keeps of a lesson; each weighs the same in the mean.
         pool = [other[:-1][:256:8] for name, other in episodes.items() if name != family]
         means = [one.mean(axis=0, dtype=np.float64) for one in pool]
-        centre = np.mean(means, axis=0).astype(np.float32)
-        units = [normalized(one, centre) for one in pool]
+        center = np.mean(means, axis=0).astype(np.float32)
+        units = [normalized(one, center) for one in pool]
         typical = typical_cosine(len(units), units.__getitem__)
-        rows = normalized(own, centre)
+        rows = normalized(own, center)
         lesson, units = rows[:-1], units[:7]
         history = np.concatenate([lesson, *units])
-        rule = Rule("max", Rule("max").threshold(typical))
+        rule = Rule("max", Rule("max").cosine(typical))
         ((start, stop),) = choose(embedded(history, rows[-1]), rule).spans
         shared = max(0, min(stop, len(lesson)) - start)
         purities.append(shared / (stop - start))

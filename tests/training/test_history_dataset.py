@@ -277,7 +277,7 @@ def test_sessions_drawn_anew_keep_the_rules(make: Make, buffers: Path) -> None:
         ({"memory": "framesamp:1"}, InvalidOptionError, "framesamp:1"),
         ({"memory": "full:9"}, InvalidOptionError, "full:9"),
         ({"memory": "sometimes"}, UnknownNameError, "sometimes"),
-        ({"cameras": ["side"]}, UnknownNameError, "side"),
+        ({"cameras": ["side"]}, UnknownNameError, r"'side'(.|\n)*`cameras` to one of"),
         ({"cameras": "front"}, InvalidOptionError, "'front'"),
         ({"families": "MoveCube"}, InvalidOptionError, "'MoveCube'"),
         ({"image_size": 33}, InvalidOptionError, "32"),

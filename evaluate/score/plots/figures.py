@@ -4,11 +4,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.constants import DIFFICULTIES
+from robomme_interference_data.constants import DIFFICULTIES, RECORDINGS
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import published_base
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
-from robomme_interference_data.simulators.registry import RECORDINGS
 from robomme_interference_data.viz.figure import INK, open_figure, save_figure
 
 from . import curves, forests, matrices

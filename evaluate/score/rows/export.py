@@ -6,9 +6,9 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
+from robomme_interference_data.constants import RECORDINGS
 from robomme_interference_data.errors import InvalidOptionError, counted
 from robomme_interference_data.schema.rollouts import Status
-from robomme_interference_data.simulators.registry import RECORDINGS
 from robomme_interference_data.storage.files import atomic_path
 
 from .reading import Rows

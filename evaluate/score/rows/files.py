@@ -7,25 +7,26 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 import pyarrow.json as pa_json
 
-from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD, RUN_TABLES
+from robomme_interference_data.constants import MOST_ROW_BYTES, RUN_HEADER, RUN_RECORD, RUN_TABLES
 from robomme_interference_data.errors import (
     FormatError,
     InvalidOptionError,
     MissingFileError,
     named,
 )
-from robomme_interference_data.evaluate.run.log import MOST_BYTES, RunHeader, whole_lines
-from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.ids import nth_number
-from robomme_interference_data.schema.codec import arrow_schema
 from robomme_interference_data.schema.rollouts import KEY_COLUMNS, Status
-from robomme_interference_data.storage.files import parse_json, read_bytes, read_header
-from robomme_interference_data.storage.parquet import open_parquet, read_table, reading
+from robomme_interference_data.storage.files import parse_json, read_bytes, read_header, reading
+
+from .values import record_schema
+
+if TYPE_CHECKING:
+    from robomme_interference_data.evaluate.run.header import RunHeader
 
 _REQUIRED = ("family", "condition", "episode", "status", "success")
 _RELEASED_NAMES = {"variant": "system", "retrieval_model": "retrieval"}
@@ -44,14 +45,14 @@ class Part:
     malformed: Mapping[int, str] = field(default_factory=dict)
 
 
-def find_sources(paths: Sequence[Path]) -> dict[Path, RunHeader | None]:
+def find_sources(paths: Sequence[Path]) -> "dict[Path, RunHeader | None]":
     """Return the file of rows of each path, with the header of the run that it belongs to.
 
     In a run's folder the file is the record.
     """
     sources: dict[Path, RunHeader | None] = {}
-    for given in paths:
-        path = given / RUN_RECORD if given.is_dir() else given
+    for source in paths:
+        path = source / RUN_RECORD if source.is_dir() else source
         if not path.is_file():
             raise MissingFileError(
                 f"there is no file {path}",
@@ -61,8 +62,15 @@ def find_sources(paths: Sequence[Path]) -> dict[Path, RunHeader | None]:
             raise InvalidOptionError(f"{path} is given twice", "Give each file once.")
         header = path.parent / RUN_HEADER
         of_run = path.name in (RUN_RECORD, *RUN_TABLES) and header.is_file()
-        sources[path] = read_header(header, RunHeader) if of_run else None
+        sources[path] = _read_run_header(header) if of_run else None
     return sources
+
+
+def _read_run_header(path: Path) -> "RunHeader":
+    # Files of rows alone do without runs.
+    from robomme_interference_data.evaluate.run.header import RunHeader
+
+    return read_header(path, RunHeader)
 
 
 def system_of(path: Path) -> str | None:
@@ -126,6 +134,9 @@ def _columns(path: Path, table: pa.Table) -> dict[str, list[Any]]:
 
 
 def _read_parquet(path: Path, names: Sequence[str], has_system: bool) -> Part:
+    # Only for these files: a run is read from its record.
+    from robomme_interference_data.storage.parquet import open_parquet, read_table
+
     with open_parquet(path) as file:
         _check_count(file.metadata.num_rows)
         selected = _select(path, file.schema_arrow.names, names, has_system)
@@ -137,7 +148,7 @@ def _read_parquet(path: Path, names: Sequence[str], has_system: bool) -> Part:
 
 
 def _read_csv(path: Path, names: Sequence[str], has_system: bool) -> Part:
-    text = read_bytes(path, MOST_BYTES).removeprefix(codecs.BOM_UTF8).decode()
+    text = read_bytes(path, MOST_ROW_BYTES).removeprefix(codecs.BOM_UTF8).decode()
     csv.field_size_limit(len(text) + 1)
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows: dict[int, list[str]] = {}
@@ -166,13 +177,15 @@ def _read_csv(path: Path, names: Sequence[str], has_system: bool) -> Part:
 def _read_record(path: Path, names: Sequence[str], has_system: bool) -> Part:
     """Read a run's record: every finished row, and of other rollouts the last row.
 
-    The types are the schema's; a row object for each line would take ten times as long.
+    The types are those of a rollout's row; a row object for each line would take ten times as long.
     """
-    if not (data := whole_lines(path)):
+    from robomme_interference_data.evaluate.run.header import whole_lines
+
+    data = whole_lines(path)
+    if not data:
         return Part({}, [])
     _check_count(data.count(b"\n"))
-    fields = [arrow_schema(Rollout).field(name) for name in {*names, *KEY_COLUMNS}]
-    columns = _columns(path, _parse_record(path, data, pa.schema(fields)))
+    columns = _columns(path, _parse_record(path, data, record_schema({*names, *KEY_COLUMNS})))
     keys = [*zip(*(columns[name] for name in KEY_COLUMNS), strict=True)]
     last = {key: at for at, key in enumerate(keys)}
     kept = [
@@ -223,7 +236,7 @@ def _read_vla_eval(path: Path, names: Sequence[str], has_system: bool) -> Part:
     An episode's metrics are a row. One that has a reason of a failure instead is an error: it says
     nothing about the policy, though vla-eval counts it as no success.
     """
-    results = parse_json(read_bytes(path, MOST_BYTES), str(path))
+    results = parse_json(read_bytes(path, MOST_ROW_BYTES), str(path))
     rows: dict[int, list[Any]] = {}
     malformed: dict[int, str] = {}
     try:

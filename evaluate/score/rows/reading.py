@@ -5,22 +5,24 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from robomme_interference_data.constants import RECORDINGS
 from robomme_interference_data.errors import (
     FormatError,
     InterferenceError,
     InvalidOptionError,
     counted,
 )
-from robomme_interference_data.evaluate.run.log import RunHeader
 from robomme_interference_data.evaluate.systems import FACT_COLUMNS, SYSTEMS, name_system
 from robomme_interference_data.schema.rollouts import FINAL, Status, success_of
 from robomme_interference_data.schema.shifts import NO_SHIFT
-from robomme_interference_data.simulators.registry import RECORDINGS
 
 from .files import Part, find_sources, read_file, system_of
 from .values import DEFAULTS, Row, parse, shifted
+
+if TYPE_CHECKING:
+    from robomme_interference_data.evaluate.run.header import RunHeader
 
 _SHOWN = 10  # bad rows that are listed; the others are counted
 
@@ -43,7 +45,7 @@ class Rows:
     """
 
     rows: tuple[Row, ...]
-    sources: Mapping[Path, RunHeader | None]
+    sources: "Mapping[Path, RunHeader | None]"
     revisions: Mapping[str, str] = field(default_factory=dict)
     unpinned: frozenset[tuple[str, str]] = frozenset()
     refusals: tuple[str, ...] = ()

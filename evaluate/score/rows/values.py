@@ -3,18 +3,26 @@
 import math
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NamedTuple, get_type_hints
+from typing import Any, NamedTuple, get_args, get_type_hints
 
-from robomme_interference_data.constants import DIFFICULTIES, MAX_STEPS, PROTOCOL_VERSION, SPLITS
+import pyarrow as pa
+
+from robomme_interference_data.constants import (
+    DIFFICULTIES,
+    MAX_STEPS,
+    OFFICIAL,
+    PROTOCOL_VERSION,
+    SPLITS,
+)
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evaluate.systems import name_system
+from robomme_interference_data.evaluate.systems import SystemFacts, name_system
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.schema.codec import arrow_schema
 from robomme_interference_data.schema.conditions import parse_condition
-from robomme_interference_data.schema.rollouts import FINAL, Status
+from robomme_interference_data.schema.rollouts import FINAL, Outcome, RolloutKey, Status
 from robomme_interference_data.schema.shifts import NO_SHIFT, parse_shift
-from robomme_interference_data.simulators.registry import OFFICIAL
 
 RELEASED_SIMULATOR = OFFICIAL
 """The simulator of rows that name none."""
@@ -69,6 +77,35 @@ DEFAULTS = {
     "reference": False,
 }
 """Values of columns that the released CSV lacks; any other is None."""
+
+_ARROW_TYPES = {
+    str: pa.string(),
+    int: pa.int64(),
+    float: pa.float64(),
+    bool: pa.bool_(),
+    Path: pa.string(),
+}
+
+
+def record_schema(names: Iterable[str]) -> pa.Schema:
+    """Return the schema of some columns in the record of a run.
+
+    Every record has key, outcome and facts. The other columns of `Row` belong to features, and
+    their types follow from `Row`, so that scoring imports no feature to read its columns.
+    """
+    required = {
+        field.name: field
+        for group in (RolloutKey, Outcome, SystemFacts)
+        for field in arrow_schema(group)
+    }
+    hints = get_type_hints(Row)
+    return pa.schema(
+        [
+            required.get(name) or pa.field(name, _ARROW_TYPES[get_args(hints[name])[0]])
+            for name in names
+        ]
+    )
+
 
 _SEPARATOR = "+"  # between a simulator and its shift; no simulator's name contains it
 # Used in file names, so no `/`. A user's simulator is named `module:function`.

@@ -22,8 +22,7 @@ from robomme_interference_data.ids import EpisodeId, format_numbers
 from robomme_interference_data.schema.conditions import in_order
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.stats.bootstrap import Interval
-from robomme_interference_data.stats.intervals import wilson
-from robomme_interference_data.stats.strata import stratified_n
+from robomme_interference_data.stats.intervals import stratified_n, wilson
 from robomme_interference_data.viz.tables import Columns, Table, percent
 
 from .comparison import record_table

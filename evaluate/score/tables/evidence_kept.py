@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.evaluate.score.outcomes import Outcomes, Statuses, counting, rate_of
 from robomme_interference_data.evaluate.score.partners import control_of
-from robomme_interference_data.stats.strata import mantel_haenszel
+from robomme_interference_data.stats.significance import mantel_haenszel
 from robomme_interference_data.viz.tables import Columns, Table
 
 from .comparison import record_table, tested_table
