@@ -16,7 +16,7 @@ from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.storage.arrays import FeatureDigests
 
 from .base import Simulator
-from .episode import Begun, Demonstration, EpisodeInfo, Observation, choose_cameras
+from .episode import Demonstration, EpisodeInfo, EpisodeStart, Observation, choose_cameras
 
 
 class Recordings(Simulator):
@@ -88,7 +88,7 @@ class Recordings(Simulator):
         }
 
     @override
-    def _begin(self, episode: EpisodeId, every: int) -> Begun:
+    def _begin(self, episode: EpisodeId, frame_step: int) -> EpisodeStart:
         query, executions = self._buffer_set.query(episode), self._executions
         index = executions.index_of(episode)
         record = self._current = executions.record(index)

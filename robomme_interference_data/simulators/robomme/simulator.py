@@ -18,9 +18,9 @@ from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.episode import (
     ACTION_SIZE,
     CAMERAS,
-    Begun,
     Demonstration,
     EpisodeInfo,
+    EpisodeStart,
     Observation,
     choose_cameras,
 )
@@ -159,7 +159,7 @@ class RoboMMESimulator(Simulator):
         super().close()
         self._process.end()
 
-    def _begin(self, episode: EpisodeId, every: int) -> Begun:
+    def _begin(self, episode: EpisodeId, frame_step: int) -> EpisodeStart:
         if episode.answer is not None:
             raise UnknownNameError(
                 f"{episode}: RoboMME cannot combine a scene with another answer",
@@ -180,12 +180,12 @@ class RoboMMESimulator(Simulator):
             index=episode.index,
             max_steps=MAX_STEPS,
             cameras=self._cameras,
-            every=every,
+            frame_step=frame_step,
             subgoals=self._subgoals,
         )
         self._subgoal = facts["subgoal"]
         first = self._observation(arrays, self._cameras)
-        images = {camera: arrays[camera][:-1] for camera in self._cameras if every}
+        images = {camera: arrays[camera][:-1] for camera in self._cameras if frame_step}
         no_actions = np.empty((0, ACTION_SIZE), np.float32)
         evidence = self._read_facts(facts, episode.family, arrays)
         lesson = Demonstration(images, arrays["states"][:-1], no_actions, *evidence)
