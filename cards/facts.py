@@ -16,7 +16,7 @@ from robomme_interference_data.storage.files import sha256_file
 from .markdown import code, escape
 from .publication import check_repo_id, is_commit
 
-Rows = list[tuple[str, Any]]
+ProvenanceRows = list[tuple[str, Any]]
 """Names and values of a table of provenance, in Markdown."""
 
 
@@ -52,7 +52,7 @@ class Facts:
     simulators: Sequence[str]
     simulated: bool
     limits: Sequence[str]
-    provenance: Rows
+    provenance: ProvenanceRows
     pictures: Callable[[], Mapping[str, bytes]]
     values: Mapping[str, Any]
     base_kind: str | None = None
@@ -122,7 +122,7 @@ def repositories_of(dataset: Dataset) -> dict[str, str | None]:
     return repositories
 
 
-def dataset_rows(dataset: Dataset, name: str = "") -> Rows:
+def dataset_rows(dataset: Dataset, name: str = "") -> ProvenanceRows:
     """Return the provenance of a dataset; `name` distinguishes the datasets of a buffer set."""
     identity, of = dataset.identity, f" of the {escape(name)}" if name else ""
     digest = sha256_file(dataset.files.path(IDENTITY_PATH))

@@ -114,7 +114,7 @@ def plan_version(content: RepoContent, requested: Version | None) -> RepoPlan:
         PublishError: The version exists with other content, or is lower than the newest one, or
             the repository holds something else.
     """
-    published = _Published(content)
+    published = _RepoState(content)
     newest = max(published.versions, default=None)
     version = requested or newest or content.first
     files = content.files(version)
@@ -145,7 +145,7 @@ def plan_next_version(content: RepoContent, requested: Version | None) -> RepoPl
         content: What the repository is to hold.
         requested: The version if the repository has none; None for its first.
     """
-    published = _Published(content)
+    published = _RepoState(content)
     newest = max(published.versions, default=None)
     if newest is None:
         version = requested or content.first
@@ -177,7 +177,7 @@ def publish_version(plan: RepoPlan, *, private: bool = False) -> RepoPlan:
     return replace(plan, published=commit)
 
 
-class _Published:
+class _RepoState:
     """What the repository of a content holds on the Hub."""
 
     def __init__(self, content: RepoContent):

@@ -30,7 +30,7 @@ from robomme_interference_data.storage.files import sha256_file
 from robomme_interference_data.viz.figure import open_figure, save_figure
 from robomme_interference_data.viz.tables import Columns, Table
 
-from .facts import CardTable, Facts, Rows, origin_limit
+from .facts import CardTable, Facts, ProvenanceRows, origin_limit
 from .markdown import Raw, code, escape
 from .publication import Publication, Version
 from .render import card_files
@@ -184,9 +184,11 @@ def _pictures(found: Score, figures: dict[str, str]) -> dict[str, bytes]:
         return {path.name: path.read_bytes() for path in sorted(Path(folder).iterdir())}
 
 
-def _provenance(found: Score, run: RunHeader | None, table: Path) -> Rows:
+def _provenance(found: Score, run: RunHeader | None, table: Path) -> ProvenanceRows:
     """Return the provenance of results: buffer set, revision, rows and policy."""
-    rows: Rows = [("buffer set of the run", code(run.buffer_set))] if run is not None else []
+    rows: ProvenanceRows = (
+        [("buffer set of the run", code(run.buffer_set))] if run is not None else []
+    )
     for simulator, revision in sorted(found.rows.revisions.items()):
         rows.append((f"revision of the buffer set, {escape(simulator)}", code(revision)))
     if found.rows.unpinned:

@@ -14,7 +14,7 @@ from robomme_interference_data.constants import ACTION, FPS, STATE, VALUE_NAMES
 from .base import Robot
 
 
-class _Family(NamedTuple):
+class _Recorded(NamedTuple):
     """A family: number in RoboMME's seeds, block of 100 in its LeRobot datasets, and goal patterns.
 
     A goal must have all of `has` and none of `lacks`.
@@ -34,31 +34,33 @@ _ORDINAL = r"(?:first|second|third|\w+th|\d+(?:st|nd|rd|th)|last)"  # fourth, fi
 
 ROBOMME = {
     # counting
-    "BinFill": _Family(4, 12, (r"\bcubes?\b.*\b(?:in|into) the bin\b",)),
-    "PickXtimes": _Family(
+    "BinFill": _Recorded(4, 12, (r"\bcubes?\b.*\b(?:in|into) the bin\b",)),
+    "PickXtimes": _Recorded(
         1, 5, (r"\bpick up\b.*\bcube\b.*\bplace it on the target\b",), (_VIDEO, r"\bleft\b")
     ),
-    "SwingXtimes": _Family(3, 7, (r"\bcube\b.*\bright[- ]side target\b.*\bleft[- ]side target\b",)),
-    "StopCube": _Family(2, 6, (r"\bstop the cube\b.*\btarget\b",)),
+    "SwingXtimes": _Recorded(
+        3, 7, (r"\bcube\b.*\bright[- ]side target\b.*\bleft[- ]side target\b",)
+    ),
+    "StopCube": _Recorded(2, 6, (r"\bstop the cube\b.*\btarget\b",)),
     # permanence
-    "VideoUnmask": _Family(6, 15, (_VIDEO, _HIDDEN)),
-    "VideoUnmaskSwap": _Family(5, 4, (_VIDEO, _HIDDEN)),
-    "ButtonUnmask": _Family(8, 2, (r"\bpress the button\b", _HIDDEN), (_VIDEO, r"\bbuttons\b")),
-    "ButtonUnmaskSwap": _Family(7, 1, (r"\bpress\b.*\bbuttons\b", _HIDDEN), (_VIDEO,)),
+    "VideoUnmask": _Recorded(6, 15, (_VIDEO, _HIDDEN)),
+    "VideoUnmaskSwap": _Recorded(5, 4, (_VIDEO, _HIDDEN)),
+    "ButtonUnmask": _Recorded(8, 2, (r"\bpress the button\b", _HIDDEN), (_VIDEO, r"\bbuttons\b")),
+    "ButtonUnmaskSwap": _Recorded(7, 1, (r"\bpress\b.*\bbuttons\b", _HIDDEN), (_VIDEO,)),
     # reference
-    "PickHighlight": _Family(12, 8, (r"\bcubes?\b", r"\bhighlight")),
-    "VideoRepick": _Family(9, 14, (_VIDEO, r"\bpick(?:ed)? up\b", _SAME_OBJECT)),
-    "VideoPlaceButton": _Family(
+    "PickHighlight": _Recorded(12, 8, (r"\bcubes?\b", r"\bhighlight")),
+    "VideoRepick": _Recorded(9, 14, (_VIDEO, r"\bpick(?:ed)? up\b", _SAME_OBJECT)),
+    "VideoPlaceButton": _Recorded(
         10, 3, (_VIDEO, _ON_TARGET, r"\b(?:before|after) the button was pressed\b")
     ),
-    "VideoPlaceOrder": _Family(
+    "VideoPlaceOrder": _Recorded(
         11, 13, (_VIDEO, _ON_TARGET, rf"\b{_ORDINAL} target\b"), (r"\bbutton was pressed\b",)
     ),
     # imitation
-    "MoveCube": _Family(14, 9, (_VIDEO, r"\bmove the cube\b", r"\bsame (?:manner|way)\b")),
-    "InsertPeg": _Family(13, 10, (_VIDEO, r"\bpeg\b", r"\binsert\b")),
-    "PatternLock": _Family(15, 0, (_VIDEO, r"\b(?:re)?trace\b", r"\bsame (?:pattern|path)\b")),
-    "RouteStick": _Family(16, 11, (_VIDEO, r"\bnavigate around the sticks\b")),
+    "MoveCube": _Recorded(14, 9, (_VIDEO, r"\bmove the cube\b", r"\bsame (?:manner|way)\b")),
+    "InsertPeg": _Recorded(13, 10, (_VIDEO, r"\bpeg\b", r"\binsert\b")),
+    "PatternLock": _Recorded(15, 0, (_VIDEO, r"\b(?:re)?trace\b", r"\bsame (?:pattern|path)\b")),
+    "RouteStick": _Recorded(16, 11, (_VIDEO, r"\bnavigate around the sticks\b")),
 }
 """By name."""
 

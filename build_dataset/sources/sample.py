@@ -60,7 +60,7 @@ class SampleSource(Source):
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
         name = episode.id
         number = episode.key
-        scene = _Scene(name, number, self._size)
+        scene = _SampleScene(name, number, self._size)
         short = (number, name.split, name.index) == (0, "train", 1)
         chosen = choose_cameras(cameras)
         lesson = 48 + 16 * (name.index % 2)
@@ -72,7 +72,7 @@ class SampleSource(Source):
         return Recording(*known, True, frames, evidence, robot=ROBOT)
 
 
-class _Scene:
+class _SampleScene:
     """One episode's table, cubes and path, on a grid of 256 × 256."""
 
     def __init__(self, episode: EpisodeId, family: int, size: int):

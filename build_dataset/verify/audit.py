@@ -16,7 +16,7 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.schema.conditions import KINDS, Kind, parse_condition
+from robomme_interference_data.schema.conditions import KINDS, ConditionKind, parse_condition
 from robomme_interference_data.schema.manifest import BufferManifest, SessionEntry
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.viz.tables import Columns, Table
@@ -122,7 +122,7 @@ def audit_buffer_set(buffer_set: BufferSet) -> Audit:
     return audit
 
 
-def _is_query(session: SessionEntry, manifest: BufferManifest, kind: Kind) -> bool:
+def _is_query(session: SessionEntry, manifest: BufferManifest, kind: ConditionKind) -> bool:
     """Return whether a session shows the query's scene, as its kind of condition permits."""
     role, source = session.role, session.source
     if role == "contradiction":

@@ -26,7 +26,7 @@ from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.systems import check_history, name_system
 from robomme_interference_data.runtime.executor import Worker
-from robomme_interference_data.schema.evidence import among
+from robomme_interference_data.schema.evidence import evidence_among
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.schema.shifts import NO_SHIFT
@@ -107,7 +107,7 @@ def run_rollout(
                 chunks = stack.enter_context(_decode(reader, buffer, given, policy, config))
             privileged: tuple[Any, ...] = ()
             if policy.privileged:
-                evidence = buffer.evidence and among(buffer.evidence, given)
+                evidence = buffer.evidence and evidence_among(buffer.evidence, given)
                 privileged = simulator, evidence, answer
             rollout_info = RolloutInfo(info.goal, len(given), config.model_seed, *privileged)
             policy.reset(rollout_info)

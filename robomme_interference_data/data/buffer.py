@@ -63,7 +63,7 @@ class Buffer:
         *,
         cache: "DecodedCache | None" = None,
         threads: int | None = None,
-        check_rules: Callable[[], None] | None = None,
+        check_rules: Callable[[BufferManifest], None] | None = None,
     ):
         self.manifest = manifest
         self.query = query
@@ -327,7 +327,7 @@ class Buffer:
         for dataset in {query.dataset, *(self._datasets[e.dataset] for e in manifest.sessions)}:
             dataset.check_records()
         if self._check_rules is not None:  # else no rule made the buffer
-            self._check_rules()
+            self._check_rules(manifest)
         for entry in manifest.sessions:
             span = entry.start, entry.stop
             what = f"{entry.role} {entry.source}"

@@ -3,7 +3,7 @@
 import logging
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from robomme_interference_data.storage.hub import HubFiles
 
     from .fetched_copy import FetchedCopy
+    from .query_sessions import SessionSource
 
 logger = logging.getLogger(__name__)
 _LOCATION = re.compile(r"\.|[\w.-]+(?:/[\w.-]+)+@[0-9a-f]{40}")
@@ -382,14 +383,18 @@ class BufferSet:
         if planned:
             self._table.check(self.fix)
             for manifest in self.manifests(condition=parsed):
-                self._check_rules(manifest)
+                self.check_rules(manifest)
+
+    def check_rules(self, manifest: BufferManifest) -> None:
+        """Check that a manifest is the one that the rules give; see `SessionSource.check`."""
+        self._source.check(manifest)
 
     @cached_property
-    def _check_rules(self) -> Callable[[BufferManifest], None]:
-        """Checks that a manifest is the one that the rules give; see `SessionSource.check`."""
+    def _source(self) -> "SessionSource":
+        """What the rules depend on: needed, and imported, only to check."""
         from .query_sessions import SessionSource
 
-        return SessionSource(self.datasets, self.header.seed).check
+        return SessionSource(self.datasets, self.header.seed)
 
     def buffers(self, **properties: Any) -> Iterator[Buffer]:
         """Yield all buffers, or those with all the given properties; see `manifests`."""
@@ -406,7 +411,7 @@ class BufferSet:
             self.datasets,
             cache=self._cache,
             threads=self._threads,
-            check_rules=lambda: self._check_rules(manifest),
+            check_rules=self.check_rules,
         )
 
     def _check_episode(self, episode: EpisodeId) -> None:

@@ -85,7 +85,7 @@ class FetchConfig:
 
 
 @dataclass(frozen=True)
-class Part:
+class FetchPart:
     """Files to download from one repository.
 
     Attributes:
@@ -106,7 +106,9 @@ class Part:
     unlisted: tuple[str, ...]
 
 
-def plan_fetch(buffer_set: "BufferSet", config: FetchConfig, to: Path | None = None) -> list[Part]:
+def plan_fetch(
+    buffer_set: "BufferSet", config: FetchConfig, to: Path | None = None
+) -> list[FetchPart]:
     """Return the files to download from each repository; only listings and metadata are read.
 
     A repository may hold anything, but only files that the buffer set lists are fetched: those of
@@ -162,7 +164,7 @@ def plan_fetch(buffer_set: "BufferSet", config: FetchConfig, to: Path | None = N
         chosen = {path: sizes[path] for path in sorted(paths)}
         unlisted = sizes.keys() - paths - sums.keys() if whole else ()
         parts.append(
-            Part(
+            FetchPart(
                 files,
                 folder,
                 chosen,
@@ -174,7 +176,7 @@ def plan_fetch(buffer_set: "BufferSet", config: FetchConfig, to: Path | None = N
     return parts
 
 
-def fetch(parts: Sequence[Part], to: Path | None = None) -> None:
+def fetch(parts: Sequence[FetchPart], to: Path | None = None) -> None:
     """Download missing files; each is checked against the Hub's digest.
 
     If `to` is given, all files are also copied into that folder, or added to an earlier copy of the
@@ -240,7 +242,7 @@ def _earlier_files(to: Path, location: str, header: Path) -> tuple[str, ...]:
     return record.files
 
 
-def _copy(part: Part, staged: Path, to: Path) -> None:
+def _copy(part: FetchPart, staged: Path, to: Path) -> None:
     """Copy what a folder lacks into its staging folder, and check it."""
 
     def is_there(path: str) -> bool:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import KEY_FRAMES
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.schema.manifest import Session, SessionEntry
-from robomme_interference_data.schema.sampling import runs
 
 from .dataset import Dataset, camera_feature
 
@@ -58,8 +57,10 @@ class FrameReader:
 
     def iter(self, camera: str, chosen: Sequence[int]) -> Generator[NDArray[np.uint8]]:
         """Yield frames of a camera, `(H, W, 3) uint8`, by their ascending indices."""
-        for start, stop in runs(chosen):
-            yield from self._iter_frames(camera, start, stop)
+        indices = np.asarray(chosen, np.int64)
+        for run in np.split(indices, np.flatnonzero(np.diff(indices) > 1) + 1):
+            if len(run):
+                yield from self._iter_frames(camera, int(run[0]), int(run[-1]) + 1)
 
     def _cached(
         self, entry: SessionEntry, camera: str
@@ -107,8 +108,8 @@ class FrameReader:
         reading = [pool.submit(read, first) for first in range(0, length, piece)]
 
         def finish() -> None:
-            for one in reading:
-                one.result()
+            for piece_read in reading:
+                piece_read.result()
             if cached is None:
                 self._keep(key, shown[:, 0])
 

@@ -26,7 +26,7 @@ def duration(seconds: float) -> str:
     return f"{max(1, round(seconds / 60))} min"
 
 
-class _Rate(ProgressColumn):
+class _RateColumn(ProgressColumn):
     def __init__(self, unit: str):
         super().__init__()
         self._unit = unit
@@ -65,7 +65,7 @@ class WorkProgress:
             BarColumn(),
             MofNCompleteColumn(),
             TextColumn(unit),
-            _Rate(unit),
+            _RateColumn(unit),
             TimeRemainingColumn(),
             console=self.console,
             speed_estimate_period=3600,  # s; a single task may take half of it

@@ -130,7 +130,7 @@ def _names(record: Any) -> list[str]:
 
 
 @dataclass(frozen=True)
-class _Codec:
+class _Converter:
     """Conversions of a type; `arrow` takes the keys of dicts.
 
     Without `write`, values are plain already. `item` is the `write` of a list's values.
@@ -143,7 +143,7 @@ class _Codec:
     item: Callable[[Any], Any] | None = None
 
 
-def _codec_of(hint: Any) -> _Codec:
+def _codec_of(hint: Any) -> _Converter:
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in (UnionType, Union):
         return _or_none(_codec(next(part for part in arguments if part is not NoneType)))
@@ -157,22 +157,22 @@ def _codec_of(hint: Any) -> _Codec:
                 raise ValueError(f"a number of {value.bit_length()} bits; expected at most 64")
             return value if type(value) is hint else hint(value)
 
-        return _Codec(lambda keys: kind, scalar)
+        return _Converter(lambda keys: kind, scalar)
     if hint is EpisodeId:
-        return _Codec(lambda keys: pa.string(), EpisodeId.parse, str)
+        return _Converter(lambda keys: pa.string(), EpisodeId.parse, str)
     if is_dataclass(hint):
         return _record(hint)
     if origin in (tuple, dict):
         return _list(_codec(arguments[0])) if origin is tuple else _map(_codec(arguments[1]))
-    return _Codec(lambda keys: pa.null(), lambda value: value)
+    return _Converter(lambda keys: pa.null(), lambda value: value)
 
 
-_codec: Callable[[Any], _Codec] = cache(_codec_of)
+_codec: Callable[[Any], _Converter] = cache(_codec_of)
 
 
-def _or_none(plain: _Codec) -> _Codec:
+def _or_none(plain: _Converter) -> _Converter:
     read, write = plain.read, plain.write
-    return _Codec(
+    return _Converter(
         plain.arrow,
         lambda value: None if value is None else read(value),
         write and (lambda value: None if value is None else write(value)),
@@ -180,9 +180,9 @@ def _or_none(plain: _Codec) -> _Codec:
     )
 
 
-def _list(item: _Codec) -> _Codec:
+def _list(item: _Converter) -> _Converter:
     read, write = item.read, item.write
-    return _Codec(
+    return _Converter(
         lambda keys: pa.list_(pa.field("item", item.arrow(keys), nullable=False)),
         lambda value: tuple(map(read, _of((list, tuple), value, "a list"))),
         lambda value: list(map(write, value) if write else value),
@@ -190,21 +190,21 @@ def _list(item: _Codec) -> _Codec:
     )
 
 
-def _map(item: _Codec) -> _Codec:
+def _map(item: _Converter) -> _Converter:
     read, write = item.read, item.write
 
     def checked(value: Any) -> Any:
         items = _of((dict,), value, "a map").items()
         return {_of((str,), key, "text"): read(one) for key, one in items}
 
-    return _Codec(
+    return _Converter(
         lambda keys: pa.struct([pa.field(key, item.arrow(keys), nullable=False) for key in keys]),
         checked,
         write and (lambda value: {key: write(one) for key, one in value.items()}),
     )
 
 
-def _record(record: Any) -> _Codec:
+def _record(record: Any) -> _Converter:
     hints = get_type_hints(record)
     codecs = {name: _codec(hints[name]) for name in _names(record)}
     identified = "episode_id" in codecs
@@ -242,7 +242,7 @@ def _record(record: Any) -> _Codec:
             plain |= {part: getattr(value.episode_id, part) for part in _PARTS}
         return plain
 
-    return _Codec(arrow, read, write)
+    return _Converter(arrow, read, write)
 
 
 def _of(types: tuple[type, ...], value: Any, expected: str) -> Any:

@@ -60,7 +60,7 @@ type Sessions = tuple[SessionEntry, ...]
 
 
 @dataclass(frozen=True)
-class Kind:
+class ConditionKind:
     """A family of conditions that differ only in `k`.
 
     Attributes:
@@ -91,70 +91,72 @@ class Kind:
         return _kind, (self.name,)
 
 
-def _kind(name: str) -> Kind:
+def _kind(name: str) -> ConditionKind:
     return KINDS[name]
 
 
 _KINDS = (
-    Kind(NO_HISTORY, lambda p, k: (), "none", "the floor: no memory (paper)", counted=False),
-    Kind(
+    ConditionKind(
+        NO_HISTORY, lambda p, k: (), "none", "the floor: no memory (paper)", counted=False
+    ),
+    ConditionKind(
         "k",
         lambda p, k: (p.lesson(), *p.units(k)),
         "lesson, n units",
         "retroactive interference (paper)",
     ),
-    Kind(
+    ConditionKind(
         "before",
         lambda p, k: (*p.units(k), p.lesson()),
         "n units, lesson",
         "proactive interference",
     ),
-    Kind(
+    ConditionKind(
         "middle",
         lambda p, k: (*p.units(k)[: (k + 1) // 2], p.lesson(), *p.units(k)[(k + 1) // 2 :]),
         "⌈n/2⌉ units, lesson, the other units",
         "position",
     ),
-    Kind(
+    ConditionKind(
         "held",
         lambda p, k: (p.lesson(), *(p.lesson("last") for _ in range(k))),
         "lesson, its last frame for n × 32 frames",
         "delay and dilution without content",
     ),
-    Kind(
+    ConditionKind(
         "same",
         lambda p, k: (p.lesson(), *p.own_units(k)),
         "lesson, n units of the query's own family, other scenes",
         "similarity",
         own_family=True,
     ),
-    Kind(
+    ConditionKind(
         "parts",
         lambda p, k: (p.lesson("first"), *p.units(k), p.lesson("second")),
         "first half of the lesson, n units, second half",
         "scattered evidence",
     ),
-    Kind(
+    ConditionKind(
         "raw",
         lambda p, k: (p.lesson(), *p.units(k, RAW_DISTRACTORS)),
         "lesson, the same n units at full rate: 256 frames, stride 1",
         "whether the change of frame rate reveals where the lesson ends",
         (RAW_DISTRACTORS,),
     ),
-    Kind(
+    ConditionKind(
         "absent",
         lambda p, k: tuple(p.units(k)),
         "n units",
         "false memory: must not differ from no-history",
     ),
-    Kind(
+    ConditionKind(
         "stale",
         lambda p, k: (p.contradiction(), p.lesson(), *p.units(k)),
         "contradicting lesson, lesson, n units",
         "updating: the newer lesson counts",
         (CONTRADICTIONS,),
     ),
-    Kind(
+    ConditionKind(
         "misled",
         lambda p, k: (p.contradiction(), *p.units(k)),
         "contradicting lesson, n units",
@@ -163,7 +165,7 @@ _KINDS = (
     ),
 )
 
-KINDS: dict[str, Kind] = {kind.name: kind for kind in _KINDS}
+KINDS: dict[str, ConditionKind] = {kind.name: kind for kind in _KINDS}
 """All kinds by name, in the order of tables."""
 
 _COUNTED = re.compile(r"(?:(?P<kind>[a-z]+)-)?k(?P<k>0|[1-9][0-9]?)")
@@ -180,7 +182,7 @@ class Condition:
     """
 
     name: str
-    kind: Kind
+    kind: ConditionKind
     k: int
 
     def sessions(self, provider: SessionProvider) -> Sessions:

@@ -92,7 +92,7 @@ def map_evidence(
     return tuple(mapped)
 
 
-def among(evidence: Iterable[Evidence], frames: Sequence[int]) -> tuple[Evidence, ...]:
+def evidence_among(evidence: Iterable[Evidence], frames: Sequence[int]) -> tuple[Evidence, ...]:
     """Return the evidence in a selection of frames, with frame ranges in that selection.
 
     `frames` are indices in the buffer, ascending.

@@ -22,10 +22,10 @@ from .checks import check_begun
 from .episode import ACTION_SIZE, CAMERAS, Begun, Observation, action_array
 from .scene import Scene
 
-ACTED = ("oracle", "guess", "recall", "answer")
+SCRIPTED = ("oracle", "guess", "recall", "answer")
 """Built-in policies of `Simulator.act`."""
 
-BUILT_IN = (*ACTED, "follow-subgoals")
+BUILT_IN = (*SCRIPTED, "follow-subgoals")
 """All built-in policies of a simulator."""
 
 
@@ -236,7 +236,7 @@ class Simulator(ABC):
             SimulatorCrashError: No episode is running, or the simulator is closed.
         """
         self._running()
-        if policy not in ACTED or policy not in self.policies:
+        if policy not in SCRIPTED or policy not in self.policies:
             raise UnknownNameError.among("built-in policy", policy, self.name, self.policies)
         return self._act(policy, known or {}, answer)
 

@@ -29,7 +29,7 @@ _TRUE, _FALSE, _I32, _I64, _BINARY, _STRUCT = 1, 2, 5, 6, 8, 12
 """Thrift's kinds of values that headers have."""
 
 
-class _Page(NamedTuple):
+class _PageHeader(NamedTuple):
     """The header of a page, and where its content starts; `stored` is its size in the file."""
 
     kind: int
@@ -71,7 +71,7 @@ def decoded_size(
     return size
 
 
-def _read_pages(file: BinaryIO, column: pq.ColumnChunkMetaData) -> Iterator[_Page]:
+def _read_pages(file: BinaryIO, column: pq.ColumnChunkMetaData) -> Iterator[_PageHeader]:
     """Yield the pages that pyarrow reads, which are those up to the last value."""
     position = column.data_page_offset
     if 0 < (column.dictionary_page_offset or 0) < position:
@@ -84,7 +84,7 @@ def _read_pages(file: BinaryIO, column: pq.ColumnChunkMetaData) -> Iterator[_Pag
         kind, size, stored = (header.get((number, _I32), -1) for number in (1, 2, 3))
         details = header.get((_DETAILS.get(kind, 0), _STRUCT), {})
         encoding = details.get((4 if kind == _DATA_V2 else 2, _I32), 0)
-        page = _Page(kind, size, stored, details.get((1, _I32), 0), encoding, file.tell())
+        page = _PageHeader(kind, size, stored, details.get((1, _I32), 0), encoding, file.tell())
         position = page.start + stored
         if not all(0 <= number < 1 << 31 for number in page[:5]) or position > stop:
             raise ValueError(f"{page} in a column of {stop - page.start} further bytes")
@@ -97,7 +97,7 @@ def _read_pages(file: BinaryIO, column: pq.ColumnChunkMetaData) -> Iterator[_Pag
         raise ValueError(f"a column has {values} values; its metadata has {column.num_values}")
 
 
-def _longest_text(file: BinaryIO, page: _Page, compression: str) -> int:
+def _longest_text(file: BinaryIO, page: _PageHeader, compression: str) -> int:
     """Return the length of the longest text in a dictionary."""
     file.seek(page.start)
     data = file.read(page.stored)

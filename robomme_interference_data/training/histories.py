@@ -19,14 +19,14 @@ from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.schema.shifts import Shift
 
 from .draws import number_from
-from .rows import Rows
+from .rows import StoredRows
 
 _Key = tuple[EpisodeId, str, Shift | None]
 """Query episode, condition, and the shift of the first live view that a retrieval step matches."""
 
 
 @dataclass(frozen=True)
-class History:
+class DrawnHistory:
     """The history of a query that a memory gets, which a retrieval step may have shortened.
 
     Attributes:
@@ -55,12 +55,12 @@ class Histories:
     def __init__(
         self,
         buffer_set: BufferSet,
-        rows: Rows,
+        rows: StoredRows,
         retrieval: StoredSelector | None,
         redraw: tuple[int, frozenset[int] | None] | None,
     ):
         self._set, self._rows, self._retrieval = buffer_set, rows, retrieval
-        self._redraw, self._known = redraw, dict[_Key, History]()
+        self._redraw, self._known = redraw, dict[_Key, DrawnHistory]()
         self._drawing: tuple[int, SessionSource] | None = None  # epoch, and what its draws are of
         spans = (
             span
@@ -88,7 +88,9 @@ class Histories:
                     key = buffer.episode_id, buffer.condition, shift
                     self._known[key] = self._of(buffer, shift)
 
-    def get(self, epoch: int, episode: EpisodeId, condition: str, shift: Shift | None) -> History:
+    def get(
+        self, epoch: int, episode: EpisodeId, condition: str, shift: Shift | None
+    ) -> DrawnHistory:
         """Return the history of a query, planned or drawn in this epoch.
 
         `shift` is that of the first live view, on which the choice of a retrieval step depends.
@@ -106,7 +108,7 @@ class Histories:
             self._known[key] = self._of(Buffer(manifest, query, self._set.datasets), shift)
         return self._known[key]
 
-    def _of(self, buffer: Buffer, shift: Shift | None) -> History:
+    def _of(self, buffer: Buffer, shift: Shift | None) -> DrawnHistory:
         """Return the history of a buffer's query, as the retrieval step leaves it."""
         rows = buffer.gather(
             lambda one: (
@@ -123,4 +125,4 @@ class Histories:
         if self._retrieval is not None and len(rows):
             chosen = self._retrieval.select(self._set, buffer, shift)
             rows, evidence = rows[chosen], evidence if evidence is None else evidence[chosen]
-        return History(rows, evidence)
+        return DrawnHistory(rows, evidence)

@@ -22,10 +22,10 @@ from robomme_interference_data.schema.shifts import NO_SHIFT, parse_shift
 from robomme_interference_data.storage.cache import default_cache_folder
 
 from .draws import Weights
-from .histories import Histories, History
+from .histories import DrawnHistory, Histories
 from .moments import check_arguments, check_size, choose_moments, needed_datasets
 from .question_tensors import QuestionTensors
-from .rows import PADDING, Rows
+from .rows import PADDING, StoredRows
 
 if TYPE_CHECKING:
     import torch
@@ -39,7 +39,7 @@ class _Drawn(NamedTuple):
     moment: int
     condition: str
     shift: str
-    history: History
+    history: DrawnHistory
 
 
 class HistoryDataset:
@@ -166,7 +166,7 @@ class HistoryDataset:
         for dataset in datasets.values():
             dataset.check_records()
         size = check_size(self.buffer_set, self.cameras, image_size)
-        self._rows = Rows(datasets)
+        self._rows = StoredRows(datasets)
         self._moments = choose_moments(
             self.buffer_set, self._rows, families, episodes, actions=actions
         )

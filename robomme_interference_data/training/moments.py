@@ -16,7 +16,7 @@ from robomme_interference_data.ids import EpisodeId, format_numbers, parse_numbe
 from robomme_interference_data.schema.conditions import datasets_of, parse_condition
 from robomme_interference_data.schema.shifts import NO_SHIFT
 
-from .rows import Rows
+from .rows import StoredRows
 
 _NO_ACTIONS = "Items without actions (chunk=0) need no executions."
 
@@ -116,7 +116,7 @@ class Moments:
 
 def choose_moments(
     buffer_set: BufferSet,
-    rows: Rows,
+    rows: StoredRows,
     families: Sequence[str],
     episodes: str | None,
     *,

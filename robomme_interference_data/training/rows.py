@@ -20,7 +20,7 @@ PADDING = -1
 """The row of a place without a frame."""
 
 
-class Rows:
+class StoredRows:
     """The stored values of several datasets, by row."""
 
     def __init__(self, datasets: Mapping[str, Dataset]):

@@ -470,3 +470,18 @@ def test_a_row_that_is_missing(own_buffers: Path) -> None:
         load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
     with pytest.raises(FormatError, match="no row of VideoRepick/test/0 under k7"):
         load_buffer_set(own_buffers).load("VideoRepick/test/0", "k7")
+
+
+def test_loading_from_a_folder_imports_little() -> None:
+    """No Hub, no rules, no copies, no pictures: at most 23 modules beside empty packages."""
+    code = f"""
+import sys
+from robomme_interference_data import load_buffer
+load_buffer("MoveCube/test/0", "k7", buffer_set={str(GOLDEN)!r}).frames("front")
+print(*(name for name in sys.modules if name.startswith("robomme_interference_data.")))
+"""
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    packages = {f"robomme_interference_data.{name}" for name in ("data", "schema", "storage")}
+    modules = {*done.stdout.split()} - packages
+    assert len(modules) <= 23, sorted(modules)

@@ -16,7 +16,7 @@ from robomme_interference_data.errors import FormatError
 from robomme_interference_data.schema.codec import from_dict, to_dict
 from robomme_interference_data.schema.evidence import (
     Evidence,
-    among,
+    evidence_among,
     known_parts,
     map_evidence,
     spans_of_parts,
@@ -149,10 +149,10 @@ def test_evidence_kept_by_hand() -> None:
 
 def test_evidence_among_some_frames_has_its_places_among_them() -> None:
     evidence = placed(ENTRY)
-    assert places(among(evidence, range(5, 20))) == [(0, 0, 5), (1, 3, 15)]
-    assert places(among(evidence, range(20))) == places(evidence)
-    assert places(among(evidence, [0, 1, 8, 12, 30])) == [(0, 2, 3), (1, 2, 4)]
-    assert among(evidence, [0, 1]) == ()
+    assert places(evidence_among(evidence, range(5, 20))) == [(0, 0, 5), (1, 3, 15)]
+    assert places(evidence_among(evidence, range(20))) == places(evidence)
+    assert places(evidence_among(evidence, [0, 1, 8, 12, 30])) == [(0, 2, 3), (1, 2, 4)]
+    assert evidence_among(evidence, [0, 1]) == ()
 
 
 # --- known ---------------------------------------------------------------------------------------

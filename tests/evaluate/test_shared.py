@@ -25,7 +25,7 @@ from robomme_interference_data.evaluate.policies.process import (
 from robomme_interference_data.evaluate.policies.shared import PolicyHost, SharedPolicy
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.runtime.worker import Worker
-from robomme_interference_data.simulators.base import Observation
+from robomme_interference_data.simulators.episode import Observation
 
 
 def config(policy: str, **changes: Any) -> RunConfig:

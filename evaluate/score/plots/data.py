@@ -9,7 +9,12 @@ from robomme_interference_data.evaluate.score.partners import base_of
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.cells import SuccessCell
 from robomme_interference_data.evaluate.systems import published_base
-from robomme_interference_data.schema.conditions import Condition, Kind, in_order, parse_condition
+from robomme_interference_data.schema.conditions import (
+    Condition,
+    ConditionKind,
+    in_order,
+    parse_condition,
+)
 from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.viz.figure import INK
 
@@ -101,11 +106,11 @@ class Data:
             self.cells[name, cell.condition, cell.part] = cell
 
     @property
-    def kinds(self) -> list[Kind]:
+    def kinds(self) -> list[ConditionKind]:
         """The kinds of its conditions, in the order of tables."""
         return list(dict.fromkeys(condition.kind for condition in self.conditions))
 
-    def of(self, kinds: Container[Kind]) -> Self:
+    def of(self, kinds: Container[ConditionKind]) -> Self:
         """Return the data of some kinds of conditions, at the same places on the x axis."""
         chosen = copy(self)
         chosen.conditions = [each for each in self.conditions if each.kind in kinds]

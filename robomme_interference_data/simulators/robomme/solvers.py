@@ -41,7 +41,7 @@ class _Handing:
         return result
 
 
-class Script:
+class SolverScript:
     """The actions of RoboMME's solvers in one live episode.
 
     Args:
@@ -52,7 +52,7 @@ class Script:
     def __init__(self, env: Any, steps: Any) -> None:
         self._env, self._steps = _Handing(env), steps
         self._planner: Any = None  # one, because it knows if the gripper holds something
-        self._run: _Run | None = None
+        self._run: _SolverThread | None = None
         self._text: str | None = None  # of the subgoal that is followed
         self._next: tuple[str, list[list[int]]] | None = None
 
@@ -94,7 +94,7 @@ class Script:
         joints = self._env.unwrapped.agent.robot.qpos[0]
         return [*map(float, joints[:7]), 1.0]
 
-    def _start(self, steps: Any) -> "_Run":
+    def _start(self, steps: Any) -> "_SolverThread":
         solvers = importlib.import_module("robomme.robomme_env.utils.subgoal_planner_func")
         planner = self._planner = self._planner or _planner(self._env, stick=self._steps.stick)
 
@@ -102,7 +102,7 @@ class Script:
             for name, arguments in steps:
                 getattr(solvers, name)(self._env, planner, **arguments)
 
-        return _Run(self._env, solve)
+        return _SolverThread(self._env, solve)
 
     def stepped(self, result: Any) -> None:
         """Keep what the environment returned for the last action, for the solvers."""
@@ -115,7 +115,7 @@ class Script:
             self._run.close()
 
 
-class _Run:
+class _SolverThread:
     """Solvers in a thread.
 
     Attributes:
@@ -130,7 +130,7 @@ class _Run:
         self._thread.start()
 
     def act(self) -> list[float]:
-        """Return the next action; see `Script.act`."""
+        """Return the next action; see `SolverScript.act`."""
         if self._last is not None:
             if self.done or self.result is None:
                 return self._last

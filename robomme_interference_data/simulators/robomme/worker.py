@@ -144,7 +144,7 @@ class Episodes:
             facts["scene"] = _facts.read_facts(self._env, family, _steps.pixel)
             arrays["moments"] = log.moments(self._env)
             steps = _steps.STEPS[family](self._env.unwrapped)
-            self._script = _solvers.Script(self._env, steps)
+            self._script = _solvers.SolverScript(self._env, steps)
         except Exception as error:
             traceback.print_exc()
             facts |= {"scene": None, "unreadable": _text(error)}
