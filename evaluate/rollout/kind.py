@@ -46,7 +46,6 @@ from robomme_interference_data.evaluate.run.kind import Run, RunKind, retrieval_
 from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
 from robomme_interference_data.evaluate.systems import SystemFacts, name_system
 from robomme_interference_data.runtime.executor import WorkerPool
-from robomme_interference_data.schema.subgoal import ORACLE
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.registry import simulator_class, simulator_versions
 
