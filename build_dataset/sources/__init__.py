@@ -67,7 +67,7 @@ def open_source(specification: str, *, shifted: bool = False, **options: Any) ->
     spec = _parse(specification)
     simulator = spec.arguments.get("name")
     if shifted and not (simulator and simulator_class(simulator).shifts):
-        able = [one for one in SIMULATORS if simulator_class(one).shifts]
+        able = [name for name in SIMULATORS if simulator_class(name).shifts]
         raise InvalidOptionError(
             f"the source {specification} cannot show its episodes under shifts",
             f"Use {' or '.join(able)}, with demonstrations built from it.",
