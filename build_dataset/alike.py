@@ -33,9 +33,9 @@ def in_buffers(features: Mapping[str, tuple[int, ...]], fps: float) -> Look:
     return Look({name: shape for name, shape in features.items() if name != ACTION}, fps)
 
 
-def differences(one: tuple[str, Look], other: tuple[str, Look]) -> list[str]:
+def differences(left: tuple[str, Look], right: tuple[str, Look]) -> list[str]:
     """Return how two looks differ, a clause each; every look comes with the name of its owner."""
-    (first, a), (second, b) = one, other
+    (first, a), (second, b) = left, right
     facts: dict[str, tuple[str | None, str | None]] = {}
     for feature in sorted(a.features.keys() | b.features.keys()):
         title = _title(feature)
@@ -48,7 +48,7 @@ def differences(one: tuple[str, Look], other: tuple[str, Look]) -> list[str]:
     return unequal((first, here), (second, {what: values[1] for what, values in facts.items()}))
 
 
-def differ_in_cameras(one: Look, other: Look) -> bool:
+def differ_in_cameras(left: Look, right: Look) -> bool:
     """Return whether two looks differ in cameras alone, so that a choice of cameras mends it."""
 
     def without_others(look: Look) -> Look:
@@ -56,16 +56,16 @@ def differ_in_cameras(one: Look, other: Look) -> bool:
             name: shape
             for name, shape in look.features.items()
             if not name.startswith(CAMERA_PREFIX)
-            or one.features.get(name) == other.features.get(name)
+            or left.features.get(name) == right.features.get(name)
         }
         return replace(look, features=shared)
 
-    return not differences(("", without_others(one)), ("", without_others(other)))
+    return not differences(("", without_others(left)), ("", without_others(right)))
 
 
-def unequal(one: tuple[str, Mapping[str, Any]], other: tuple[str, Mapping[str, Any]]) -> list[str]:
+def unequal(left: tuple[str, Mapping[str, Any]], right: tuple[str, Mapping[str, Any]]) -> list[str]:
     """Return which facts differ, a clause each; every map of facts comes with its owner's name."""
-    (first, here), (second, there) = one, other
+    (first, here), (second, there) = left, right
     return [
         f"{what}: {_shown(here, what)} in {first}, {_shown(there, what)} in {second}"
         for what in {**here, **there}
@@ -78,9 +78,9 @@ def _shown(facts: Mapping[str, Any], what: str) -> object:
     return _UNKNOWN if value is None else value
 
 
-def same_rate(one: float, other: float) -> bool:
+def same_rate(left: float, right: float) -> bool:
     """Return whether two frame rates are the same, such as 29.97 and 30000 / 1001."""
-    return math.isclose(one, other, rel_tol=1e-5)
+    return math.isclose(left, right, rel_tol=1e-5)
 
 
 def _title(feature: str) -> str:

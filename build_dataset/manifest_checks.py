@@ -39,11 +39,13 @@ def check_features(datasets: Mapping[str, Dataset]) -> None:
 
 def check_scenes(shifted: Dataset, base: Dataset) -> None:
     """Check that the views under shifts show the scenes of all demonstrations."""
-    sources, expected = ([*one.identity.sources] for one in (shifted, base))
-    views, queries = ({r.episode_id for r in one.records()} for one in (shifted, base))
+    sources, expected = ([*dataset.identity.sources] for dataset in (shifted, base))
+    views, queries = ({r.episode_id for r in dataset.records()} for dataset in (shifted, base))
     problem = f"lacks {min(queries - views)}" if queries - views else ""
     if other := [source for source in sources if source not in expected]:
-        nearest = next((one for one in expected if one["kind"] == other[0]["kind"]), expected[0])
+        nearest = next(
+            (source for source in expected if source["kind"] == other[0]["kind"]), expected[0]
+        )
         found = unequal(("it", other[0]), (f"the {DEMONSTRATIONS}", nearest))
         problem = f"is of another source: {'; '.join(found)}"
     if problem:

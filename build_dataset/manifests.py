@@ -79,11 +79,11 @@ def plan_manifests(
     ordered = in_order(conditions)
     check_needs(ordered, files)
     opened = {}
-    for name, one in files.items():
-        opened[name] = dataset = Dataset(one)
+    for name, dataset_files in files.items():
+        opened[name] = dataset = Dataset(dataset_files)
         if dataset.kind != name:
             raise InvalidOptionError(
-                f"{one.describe()} is a dataset of {dataset.kind}; expected {name}",
+                f"{dataset_files.describe()} is a dataset of {dataset.kind}; expected {name}",
                 f"Move it away, and build the {name} in its place.",
                 f"build BUFFER_SET --only {name} --source KIND:PATH",
             )
@@ -111,10 +111,14 @@ def plan_manifests(
 
 def planned_buffers(plan: ManifestPlan) -> Iterator[BufferManifest]:
     """Yield the manifests of all buffers: queries in canonical order, conditions as planned."""
-    for record in sorted(plan.demonstrations.records(), key=lambda one: one.episode_id.sort_key):
+    for record in sorted(
+        plan.demonstrations.records(), key=lambda record: record.episode_id.sort_key
+    ):
         sessions = QuerySessions(plan.source, record)
         # The largest first: smaller draws are the beginning of it.
-        buffers = {one.name: sessions.buffer(one) for one in reversed(plan.conditions)}
+        buffers = {
+            condition.name: sessions.buffer(condition) for condition in reversed(plan.conditions)
+        }
         for condition in plan.conditions:
             manifest, limit = buffers[condition.name], plan.position_limit
             needed = manifest.history_frames + MAX_STEPS

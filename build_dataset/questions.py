@@ -66,8 +66,8 @@ def write_questions(questions: Sequence[Question], folder: Path) -> Path:
         writing(out) as file,
         pq.ParquetWriter(file, schema, compression="none", write_page_checksum=True) as writer,
     ):
-        for one in questions:  # one row group each: the pictures are already compressed
-            writer.write_table(to_table([one], schema))
+        for question in questions:  # one row group each: the pictures are already compressed
+            writer.write_table(to_table([question], schema))
     header = read_header(folder / MANIFEST_PATH, ManifestHeader)
     write_json(folder / MANIFEST_PATH, to_dict(replace(header, questions=sha256_file(out))))
     return out
@@ -85,18 +85,21 @@ def _planned(query: Query, revision: str) -> tuple[Question, Marks]:
     for number, answer in enumerate(scene.answers):
         numbers.setdefault(scene.choice(answer), number)
     right = scene.choice(scene.own_answer(seed))
-    others = sorted((one for one in numbers if one != right), key=lambda one: _lot(name, "of", one))
+    others = sorted(
+        (choice for choice in numbers if choice != right),
+        key=lambda choice: _lot(name, "of", choice),
+    )
     if len(others) >= _MOST:
         others = others[: _DRAWN - 1]
-    chosen = sorted([right, *others], key=lambda one: _lot(name, "order", one))
-    options = [scene.option(one) for one in chosen]
-    marks = [scene.pixels(one.marks) for one in options]
+    chosen = sorted([right, *others], key=lambda choice: _lot(name, "order", choice))
+    options = [scene.option(choice) for choice in chosen]
+    marks = [scene.pixels(option.marks) for option in options]
     question = Question(
         query.episode_id,
         revision,
         scene.question,
-        tuple(one.words for one in options),
-        tuple(numbers[one] for one in chosen),
+        tuple(option.words for option in options),
+        tuple(numbers[choice] for choice in chosen),
         chosen.index(right),
         tuple(" ".join(f"{y},{x}" for y, x in points) for points in marks),
         picture=b"",

@@ -161,7 +161,7 @@ def merge(
     lists = {name: getattr(merged, name) for name in _LISTS}
     if as_json:
         listed = {
-            name: [{"episode": str(one.episode), "condition": one.condition} for one in items]
+            name: [{"episode": str(item.episode), "condition": item.condition} for item in items]
             for name, items in lists.items()
         }
         print_json({"planned": merged.planned, "rows": len(merged.rows), **listed})

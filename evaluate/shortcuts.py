@@ -74,25 +74,25 @@ def cues_of(buffer_set: BufferSet) -> list[Cues]:
     """
     return [
         Cues(
-            one.episode_id.family,
-            one.record.evidence or (),
-            one.lesson_frames,
-            one.goal,
-            one.frame() if one.dataset.cameras else None,
+            query.episode_id.family,
+            query.record.evidence or (),
+            query.lesson_frames,
+            query.goal,
+            query.frame() if query.dataset.cameras else None,
         )
-        for one in queries_with_evidence(buffer_set)
+        for query in queries_with_evidence(buffer_set)
     ]
 
 
 def shortcuts(episodes: Sequence[Cues]) -> Iterator[Shortcut]:
     """Yield, for each family and each part of its answers, what each cue reveals."""
-    for family in dict.fromkeys(one.family for one in episodes):
-        members = [one for one in episodes if one.family == family]
-        texts = [{span.part: span.text for span in one.evidence} for one in members]
-        if len({len(one) for one in texts}) > 1:
-            yield _measure(family, COUNT, members, [len(one) for one in texts])
-        for part in sorted({part for one in texts for part in one}):
-            have = [at for at, one in enumerate(texts) if part in one]
+    for family in dict.fromkeys(episode.family for episode in episodes):
+        members = [episode for episode in episodes if episode.family == family]
+        texts = [{span.part: span.text for span in episode.evidence} for episode in members]
+        if len({len(answer) for answer in texts}) > 1:
+            yield _measure(family, COUNT, members, [len(answer) for answer in texts])
+        for part in sorted({part for answer in texts for part in answer}):
+            have = [at for at, answer in enumerate(texts) if part in answer]
             values = [texts[at][part] for at in have]
             if len(set(values)) > 1:
                 yield _measure(family, str(part), [members[at] for at in have], values)
@@ -101,13 +101,13 @@ def shortcuts(episodes: Sequence[Cues]) -> Iterator[Shortcut]:
 def _measure(
     family: str, part: str, members: Sequence[Cues], values: Sequence[Hashable]
 ) -> Shortcut:
-    lengths = np.array([[one.length] for one in members], np.float64)
-    views = [one.view for one in members if one.view is not None]
+    lengths = np.array([[episode.length] for episode in members], np.float64)
+    views = [episode.view for episode in members if episode.view is not None]
     seen: int | None = None
     if len(views) == len(members):
         seen = by_nearest(Thumbnail().prepare(np.stack(views)), values)
     frequent = max(Counter(values).values())
-    goals = by_group([one.goal for one in members], values)
+    goals = by_group([episode.goal for episode in members], values)
     return Shortcut(family, part, len(values), frequent, by_nearest(lengths, values), goals, seen)
 
 
@@ -136,7 +136,7 @@ def by_group(groups: Sequence[Hashable], values: Sequence[Hashable]) -> int:
     for at, value in enumerate(values):
         others = [*values[:at], *values[at + 1 :]]
         names = [*groups[:at], *groups[at + 1 :]]
-        same = [one for one, name in zip(others, names, strict=True) if name == groups[at]]
+        same = [other for other, name in zip(others, names, strict=True) if name == groups[at]]
         [(guess, _)] = Counter(same or others).most_common(1)
         right += guess == value
     return right
@@ -157,8 +157,16 @@ def shortcut_table(found: Sequence[Shortcut], title: str) -> Table:
             "live_view": "count",
         },
         [
-            (one.family, one.part, one.queries, one.most_frequent, one.length, one.goal, one.view)
-            for one in found
+            (
+                shortcut.family,
+                shortcut.part,
+                shortcut.queries,
+                shortcut.most_frequent,
+                shortcut.length,
+                shortcut.goal,
+                shortcut.view,
+            )
+            for shortcut in found
         ],
         "right guesses of each part of the answer (count: of how many there are) without the "
         "lesson's frames: always the most frequent value; the value of the other episode nearest "

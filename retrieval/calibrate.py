@@ -87,7 +87,7 @@ class Calibration:
         )
         parts = [title, summary]
         if self.held_out:
-            fitted = [one.threshold for one in self.held_out]
+            fitted = [trial.threshold for trial in self.held_out]
             head = (
                 "Fitted without one family, graded on it: thresholds from "
                 f"{min(fitted):.3f} to {max(fitted):.3f}"
@@ -100,7 +100,7 @@ class Calibration:
             }
             rows = [(t.family, t.threshold, t.purity, t.coverage) for t in self.held_out]
             parts.append(Table("held_out", head, left_out, rows).text())
-        conditions = dict.fromkeys(one.condition for one in self.sweep)
+        conditions = dict.fromkeys(trial.condition for trial in self.sweep)
         columns: Columns = {"threshold": "text"}
         for part in ("purity", "coverage"):
             columns |= {f"{part}_{name}": "rate" for name in conditions}
@@ -125,8 +125,8 @@ def calibrate(
         thresholds: Other thresholds, ascending.
     """
     threshold, high, low = _fit(measured)
-    families = dict.fromkeys(one.episode_id.family for one in measured)
-    conditions = [one.name for one in in_order({one.condition for one in measured})]
+    families = dict.fromkeys(buffer.episode_id.family for buffer in measured)
+    conditions = [buffer.name for buffer in in_order({buffer.condition for buffer in measured})]
     cuts, lowest = _true_cosines(measured)
     return Calibration(
         rule=str(rule),
@@ -151,9 +151,9 @@ def _trial(
     measured: Sequence[Similarities], threshold: float, *, family: str = ALL, condition: str = ALL
 ) -> Trial:
     grades = [
-        grade(one, Rule(threshold=threshold))
-        for one in measured
-        if family in (ALL, one.episode_id.family) and condition in (ALL, one.condition)
+        grade(buffer, Rule(threshold=threshold))
+        for buffer in measured
+        if family in (ALL, buffer.episode_id.family) and condition in (ALL, buffer.condition)
     ]
     purity, coverage = np.array([(g.purity, g.coverage) for g in grades], float).mean(axis=0)
     return Trial(threshold, family, condition, float(purity), float(coverage))
@@ -166,7 +166,7 @@ def _fit(
 
     `without` is a family to leave out: its queries, and its sessions and cuts in other buffers.
     """
-    kept = [one for one in measured if one.episode_id.family != without]
+    kept = [buffer for buffer in measured if buffer.episode_id.family != without]
     cuts, lowest = _true_cosines(kept, without)
     if not cuts or not lowest:
         missing = "cut between sessions" if not cuts else "session of two frames or more"
@@ -184,16 +184,16 @@ def _true_cosines(
     """Return the cosines across true cuts, and the lowest inside each session, both ascending."""
     cuts: dict[Any, float] = {}
     lowest: dict[Any, float] = {}
-    for one in measured:
+    for buffer in measured:
         before: tuple[Any, ...] | None = None
-        for session in one.sessions:
+        for session in buffer.sessions:
             entry = session.entry
             stored = entry.dataset, entry.episode_index, entry.start, entry.stop, entry.repeat
             current = None if session.family == without else stored
             if before and current:
-                cuts[before, current] = float(one.adjacent[session.start - 1])
+                cuts[before, current] = float(buffer.adjacent[session.start - 1])
             if current and len(session) > 1:
-                lowest[current] = float(one.adjacent[session.start : session.stop - 1].min())
+                lowest[current] = float(buffer.adjacent[session.start : session.stop - 1].min())
             before = current
     return sorted(cuts.values()), sorted(lowest.values())
 

@@ -21,13 +21,13 @@ def draw_cells(cells: Sequence[Cell], title: str, out: Path) -> None:
     """Draw purity and coverage by condition: a line per family of one rule, or per rule."""
     rules = dict.fromkeys(cell.rule for cell in cells)
     lines: dict[str, list[Cell]] = {}
-    for cell in sorted(cells, key=lambda one: one.family != ALL):
+    for cell in sorted(cells, key=lambda cell: cell.family != ALL):
         if len(rules) == 1:
             label = "all families" if cell.family == ALL else cell.family
             lines.setdefault(label, []).append(cell)
         elif cell.family == ALL:
             lines.setdefault(cell.rule, []).append(cell)
-    names = [one.name for one in in_order({cell.condition for cell in cells})]
+    names = [condition.name for condition in in_order({cell.condition for cell in cells})]
     with _two_panels(title, out) as panels:
         for axes, share in zip(panels, _SHARES, strict=True):
             for number, (label, line) in enumerate(lines.items()):

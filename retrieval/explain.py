@@ -45,18 +45,18 @@ class Explanation:
 
     def text(self) -> str:
         """Return the explanation in a few lines."""
-        one, method = self.grade, self.grade.rule.partition("/")[0]
+        graded, method = self.grade, self.grade.rule.partition("/")[0]
         score = "" if self.score is None else f", {self.score:.3f}"
-        parts = f"{one.segments} segment{'s' if one.segments > 1 else ''}"
+        parts = f"{graded.segments} segment{'s' if graded.segments > 1 else ''}"
         outside = "all frames are chosen"
         if self.other is not None:
             source = f"frame {self.other} of {self.other_source}"
             outside = f"the closest other frame is {source}, {self.other_cosine:.3f}"
         lesson = frames_text(self.lesson)
         lines = (
-            f"{one.episode_id} under {one.condition}, {self.camera} camera, rule {one.rule}: "
-            f"{one.history_frames} history frames, cut into {parts} where the cosine of "
-            f"adjacent frames is below {one.threshold:.3f}",
+            f"{graded.episode_id} under {graded.condition}, {self.camera} camera, rule "
+            f"{graded.rule}: {graded.history_frames} history frames, cut into {parts} where the "
+            f"cosine of adjacent frames is below {graded.threshold:.3f}",
             f"Chosen: frames {frames_text(self.chosen)}, of {', '.join(self.sessions)}",
             f"Why: {method} takes {METHODS[method]}{score}",
             f"The live image is closest to frame {self.closest} of these, with cosine "
@@ -67,11 +67,11 @@ class Explanation:
 
     def graded(self) -> str:
         """Return purity and coverage of the choice, in words."""
-        one = self.grade
-        if one.coverage is None:
+        graded = self.grade
+        if graded.coverage is None:
             return "the history holds no lesson"
-        false = f"{one.false_sessions} false session{'' if one.false_sessions == 1 else 's'}"
-        return f"purity {percent(one.purity)}, coverage {percent(one.coverage)}, {false}"
+        false = f"{graded.false_sessions} false session{'' if graded.false_sessions == 1 else 's'}"
+        return f"purity {percent(graded.purity)}, coverage {percent(graded.coverage)}, {false}"
 
 
 def frames_text(spans: Sequence[Span]) -> str:
@@ -98,7 +98,7 @@ def explain(
         grade(measured, rule),
         choice.spans,
         max(scores, default=None),
-        tuple(f"{one.role} {one.source}" for one in touched),
+        tuple(f"{session.role} {session.source}" for session in touched),
         closest,
         float(alike[closest]),
         other,

@@ -150,19 +150,19 @@ def cells(grades: Sequence[Grade]) -> Iterator[Cell]:
     The grades are of buffers that hold frames of the lesson; rules and families keep their order.
     """
     groups: dict[tuple[str, str, str], list[Grade]] = {}
-    for one in grades:
-        for family in (one.episode_id.family, ALL):
-            groups.setdefault((one.rule, family, one.condition), []).append(one)
-    rules = dict.fromkeys(one.rule for one in grades)
-    families = [*dict.fromkeys(one.episode_id.family for one in grades), ALL]
-    conditions = [one.name for one in in_order({one.condition for one in grades})]
+    for graded in grades:
+        for family in (graded.episode_id.family, ALL):
+            groups.setdefault((graded.rule, family, graded.condition), []).append(graded)
+    rules = dict.fromkeys(graded.rule for graded in grades)
+    families = [*dict.fromkeys(graded.episode_id.family for graded in grades), ALL]
+    conditions = [graded.name for graded in in_order({graded.condition for graded in grades})]
     for key in product(rules, families, conditions):
         if key in groups:
             yield _cell(*key, groups[key])
 
 
 def _cell(rule: str, family: str, condition: str, grades: Sequence[Grade]) -> Cell:
-    count, hits = len(grades), sum(one.hit for one in grades)
+    count, hits = len(grades), sum(graded.hit for graded in grades)
     means = [(g.purity, g.coverage, g.evidence_kept, g.false_sessions) for g in grades]
     values = np.array(means, float)  # NaN for None
     # One key for all cells: equal values have equal intervals.

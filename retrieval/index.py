@@ -178,7 +178,7 @@ class _EmbedTask:
                 waiting.append(pool.submit(prepare, start))
                 if len(waiting) > 2 * self.threads:  # prepared images are large
                     features.append(self.encoder.features(waiting.popleft().result()))
-            features += [self.encoder.features(one.result()) for one in waiting]
+            features += [self.encoder.features(future.result()) for future in waiting]
         with np.errstate(over="ignore"):  # too large values become infinite, which is an error
             return np.concatenate(features).astype(np.float16)
 

@@ -121,7 +121,9 @@ def _stored(
 ) -> StoredEpisode:
     location = dataset.lerobot.locate(record.episode_index)
     stats = {
-        feature: {name: before_scaling(name, one) for name, one in statistics[feature].items()}
+        feature: {
+            name: before_scaling(name, values) for name, values in statistics[feature].items()
+        }
         for feature in location.videos
     }
     videos = {feature: dataset.files.path(path) for feature, (path, _) in location.videos.items()}

@@ -87,9 +87,9 @@ def identity_of(
         codec=codec,
         cameras=tuple(name.removeprefix(CAMERA_PREFIX) for name in cameras),
         unit=unit.in_dataset(kind)._asdict() if kind in UNITS else None,
-        simulators=tuple(sorted({one.simulator for one in records if one.simulator})),
+        simulators=tuple(sorted({record.simulator for record in records if record.simulator})),
         sources=tuple(sources),
-        counts=Counts(len(records), sum(one.length for one in records), dict(families)),
+        counts=Counts(len(records), sum(record.length for record in records), dict(families)),
         sums=sums,
     )
     return replace(identity, revision=revision_of(identity, info, records))
@@ -130,7 +130,7 @@ class BuildReport:
     @property
     def reasons(self) -> dict[str, str]:
         """Id to reason of the skipped episodes."""
-        return {str(one.episode_id): one.why for one in self.skipped}
+        return {str(episode.episode_id): episode.why for episode in self.skipped}
 
 
 def report_of(identity: DatasetIdentity, skipped: dict[str, str]) -> dict[str, Any]:

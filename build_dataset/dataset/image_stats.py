@@ -86,5 +86,5 @@ def before_scaling(name: str, values: NDArray[Any]) -> tuple[float, ...]:
     for value in values.tolist():
         near = value * 255
         steps = (near, math.nextafter(near, math.inf), math.nextafter(near, -math.inf))
-        scaled.append(next((one for one in steps if one / 255 == value), near))
+        scaled.append(next((step for step in steps if step / 255 == value), near))
     return tuple(scaled)

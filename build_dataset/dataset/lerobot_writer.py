@@ -126,7 +126,9 @@ def _state_rate(path: Path, fps: float) -> None:
 def _declared(features: dict[str, tuple[int, ...]], robot: Robot) -> dict[str, dict[str, Any]]:
     """Return LeRobot's feature table: cameras first, then state and action."""
     declared: dict[str, dict[str, Any]] = {}
-    for name in sorted(features, key=lambda one: (len(features[one]) == 1, one == ACTION, one)):
+    for name in sorted(
+        features, key=lambda feature: (len(features[feature]) == 1, feature == ACTION, feature)
+    ):
         shape = features[name]
         if len(shape) == 1:
             # None is LeRobot's own way to state that names are unknown.

@@ -170,8 +170,8 @@ class StageTask:
             scene=None if start is None else recording.scene,
         )
         stats = {
-            feature: {name: tuple(map(float, values)) for name, values in one.result().items()}
-            for feature, one in writer.stats.items()
+            feature: {name: tuple(map(float, values)) for name, values in images.result().items()}
+            for feature, images in writer.stats.items()
         }
         recording.robot.check_names(writer.features)
         robot = replace(recording.robot, fps=fps)

@@ -45,7 +45,7 @@ SOURCES = Registry(
         ),
         "frames": Kind("frames:FOLDER", f"{__name__}.frames:FramesSource", _LOCATION),
         **{
-            name: Kind(name, f"{__name__}.simulator:SimulatorSource", given={"name": name})
+            name: Kind(name, f"{__name__}.simulator:SimulatorSource", arguments={"name": name})
             for name in SIMULATORS
         },
         "sample": Kind("sample[:FAMILY,…]", f"{__name__}.sample:SampleSource", "(?P<families>.*)"),
@@ -65,9 +65,9 @@ def open_source(specification: str, *, shifted: bool = False, **options: Any) ->
             simulators; other kinds ignore them.
     """
     spec = _parse(specification)
-    simulator = spec.given.get("name")
+    simulator = spec.arguments.get("name")
     if shifted and not (simulator and simulator_class(simulator).shifts):
-        able = [one for one in SIMULATORS if simulator_class(one).shifts]
+        able = [name for name in SIMULATORS if simulator_class(name).shifts]
         raise InvalidOptionError(
             f"the source {specification} cannot show its episodes under shifts",
             f"Use {' or '.join(able)}, with demonstrations built from it.",
@@ -75,7 +75,7 @@ def open_source(specification: str, *, shifted: bool = False, **options: Any) ->
     factory = SOURCES.factory(spec)
     accepted, options = signature_of(factory).parameters, options | {"shifted": shifted}
     known = {name: value for name, value in options.items() if name in accepted}
-    source: Source = factory(**spec.given, **known)
+    source: Source = factory(**spec.arguments, **known)
     return source
 
 
@@ -108,4 +108,4 @@ def _parse(specification: str) -> Spec:
         meant = nearest(module, SOURCES.kinds, more="")
         hint = f"{meant} {error.hint} Other sources: {SOURCES.forms}.".lstrip()
         raise InvalidOptionError(error.message, hint) from error
-    return Spec("tabletop", given={"name": specification})
+    return Spec("tabletop", arguments={"name": specification})

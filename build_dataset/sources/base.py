@@ -198,7 +198,7 @@ def file_state(path: Path) -> tuple[int, int] | None:
     if not path.exists():
         return None
     files = [file.stat() for file in (path.iterdir() if path.is_dir() else [path])]
-    return max((one.st_mtime_ns for one in files), default=0), sum(one.st_size for one in files)
+    return max((file.st_mtime_ns for file in files), default=0), sum(file.st_size for file in files)
 
 
 def demonstration_length(flags: ArrayLike, what: str) -> int:

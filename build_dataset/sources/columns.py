@@ -41,9 +41,9 @@ def find_columns(
     """
     columns = dict(given)
     for name, usual in _USUAL.items():
-        free = [one for one in usual if one in features]
+        free = [column for column in usual if column in features]
         if name in CAMERAS:
-            free = [one for one in free if one not in given.values()]
+            free = [column for column in free if column not in given.values()]
         if name not in given and free:
             columns[name] = free[0]
     for column, feature in features.items():
@@ -104,7 +104,7 @@ def _value_names(feature: Mapping[str, Any]) -> tuple[str, ...] | None:
     names = feature.get("names")
     if isinstance(names, dict) and len(names) == 1:  # older datasets: {"motors": [...]}
         [names] = names.values()
-    if not isinstance(names, list) or not all(isinstance(one, str) for one in names):
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         return None
     return tuple(names) if len(set(names)) == len(names) == feature["shape"][0] else None
 

@@ -76,7 +76,7 @@ def read_families(path: Path, count: int) -> list[dict[str, Any]]:
             if len(cells) != len(header):
                 raise ValueError(f"{where} has {len(cells)} values; expected {len(header)}")
             row: dict[str, Any] = dict(zip(header, map(str.strip, cells), strict=True))
-            for name in (one for one in _NUMBERS if one in row):
+            for name in (column for column in _NUMBERS if column in row):
                 row[name] = _number(where, name, row[name])
             episode = row.pop("episode_index")
             if episode in rows:

@@ -50,7 +50,7 @@ def identify(family: str, seeds: dict[int, int | None]) -> dict[int, EpisodeId]:
             votes.append(number - (value - least - scale * known.code) // 100)
     first = 0
     if 0 not in seeds:  # else numbers are indices, regardless of seeds
-        first = max((0, 1), key=lambda one: (votes.count(one), one in seeds))
+        first = max((0, 1), key=lambda number: (votes.count(number), number in seeds))
     return {number: EpisodeId(family, splits[number], number - first) for number in seeds}
 
 
@@ -163,7 +163,7 @@ def _seed(group: h5py.Group) -> int | None:
 
 
 def _subgoal(info: h5py.Group) -> str:
-    name = next((one for one in _SUBGOALS if one in info), None)
+    name = next((key for key in _SUBGOALS if key in info), None)
     return _text(info[name][()]) if name else ""
 
 

@@ -50,7 +50,9 @@ class SampleSource(Source):
             for index in range(count)
         ]
         # An episode's look depends on its family's position.
-        return [SourceEpisode(one, self._families.index(one.family)) for one in sorted(ids)]
+        return [
+            SourceEpisode(episode, self._families.index(episode.family)) for episode in sorted(ids)
+        ]
 
     @override
     def contradict(self, episode: SourceEpisode) -> SourceEpisode:

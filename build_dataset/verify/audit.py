@@ -63,7 +63,11 @@ class Audit:
         columns |= counts
         columns |= {str(position): "count" for position in sorted(positions)}
         mix = [
-            (family, *_usage(used)[:4], *(positions[one][family] for one in sorted(positions)))
+            (
+                family,
+                *_usage(used)[:4],
+                *(positions[position][family] for position in sorted(positions)),
+            )
             for family, used in families.items()
         ]
         return uses, Table(

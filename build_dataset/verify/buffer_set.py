@@ -79,7 +79,7 @@ def verify_buffer_set(
             for path in further_files(folder, ()):
                 yield Violation(f"{name}/{path}", "is not part of the dataset")
     if decode:
-        progress.start("Verifying", sum(_frames(one, copy) for one in datasets.values()))
+        progress.start("Verifying", sum(_frames(dataset, copy) for dataset in datasets.values()))
     for name, dataset in datasets.items():
         units, shown = datasets.get(DISTRACTORS), progress if decode else None
         yield from caught(name, dataset_violations(name, dataset, header, units, shown, copy))
@@ -129,7 +129,7 @@ def _frames(dataset: Dataset, copy: FetchedCopy | None) -> int:
     """Return how many frames of a dataset are decoded."""
     if copy is None:
         return dataset.identity.counts.frames
-    held = (one for one in dataset.records() if copy.holds_all(dataset, one.episode_index))
+    held = (record for record in dataset.records() if copy.holds_all(dataset, record.episode_index))
     return sum(record.length for record in held)
 
 
@@ -146,18 +146,20 @@ def _buffers(buffer_set: BufferSet, datasets: Mapping[str, Dataset]) -> Iterator
 
     Of a partial copy, those are left out that need a dataset which it lacks.
     """
-    header, files = buffer_set.header, {name: one.files for name, one in datasets.items()}
+    header, files = buffer_set.header, {name: dataset.files for name, dataset in datasets.items()}
     if header.rule_version != RULE_VERSION:
         what = f"rule version {header.rule_version}; this package can check {RULE_VERSION}"
         yield Violation(HEADER, what)
         return
     conditions = in_order(header.conditions)
     if buffer_set.copy is not None:
-        conditions = tuple(one for one in conditions if files.keys() >= {*one.kind.needs})
+        conditions = tuple(
+            condition for condition in conditions if files.keys() >= {*condition.kind.needs}
+        )
     plan = plan_manifests(files, conditions, header.seed, header.position_limit)
     counts = {"queries": len(plan.demonstrations), "buffers": 0, "sessions": 0}
     stored: dict[str, dict[str, Any]] = {}
-    left_out = {*header.conditions} - {one.name for one in conditions}
+    left_out = {*header.conditions} - {condition.name for condition in conditions}
     for manifest in buffer_set.planned_manifests():
         if manifest.condition in left_out:
             counts["buffers"] += 1
@@ -190,10 +192,10 @@ def _executions(
     executions: Dataset, demonstrations: Dataset, copy: FetchedCopy | None
 ) -> Iterator[Violation]:
     """Check that executions begin with the query frames of demonstrations, bit for bit."""
-    codecs = [CODECS.get(one.identity.codec) for one in (executions, demonstrations)]
+    codecs = [CODECS.get(dataset.identity.codec) for dataset in (executions, demonstrations)]
     if not all(codec and codec.exact for codec in codecs):
         return
-    queries = {one.episode_id: one.span_sha256 for one in demonstrations.records()}
+    queries = {record.episode_id: record.span_sha256 for record in demonstrations.records()}
     for record in executions.records():
         if copy is not None and not copy.holds_all(executions, record.episode_index):
             continue
@@ -210,17 +212,19 @@ def _questions(buffer_set: BufferSet, *, decode: bool) -> Iterator[Violation]:
     drawn = decode and find_spec("PIL") is not None
     for question, marks in planned_questions(buffer_set):
         where = f"{QUESTIONS_PATH} {question.episode_id}"
-        one = stored.pop(question.episode_id)
-        if (found := replace(one, picture=b"")) != question:
+        kept = stored.pop(question.episode_id)
+        if (found := replace(kept, picture=b"")) != question:
             yield Violation(where, f"is {_difference(to_dict(found), to_dict(question))}")
             continue
         try:
-            shown = decode_image(one.picture)
+            shown = decode_image(kept.picture)
             if drawn and not _is_picture(shown, buffer_set.query(question.episode_id), marks):
                 yield Violation(where, "has a picture of something else")
         except FormatError as error:
             yield Violation(where, error.message)
-    yield from (Violation(f"{QUESTIONS_PATH} {one}", "belongs to no query") for one in stored)
+    yield from (
+        Violation(f"{QUESTIONS_PATH} {episode}", "belongs to no query") for episode in stored
+    )
 
 
 def _is_picture(stored: NDArray[np.uint8], query: Query, marks: Marks) -> bool:
@@ -237,5 +241,5 @@ def _difference(stored: Any, expected: Any) -> str:
         stored, expected, position = stored[index], expected[index], f"{position} at {index}"
     if isinstance(stored, dict) and isinstance(expected, dict):
         keys = [key for key in expected if stored.get(key) != expected[key]]
-        stored, expected = ({key: one.get(key) for key in keys} for one in (stored, expected))
+        stored, expected = ({key: values.get(key) for key in keys} for values in (stored, expected))
     return f"{stored!r}{position}; the rules give {expected!r}"

@@ -93,7 +93,7 @@ MODELS = Registry(
             f"{__package__}.openai:OpenAIModel",
             r"(?P<url>https?://[^#\s]+)#(?P<model>\S+)",
             extra="vlm",
-            no_effect=("connect_s", "response_s", "repeats"),
+            not_in_identity=("connect_s", "response_s", "repeats"),
             valid=_is_endpoint,
         ),
         "transformers": Kind(
@@ -102,7 +102,7 @@ MODELS = Registry(
             r"(?P<path>.+)",
             extra="vlm",
             # Digests identify files, wherever they are.
-            no_effect=("device", "adapter", "model", "revision"),
+            not_in_identity=("device", "adapter", "model", "revision"),
             on_hub=True,
         ),
     },

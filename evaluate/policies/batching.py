@@ -91,7 +91,7 @@ class Batcher[K: Hashable]:
             observations, goals = zip(*requests, strict=True)
             actions, error = attempt(self._policy.act_batch, sessions, observations, goals)
             if error is None and len(actions) == len(keys):
-                return {key: (one, None) for key, one in zip(keys, actions, strict=True)}
+                return {key: (chunk, None) for key, chunk in zip(keys, actions, strict=True)}
             if not self._warned:
                 problem = error or f"it returned {len(actions)} results"
                 logger.warning("A batch of %d is repeated one by one: %s", len(keys), problem)

@@ -138,7 +138,9 @@ class ServerConnection(ABC):
                 warned = True
                 logger.warning(
                     "Waiting until policy server %s answers, for %g s at most: %s",
-                    *(self.name, self._connect_s, reason),
+                    self.name,
+                    self._connect_s,
+                    reason,
                 )
             time.sleep(pause)
             pause = min(2 * pause, longest)

@@ -61,25 +61,26 @@ def describe_policy(
         with closing(make_policy(text, options)) as policy:
             return policy, {}
     with redirect_stdout(sys.stderr):  # stdout is for the rows
-        policies, every = [], []
+        policies, reports = [], []
         for worker in range(len(server_addresses(text)) or 1):
             policies.append(make_policy(text, options, worker=worker))
             with closing(policies[-1]):
-                every.append(policy_metadata(text, policies[-1]))
-    policy, metadata = policies[0], dict(every[0])
+                reports.append(policy_metadata(text, policies[-1]))
+    policy, metadata = policies[0], dict(reports[0])
     if server_addresses(text):
         # Of a vla-eval server this is known only after its hello.
         if getattr(policy, "one_client", False):
             check_workers(text, workers)
-        check_metadata(every, policy_options(text, options)["checkpoint"])
-        metadata["server"] = ", ".join(one["server"] for one in every)
+        check_metadata(reports, policy_options(text, options)["checkpoint"])
+        metadata["server"] = ", ".join(reported["server"] for reported in reports)
     if policy.privileged:
         metadata["privileged"] = True
         if policy_kind(text).role is Role.OWN:
             logger.warning(
                 "The policy %s is privileged: it gets the simulator under every condition, also "
                 "under %s; run.json records this.",
-                *(text, NO_HISTORY),
+                text,
+                NO_HISTORY,
             )
     return policy, metadata
 
@@ -104,10 +105,10 @@ def policy_metadata(text: str, policy: Policy) -> dict[str, Any]:
     )
 
 
-def check_metadata(every: Sequence[Mapping[str, Any]], checkpoint: str | None) -> None:
+def check_metadata(reports: Sequence[Mapping[str, Any]], checkpoint: str | None) -> None:
     """Check that servers report the same model, and the checkpoint that the user names, if any."""
-    first = every[0]
-    for other in every:
+    first = reports[0]
+    for other in reports:
         if other["server_metadata"] != first["server_metadata"]:
             raise PolicyServerError(
                 f"the policy servers {first['server']} and {other['server']} serve different "
@@ -175,7 +176,7 @@ def policy_identity(
             json.dumps(value)
             values[name] = plain(value)
     return {
-        "policy": spec.kind if POLICIES.kinds[spec.kind].no_effect else text,
+        "policy": spec.kind if POLICIES.kinds[spec.kind].not_in_identity else text,
         "policy_options": POLICIES.identity(spec, values),
         "policy_metadata": POLICIES.identity(spec, metadata),
     }

@@ -40,8 +40,10 @@ _FILES = ("*.json", "*.safetensors", "*.model")
 """What a policy is loaded from: configuration, weights, tokenizers."""
 
 _NEEDED = (
-    *("config.json", "model.safetensors"),
-    *("policy_preprocessor.json", "policy_postprocessor.json"),
+    "config.json",
+    "model.safetensors",
+    "policy_preprocessor.json",
+    "policy_postprocessor.json",
 )
 
 
@@ -102,7 +104,7 @@ class LeRobotPolicy(BatchPolicy):
         session._recent = deque(maxlen=self._steps)
         # A copy of all that the model keeps between calls, whatever its type, but not of tensors.
         weights = (*self._model.parameters(), *self._model.buffers())
-        session._model = copy.deepcopy(self._model, {id(one): one for one in weights})
+        session._model = copy.deepcopy(self._model, {id(tensor): tensor for tensor in weights})
         return session
 
     def reset(self, info: RolloutInfo) -> None:
@@ -122,11 +124,11 @@ class LeRobotPolicy(BatchPolicy):
         """Keep the last few frames as LeRobot's processors take them: images from 0 to 1."""
         for index in range(max(0, len(states) - self._steps), len(states)):
             state = torch.from_numpy(np.array(states[index], np.float32))
-            one: dict[str, Any] = {STATE: state[None]}
+            seen: dict[str, Any] = {STATE: state[None]}
             for camera in self.cameras:
                 pixels = torch.from_numpy(frames[camera][index].copy()).permute(2, 0, 1)
-                one[CAMERA_PREFIX + camera] = (pixels.to(torch.float32) / 255).contiguous()[None]
-            self._recent.append(one)
+                seen[CAMERA_PREFIX + camera] = (pixels.to(torch.float32) / 255).contiguous()[None]
+            self._recent.append(seen)
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return a chunk of actions, `(n, 8) float32`, n at most 16."""
@@ -142,9 +144,9 @@ class LeRobotPolicy(BatchPolicy):
     ) -> list[NDArray[np.float32]]:
         """Return the chunks of several sessions, `(n, 8) float32` each; see the class."""
         batch = None
-        if not (self._draws or self._ensembles or any(one._has_queue for one in sessions)):
+        if not (self._draws or self._ensembles or any(session._has_queue for session in sessions)):
             pairs = zip(sessions, goals, strict=True)
-            batch = _stacked([one._processed(goal)[-1] for one, goal in pairs])
+            batch = _stacked([session._processed(goal)[-1] for session, goal in pairs])
         if batch is not None:
             with torch.inference_mode(), self._seeded():
                 before = self._generators()
@@ -152,17 +154,19 @@ class LeRobotPolicy(BatchPolicy):
                 self._draws = not all(map(torch.equal, before, self._generators()))
                 if not self._draws:
                     parts = zip(sessions, chunks.unbind(), strict=True)
-                    actions = [one._finished([*chunk[:, None]]) for one, chunk in parts]
-                    for one in sessions:
-                        one._recent.clear()
+                    actions = [session._finished([*chunk[:, None]]) for session, chunk in parts]
+                    for session in sessions:
+                        session._recent.clear()
                     return actions
         # Each session has its own seed, which a batch could not follow.
-        every = zip(sessions, observations, goals, strict=True)
-        return [session.act(observation, goal) for session, observation, goal in every]
+        return [
+            session.act(observation, goal)
+            for session, observation, goal in zip(sessions, observations, goals, strict=True)
+        ]
 
     def _processed(self, goal: str) -> list[dict[str, Any]]:
         """Return the last observations as the model takes them."""
-        return [self._before(one | {"task": [goal]}) for one in self._recent]
+        return [self._before(seen | {"task": [goal]}) for seen in self._recent]
 
     def _finished(self, chunk: list[torch.Tensor]) -> NDArray[np.float32]:
         """Return the executed part of a chunk, `(n, 8)`, in the units of actions."""
@@ -180,11 +184,11 @@ class LeRobotPolicy(BatchPolicy):
     def _ask(self, earlier: list[dict[str, Any]], last: dict[str, Any]) -> list[torch.Tensor]:
         """Return all actions, `(1, 8)` each, that the policy queues for its last observations."""
         queue = self._model._queues[ACTION]
-        for one in earlier:
+        for processed in earlier:
             queue.clear()
             # The policy predicts only when no action is left: it returns this one.
             queue.append(torch.zeros(1, ACTION_SIZE))
-            self._model.select_action(one)
+            self._model.select_action(processed)
         queue.clear()
         first = self._model.select_action(last)
         rest = list(self._model._queues[ACTION])
@@ -196,10 +200,10 @@ class LeRobotPolicy(BatchPolicy):
         """Whether it averages over the chunks of every step."""
         return getattr(self._config, "temporal_ensemble_coeff", None) is not None
 
-    def _predict(self, one: dict[str, Any]) -> list[torch.Tensor]:
+    def _predict(self, processed: dict[str, Any]) -> list[torch.Tensor]:
         if self._ensembles:
-            return [self._model.select_action(one)]
-        return list(self._chunk(one).unbind(1))
+            return [self._model.select_action(processed)]
+        return list(self._chunk(processed).unbind(1))
 
     def _chunk(self, batch: dict[str, Any]) -> torch.Tensor:
         """Return the actions of B observations, `(B, n, 8)`."""
@@ -246,14 +250,14 @@ def _stacked(items: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     """
     batch: dict[str, Any] = {}
     for name, first in items[0].items():
-        values = [one[name] for one in items]
+        values = [item[name] for item in items]
         if isinstance(first, torch.Tensor):
-            if {one.shape for one in values} != {first.shape}:
+            if {value.shape for value in values} != {first.shape}:
                 return None
             batch[name] = torch.cat(values)
         elif isinstance(first, list):
-            batch[name] = [entry for one in values for entry in one]
-        elif any(one != first for one in values):
+            batch[name] = [entry for value in values for entry in value]
+        elif any(value != first for value in values):
             return None
         else:
             batch[name] = first
@@ -264,7 +268,7 @@ def find_policy(path: str) -> tuple[Path, str]:
     """Return the folder with a policy's files, and its source, on the Hub with the commit."""
     files = locate(path, "model")
     folder, name = files.snapshot(*_FILES), files.location
-    missing = [one for one in _NEEDED if not (folder / one).is_file()]
+    missing = [name for name in _NEEDED if not (folder / name).is_file()]
     if missing:
         raise MissingFileError(
             f"{', '.join(missing)} missing in {name}",

@@ -26,8 +26,8 @@ from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.lazy import load_extra
 from robomme_interference_data.runtime.executor import (
     Resources,
-    Session,
     Worker,
+    WorkerPool,
     make_executor,
     ray_address,
 )
@@ -180,11 +180,11 @@ def _local_processes(config: RunConfig) -> Iterator[Sequence[Address]]:
     folder = Path(tempfile.mkdtemp(prefix="policies-"))  # which other users cannot enter
     key = secrets.token_bytes(_KEY_BYTES)
     addresses = tuple(SocketAddress(folder / str(n), key, n) for n in range(count))
-    with make_executor(replace(config, workers=count)).session(ServePolicy(config)) as session:
+    with make_executor(replace(config, workers=count)).pool(ServePolicy(config)) as pool:
 
         def supervise() -> None:
             try:
-                for outcome in session.run(addresses, attempts=sys.maxsize):
+                for outcome in pool.run(addresses, attempts=sys.maxsize):
                     if outcome.error is not None:
                         failures.append(WorkerError(f"the policy's process ended: {outcome.error}"))
                         break
@@ -202,12 +202,12 @@ def _local_processes(config: RunConfig) -> Iterator[Sequence[Address]]:
             yield addresses
         finally:
             shutil.rmtree(folder, ignore_errors=True)
-            _join(thread, session)
+            _join(thread, pool)
 
 
-def _join(thread: threading.Thread, session: Session) -> None:
+def _join(thread: threading.Thread, pool: WorkerPool) -> None:
     """Wait for processes that end; kill those that do not in time, such as in a long call."""
     thread.join(CLOSE_S)
     while thread.is_alive():
-        session.kill()  # those that replace them find no folder, and end
+        pool.kill()  # those that replace them find no folder, and end
         thread.join(CLOSE_S)

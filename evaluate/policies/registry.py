@@ -29,7 +29,7 @@ def policy_kind(text: str) -> PolicyKind:
 
 def policy_memory(text: str) -> str | None:
     """Return the memory of a policy, such as `framesamp:32`; None if its text has none."""
-    return POLICIES.parse(text).given.get("memory")
+    return POLICIES.parse(text).arguments.get("memory")
 
 
 def server_addresses(text: str) -> tuple[tuple[str, int], ...]:
@@ -102,7 +102,7 @@ def _factory(text: str, worker: int) -> tuple[Factory, dict[str, Any]]:
             check_workers(text, worker + 1)
         host, port = servers[worker % len(servers)]
         return POLICIES.factory(spec), {"host": host, "port": port}
-    return POLICIES.factory(spec), dict(spec.given)
+    return POLICIES.factory(spec), dict(spec.arguments)
 
 
 def check_members(what: str, policy: Any) -> None:
@@ -113,7 +113,7 @@ def check_members(what: str, policy: Any) -> None:
         if kind is bool:
             valid, expected = isinstance(value, bool), "True or False"
         else:
-            valid = isinstance(value, tuple | list) and all(isinstance(one, str) for one in value)
+            valid = isinstance(value, tuple | list) and all(isinstance(name, str) for name in value)
             expected = "a tuple of names of cameras, such as ('front', 'wrist'), or an empty one"
         if not valid:
             wrong.append(f"{name} {value!r}; expected {expected}")

@@ -193,7 +193,7 @@ def _check_policies(config: RunConfig, kind: PolicyKind, policy: Policy) -> None
     ):
         if not valid:
             raise InvalidOptionError.expected(name, getattr(config, name), expected)
-    missing = [f"{one}()" for one in BATCH_METHODS if not callable(getattr(policy, one, None))]
+    missing = [f"{name}()" for name in BATCH_METHODS if not callable(getattr(policy, name, None))]
     fault = None
     if kind.server is not None and kind.server.one_client:
         fault = "its server holds one memory"

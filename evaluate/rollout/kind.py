@@ -45,7 +45,7 @@ from robomme_interference_data.evaluate.run.config import RunConfig, check_unuse
 from robomme_interference_data.evaluate.run.kind import Run, RunKind, retrieval_text, short_digest
 from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
 from robomme_interference_data.evaluate.systems import SystemFacts, name_system
-from robomme_interference_data.runtime.executor import Session
+from robomme_interference_data.runtime.executor import WorkerPool
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.registry import simulator_class, simulator_versions
 
@@ -124,15 +124,15 @@ class Rollouts(RunKind[RunConfig]):
         """Return the function that runs rollouts."""
         return RolloutTask(run, self._answers, self._addresses)
 
-    def needs_session(self, todo: Sequence[WorkItem]) -> bool:
+    def needs_workers(self, todo: Sequence[WorkItem]) -> bool:
         """Whether there is work, or a server that only workers start must be identified."""
         return bool(todo) or starts_server(self.config.policy)
 
-    def open(self, session: Session, todo: Sequence[WorkItem]) -> None:
+    def open(self, pool: WorkerPool, todo: Sequence[WorkItem]) -> None:
         """Let a worker start the policy's server, and the simulator, before the first rollout."""
         config = self.config
         if starts_server(config.policy):
-            self._policy_metadata, keeps = _opened(session, Opening("server"), None)
+            self._policy_metadata, keeps = _opened(pool, Opening("server"), None)
             options = policy_options(config.policy, config.policy_options)
             check_metadata([self._policy_metadata], options["checkpoint"])
             if keeps is not None:
@@ -143,7 +143,7 @@ class Rollouts(RunKind[RunConfig]):
             # Of a function that declares no class nothing is known, not even how it begins.
             tried = simulator.try_out and simulator is not Simulator
             opening = Opening("simulator", todo[0].episode if tried else None)
-            _opened(session, opening, config.simulator_timeout_s)
+            _opened(pool, opening, config.simulator_timeout_s)
             check_servers_memory(config.policy, config.policy_options, self._system)
 
     def identity(self, plan: Plan) -> dict[str, Any]:
@@ -184,8 +184,8 @@ class Offline(Rollouts):
             executions.index_of(episode)  # raises
 
 
-def _opened(session: Session, opening: Opening, time_limit: float | None) -> Any:
-    (outcome,) = session.run([opening], time_limit=time_limit, attempts=1)
+def _opened(pool: WorkerPool, opening: Opening, time_limit: float | None) -> Any:
+    (outcome,) = pool.run([opening], time_limit=time_limit, attempts=1)
     if isinstance(outcome.error, InterferenceError):
         raise outcome.error
     if outcome.error is not None and opening.what == "server":

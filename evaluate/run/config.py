@@ -255,7 +255,7 @@ def check_retrieval(config: RetrievalConfig) -> None:
 
 def check_unused(config: WorkConfig, names: Iterable[str], on: str, hint: str) -> None:
     """Raise an error if one of some settings, which have no effect on a run, is set."""
-    defaults = {one.name: one.default for one in fields(config)}
+    defaults = {field.name: field.default for field in fields(config)}
     for name in names:
         if getattr(config, name) != defaults[name]:
             raise InvalidOptionError(f"{named(name)} has no effect on {on}", hint)

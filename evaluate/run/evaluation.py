@@ -20,7 +20,7 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.runtime.executor import (
     Executor,
     Outcome,
-    Session,
+    WorkerPool,
     end_if_starting,
     make_executor,
 )
@@ -129,11 +129,11 @@ def run_evaluation(
         todo = [item for item in items if item not in existing or not is_done(existing[item])]
         executor = executor or make_executor(config)
         run: Run[Any] = Run(config, kind.system, kind.facts(), buffer_set.name, buffer_set.revision)
-        session: Session | None = None
-        if kind.needs_session(todo):
+        pool: WorkerPool | None = None
+        if kind.needs_workers(todo):
             stack.enter_context(kind.shared())
-            session = stack.enter_context(executor.session(kind.task(run)))
-            kind.open(session, todo)
+            pool = stack.enter_context(executor.pool(kind.task(run)))
+            kind.open(pool, todo)
         identity = run_identity(kind, plan)
         with open_log(folder, identity, buffer_set.name, resume=not config.no_resume) as log:
             log.begin(invocation(kind, plan, command))
@@ -144,7 +144,7 @@ def run_evaluation(
             if config.track is not None:
                 opened = partial(open_tracker, config.track, folder, plain(identity))
                 callbacks.append(stack.enter_context(Tracking(config.track, opened)))
-            return _run_items(run, kind, session, items, log, callbacks)
+            return _run_items(run, kind, pool, items, log, callbacks)
 
 
 def plan_run(kind: RunKind[Any]) -> tuple[Plan, tuple[WorkItem, ...]]:
@@ -183,7 +183,7 @@ def _kind(config: RunConfig | AskConfig, buffer_set: BufferSet) -> RunKind[Any]:
 def _run_items(
     run: Run[Any],
     kind: RunKind[Any],
-    session: Session | None,
+    pool: WorkerPool | None,
     items: Sequence[WorkItem],
     log: RunLog,
     callbacks: Sequence[ProgressCallback],
@@ -196,8 +196,8 @@ def _run_items(
     errors, full = 0, False
     with ExitStack() as stack:
         outcomes: Any = ()
-        if session is not None:
-            outcomes = session.run(
+        if pool is not None:
+            outcomes = pool.run(
                 [Job(one, kind.metadata) for one in shuffle_work(set(items) - done.keys())],
                 time_limit=run.config.rollout_timeout_s,
                 again=(SimulatorCrashError, ServerKeepaliveError, ServerDiedError),

@@ -18,7 +18,7 @@ from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.evaluate.policies.registry import policy_kind
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.retrieval.columns import retrieval_columns
-from robomme_interference_data.runtime.executor import Session, Worker
+from robomme_interference_data.runtime.executor import Worker, WorkerPool
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.rollouts import Status, success_of
 from robomme_interference_data.schema.sampling import (
@@ -255,11 +255,11 @@ class RunKind[C: RunConfig | AskConfig](ABC):
     def task(self, run: Run[C]) -> RunTask[C]:
         """Return the function of the workers."""
 
-    def needs_session(self, todo: Sequence[WorkItem]) -> bool:
+    def needs_workers(self, todo: Sequence[WorkItem]) -> bool:
         """Whether the run needs workers."""
         return bool(todo)
 
-    def open(self, session: Session, todo: Sequence[WorkItem]) -> None:
+    def open(self, pool: WorkerPool, todo: Sequence[WorkItem]) -> None:
         """Let a worker open what the run uses, and check it."""
 
     @abstractmethod

@@ -116,7 +116,7 @@ def _sequential(margin: float, episodes: int, flips: float, levels: Sequence[flo
     steps = generator_of("looks").multinomial(sizes, np.array(chances) / sum(chances))
     counts = steps[..., :2].cumsum(axis=1)
     pairs, place = np.unique(counts.reshape(-1, 2), axis=0, return_inverse=True)
-    ps = np.array([mcnemar(*both)[0] for both in pairs.tolist()])[place].reshape(counts.shape[:2])
+    ps = np.array([mcnemar(*both) for both in pairs.tolist()])[place].reshape(counts.shape[:2])
     return float((ps <= levels).any(axis=1).mean())
 
 

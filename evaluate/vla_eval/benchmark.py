@@ -33,8 +33,21 @@ from .configuration import check_label
 from .observations import ACTION_SPEC, CAMERAS, OBSERVATION_SPEC, ObservingPolicy
 
 SETTINGS = (
-    *("conditions", "families", "episodes", "split", "simulator", "robomme_python", "shift"),
-    *("retrieval", "retrieval_rule", "retrieval_camera", "check_lesson", "model_seed"),
+    # Which rollouts:
+    "conditions",
+    "families",
+    "episodes",
+    "split",
+    "model_seed",
+    # The simulator:
+    "simulator",
+    "robomme_python",
+    "shift",
+    "check_lesson",
+    # The retrieval step:
+    "retrieval",
+    "retrieval_rule",
+    "retrieval_camera",
 )
 """Settings of `evaluate` that the benchmark takes too."""
 
@@ -107,7 +120,7 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
         super().__init__()
         if unknown := sorted({*settings} - {*SETTINGS}):
             raise UnknownNameError.among("setting", unknown[0], "the benchmark", SETTINGS)
-        defaults = {one.name: one.default for one in fields(RunConfig)}
+        defaults = {field.name: field.default for field in fields(RunConfig)}
         chosen = {name: _typed(name, value, defaults[name]) for name, value in settings.items()}
         _typed("buffer_set", buffer_set, "")
         _typed("send_wrist_image", send_wrist_image, False)
@@ -126,7 +139,7 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
         )
         kind = Rollouts(config, opened)
         kind.prepare()
-        with_history = [one for one in config.conditions if one != NO_HISTORY]
+        with_history = [name for name in config.conditions if name != NO_HISTORY]
         if with_history and not send_video_history:
             raise InvalidOptionError(
                 "the server did not ask for histories: its observation_params have no "
@@ -169,9 +182,9 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
     def get_observation_spec(self) -> dict[str, DimSpec]:
         """Return what an observation holds."""
         names = ["language", *(CAMERAS[camera] for camera in self._policy.cameras)]
-        return {
-            name: OBSERVATION_SPEC[name] for name in names + ["state"] * self._policy.sends_state
-        }
+        if self._policy.sends_state:
+            names.append("state")
+        return {name: OBSERVATION_SPEC[name] for name in names}
 
     def reset(self, task: Task) -> ServerObservation:
         """Begin the rollout of an episode; return what the server gets first."""

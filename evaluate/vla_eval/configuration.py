@@ -60,18 +60,22 @@ def configuration(
     groups = defaultdict[int, list[str]](list)
     for group, numbers in plan.episodes.items():
         groups[count_numbers(numbers)].append(group.partition("/")[0])
-    params: dict[str, Any] = {"buffer_set": opened.location, "system": system}
-    params |= {"simulator": simulator, "conditions": [*plan.conditions]}
-    params |= {} if episodes is None else {"episodes": episodes}
-    entries = [
-        {
-            "benchmark": BENCHMARK,
-            **({"subname": f"{count}-episodes"} if len(groups) > 1 else {}),
-            "episodes_per_task": count,
-            "params": params | {"families": names},
-        }
-        for count, names in groups.items()
-    ]
+    params: dict[str, Any] = {
+        "buffer_set": opened.location,
+        "system": system,
+        "simulator": simulator,
+        "conditions": [*plan.conditions],
+    }
+    if episodes is not None:
+        params["episodes"] = episodes
+    entries = []
+    for count, names in groups.items():
+        entry: dict[str, Any] = {"benchmark": BENCHMARK}
+        if len(groups) > 1:  # entries of one benchmark need different names
+            entry["subname"] = f"{count}-episodes"
+        entry["episodes_per_task"] = count
+        entry["params"] = params | {"families": names}
+        entries.append(entry)
     whole = {
         "server": {"url": url, "timeout": _ANSWER_S},
         "output_dir": output_dir,

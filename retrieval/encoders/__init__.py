@@ -104,5 +104,5 @@ def make_encoder(name: str, *, device: str | None = None, batch: int | None = No
         raise InvalidOptionError.expected("batch", batch, "1 or more")
     spec = ENCODERS.parse(name)
     options = {"device": device, "batch": batch} if spec.kind == "siglip" else {}
-    encoder: Encoder = ENCODERS.factory(spec)(**spec.given, **options)
+    encoder: Encoder = ENCODERS.factory(spec)(**spec.arguments, **options)
     return encoder

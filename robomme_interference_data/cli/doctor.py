@@ -110,7 +110,9 @@ def check_packages(extra: str = "") -> Check:
     if not problems and not extra:
         problems = [*_unusable()]
     if not problems:
-        versions = ", ".join(f"{one.name} {metadata.version(one.name)}" for one in required)
+        versions = ", ".join(
+            f"{package.name} {metadata.version(package.name)}" for package in required
+        )
         return Check(name, True, versions)
     if extra:
         if extra in TORCH_EXTRAS and util.find_spec("torch") is None:
@@ -136,7 +138,12 @@ def _requirements(distribution: str, extra: str) -> list[Requirement]:
         return requirement.marker is None or requirement.marker.evaluate({"extra": extra})
 
     requirements = [Requirement(line) for line in metadata.requires(distribution) or ()]
-    return [one for one in requirements if applies(one, extra) and not (extra and applies(one, ""))]
+    return [
+        requirement
+        for requirement in requirements
+        # Those of an extra are asked for alone.
+        if applies(requirement, extra) and (not extra or not applies(requirement, ""))
+    ]
 
 
 def _problems(requirement: Requirement) -> Iterator[str]:

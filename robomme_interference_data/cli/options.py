@@ -106,7 +106,11 @@ def _rare_settings(config: Any) -> type | None:
     """Return a dataclass of the settings without an option of their own; None without any."""
     hints = get_type_hints(config)
     fields: list[Any] = [
-        (field.name, hints[field.name], dataclasses.field(default=field.default))
+        (
+            field.name,
+            hints[field.name],
+            dataclasses.field(default=field.default, metadata=field.metadata),
+        )
         for field in dataclasses.fields(config)
         if SETTING in field.metadata and field.metadata[SETTING]["rare"]
     ]
@@ -114,11 +118,14 @@ def _rare_settings(config: Any) -> type | None:
 
 
 def _set_option(rare: Any) -> inspect.Parameter:
-    names = ", ".join(field.name for field in dataclasses.fields(rare))
+    settings = [
+        f"{field.name}: {with_addresses(field.metadata[SETTING]['help'])}"
+        for field in dataclasses.fields(rare)
+    ]
     option: Any = typer.Option(
         f"--{_SET}",
         metavar="NAME=VALUE",
-        help=f"Rarely used settings: {names}.",
+        help=f"Rarely used settings. {' '.join(settings)}",
         show_default=False,
     )
     annotation = Annotated[list[str], option]

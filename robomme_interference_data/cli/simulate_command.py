@@ -68,7 +68,7 @@ def simulate(
 
     check_shift(simulator, shift)
     supported = simulator_class(simulator)
-    policies = (*(one for one in ("oracle", "guess") if one in supported.policies), NO_POLICY)
+    policies = (*(name for name in ("oracle", "guess") if name in supported.policies), NO_POLICY)
     if policy not in policies:
         raise InvalidOptionError.one_of(f"policy on {simulator}", policy, policies)
     if video is not None and (video.suffix != ".mp4" or video.is_dir()):

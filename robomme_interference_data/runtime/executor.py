@@ -30,7 +30,7 @@ __all__ = [
     "Processes",
     "Resources",
     "Serial",
-    "Session",
+    "WorkerPool",
     "Task",
     "Worker",
     "end_if_starting",
@@ -130,7 +130,7 @@ def own_versions() -> dict[str, str]:
     return {"python": platform.python_version(), package: metadata.version(package)}
 
 
-Session = Scheduler[Any]
+WorkerPool = Scheduler[Any]
 """Workers that keep their copies of a function, and its resources, between runs."""
 
 
@@ -144,7 +144,7 @@ class Executor(ABC):
     workers: int
 
     @abstractmethod
-    def session(self, function: Task) -> AbstractContextManager[Session]:
+    def pool(self, function: Task) -> AbstractContextManager[WorkerPool]:
         """Keep workers for a function in the block, through several runs; then end all workers.
 
         Args:
@@ -169,8 +169,8 @@ class Executor(ABC):
         end_if_starting()
         todo = list(tasks)
         if todo:
-            with self.session(function) as session:
-                yield from session.run(todo, **limits)
+            with self.pool(function) as pool:
+                yield from pool.run(todo, **limits)
 
 
 @dataclass(frozen=True)
@@ -180,8 +180,8 @@ class Serial(Executor):
     workers = 1
 
     @contextmanager
-    def session(self, function: Task) -> Iterator[Session]:
-        """Release the function's resources when the block ends; see `Executor.session`."""
+    def pool(self, function: Task) -> Iterator[WorkerPool]:
+        """Release the function's resources when the block ends; see `Executor.pool`."""
         with closing(_SerialScheduler(function, 1)) as scheduler:
             yield scheduler
 
@@ -240,8 +240,8 @@ class Processes(Executor):
             )
 
     @contextmanager
-    def session(self, function: Task) -> Iterator[Session]:
-        """Keep worker processes in the block; see `Executor.session`."""
+    def pool(self, function: Task) -> Iterator[WorkerPool]:
+        """Keep worker processes in the block; see `Executor.pool`."""
         end_if_starting()
         with closing(ProcessScheduler(function, self.workers)) as scheduler:
             yield scheduler

@@ -132,18 +132,19 @@ class ProcessScheduler(Scheduler[WorkerProcess]):
 
     def wait(self, workers: Sequence[WorkerProcess]) -> Iterable[WorkerProcess]:
         """Wait for outcomes; a worker that died has one, too."""
-        answered = wait([one.pipe for one in workers], timeout=_LOOK_S)
-        for one in workers:
-            one.check_start()
-        return [one for one in workers if one.pipe in answered]
+        answered = wait([worker.pipe for worker in workers], timeout=_LOOK_S)
+        for worker in workers:
+            worker.check_start()
+        return [worker for worker in workers if worker.pipe in answered]
 
     def close(self) -> None:
         """End all worker processes."""
-        for one in self.workers:
-            one.pipe.close()
+        for worker in self.workers:
+            worker.pipe.close()
+        # All release their resources at the same time.
         deadline = time.monotonic() + CLOSE_S
-        for one in self.workers:
-            one.end(max(0.0, deadline - time.monotonic()))
+        for worker in self.workers:
+            worker.end(max(0.0, deadline - time.monotonic()))
 
 
 def _serve(function: Task, pipe: Connection, number: int, home: Path) -> None:

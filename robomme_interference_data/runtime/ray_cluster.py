@@ -28,7 +28,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from robomme_interference_data.errors import InvalidOptionError, WorkerError, first_line
 
-from .executor import Executor, Resources, Session, describe
+from .executor import Executor, Resources, WorkerPool, describe
 from .process import CLOSE_S, START_S, end_if_starting
 from .safe_path import SAFE_PATH, safe_path
 from .scheduler import Scheduler
@@ -78,8 +78,8 @@ class RayWorkers(Executor):
             raise InvalidOptionError.expected("executor", f"ray:{self.address}", expected)
 
     @contextmanager
-    def session(self, function: Task) -> Iterator[Session]:
-        """Keep workers on nodes of a cluster in the block; see `Executor.session`."""
+    def pool(self, function: Task) -> Iterator[WorkerPool]:
+        """Keep workers on nodes of a cluster in the block; see `Executor.pool`."""
         end_if_starting()
         with connected(self.address), closing(_RayScheduler(function, self)) as scheduler:
             yield scheduler

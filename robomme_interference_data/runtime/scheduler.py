@@ -99,7 +99,9 @@ class Scheduler[H: Handle](ABC):
                 for worker in [worker for worker in free if worker.ready][: len(waiting)]:
                     busy[worker] = waiting.popleft()
                     worker.send(busy[worker].task, time_limit)
-                starting = [one for one in self.workers if not one.ready] if waiting else []
+                starting = []
+                if waiting:
+                    starting = [worker for worker in self.workers if not worker.ready]
                 for worker in self.wait([*busy, *starting]):
                     outcome, queued = worker.receive(), busy.pop(worker)
                     if isinstance(outcome.error, WorkerRetiredError):

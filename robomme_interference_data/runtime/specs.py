@@ -39,9 +39,9 @@ class Kind:
         factory: Its factory, `package.module:name`.
         target: Regular expression of the target; its named groups are arguments of the factory.
         default: The target of a spec without one.
-        given: Further arguments of the factory.
+        arguments: Further arguments of the factory.
         extra: The extra that has its libraries.
-        no_effect: Options, and keys of metadata, that change no result.
+        not_in_identity: Options, and keys of metadata, that change no result.
         valid: Further check of the target.
         spelled: The one spelling of a target that has several; it may reject the target.
         on_hub: Whether the target is a folder, or a model on the Hub that `pin` pins.
@@ -51,9 +51,9 @@ class Kind:
     factory: str
     target: str = ""
     default: str = ""
-    given: Mapping[str, Any] = field(default_factory=dict)
+    arguments: Mapping[str, Any] = field(default_factory=dict)
     extra: str = ""
-    no_effect: tuple[str, ...] = ()
+    not_in_identity: tuple[str, ...] = ()
     valid: Callable[[str], bool] = lambda target: True
     spelled: Callable[[str], str] = lambda target: target
     on_hub: bool = False
@@ -65,7 +65,7 @@ class Spec:
 
     kind: str
     target: str = ""
-    given: Mapping[str, Any] = field(default_factory=dict, compare=False)
+    arguments: Mapping[str, Any] = field(default_factory=dict, compare=False)
 
     def __str__(self) -> str:
         return f"{self.kind}:{self.target}" if self.target else self.kind
@@ -97,7 +97,7 @@ class Registry[K: Kind]:
             raise InvalidOptionError.expected(self._what, text, kind.form)
         if kind.spelled(target) != target:
             return self.parse(f"{name}:{kind.spelled(target)}")
-        return Spec(name, target, {**kind.given, **match.groupdict()})
+        return Spec(name, target, {**kind.arguments, **match.groupdict()})
 
     @property
     def forms(self) -> str:
@@ -127,16 +127,16 @@ class Registry[K: Kind]:
         """Return all options, defaults included; see `bind_options`."""
         spec = self.parse(text)
         what = f"{self._what} {text!r}"
-        return bind_options(what, self.factory(spec), spec.given, options, also)
+        return bind_options(what, self.factory(spec), spec.arguments, options, also)
 
     def make(self, text: str, options: Iterable[str] = (), also: Iterable[str] = ()) -> Any:
         """Make what a text and its `NAME=VALUE` options describe; see `bind_options`."""
         spec = self.parse(text)
-        return self.factory(spec)(**spec.given, **self.options(text, options, also))
+        return self.factory(spec)(**spec.arguments, **self.options(text, options, also))
 
     def identity(self, spec: Spec, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return the options, or entries of metadata, that can change a result."""
-        without = self.kinds[spec.kind].no_effect
+        without = self.kinds[spec.kind].not_in_identity
         return {name: value for name, value in sorted(values.items()) if name not in without}
 
 

@@ -159,14 +159,6 @@ def above_chance(rate: float, chance: float) -> float:
     return (rate - chance) / (1 - chance) if chance < 1 else math.nan
 
 
-def cohens_h(rate: float, other: float) -> float:
-    """Return Cohen's effect size 2 arcsin √rate − 2 arcsin √other: 0.2 is small, 0.8 large.
-
-    Source: Cohen (1988), Statistical Power Analysis for the Behavioral Sciences, chapter 6.
-    """
-    return 2 * math.asin(math.sqrt(rate)) - 2 * math.asin(math.sqrt(other))
-
-
 def stratified_n(successes: Floats, trials: Floats, weights: Floats | None = None) -> float:
     """Return the number of independent trials that a weighted rate over fixed strata is worth.
 

@@ -22,32 +22,27 @@ _LATTICE = 27720  # divisible by every number up to 12: exact for means of so ma
 _STEPS = 20  # exact for means of 4 or 5 repeats
 
 
-def mcnemar(gained: int, lost: int) -> tuple[float, float]:
-    """Return the two-sided p-value of the exact McNemar test, and its mid-p.
+def mcnemar(gained: int, lost: int) -> float:
+    """Return the two-sided p-value of the exact McNemar test.
 
     With n = gained + lost discordant pairs and m the smaller count: p = min(1, 2 · P(X ≤ m)) for X
-    ~ Binomial(n, ½), or 1 without such pairs. The exact test is conservative; the less conservative
-    mid-p is p − P(X = m), or 1 if gained = lost.
+    ~ Binomial(n, ½), or 1 without such pairs. The test is conservative.
 
-    Source: McNemar (1947), Psychometrika 12, 153–157; mid-p: Fagerland, Lydersen and Laake (2013),
-    BMC Medical Research Methodology 13, 91.
+    Source: McNemar (1947), Psychometrika 12, 153–157.
     """
     pairs = gained + lost
     ways = total = 1  # to choose i of the pairs, and up to i
     for i in range(min(gained, lost)):
         ways = ways * (pairs - i) // (i + 1)
         total += ways
-    if gained == lost:
-        return 1.0, 1.0
-    return min(1.0, 2 * total / 2**pairs), min(1.0, (2 * total - ways) / 2**pairs)
+    return min(1.0, 2 * total / 2**pairs)
 
 
-def sign_flip(differences: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the two-sided p-value of the exact sign-flip test of paired means, and its mid-p.
+def sign_flip(differences: NDArray[np.float64]) -> float:
+    """Return the two-sided p-value of the exact sign-flip test of paired means.
 
     Of the 2ⁿ ways to assign signs to the n differences, `(E,) float64`, p is the share whose sum is
-    at least as far from 0 as the observed one. The mid-p counts sums that are equally far by half,
-    and is 1 if the observed sum is 0. For single rollouts this is McNemar's exact test.
+    at least as far from 0 as the observed one. For single rollouts this is McNemar's exact test.
 
     The differences are multiples of a common step. If the largest exceeds twenty steps, they are
     rounded to twentieths; the test stays exact for these.
@@ -62,7 +57,7 @@ def sign_flip(differences: NDArray[np.float64]) -> tuple[float, float]:
         steps //= max(1, int(np.gcd.reduce(steps)))
     observed, counts = abs(int(steps.sum())), np.bincount(np.abs(steps))
     if not observed:
-        return 1.0, 1.0
+        return 1.0
     if len(counts) == 2:
         ones = int(counts[1])
         return mcnemar((ones + observed) // 2, (ones - observed) // 2)
@@ -75,7 +70,7 @@ def sign_flip(differences: NDArray[np.float64]) -> tuple[float, float]:
     # The number of sums that are `observed` or more.
     last = (len(chances) - 1 - observed) // 2 + 1
     tail = chances[len(chances) - last :]
-    return min(1.0, 2 * float(tail.sum())), min(1.0, float(2 * tail.sum() - tail[0]))
+    return min(1.0, 2 * float(tail.sum()))
 
 
 @lru_cache(maxsize=1024)

@@ -109,7 +109,7 @@ def _store(
         values.flush()
         (done / str(episode)).touch()
 
-    progress.start(f"Storing {feature.rpartition('.')[2]} of {dataset.kind}", len(dataset))
+    progress.start(f"{dataset.kind}: {feature.rpartition('.')[2]}", len(dataset))
     progress.advance(len(dataset) - len(missing), before=True)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         try:

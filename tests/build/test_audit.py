@@ -39,7 +39,7 @@ def test_use_by_hand(tmp_path: Path) -> None:
     assert used == {"no-history": [0, 0], "k0": [0, 0], "k1": [1, 2]}
     uses, families = report.tables()
     assert uses.rows[2] == ("k1", 2, 1, 1.5, 2, 0)
-    assert families.rows == (("MoveCube", 1, 1, 1, 1, 1), ("Drawer", 1, 2, 2, 2, 2))
+    assert families.rows == [("MoveCube", 1, 1, 1, 1, 1), ("Drawer", 1, 2, 2, 2, 2)]
     units = json.loads(json.dumps(report.as_dict()))["units"]
     assert units == {"MoveCube/train/0": 1, "Drawer/train/5": 2}
 

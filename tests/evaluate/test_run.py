@@ -192,7 +192,7 @@ def test_a_run_stops_after_max_errors_in_a_row(tmp_path: Path, trouble: Path) ->
 def test_a_run_without_workers_stops_with_the_reason(tmp_path: Path) -> None:
     class Lost(Serial):
         @contextmanager
-        def session(self, function: Any) -> Iterator[Any]:
+        def pool(self, function: Any) -> Iterator[Any]:
             yield self
 
         def run(self, tasks: Any, **_: Any) -> Generator[Outcome]:

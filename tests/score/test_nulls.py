@@ -218,7 +218,7 @@ def looking(levels: tuple[float, ...]) -> float:
     """Share of studies of two equal systems with a finding at any of ten looks."""
     generator = generator_of("looking")
     flips = generator.multinomial(45, [0.1, 0.1, 0.8], (2000, 10))[..., :2].cumsum(axis=1)
-    ps = [[mcnemar(*map(int, both))[0] for both in study] for study in flips]
+    ps = [[mcnemar(*map(int, both)) for both in study] for study in flips]
     return float((np.array(ps) <= levels).any(axis=1).mean())
 
 

@@ -13,6 +13,7 @@ from support.buffer_sets import copy_buffer_set, dataset, stored_frames, stored_
 from support.retrieval import QUIET
 
 from robomme_interference_data.errors import HashMismatchError
+from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.training import frame_store, resize
 from robomme_interference_data.training.frame_store import first_rows, stored_values
 
@@ -44,6 +45,19 @@ def test_all_frames_in_order(size: int | None, tiny_buffers: Path, tmp_path: Pat
         frames = stored_frames("distractors", record.episode_id, "front")
         np.testing.assert_array_equal(values[part], resize(frames, size))
         np.testing.assert_array_equal(states[part], stored_states("distractors", record.episode_id))
+
+
+def test_a_bar_fits_into_a_line(
+    tiny_buffers: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    with WorkProgress(unit="episodes") as progress:
+        stored_values(dataset(tiny_buffers, "demonstrations"), FRONT, tmp_path, 16, progress)
+    [line] = filter(str.strip, capsys.readouterr().err.splitlines())
+    assert line.startswith("demonstrations: front ")
 
 
 def test_what_is_stored_is_not_decoded_again(

@@ -96,7 +96,6 @@ def pair(
     if n == counting(first).sum() == counting(second).sum():
         return _of_single(before, after)
     at = partial(_clusters, first, second)
-    p, _ = sign_flip(after - before)
     if matched is not None:
         first_seeds, second_seeds = zip(*matched, strict=True)
         first, second = first[:, first_seeds], second[:, second_seeds]
@@ -113,7 +112,7 @@ def pair(
         pairs=len(episodes),
         gained=int((new & ~old).sum()),
         lost=int((old & ~new).sum()),
-        p=p,
+        p=sign_flip(after - before),
     )
 
 
@@ -130,7 +129,6 @@ def _of_single(before: Floats, after: Floats) -> Pairs:
     def at(level: float) -> Interval:
         return Interval(change, *newcombe_paired(both, gained, lost, neither, level))
 
-    p, _ = mcnemar(gained, lost)
     return Pairs(
         n=n,
         first=won_before / n,
@@ -140,7 +138,7 @@ def _of_single(before: Floats, after: Floats) -> Pairs:
         pairs=n,
         gained=gained,
         lost=lost,
-        p=p,
+        p=mcnemar(gained, lost),
     )
 
 
