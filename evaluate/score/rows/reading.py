@@ -87,7 +87,8 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
     refusals = [f"{checks.locate(at)}: {reason}" for at, reason in sorted(checks.reasons.items())]
     if refusals and not lenient:
         lines = [f"{counted(len(refusals), 'bad row')}:", *refusals[:_SHOWN]]
-        lines += [f"… and {len(refusals) - _SHOWN:,} more"] * (len(refusals) > _SHOWN)
+        if len(refusals) > _SHOWN:
+            lines.append(f"… and {len(refusals) - _SHOWN:,} more")
         raise FormatError("\n".join(lines), "Correct them, or leave them out with lenient=True.")
     rows = tuple(checks.sound.values())
     cells = {(row.simulator, row.system, row.revision) for row in rows}
@@ -189,8 +190,9 @@ class _Checks:
         for locations in [group for group in groups.values() if len(group) > 1]:
             first, *others = locations
             contradicted = len({self.sound[at].status for at in locations}) > 1
-            reason = "the same rollout as {}" + "; its rows contradict each other" * contradicted
+            reason = "the same rollout as {}"
             if contradicted:
+                reason += "; its rows contradict each other"
                 self._refuse([(first, reason.format(self.locate(others[0])))])
             self._refuse((at, reason.format(self.locate(first))) for at in others)
 
