@@ -34,7 +34,8 @@ from robomme_interference_data.cards.publish import (
     publish_buffer_set,
 )
 from robomme_interference_data.cards.publisher import Publisher
-from robomme_interference_data.data.fetch import FetchConfig, fetch, plan_fetch
+from robomme_interference_data.data.fetch import fetch
+from robomme_interference_data.data.fetch_plan import FetchConfig, plan_fetch
 
 CONDITIONS = ("k0", "k1", "k3", "k7")
 REAL, WHOLE, PLAIN = "someone/real", "someone/whole", "someone/plain"

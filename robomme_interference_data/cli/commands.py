@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from robomme_interference_data.data.fetch import FetchConfig
+from robomme_interference_data.data.fetch_plan import FetchConfig
 from robomme_interference_data.errors import counted
 
 from .console import check_output, echo, graceful_interrupt, print_json, print_status
@@ -112,7 +112,7 @@ def fetch(
     ```
     """
     from robomme_interference_data.data.fetch import fetch as fetch_parts
-    from robomme_interference_data.data.fetch import plan_fetch
+    from robomme_interference_data.data.fetch_plan import plan_fetch
     from robomme_interference_data.data.loading import load_buffer_set
 
     check_output(None if to is None else to.resolve().parent)  # `to` may be an earlier copy

@@ -3,8 +3,13 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from robomme_interference_data.constants import FETCH_RECORD, INFO_PATH, QUESTIONS_PATH
-from robomme_interference_data.errors import MissingFileError
+from robomme_interference_data.constants import (
+    FETCH_RECORD,
+    INFO_PATH,
+    MANIFEST_PATH,
+    QUESTIONS_PATH,
+)
+from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.schema.manifest import BufferManifest, FetchRecord, ManifestHeader
 from robomme_interference_data.storage.files import Files, LocalFiles, read_header
 
@@ -28,6 +33,33 @@ def open_copy(root: Path) -> "FetchedCopy":
 def fetch_command(root: Path, record: FetchRecord) -> str:
     """Return the command that adds all that a copy lacks."""
     return f"fetch {record.location} --to {root}"
+
+
+def earlier_files(to: Path, location: str, header: Path) -> tuple[str, ...]:
+    """Return the files of an earlier copy of a buffer set; check that a folder holds nothing else.
+
+    `location` and `header`, the file of its manifests' header, identify the buffer set.
+    """
+    if not to.exists() or (to.is_dir() and not any(to.iterdir())):
+        return ()
+    record = read_fetch_record(to) if (to / FETCH_RECORD).is_file() else None
+    if record is None:
+        raise InvalidOptionError(
+            f"{to} exists, and is no copy of a buffer set",
+            "Give another folder: fetch NAMESPACE/NAME --to FOLDER.",
+        )
+    existing = to / MANIFEST_PATH
+    if existing.is_file():
+        is_same = existing.read_bytes() == header.read_bytes()
+    else:  # an interrupted copy: the header is moved last
+        is_same = record.location == location
+    if not is_same:
+        raise InvalidOptionError(
+            f"{to} is a copy of {record.location}",
+            "Give another folder, or add to this copy:",
+            fetch_command(to, record),
+        )
+    return record.files
 
 
 class FetchedCopy:
