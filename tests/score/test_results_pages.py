@@ -20,7 +20,8 @@ from robomme_interference_data.evaluate.shortcuts import Cues, Shortcut, shortcu
 from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.schema.shifts import NO_SHIFT
-from robomme_interference_data.simulators.robomme.scenes import OfficialScene, read_scene
+from robomme_interference_data.simulators.robomme.recorded_scene import read_scene
+from robomme_interference_data.simulators.robomme.scenes import OfficialScene
 from robomme_interference_data.stats.intervals import newcombe, wilson
 
 CEILINGS = (RESULTS / "robomme-ceilings.md").read_text(encoding="utf-8")

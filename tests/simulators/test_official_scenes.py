@@ -14,7 +14,8 @@ from robomme_interference_data.build_dataset.questions import planned_questions
 from robomme_interference_data.constants import DEMONSTRATIONS
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.simulators.robomme.scenes import OfficialScene, read_scene
+from robomme_interference_data.simulators.robomme.recorded_scene import read_scene
+from robomme_interference_data.simulators.robomme.scenes import OfficialScene
 
 # What RoboMME 0.1.0 (commit 598e3b4) recorded; `moments` are runs of equal tasks: first step,
 # number of frames, task, whether hidden things are visible.

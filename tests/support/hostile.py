@@ -31,7 +31,7 @@ from robomme_interference_data.data.questions import digest_questions, read_ques
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.evaluate.run.log import read_run
 from robomme_interference_data.evaluate.score.rows.reading import read_rows
-from robomme_interference_data.simulators.robomme.scenes import read_scene
+from robomme_interference_data.simulators.robomme.recorded_scene import read_scene
 from robomme_interference_data.storage.arrays import read_array
 from robomme_interference_data.storage.encode import decode_image
 from robomme_interference_data.storage.files import LocalFiles, read_sums

@@ -6,16 +6,14 @@ of moves, placements and swaps of a lesson are taken as known: nearly all follow
 which policies know.
 """
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
-from functools import cache, lru_cache
+from functools import cache
 from itertools import combinations, pairwise, product
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import FormatError
 from robomme_interference_data.schema.evidence import spans_of_parts
 from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.schema.subgoal import Pixel
@@ -40,10 +38,7 @@ from robomme_interference_data.simulators.scene import (
 _UNRECORDED = ("static", "NO RECORD")
 """Names of tasks in which the robot rests, or that RoboMME does not record."""
 
-# Upper bounds, so that an untrusted scene has no endless number of possible answers.
-_MOST = {"points": 25, "colors": 3, "visits": 4, "swaps": 3}
-_MOST_MOVES = 8  # of a path, or its buttons
-_MOST_SWAPPING = 5  # things where some swap places
+_MOST_SWAPPING = 5  # things where some swap places: an untrusted scene may state any number
 
 
 class Moment(NamedTuple):
@@ -151,7 +146,7 @@ class OfficialSwaps(SwapScene, OfficialScene):
                 yield part
 
 
-class VideoUnmask(UnmaskScene, OfficialScene):
+class OfficialVideoUnmask(UnmaskScene, OfficialScene):
     """Containers over cubes."""
 
     def set_up(self) -> None:
@@ -161,14 +156,14 @@ class VideoUnmask(UnmaskScene, OfficialScene):
         return (0,) if moment.revealed else ()
 
 
-class VideoUnmaskSwap(OfficialSwaps, VideoUnmask):
+class OfficialVideoUnmaskSwap(OfficialSwaps, OfficialVideoUnmask):
     """As `VideoUnmask`, then containers swap places."""
 
     def shown(self, moment: Moment) -> Iterable[int]:
-        return (*VideoUnmask.shown(self, moment), *OfficialSwaps.shown(self, moment))
+        return (*OfficialVideoUnmask.shown(self, moment), *OfficialSwaps.shown(self, moment))
 
 
-class VideoRepick(RepickScene, OfficialSwaps):
+class OfficialVideoRepick(RepickScene, OfficialSwaps):
     """The arm picks one of several cubes, which may then swap places."""
 
     def shown(self, moment: Moment) -> Iterable[int]:
@@ -177,7 +172,7 @@ class VideoRepick(RepickScene, OfficialSwaps):
             yield 0
 
 
-class VideoPlaceButton(PlaceScene, OfficialSwaps):
+class OfficialVideoPlaceButton(PlaceScene, OfficialSwaps):
     """The cube is placed on a target, a button is pressed, it is placed on another one."""
 
     cube = "the cube"
@@ -205,7 +200,7 @@ class VideoPlaceButton(PlaceScene, OfficialSwaps):
                 yield number
 
 
-class VideoPlaceOrder(VideoPlaceButton):
+class OfficialVideoPlaceOrder(OfficialVideoPlaceButton):
     """The cube is placed on two to four targets in sequence."""
 
     def set_up(self) -> None:
@@ -214,7 +209,7 @@ class VideoPlaceOrder(VideoPlaceButton):
         self.times = [f"as the {ordinal} one" for ordinal in ordinals]
 
 
-class MoveCube(MoveScene, OfficialScene):
+class OfficialMoveCube(MoveScene, OfficialScene):
     """The arm moves a cube to the target in one of three manners."""
 
     words: ClassVar = {
@@ -230,7 +225,7 @@ class MoveCube(MoveScene, OfficialScene):
         return (0,) if moment.task in self.tasks_of() else ()
 
 
-class InsertPeg(OfficialScene):
+class OfficialInsertPeg(OfficialScene):
     """The arm picks up one of three pegs by one end, and inserts it from one side of the box."""
 
     question = "Which peg was picked up, by which end, and from which side was it inserted?"
@@ -247,7 +242,7 @@ class InsertPeg(OfficialScene):
         return Option(f"this peg, by the {end} end, from the {side} side", (self.points[peg],))
 
 
-class PatternLock(OfficialScene):
+class OfficialPatternLock(OfficialScene):
     """A path over a grid of buttons; the stick begins the episode above the first one."""
 
     question = "Which path did the stick take over the buttons? Each picture shows one."
@@ -263,7 +258,7 @@ class PatternLock(OfficialScene):
         return tuple(f"moves {_direction(r1 - r0, c1 - c0)}" for (r0, c0), (r1, c1) in moves)
 
 
-class RouteStick(OfficialScene):
+class OfficialRouteStick(OfficialScene):
     """A path past posts: from target to neighboring target, around the post between them.
 
     An answer is the targets, from right to left 0 to 4, and the direction of each move. The stick
@@ -289,46 +284,6 @@ class RouteStick(OfficialScene):
         return Option("; ".join(self.answer_texts(choice)))
 
 
-_SCENES: dict[str, type[OfficialScene]] = {
-    each.__name__: each
-    for each in (
-        VideoRepick,
-        VideoPlaceOrder,
-        VideoPlaceButton,
-        VideoUnmask,
-        VideoUnmaskSwap,
-        MoveCube,
-        InsertPeg,
-        PatternLock,
-        RouteStick,
-    )
-}
-
-
-@lru_cache(8)
-def read_scene(family: str, recorded: str, difficulty: str) -> OfficialScene:
-    """Return the scene that was recorded as JSON.
-
-    Raises:
-        FormatError: The text is not what `facts.py` records of this family.
-    """
-    try:
-        facts = json.loads(recorded)
-        for name, most in _MOST.items():
-            if name in facts and len(facts[name]) > most:
-                raise ValueError(f"{name} has over {most} entries")
-        if _longest(facts["answer"]) > _MOST_MOVES:
-            raise ValueError(f"the answer has over {_MOST_MOVES} entries")
-        scene = _SCENES[family](facts, difficulty)
-        answer = scene.own_answer(0)
-        if answer not in scene.answers:
-            raise ValueError(f"the answer {answer} is not possible")
-        scene.parts(answer)
-    except (ValueError, LookupError, TypeError, ArithmeticError, RecursionError) as error:
-        raise FormatError(f"the recorded scene of {family} is damaged: {error}") from error
-    return scene
-
-
 @cache
 def _swap_series(count: int, swaps: int) -> dict[tuple[Pair, ...], tuple[str, ...]]:
     series = product(combinations(range(count), 2), repeat=swaps)
@@ -340,11 +295,6 @@ def _direction(rows: int, columns: int) -> str:
     along = {1: "forward", -1: "backward"}.get(rows)
     across = {1: "left", -1: "right"}.get(columns)
     return "-".join(word for word in (along, across) if word)
-
-
-def _longest(value: Any) -> int:
-    """Return the length of the longest list in a value of JSON, itself included."""
-    return max([len(value), *map(_longest, value)]) if isinstance(value, list) else 0
 
 
 def _frozen(value: Any) -> Any:

@@ -27,7 +27,8 @@ from robomme_interference_data.simulators.episode import (
 from robomme_interference_data.simulators.tabletop.episodes import episode_ids
 
 from .process import Arrays, Process, find_python, installed_versions
-from .scenes import OfficialScene, read_scene
+from .recorded_scene import read_scene
+from .scenes import OfficialScene
 
 FRAME_SHAPE = (256, 256, 3)
 
