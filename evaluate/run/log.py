@@ -31,7 +31,7 @@ from robomme_interference_data.storage.files import (
 from robomme_interference_data.storage.parquet import writing
 from robomme_interference_data.storage.staging import file_lock
 
-from .plan import Plan, WorkItem
+from .plan import RunPlan, WorkItem
 from .row import Rollout
 
 ERRORS_LOG = "errors.log"
@@ -59,7 +59,7 @@ class Invocation:
 
     command: tuple[str, ...]
     settings: dict[str, Any]
-    plan: Plan
+    plan: RunPlan
     versions: dict[str, str]
     git: str | None
     machine: str
@@ -80,18 +80,18 @@ class RunHeader:
         status: `running`, `complete`, or, if something is missing or broke, `incomplete`.
         planned: Rollouts of all plans together.
         counts: Rows by status.
-        starts: The invocations.
+        invocations: One for each time that the command was started or resumed.
         merged: Names of the folders that a merged run is made of.
     """
 
     format_version: int
     identity: dict[str, Any]
     buffer_set: str
-    plans: tuple[Plan, ...] = ()
+    plans: tuple[RunPlan, ...] = ()
     status: str = "running"
     planned: int = 0
     counts: dict[str, int] = field(default_factory=dict)
-    starts: tuple[Invocation, ...] = ()
+    invocations: tuple[Invocation, ...] = ()
     merged: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -104,7 +104,7 @@ class RunHeader:
         """All planned rollouts, each once, in canonical order."""
         return tuple(sorted({item for plan in self.plans for item in plan.items()}))
 
-    def standing(self, rows: Mapping[WorkItem, Rollout], status: str = "") -> "RunHeader":
+    def with_status(self, rows: Mapping[WorkItem, Rollout], status: str = "") -> "RunHeader":
         """Return the header with status and counts for these rows, over all of its plans."""
         items = self.items
         whole = all(item in rows and is_done(rows[item]) for item in items)
@@ -123,8 +123,8 @@ class RunLog:
         """Record an invocation."""
         plans = self.header.plans
         plans += () if start.plan in plans else (start.plan,)
-        header = replace(self.header, plans=plans, starts=(*self.header.starts, start))
-        self._write_header(header.standing(self.rows, "running"))
+        header = replace(self.header, plans=plans, invocations=(*self.header.invocations, start))
+        self._write_header(header.with_status(self.rows, "running"))
 
     def append(self, row: Rollout, trace: str | None = None) -> None:
         """Write a row to the disk, and the traceback of an error."""
@@ -157,7 +157,7 @@ class RunLog:
             pq.write_table(table, file, compression="zstd")
         with writing(text) as file:
             pa_csv.write_csv(table, file)
-        self._write_header(header.standing(self.rows))
+        self._write_header(header.with_status(self.rows))
 
     def _write_header(self, header: RunHeader) -> None:
         write_json(self.folder / RUN_HEADER, to_dict(header))
@@ -206,7 +206,7 @@ def read_run(folder: Path) -> tuple[RunHeader, dict[WorkItem, Rollout]]:
                 f"{folder} holds no run: {name} is missing", "Give a complete folder of a run."
             )
     header, rows = read_header(folder / RUN_HEADER, RunHeader), read_record(folder)
-    return header.standing(rows), rows
+    return header.with_status(rows), rows
 
 
 def read_record(folder: Path) -> dict[WorkItem, Rollout]:

@@ -36,7 +36,7 @@ _MAX_ROWS = 1 << 20
 
 
 @dataclass(frozen=True)
-class Part:
+class FileColumns:
     """The columns of one file, the line of each row, and why other lines are not rows."""
 
     columns: Mapping[str, Sequence[Any]]
@@ -50,14 +50,16 @@ def find_sources(paths: Sequence[Path]) -> dict[Path, RunHeader | None]:
     In a run's folder the file is the record.
     """
     sources: dict[Path, RunHeader | None] = {}
-    for given in paths:
-        path = given / RUN_RECORD if given.is_dir() else given
+    for path_or_folder in paths:
+        path = path_or_folder
+        if path.is_dir():
+            path = path / RUN_RECORD
         if not path.is_file():
             raise MissingFileError(
                 f"there is no file {path}",
                 "Give folders of runs, .csv, .parquet or .jsonl files, or .json of vla-eval.",
             )
-        if any(path.samefile(other) for other in sources):
+        if any(path.samefile(source) for source in sources):
             raise InvalidOptionError(f"{path} is given twice", "Give each file once.")
         header = path.parent / RUN_HEADER
         of_run = path.name in (RUN_RECORD, *RUN_TABLES) and header.is_file()
@@ -71,7 +73,7 @@ def system_of(path: Path) -> str | None:
     return match[1] if match else None
 
 
-def read_file(path: Path, names: Sequence[str], has_system: bool) -> Part:
+def read_file(path: Path, names: Sequence[str], has_system: bool) -> FileColumns:
     """Read those of the named columns that a file has.
 
     The file must have a column `system` unless the system is known otherwise (`has_system`).
@@ -125,18 +127,18 @@ def _columns(path: Path, table: pa.Table) -> dict[str, list[Any]]:
     return {name: table[name].to_pylist() for name in table.column_names}
 
 
-def _read_parquet(path: Path, names: Sequence[str], has_system: bool) -> Part:
+def _read_parquet(path: Path, names: Sequence[str], has_system: bool) -> FileColumns:
     with open_parquet(path) as file:
         _check_count(file.metadata.num_rows)
         selected = _select(path, file.schema_arrow.names, names, has_system)
         table = read_table(file, path, list(selected.values()))
     columns = _columns(path, table)
-    return Part(
+    return FileColumns(
         {name: columns[column] for name, column in selected.items()}, range(1, len(table) + 1)
     )
 
 
-def _read_csv(path: Path, names: Sequence[str], has_system: bool) -> Part:
+def _read_csv(path: Path, names: Sequence[str], has_system: bool) -> FileColumns:
     text = read_bytes(path, MOST_BYTES).removeprefix(codecs.BOM_UTF8).decode()
     csv.field_size_limit(len(text) + 1)
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
@@ -160,16 +162,16 @@ def _read_csv(path: Path, names: Sequence[str], has_system: bool) -> Part:
         for name, column in selected.items()
         for at in [header.index(column)]
     }
-    return Part(columns, list(rows), malformed)
+    return FileColumns(columns, list(rows), malformed)
 
 
-def _read_record(path: Path, names: Sequence[str], has_system: bool) -> Part:
+def _read_record(path: Path, names: Sequence[str], has_system: bool) -> FileColumns:
     """Read a run's record: every finished row, and of other rollouts the last row.
 
     The types are the schema's; a row object for each line would take ten times as long.
     """
     if not (data := whole_lines(path)):
-        return Part({}, [])
+        return FileColumns({}, [])
     _check_count(data.count(b"\n"))
     fields = [arrow_schema(Rollout).field(name) for name in {*names, *KEY_COLUMNS}]
     columns = _columns(path, _parse_record(path, data, pa.schema(fields)))
@@ -180,7 +182,7 @@ def _read_record(path: Path, names: Sequence[str], has_system: bool) -> Part:
         for at, (key, status) in enumerate(zip(keys, columns["status"], strict=True))
         if status != Status.ERROR or last[key] == at
     ]
-    return Part(
+    return FileColumns(
         {name: [columns[name][at] for at in kept] for name in names}, [at + 1 for at in kept]
     )
 
@@ -217,7 +219,7 @@ def _parse_record(path: Path, data: bytes, schema: pa.Schema) -> pa.Table:
         raise
 
 
-def _read_vla_eval(path: Path, names: Sequence[str], has_system: bool) -> Part:
+def _read_vla_eval(path: Path, names: Sequence[str], has_system: bool) -> FileColumns:
     """Read the results of `vla-eval run` with the benchmark of `evaluate.vla_eval`.
 
     An episode's metrics are a row. One that has a reason of a failure instead is an error: it says
@@ -227,7 +229,7 @@ def _read_vla_eval(path: Path, names: Sequence[str], has_system: bool) -> Part:
     rows: dict[int, list[Any]] = {}
     malformed: dict[int, str] = {}
     try:
-        episodes = [one for task in results["tasks"] for one in task["episodes"]]
+        episodes = [episode for task in results["tasks"] for episode in task["episodes"]]
         _check_count(len(episodes))
         for line, episode in enumerate(episodes, 1):
             row = episode["metrics"]
@@ -246,4 +248,4 @@ def _read_vla_eval(path: Path, names: Sequence[str], has_system: bool) -> Part:
             "Expected a file of `vla-eval run` or `vla-eval export`: see docs/how-to/vla-eval.md.",
         ) from None
     columns = {name: [row[at] for row in rows.values()] for at, name in enumerate(names)}
-    return Part(columns, list(rows), malformed)
+    return FileColumns(columns, list(rows), malformed)
