@@ -14,12 +14,7 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.errors import (
-    InterferenceError,
-    InvalidOptionError,
-    UnknownNameError,
-    named,
-)
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, named
 from robomme_interference_data.evaluate.policies.capabilities import PolicyKind, Role
 from robomme_interference_data.evaluate.policies.policy import BATCH_METHODS, Policy
 from robomme_interference_data.evaluate.policies.registry import (
@@ -28,23 +23,11 @@ from robomme_interference_data.evaluate.policies.registry import (
     policy_memory,
     policy_options,
 )
-from robomme_interference_data.evaluate.run.config import (
-    RunConfig,
-    check_unused,
-    nothing_to_retrieve,
-    with_retrieval,
-)
-from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
-from robomme_interference_data.evaluate.systems import (
-    SYSTEMS,
-    System,
-    SystemFacts,
-    check_history,
-    name_system,
-)
+from robomme_interference_data.evaluate.run.config import RunConfig, check_unused, with_retrieval
+from robomme_interference_data.evaluate.run.plan import RunPlan, WorkItem
+from robomme_interference_data.evaluate.systems import SYSTEMS, System, check_history, name_system
 from robomme_interference_data.retrieval.select import Rule
 from robomme_interference_data.runtime.executor import Resources
-from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.simulators.registry import SIMULATORS, check_shift, simulator_class
 
@@ -264,7 +247,11 @@ def _check_subgoals(config: RunConfig) -> None:
 
 
 def check_plan(
-    config: RunConfig, system: System, buffer_set: BufferSet, plan: Plan, items: Sequence[WorkItem]
+    config: RunConfig,
+    system: System,
+    buffer_set: BufferSet,
+    plan: RunPlan,
+    items: Sequence[WorkItem],
 ) -> None:
     """Check every rollout of a plan."""
     kind, simulator = policy_kind(config.policy), simulator_class(config.simulator)
@@ -301,17 +288,3 @@ def check_plan(
             if WorkItem(name, manifest.episode_id) in planned:
                 longest[name] = max(manifest.history_frames, longest[name])
         check_history(system, longest)
-
-
-def condition_refusal(facts: SystemFacts, condition: str) -> InterferenceError | None:
-    """Return why a condition does not apply to a system, or None."""
-    if facts.applies(condition):
-        return None
-    if condition == NO_HISTORY:
-        return nothing_to_retrieve(
-            f"Run {NO_HISTORY} without {named('retrieval')}: it is the same system there."
-        )
-    return InvalidOptionError(
-        f"the system takes no history, so {condition} has no effect",
-        f"Set {named('conditions')} to {NO_HISTORY}.",
-    )

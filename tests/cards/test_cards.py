@@ -16,10 +16,10 @@ from robomme_interference_data.cards.render import BIBTEX, PAPER, README, card_f
 from robomme_interference_data.cards.tables import columns_of
 from robomme_interference_data.constants import RECORDS_PATH
 from robomme_interference_data.data.questions import Question
+from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.schema.codec import arrow_schema
 from robomme_interference_data.schema.manifest import BufferManifest
 from robomme_interference_data.schema.records import EpisodeRecord
-from robomme_interference_data.schema.rollouts import Rollout
 
 NAMES = ("demonstrations", "buffer_set", "results")
 ROOT = Path(__file__).parents[2]

@@ -250,7 +250,7 @@ def test_the_prompt_and_the_model_identify_the_run(tmp_path: Path) -> None:
                 run_one(tmp_path / "run", **behind(server, **changes))
         with pytest.raises(RunError, match="subgoals"):
             run_one(tmp_path / "run", policy=TOLD)
-    start = header(tmp_path / "run")["starts"][0]
+    start = header(tmp_path / "run")["invocations"][0]
     assert start["policy"]["subgoals"]["model"] == {"model": "tiny"}
 
 

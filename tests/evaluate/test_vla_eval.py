@@ -145,7 +145,7 @@ def test_a_run_resumes_with_the_same_checkpoint_only(tmp_path: Path) -> None:
         assert (identity["policy"], identity["policy_options"]) == (
             *("vla-eval", {"checkpoint": "mine/1"}),
         )
-        (start,) = header(tmp_path / "run")["starts"]
+        (start,) = header(tmp_path / "run")["invocations"]
         assert start["policy"]["server"] == f"127.0.0.1:{port}"
         assert start["versions"]["vla-eval"]
         assert run(tmp_path / "run", policy_options=NAMED, **settings).rows == result.rows

@@ -84,10 +84,10 @@ def test_the_command_may_be_killed_or_stopped_at_any_moment(
         assert running.returncode == 128 + number
         assert "Traceback" not in err and "resume with:\nrobomme-interference evaluate" in err
         assert sum(header["counts"].values()) == len(rows)
-        assert header["starts"][-1]["stopped"] == "interrupted"
+        assert header["invocations"][-1]["stopped"] == "interrupted"
         assert len((out / "rollouts.csv").read_text().splitlines()) == len(rows) + 1
     finish(out)
-    starts = json.loads((out / "run.json").read_text())["starts"]
+    starts = json.loads((out / "run.json").read_text())["invocations"]
     killed = [one == signal.SIGKILL for one in sent]
     assert [one["ended"] is None for one in starts] == [*killed, False]
     assert runs.finished_rows(out) == undisturbed
@@ -162,7 +162,8 @@ def test_servers_that_go_away_cost_no_rollout(tmp_path: Path, monkeypatch: Any) 
     assert 1 <= len(rows) < ROLLOUTS and {row.status for row in rows.values()} == {"fail"}
     header = json.loads((tmp_path / "two" / "run.json").read_text())
     assert (
-        header["status"] == "incomplete" and "cannot be reached" in header["starts"][0]["stopped"]
+        header["status"] == "incomplete"
+        and "cannot be reached" in header["invocations"][0]["stopped"]
     )
     with servers(2) as (_, urls):
         monkeypatch.setenv("SERVERS", urls)

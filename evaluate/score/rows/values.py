@@ -174,10 +174,12 @@ def _check_simulator(text: str) -> None:
 
 
 _CHECKS: dict[str, Callable[[str], object]] = {
-    **{"system": name_system, "condition": parse_condition},
-    **{"shift": parse_shift, "simulator": _check_simulator},
+    "system": name_system,
+    "condition": parse_condition,
+    "shift": parse_shift,
+    "simulator": _check_simulator,
     "family": lambda text: EpisodeId(text, "test", 0),
-    "action_l1_values": lambda text: [_number(one, _LARGEST) for one in text.split()],
+    "action_l1_values": lambda text: [_number(value, _LARGEST) for value in text.split()],
 }
 
 
