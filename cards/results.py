@@ -72,7 +72,7 @@ def results_facts(results: Score | Path) -> Facts:
         split=splits.pop() if len(splits) == 1 else "mixed",
     )
     every = found.all_outcomes
-    systems = dict.fromkeys(name for one in every for name in one.systems)
+    systems = dict.fromkeys(name for outcomes in every for name in outcomes.systems)
     names = list(map(display_name, systems))
     offline = not found.outcomes
     figures = {
@@ -94,7 +94,7 @@ def results_facts(results: Score | Path) -> Facts:
         title="RoboMME-Interference results",
         examples=len(found.rows),
         tables=[rows],
-        simulators=tuple(one.simulator for one in every),
+        simulators=tuple(outcomes.simulator for outcomes in every),
         simulated=not offline,
         limits=_limits(found),
         provenance=_provenance(found, run, file),
@@ -109,9 +109,10 @@ def results_facts(results: Score | Path) -> Facts:
             "headlines": headlines(found),
             "figures": captions,
             "grids": [
-                {"title": one.title, "table": one, "note": Raw(one.note)} for one in found.grids
+                {"title": table.title, "table": table, "note": Raw(table.note)}
+                for table in found.grids
             ],
-            "differences": [{"table": one, "note": Raw(one.note)} for one in differences],
+            "differences": [{"table": table, "note": Raw(table.note)} for table in differences],
             "standing": _standing(found, run),
             "grid": "all recordings in the rows and in the plan of the run"
             if offline
@@ -120,9 +121,9 @@ def results_facts(results: Score | Path) -> Facts:
             "rows": len(found.rows),
             "rows_file": rows.path,
             "statuses": ", ".join(
-                f"{statuses[one]:,} {one}"
-                for one in STATUSES
-                if statuses[one] or (one is Status.MEASURED) is offline
+                f"{statuses[status]:,} {status}"
+                for status in STATUSES
+                if statuses[status] or (status is Status.MEASURED) is offline
             ),
             "refused": found.rows.refused,
         },
@@ -134,7 +135,7 @@ def results_facts(results: Score | Path) -> Facts:
 
 
 def _limits(found: Score) -> list[str]:
-    limits = [origin_limit([one.simulator for one in found.all_outcomes]), *found.notes]
+    limits = [origin_limit([outcomes.simulator for outcomes in found.all_outcomes]), *found.notes]
     what = "success rates" if found.outcomes else "action errors"
     if not all(cell.complete for cell in _whole(found)):
         limits.append(
@@ -265,7 +266,7 @@ def results_content(found: Score, run: Path, config: Publication) -> RepoContent
     with TemporaryDirectory() as name:
         folder = Path(name)
         write_score(found, folder, command=command)
-        for path in sorted(one for one in folder.rglob("*") if one.is_file()):
+        for path in sorted(path for path in folder.rglob("*") if path.is_file()):
             files[f"score/{path.relative_to(folder).as_posix()}"] = LocalFile(path.read_bytes())
     facts = results_facts(found)
 

@@ -53,7 +53,7 @@ class SimulatorSource(Source):
 
     @override
     def episodes(self) -> list[SourceEpisode]:
-        usual, further = self._class.episodes(), self._class.further_episodes()
+        usual, further = self._class.episodes(), self._class.extra_episodes()
         if not usual:
             raise SourceError(
                 f"the simulator {self.name} lists no episodes",

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators import Demonstration, EpisodeInfo, Observation, Simulator
-from robomme_interference_data.simulators.episode import Begun
+from robomme_interference_data.simulators.episode import EpisodeStart
 
 SIDE, CUE, SPEED, REACH = 64, 10, 0.05, 0.12
 COLORS = {
@@ -98,7 +98,7 @@ class LampSimulator(Simulator):
         button = self._env.right if policy == "oracle" else self._guess
         return np.clip((CORNERS[button] - self._env.position) / SPEED, -1, 1)
 
-    def _begin(self, episode: EpisodeId, every: int) -> Begun:
+    def _begin(self, episode: EpisodeId, frame_step: int) -> EpisodeStart:
         family = list(GOALS).index(episode.family)  # no scene occurs twice
         seed = 2000 * family + 1000 * (episode.split == "test") + episode.index
         state, _ = self._env.reset(seed=seed, options={"family": episode.family})
@@ -106,7 +106,7 @@ class LampSimulator(Simulator):
         states, seen, still = [], [], np.zeros(2, np.float32)
         for step in range(CUE):
             states.append(state)
-            if every and step % every == 0:
+            if frame_step and step % frame_step == 0:
                 seen.append(self._images())
             state, *_ = self._env.step(still)
         images = {camera: np.stack([one[camera] for one in seen]) for camera in self._drawn if seen}

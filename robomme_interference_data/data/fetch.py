@@ -335,7 +335,7 @@ def _needed(
     if EXECUTIONS in episodes and (whole or config.executions):
         executions = datasets[EXECUTIONS] = buffer_set.datasets[EXECUTIONS]
         episodes[EXECUTIONS] = {
-            one.episode_index for one in executions.records() if one.episode_id in queries
+            record.episode_index for record in executions.records() if record.episode_id in queries
         }
     return datasets, episodes
 

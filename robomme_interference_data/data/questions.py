@@ -84,9 +84,10 @@ class Question:
 
 def digest_questions(questions: Iterable[Question]) -> str:
     """Return the SHA-256 over all questions, answers and pictures."""
-    ordered = sorted(questions, key=lambda one: one.episode_id)
+    ordered = sorted(questions, key=lambda question: question.episode_id)
     return digest_json(
-        to_dict(one) | {"picture": sha256(one.picture).hexdigest()} for one in ordered
+        to_dict(question) | {"picture": sha256(question.picture).hexdigest()}
+        for question in ordered
     )
 
 
@@ -105,11 +106,11 @@ def read_questions(buffer_set: BufferSet) -> dict[EpisodeId, Question]:
     if sha256_file(path) != buffer_set.header.questions:
         raise FormatError(f"{path} does not have the SHA-256 in {MANIFEST_PATH}", hint, command)
     table = read_table(open_parquet(path), path)
-    questions = {one.episode_id: one for one in from_table(Question, table, path)}
+    questions = {question.episode_id: question for question in from_table(Question, table, path)}
     revision = buffer_set.datasets[DEMONSTRATIONS].identity.revision
     if len(questions) != len(table):
         raise FormatError.damaged(path, "a query has two questions")
-    if any(one.revision != revision for one in questions.values()):
+    if any(question.revision != revision for question in questions.values()):
         raise FormatError(f"{path} has questions for other demonstrations", hint, command)
     if lacking := sorted({*buffer_set.episode_ids} - questions.keys()):
         raise FormatError(f"{path} lacks the question of {lacking[0]}", hint, command)

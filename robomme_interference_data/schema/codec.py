@@ -69,18 +69,18 @@ def _column(field: pa.Field, records: Sequence[Any]) -> pa.Array:
     if not records:
         return pa.array([], field.type)
     if field.name not in _names(records[0]):  # a part of the id
-        return pa.array([getattr(one.episode_id, field.name) for one in records], field.type)
-    values = [getattr(one, field.name) for one in records]
+        return pa.array([getattr(record.episode_id, field.name) for record in records], field.type)
+    values = [getattr(record, field.name) for record in records]
     codec = _codec(get_type_hints(type(records[0]))[field.name])
     if codec.write is None:
         return pa.array(values, field.type)
     if codec.item is None:
-        return pa.array([codec.write(one) for one in values], field.type)
-    listed = [one for value in values for one in value]
-    distinct = {id(one): one for one in listed}
+        return pa.array([codec.write(value) for value in values], field.type)
+    listed = [item for value in values for item in value]
+    distinct = {id(item): item for item in listed}
     position = {key: number for number, key in enumerate(distinct)}
-    converted = [codec.item(one) for one in distinct.values()]
-    order = pa.array([position[id(one)] for one in listed], pa.int64())
+    converted = [codec.item(item) for item in distinct.values()]
+    order = pa.array([position[id(item)] for item in listed], pa.int64())
     items = pa.array(converted, field.type.value_type).take(order)
     offsets = pa.array([0, *accumulate(map(len, values))], pa.int32())
     return pa.ListArray.from_arrays(offsets, items, type=field.type)
@@ -195,12 +195,12 @@ def _map(item: _Converter) -> _Converter:
 
     def checked(value: Any) -> Any:
         items = _of((dict,), value, "a map").items()
-        return {_of((str,), key, "text"): read(one) for key, one in items}
+        return {_of((str,), key, "text"): read(inner) for key, inner in items}
 
     return _Converter(
         lambda keys: pa.struct([pa.field(key, item.arrow(keys), nullable=False) for key in keys]),
         checked,
-        write and (lambda value: {key: write(one) for key, one in value.items()}),
+        write and (lambda value: {key: write(inner) for key, inner in value.items()}),
     )
 
 
@@ -236,8 +236,8 @@ def _record(record: Any) -> _Converter:
     def write(value: Any) -> Any:
         plain = {}
         for name, codec in codecs.items():
-            one = getattr(value, name)
-            plain[name] = one if codec.write is None else codec.write(one)
+            field_value = getattr(value, name)
+            plain[name] = field_value if codec.write is None else codec.write(field_value)
         if identified:
             plain |= {part: getattr(value.episode_id, part) for part in _PARTS}
         return plain

@@ -223,8 +223,8 @@ def parse_condition(text: str | Condition) -> Condition:
 
 def in_order(conditions: Iterable[str | Condition]) -> tuple[Condition, ...]:
     """Return conditions in the order of tables."""
-    ordered = sorted(map(parse_condition, conditions), key=lambda one: one.sort_key)
-    names = [one.name for one in ordered]
+    ordered = sorted(map(parse_condition, conditions), key=lambda condition: condition.sort_key)
+    names = [condition.name for condition in ordered]
     if not ordered or len(set(names)) < len(names):
         raise InvalidOptionError(
             f"conditions {' '.join(names) or '(none)'}; expected at least one, each once",
@@ -235,5 +235,5 @@ def in_order(conditions: Iterable[str | Condition]) -> tuple[Condition, ...]:
 
 def datasets_of(conditions: Iterable[Condition]) -> tuple[str, ...]:
     """Return the names of the datasets that conditions need."""
-    further = {name for one in conditions for name in one.kind.needs}
+    further = {name for condition in conditions for name in condition.kind.needs}
     return tuple(n for n in DATASETS if n in further or n in (DEMONSTRATIONS, DISTRACTORS))

@@ -73,7 +73,7 @@ class UnitPool:
 
         They are consecutive in the family's order; queries start seven units apart.
         """
-        units = [one for one in self._families.get(query.family, []) if one != query]
+        units = [unit for unit in self._families.get(query.family, []) if unit != query]
         if k > len(units):
             raise BuildError(
                 f"{query} needs {k} units of its own family; the pool has {len(units)} "
@@ -141,7 +141,7 @@ def check_units(
         BuildError: It has too few; the message says how many.
     """
     chosen = list(conditions)
-    for query in {one.family: one for one in sorted(queries)}.values():
+    for query in {episode.family: episode for episode in sorted(queries)}.values():
         for condition in chosen:
             condition.sessions(_UnreadSessions(query, pool))
 

@@ -50,11 +50,11 @@ def spans_of_parts(
 
     `parts` has the texts of the parts.
     """
-    frames = [frozenset(one) for one in shown]
+    frames = [frozenset(parts) for parts in shown]
     return tuple(
         EvidenceSpan(part, text, start, stop)
         for part, text in enumerate(parts)
-        for seen, start, stop in _runs(part in one for one in frames)
+        for seen, start, stop in _runs(part in parts for parts in frames)
         if seen
     )
 
@@ -65,7 +65,7 @@ def spans_of_texts(texts: Iterable[str]) -> tuple[EvidenceSpan, ...] | None:
     Empty texts and `static`, which RoboMME writes while the robot rests, are ignored. Returns None
     if no text is left.
     """
-    runs = [run for run in _runs(one.strip() for one in texts) if run[0] not in ("", "static")]
+    runs = [run for run in _runs(text.strip() for text in texts) if run[0] not in ("", "static")]
     spans = (EvidenceSpan(part, *run) for part, run in enumerate(runs))
     return tuple(spans) or None
 
@@ -97,9 +97,11 @@ def evidence_among(evidence: Iterable[Evidence], frames: Sequence[int]) -> tuple
 
     `frames` are indices in the buffer, ascending.
     """
-    ranges = ((bisect_left(frames, one.start), bisect_left(frames, one.stop)) for one in evidence)
+    ranges = (
+        (bisect_left(frames, entry.start), bisect_left(frames, entry.stop)) for entry in evidence
+    )
     shown = zip(evidence, ranges, strict=True)
-    return tuple(replace(one, start=a, stop=b) for one, (a, b) in shown if a < b)
+    return tuple(replace(entry, start=a, stop=b) for entry, (a, b) in shown if a < b)
 
 
 def known_parts(
@@ -111,12 +113,14 @@ def known_parts(
     known if at least `frames` of the kept frames show it.
     """
     counts = Counter[tuple[int, str]]()
-    for one in evidence:
-        counts[one.span.part, one.span.text] += sum(one.start <= frame < one.stop for frame in kept)
+    for entry in evidence:
+        counts[entry.span.part, entry.span.text] += sum(
+            entry.start <= frame < entry.stop for frame in kept
+        )
     texts: dict[int, str] = {}
-    for one in reversed(evidence):
-        if counts[one.span.part, one.span.text] >= frames and one.seen(kept):
-            texts.setdefault(one.span.part, one.span.text)
+    for entry in reversed(evidence):
+        if counts[entry.span.part, entry.span.text] >= frames and entry.seen(kept):
+            texts.setdefault(entry.span.part, entry.span.text)
     return texts
 
 

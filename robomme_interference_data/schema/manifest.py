@@ -89,7 +89,7 @@ def layout_sessions(
     """Return sessions with their frame ranges in a buffer: all, or those of a role."""
     stops = [0, *accumulate(entry.num_frames for entry in entries)]
     sessions = zip(stops, stops[1:], entries, strict=False)
-    return tuple(Session(*one) for one in sessions if role in (None, one[2].role))
+    return tuple(Session(*placed) for placed in sessions if role in (None, placed[2].role))
 
 
 @dataclass(frozen=True)

@@ -115,7 +115,9 @@ def runs(frames: Iterable[int]) -> tuple[tuple[int, int], ...]:
 def lesson_frames(sessions: Iterable[Session], frames: Sequence[int]) -> int:
     """Count the lesson frames among ascending indices of a buffer's frames."""
     lessons = (session for session in sessions if session.role == "lesson")
-    return sum(bisect_left(frames, one.stop) - bisect_left(frames, one.start) for one in lessons)
+    return sum(
+        bisect_left(frames, lesson.stop) - bisect_left(frames, lesson.start) for lesson in lessons
+    )
 
 
 def lesson_share(sessions: Iterable[Session], frames: Sequence[int]) -> float:
@@ -135,10 +137,10 @@ def evidence_kept(evidence: "Iterable[Evidence]", kept: Collection[int]) -> floa
     lessons do not count. `kept` are indices of frames in the buffer.
     """
     seen: dict[object, bool] = {}
-    for one in evidence:
-        if one.session.role != "contradiction":
-            key = one.session.source, one.span
-            seen[key] = seen.get(key, False) or one.seen(kept)
+    for entry in evidence:
+        if entry.session.role != "contradiction":
+            key = entry.session.source, entry.span
+            seen[key] = seen.get(key, False) or entry.seen(kept)
     return sum(seen.values()) / len(seen) if seen else None
 
 

@@ -73,4 +73,4 @@ _PIXELS = re.compile(r"<\s*(?P<y>\d{1,4})\s*,\s*(?P<x>\d{1,4})\s*>")
 def read_grounded(text: str) -> Subgoal:
     """Parse a subgoal with points as `<y, x>` in pixels, as RoboMME writes them."""
     words, numbers = read_points(text, _PIXELS)
-    return Subgoal(words.strip(), tuple((one["y"], one["x"]) for one in numbers))
+    return Subgoal(words.strip(), tuple((point["y"], point["x"]) for point in numbers))

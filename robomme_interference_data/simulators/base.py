@@ -19,7 +19,7 @@ from robomme_interference_data.schema.shifts import Shift
 from robomme_interference_data.schema.subgoal import Subgoal
 
 from .checks import check_begun
-from .episode import ACTION_SIZE, CAMERAS, Begun, Observation, action_array
+from .episode import ACTION_SIZE, CAMERAS, EpisodeStart, Observation, action_array
 from .scene import Scene
 
 SCRIPTED = ("oracle", "guess", "recall", "answer")
@@ -105,7 +105,7 @@ class Simulator(ABC):
         return []
 
     @classmethod
-    def further_episodes(cls) -> list[EpisodeId]:
+    def extra_episodes(cls) -> list[EpisodeId]:
         """Return episodes, in canonical order, that are built only if their numbers are given."""
         return []
 
@@ -153,7 +153,7 @@ class Simulator(ABC):
         """
         raise UnknownNameError(f"the simulator {type(self).__name__} does not support shifts")
 
-    def reset(self, episode_id: str, demonstration: int = True) -> Begun:
+    def reset(self, episode_id: str, demonstration: int = True) -> EpisodeStart:
         """Start an episode: play its demonstration, then set up the live scene.
 
         The same id gives the same frames, states and first observation, bit for bit.
@@ -309,7 +309,7 @@ class Simulator(ABC):
         )
 
     @abstractmethod
-    def _begin(self, episode: EpisodeId, every: int) -> Begun:
+    def _begin(self, episode: EpisodeId, frame_step: int) -> EpisodeStart:
         """Start an episode, and return every n-th frame of its demonstration, none if 0."""
 
     @abstractmethod

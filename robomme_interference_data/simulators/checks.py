@@ -56,10 +56,10 @@ def check_begun(begun: Any, name: str, cameras: Sequence[str], action_size: int)
 
 
 def check_drawn(
-    lesson: Demonstration, first: Observation, cameras: Iterable[str], every: int = 1
+    lesson: Demonstration, first: Observation, cameras: Iterable[str], frame_step: int = 1
 ) -> None:
     """Check that a simulator drew these cameras; every n-th frame of the lesson, or none at all."""
-    expected = len(range(0, len(lesson), every))
+    expected = len(range(0, len(lesson), frame_step))
     for camera in cameras:
         frames = len(lesson.images.get(camera, ())) if lesson.images else expected
         if camera not in first.images or frames != expected:

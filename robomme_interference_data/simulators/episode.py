@@ -89,7 +89,7 @@ class EpisodeInfo:
         return self.goals[0]
 
 
-Begun = tuple[Demonstration, Observation, EpisodeInfo]
+EpisodeStart = tuple[Demonstration, Observation, EpisodeInfo]
 
 
 def choose_cameras(

@@ -123,8 +123,8 @@ def row_paths(
     for _ in range(moves):
         longer = []
         for path in paths:
-            near = [one for one in (path[-1] - 1, path[-1] + 1) if 0 <= one < count]
-            onward = [one for one in near if back or one not in path[-2:-1]] or near
-            longer += [(*path, one) for one in onward]
+            near = [place for place in (path[-1] - 1, path[-1] + 1) if 0 <= place < count]
+            onward = [place for place in near if back or place not in path[-2:-1]] or near
+            longer += [(*path, place) for place in onward]
         paths = longer
     return paths

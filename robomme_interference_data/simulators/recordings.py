@@ -16,7 +16,7 @@ from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.storage.arrays import FeatureDigests
 
 from .base import Simulator
-from .episode import Begun, Demonstration, EpisodeInfo, Observation, choose_cameras
+from .episode import Demonstration, EpisodeInfo, EpisodeStart, Observation, choose_cameras
 
 
 class Recordings(Simulator):
@@ -56,9 +56,11 @@ class Recordings(Simulator):
         weight. The current episode is left out, since a policy cannot know its actions either.
         """
         episodes = self._executions.records()
-        others = [one for one in episodes if one.episode_id != self._current.episode_id]
+        others = [record for record in episodes if record.episode_id != self._current.episode_id]
         others = [
-            one for one in others if one.episode_id.family == self._current.episode_id.family
+            record
+            for record in others
+            if record.episode_id.family == self._current.episode_id.family
         ] or others
         if not others:
             raise SimulatorError(
@@ -66,8 +68,8 @@ class Recordings(Simulator):
                 "others",
                 "Build the executions of more episodes, or run another policy.",
             )
-        total = sum(self._sum_of(one.episode_index) for one in others)
-        return np.asarray(total / sum(one.length for one in others), np.float32)
+        total = sum(self._sum_of(record.episode_index) for record in others)
+        return np.asarray(total / sum(record.length for record in others), np.float32)
 
     def _sum_of(self, index: int) -> NDArray[np.float64]:
         """Return the sum of the recorded actions of an episode, `(A,) float64`."""
@@ -86,7 +88,7 @@ class Recordings(Simulator):
         }
 
     @override
-    def _begin(self, episode: EpisodeId, every: int) -> Begun:
+    def _begin(self, episode: EpisodeId, frame_step: int) -> EpisodeStart:
         query, executions = self._buffer_set.query(episode), self._executions
         index = executions.index_of(episode)
         record = self._current = executions.record(index)

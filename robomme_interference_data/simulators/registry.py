@@ -57,7 +57,9 @@ def make_simulator(name: str, **options: Any) -> Simulator:
             f"simulator {name!r}: making it raised {type(error).__name__}: {error}",
             "".join(traceback.format_exception(type(error), error, trace)).rstrip(),
         ) from error
-    missing = [f"{name}()" for name in _METHODS if not callable(getattr(simulator, name, None))]
+    missing = [
+        f"{method}()" for method in _METHODS if not callable(getattr(simulator, method, None))
+    ]
     if missing:
         raise SimulatorError(
             f"simulator {name!r}: {type(simulator).__name__} has no {', '.join(missing)}",

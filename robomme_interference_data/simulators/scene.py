@@ -129,7 +129,9 @@ class SwapScene(Scene):
         first = len(self.answer_texts(self.answers[0]))
         shown = {part: text for part, text in known.items() if part < first}
         fitting = consistent([*self.possible_swaps().items()], known, first)
-        ends = {final_places(one, swaps) for one in super().agreeing(shown) for swaps in fitting}
+        ends = {
+            final_places(answer, swaps) for answer in super().agreeing(shown) for swaps in fitting
+        }
         return [answer for answer in self.answers if final_places(answer, actual) in ends]
 
 
@@ -145,7 +147,7 @@ def consistent[T](
     for part, text in known.items():
         if part >= first:
             index = slice(part - first, part - first + 1)
-            left = [one for one in left if one[1][index] == (text,)] or left
+            left = [pair for pair in left if pair[1][index] == (text,)] or left
     return [candidate for candidate, _ in left]
 
 

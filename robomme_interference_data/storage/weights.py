@@ -11,7 +11,9 @@ from robomme_interference_data.storage.files import canonical_json, digest_folde
 
 def digest_weights(folder: Path, patterns: Sequence[str]) -> str:
     """Return `digest_folder`, from the cache if sizes and times of the files did not change."""
-    paths = sorted({path for one in patterns for path in folder.rglob(one) if path.is_file()})
+    paths = sorted(
+        {path for pattern in patterns for path in folder.rglob(pattern) if path.is_file()}
+    )
     stats = [(str(path.relative_to(folder)), path.stat()) for path in paths]
     state = [[name, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns] for name, stat in stats]
     key = canonical_json([str(folder.resolve()), state])

@@ -24,8 +24,8 @@ class Weights:
         if isinstance(given, str):
             given = (given,)
         weights = dict(given) if isinstance(given, Mapping) else dict.fromkeys(given, 1.0)
-        numbers = [one for one in weights.values() if isinstance(one, Real)]
-        if len(numbers) < len(weights) or not all(0 < one < math.inf for one in numbers):
+        numbers = [weight for weight in weights.values() if isinstance(weight, Real)]
+        if len(numbers) < len(weights) or not all(0 < weight < math.inf for weight in numbers):
             expected = "a positive weight for each name, such as {'k0': 1, 'k7': 2}"
             raise InvalidOptionError.expected(option, given, expected)
         if not weights:

@@ -101,7 +101,7 @@ def _store(
             raise OSError(error.errno, f"{what}; free space, or set another `store`") from None
         done.mkdir()
     rows = first_rows(dataset)
-    missing = [one for one in range(len(dataset)) if not (done / str(one)).exists()]
+    missing = [episode for episode in range(len(dataset)) if not (done / str(episode)).exists()]
 
     def store(episode: int) -> None:
         target = values[rows[episode] : rows[episode + 1]]
@@ -113,7 +113,7 @@ def _store(
     progress.advance(len(dataset) - len(missing), before=True)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         try:
-            for stored in as_completed([pool.submit(store, one) for one in missing]):
+            for stored in as_completed([pool.submit(store, episode) for episode in missing]):
                 stored.result()
                 progress.advance(1)
         except BaseException:

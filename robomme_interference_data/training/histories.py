@@ -111,17 +111,18 @@ class Histories:
     def _of(self, buffer: Buffer, shift: Shift | None) -> DrawnHistory:
         """Return the history of a buffer's query, as the retrieval step leaves it."""
         rows = buffer.gather(
-            lambda one: (
-                self._rows.first(one.dataset, one.episode_index) + np.arange(one.start, one.stop)
+            lambda session: (
+                self._rows.first(session.dataset, session.episode_index)
+                + np.arange(session.start, session.stop)
             ),
             np.empty(0, np.int64),
         )
         evidence: NDArray[np.bool_] | None = None
         if buffer.evidence is not None:
             evidence = np.zeros((len(rows), self.parts), bool)
-            for one in buffer.evidence:
-                if one.session.role != "contradiction":
-                    evidence[one.start : one.stop, one.span.part] = True
+            for entry in buffer.evidence:
+                if entry.session.role != "contradiction":
+                    evidence[entry.start : entry.stop, entry.span.part] = True
         if self._retrieval is not None and len(rows):
             chosen = self._retrieval.select(self._set, buffer, shift)
             rows, evidence = rows[chosen], evidence if evidence is None else evidence[chosen]

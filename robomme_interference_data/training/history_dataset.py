@@ -143,7 +143,7 @@ class HistoryDataset:
         )  # fmt: skip
         self.memory, self.seed = Memory.parse(memory), seed
         self.chunk = whole_number("chunk", chunk, "an integer from 0", 0)
-        self.cameras = tuple(camera_feature(one) for one in cameras)
+        self.cameras = tuple(camera_feature(camera) for camera in cameras)
         self._conditions = Weights.parse("conditions", conditions)
         self._shifts = Weights.parse("shifts", shifts or {NO_SHIFT: 1})
         self._shift_of = {name: parse_shift(name) for name in self._shifts.names}
@@ -236,11 +236,15 @@ class HistoryDataset:
     def __getitem__(self, index: int | list[int]) -> dict[str, Any]:
         """Return an item, or for a list of indices a batch; see the class."""
         if isinstance(index, list):
-            return self._batch([self._drawn(one) for one in index])
+            return self._batch([self._drawn(number) for number in index])
         batch = self._batch([self._drawn(index)])
         options = batch.pop("question.options", None)
         item = {name: values[0] for name, values in batch.items()}
-        return item if options is None else item | {"question.options": [one for (one,) in options]}
+        return (
+            item
+            if options is None
+            else item | {"question.options": [texts for (texts,) in options]}
+        )
 
     def _drawn(self, index: int) -> _Drawn:
         index = operator.index(index)  # draws depend on its text: a tensor has another
@@ -261,51 +265,53 @@ class HistoryDataset:
         rows, position = np.full(places, PADDING), np.zeros(places, np.int64)
         is_pad = np.ones(places, bool)
         evidence = np.zeros((*places, self._histories.parts), bool)
-        for place, one in enumerate(items):
-            past, shown = one.history.rows, one.history.evidence
-            kept = np.asarray(self.memory.earlier(len(past) + one.moment), np.int64)
+        for place, drawn in enumerate(items):
+            past, shown = drawn.history.rows, drawn.history.evidence
+            kept = np.asarray(self.memory.earlier(len(past) + drawn.moment), np.int64)
             count, ended = len(kept), int(kept.searchsorted(len(past)))
             rows[place, :ended] = past[kept[:ended]]
-            rows[place, ended:count] = kept[ended:] + (self._moments.first[one.number] - len(past))
+            rows[place, ended:count] = kept[ended:] + (
+                self._moments.first[drawn.number] - len(past)
+            )
             position[place, :count], is_pad[place, :count] = kept, False
             if shown is not None:
                 evidence[place, :ended] = shown[kept[:ended]]
-        moment = np.array([one.moment for one in items])
-        numbers = [one.number for one in items]
+        moment = np.array([drawn.moment for drawn in items])
+        numbers = [drawn.number for drawn in items]
         first = self._moments.first[numbers]
-        now = np.array([self._current_row(one) for one in items])
+        now = np.array([self._current_row(drawn) for drawn in items])
         batch: dict[str, Any] = {}
         for name in (*self.cameras, STATE):
             batch[name] = self._rows.take(name, now)
             batch[f"memory.{name.removeprefix('observation.')}"] = self._rows.take(name, rows)
         batch["memory.position"], batch["memory.is_pad"] = position, is_pad
         batch["memory.evidence"] = evidence
-        batch["evidence_known"] = np.array([one.history.evidence is not None for one in items])
-        batch["position"] = moment + [len(one.history.rows) for one in items]
+        batch["evidence_known"] = np.array([drawn.history.evidence is not None for drawn in items])
+        batch["position"] = moment + [len(drawn.history.rows) for drawn in items]
         if self.chunk:
             steps = moment[:, None] + np.arange(self.chunk)
             last = self._moments.actions[numbers][:, None] - 1
             batch[ACTION] = self._rows.take(ACTION, first[:, None] + np.minimum(steps, last))
             batch["action_is_pad"] = steps > last
         batch["frame_index"] = moment
-        batch["index"] = np.array([one.item for one in items])
+        batch["index"] = np.array([drawn.item for drawn in items])
         episodes = [self.episode_ids[number] for number in numbers]
         texts = {
-            "task": [self.buffer_set.query(one).goal for one in episodes],
-            "condition": [one.condition for one in items],
-            "shift": [one.shift for one in items],
-            "episode_id": [str(one) for one in episodes],
+            "task": [self.buffer_set.query(episode).goal for episode in episodes],
+            "condition": [drawn.condition for drawn in items],
+            "shift": [drawn.shift for drawn in items],
+            "episode_id": [str(episode) for episode in episodes],
         }
         if self._questions is not None:
             batch |= self._questions.arrays(numbers)
             texts |= self._questions.texts(numbers)
         return {name: torch.from_numpy(values) for name, values in batch.items()} | texts
 
-    def _current_row(self, one: _Drawn) -> int:
-        shift = self._shift_of[one.shift]
+    def _current_row(self, drawn: _Drawn) -> int:
+        shift = self._shift_of[drawn.shift]
         if shift is None:
-            return int(self._moments.first[one.number]) + one.moment
-        _, stored, frame = shifted_view(self.buffer_set, self.episode_ids[one.number], shift)
+            return int(self._moments.first[drawn.number]) + drawn.moment
+        _, stored, frame = shifted_view(self.buffer_set, self.episode_ids[drawn.number], shift)
         return self._rows.first(SHIFTED, stored) + frame
 
 

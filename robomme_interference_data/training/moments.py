@@ -135,20 +135,21 @@ def choose_moments(
         if buffer_set.holds(live, record.episode_index)
     }
     chosen = tuple(
-        one
-        for one in buffer_set.episode_ids
-        if one.family in (families or known)
-        and (numbers is None or one.index in numbers)
-        and one in recorded
+        episode
+        for episode in buffer_set.episode_ids
+        if episode.family in (families or known)
+        and (numbers is None or episode.index in numbers)
+        and episode in recorded
     )
-    missing = (numbers or frozenset()) - {one.index for one in chosen}
+    missing = (numbers or frozenset()) - {episode.index for episode in chosen}
     if missing or not chosen:
         expected = f"indices of episodes in the {live.kind} of {buffer_set.location}"
         hint = f"They lack {format_numbers(sorted(missing))}." if missing else None
         raise InvalidOptionError.expected("episodes", episodes, expected, hint)
-    records = [recorded[one] for one in chosen]
-    counts = np.array([one.length if actions else 0 for one in records])
+    records = [recorded[episode] for episode in chosen]
+    counts = np.array([record.length if actions else 0 for record in records])
     first = [
-        rows.first(live.kind, one.episode_index) + (one.exec_start_idx or 0) for one in records
+        rows.first(live.kind, record.episode_index) + (record.exec_start_idx or 0)
+        for record in records
     ]
     return Moments(chosen, np.array(first), counts, np.cumsum(np.maximum(counts, 1)))

@@ -19,10 +19,12 @@ class QuestionTensors:
 
     def __init__(self, buffer_set: BufferSet, episodes: Sequence[EpisodeId]):
         questions = read_questions(buffer_set)
-        options = max(len(one.options) for one in questions.values())
-        most = max(1, *(len(points) for one in questions.values() for points in one.pixels))
+        options = max(len(question.options) for question in questions.values())
+        most = max(
+            1, *(len(points) for question in questions.values() for points in question.pixels)
+        )
         shape = buffer_set.query(episodes[0]).dataset.shape()
-        self._questions = [questions[one] for one in episodes]
+        self._questions = [questions[episode] for episode in episodes]
         points = np.zeros((len(episodes), options, most, 2), np.float32)
         point_is_pad = np.ones(points.shape[:3], bool)
         for number, question in enumerate(self._questions):
@@ -32,15 +34,16 @@ class QuestionTensors:
                     shape[:2], np.float32
                 )
                 point_is_pad[number, option, : len(pixels)] = False
-        counts = np.array([len(one.options) for one in self._questions])
+        counts = np.array([len(question.options) for question in self._questions])
         self._arrays = {
             "question.option_is_pad": np.arange(options) >= counts[:, None],
             "question.points": points,
             "question.point_is_pad": point_is_pad,
-            "question.answer": np.array([one.right for one in self._questions]),
+            "question.answer": np.array([question.right for question in self._questions]),
         }
         self._texts = [
-            [*one.options, *[""] * (options - len(one.options))] for one in self._questions
+            [*question.options, *[""] * (options - len(question.options))]
+            for question in self._questions
         ]
 
     def arrays(self, numbers: list[int]) -> dict[str, NDArray[Any]]:
@@ -52,5 +55,5 @@ class QuestionTensors:
         options = zip(*(self._texts[number] for number in numbers), strict=True)
         return {
             "question": [self._questions[number].text for number in numbers],
-            "question.options": [list(one) for one in options],
+            "question.options": [list(texts) for texts in options],
         }

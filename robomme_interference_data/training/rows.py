@@ -57,7 +57,7 @@ class StoredRows:
     def take(self, feature: str, rows: NDArray[np.int64]) -> NDArray[Any]:
         """Return the values of rows, `(*rows.shape, …)`; 0 for `PADDING`."""
         arrays, flat = self._values[feature], rows.ravel()
-        some = next(one for one in arrays if one is not None)
+        some = next(array for array in arrays if array is not None)
         out = np.empty((len(flat), *some.shape[1:]), some.dtype)
         # Run by run of rows of the same dataset; PADDING belongs to none, number -1.
         owner = self._starts.searchsorted(flat, "right") - 1

@@ -74,7 +74,7 @@ def write_page(
         The size of the page in bytes.
     """
     videos: dict[Path, str] = {}
-    places = [_place(buffer_set, one, tuple(live), videos) for one in buffer.sessions]
+    places = [_place(buffer_set, session, tuple(live), videos) for session in buffer.sessions]
     script = resources.files(__package__).joinpath("templates/_buffer.js").read_text("utf-8")
     data = {"fps": buffer.query.dataset.fps, "frames": len(buffer), "sessions": places}
     values = {
@@ -88,12 +88,12 @@ def write_page(
         "evidence": _evidence(buffer, retrieved),
         "retrieved": [
             {
-                "part": one,
-                "runs": runs(one.frames),
-                "chosen": counted(len(one.frames), "frame"),
-                "by_session": Counter(buffer.session_index[list(one.frames)].tolist()),
+                "part": part,
+                "runs": runs(part.frames),
+                "chosen": counted(len(part.frames), "frame"),
+                "by_session": Counter(buffer.session_index[list(part.frames)].tolist()),
             }
-            for one in retrieved
+            for part in retrieved
         ],
         "ticks": range(0, len(buffer), round_step(len(buffer), _TICKS)),
         "live": {camera: _address(png(image)) for camera, image in live.items()},
@@ -149,7 +149,9 @@ def _sample(buffer: "Buffer", camera: str) -> list[dict[str, Any]]:
         {
             "index": index,
             "session": int(numbers[index]),
-            "shows": [one.span.text for one in buffer.evidence or () if one.seen([index])],
+            "shows": [
+                evidence.span.text for evidence in buffer.evidence or () if evidence.seen([index])
+            ],
             "picture": _address(png(_small(buffer.frame(index, camera)))),
         }
         for index in even_sample(len(buffer))[:-1]
@@ -163,11 +165,11 @@ def _evidence(buffer: "Buffer", retrieved: Sequence[RetrievedPart]) -> list[dict
     sample = even_sample(len(buffer))
     return [
         {
-            "span": one,
-            "sampled": one.seen(sample),
-            "retrieved": [one.seen(part.frames) for part in retrieved],
+            "span": evidence,
+            "sampled": evidence.seen(sample),
+            "retrieved": [evidence.seen(part.frames) for part in retrieved],
         }
-        for one in buffer.evidence
+        for evidence in buffer.evidence
     ]
 
 

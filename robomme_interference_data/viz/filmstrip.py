@@ -88,8 +88,8 @@ def round_step(frames: int, most: int) -> int:
 
 def mark_evidence(page: Page, buffer: "Buffer", left: float, scale: float, bottom: float) -> None:
     """Draw a dark line at the bottom of a bar where the buffer's frames show the answer."""
-    for one in buffer.evidence or ():
-        x, width = left + one.start * scale, (one.stop - one.start) * scale
+    for entry in buffer.evidence or ():
+        x, width = left + entry.start * scale, (entry.stop - entry.start) * scale
         page.box(x, bottom - _MARK, width, _MARK, fill=INK, edge="white", line=0.3)
 
 
@@ -174,7 +174,7 @@ def _draw_sessions(page: Page, buffer: "Buffer", camera: str, top: float) -> flo
         _draw_card(page, session, number, colors[number], (x, y, width, height))
         for index, image in zip(indices, images, strict=True):
             page.picture(image, x, y + _BAND, size)
-            if any(one.seen([index]) for one in buffer.evidence or ()):
+            if any(entry.seen([index]) for entry in buffer.evidence or ()):
                 foot = y + _BAND + tall - _MARK
                 page.box(x, foot, size, _MARK, fill=INK, edge="white", line=0.3)
             page.text(x + size / 2, y + _BAND + tall + 0.015, str(index), _NUMBER, color=_GRAY)

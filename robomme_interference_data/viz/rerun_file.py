@@ -46,15 +46,15 @@ def write_recording(buffer: "Buffer", out: Path, live: Mapping[str, NDArray[np.u
                 recording.log("state", rerun.Scalars(chunk.states[place]))
                 recording.log("session", rerun.Scalars(int(chunk.session_index[place])))
                 recording.log("sample", rerun.Scalars(int(index in sample)))
-                shown = any(one.seen([index]) for one in buffer.evidence or ())
+                shown = any(entry.seen([index]) for entry in buffer.evidence or ())
                 recording.log("evidence", rerun.Scalars(int(shown)))
         for number, session in enumerate(buffer.sessions):
             recording.set_time("frame", sequence=session.start)
             text = f"session {number}: {session.role} {session.source}"
             recording.log("text", rerun.TextLog(text))
-        for one in buffer.evidence or ():
-            recording.set_time("frame", sequence=one.start)
-            recording.log("text", rerun.TextLog(f"shows the answer: {one.span.text}"))
+        for entry in buffer.evidence or ():
+            recording.set_time("frame", sequence=entry.start)
+            recording.log("text", rerun.TextLog(f"shows the answer: {entry.span.text}"))
         recording.set_time("frame", sequence=len(buffer))
         for camera, image in live.items():
             recording.log(camera, _image(rerun, image))

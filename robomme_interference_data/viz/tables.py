@@ -59,7 +59,7 @@ class Table:
 
     def _layout(self, left: str, right: str) -> tuple[list[str], list[str], list[list[str]]]:
         """Return the mark of each column's side, the heads, and the rows as text."""
-        sides = [left if one in ("text", "flag") else right for one in self.columns.values()]
+        sides = [left if form in ("text", "flag") else right for form in self.columns.values()]
         heads = [name.replace("_", " ") for name in self.columns]
         return sides, heads, [self.cells(row) for row in self.rows]
 
@@ -235,7 +235,7 @@ def tables_text(tables: Sequence[Table]) -> str:
     return "\n\n".join(table.text() for table in shown)
 
 
-_TEX = {one: f"\\{one}" for one in "&%$#_{}"}
+_TEX = {letter: f"\\{letter}" for letter in "&%$#_{}"}
 _TEX |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 _TEX |= {"−": "$-$", "–": "--", "<": "$<$", ">": "$>$", "×": r"$\times$", "π": r"$\pi$"}
 _TEX |= {"†": r"\textdagger{}", "±": r"$\pm$", "₂": "$_2$"}
@@ -243,7 +243,7 @@ _TEX |= {"†": r"\textdagger{}", "±": r"$\pm$", "₂": "$_2$"}
 
 def _tex(text: str) -> str:
     """Return a cell as LaTeX; text between `**` is bold."""
-    parts = ["".join(_TEX.get(one, one) for one in part) for part in text.split("**")]
+    parts = ["".join(_TEX.get(letter, letter) for letter in part) for part in text.split("**")]
     return "".join(f"\\textbf{{{p}}}" if n % 2 else p for n, p in enumerate(parts))
 
 

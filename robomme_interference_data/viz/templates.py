@@ -28,7 +28,9 @@ def fill(
     folder = resources.files(package).joinpath("templates")
     filters = options.pop("filters", {})
     environment = jinja2.Environment(
-        loader=jinja2.FunctionLoader(lambda one: folder.joinpath(one).read_text(encoding="utf-8")),
+        loader=jinja2.FunctionLoader(
+            lambda name: folder.joinpath(name).read_text(encoding="utf-8")
+        ),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

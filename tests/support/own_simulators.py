@@ -11,9 +11,9 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.episode import (
-    Begun,
     Demonstration,
     EpisodeInfo,
+    EpisodeStart,
     Observation,
 )
 
@@ -30,8 +30,8 @@ class Played(Simulator):
     def _act(self, policy: str, known: Mapping[int, str], answer: int | None) -> Any:
         return self.world.act(policy)
 
-    def _begin(self, episode: EpisodeId, every: int) -> Begun:
-        lesson, first, info = self.world.reset(str(episode), bool(every))
+    def _begin(self, episode: EpisodeId, frame_step: int) -> EpisodeStart:
+        lesson, first, info = self.world.reset(str(episode), bool(frame_step))
         images = {name: image for name, image in first.images.items() if name in self.drawn}
         return lesson, Observation(images, first.state), info
 
@@ -44,8 +44,8 @@ class Played(Simulator):
 def slip(change: Callable[[Demonstration, Observation, EpisodeInfo], Any], **declared: Any) -> Any:
     """Return a simulator with a slip: something else begins than what `Played` returns."""
 
-    def begin(self: Played, episode: EpisodeId, every: int) -> Any:
-        return change(*Played._begin(self, episode, every))
+    def begin(self: Played, episode: EpisodeId, frame_step: int) -> Any:
+        return change(*Played._begin(self, episode, frame_step))
 
     return type("Slip", (Played,), {"_begin": begin, **declared})
 
@@ -92,7 +92,7 @@ class Abstract(Simulator):
 class Breaks(Played):
     """Breaks in every episode."""
 
-    def _begin(self, episode: EpisodeId, every: int) -> Begun:
+    def _begin(self, episode: EpisodeId, frame_step: int) -> EpisodeStart:
         raise RuntimeError("the arm fell off")
 
 

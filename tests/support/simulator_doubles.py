@@ -11,9 +11,9 @@ from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.shifts import Shift
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.episode import (
-    Begun,
     Demonstration,
     EpisodeInfo,
+    EpisodeStart,
     Observation,
 )
 
@@ -54,12 +54,12 @@ class Double(Simulator):
         super().close()
         self.closed = True
 
-    def _begin(self, episode: EpisodeId, every: int) -> Begun:
+    def _begin(self, episode: EpisodeId, frame_step: int) -> EpisodeStart:
         if episode.index == UNKNOWN:
             raise UnknownNameError("no such episode", "Take another.")
         lesson = Demonstration(
             {
-                name: np.stack([image] * 5)[:: every or 1]
+                name: np.stack([image] * 5)[:: frame_step or 1]
                 for name, image in self._images(episode).items()
             },
             np.arange(5, dtype=np.float32)[:, None].repeat(8, 1),

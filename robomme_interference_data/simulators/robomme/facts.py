@@ -67,7 +67,7 @@ def _unmask(base: Any, bins: list[Any]) -> dict[str, Any]:
     hiding = getattr(base, "selected_bins", bins)
     picked = sum("pick up" in str(task["name"]) for task in base.task_list)
     colors = [str(color) for color in base.color_names[:picked]]
-    answer = [_index(bins, one) for one in hiding[:picked]]
+    answer = [_index(bins, actor) for actor in hiding[:picked]]
     return {"answer": answer, "colors": colors, "swaps": _scheduled(base, bins)}
 
 
@@ -84,7 +84,7 @@ def _place_button(base: Any, targets: list[Any]) -> dict[str, Any]:
 
 def _place_order(base: Any, targets: list[Any]) -> dict[str, Any]:
     answer = _index(targets, base.target_target)
-    visits = [_index(targets, one) for one in base.which_targets_to_pick]
+    visits = [_index(targets, target) for target in base.which_targets_to_pick]
     asked = int(base.which_in_subset) - 1
     return {"answer": answer, "visits": visits, "asked": asked, "swaps": _swapped(base, targets)}
 
@@ -99,11 +99,11 @@ def _insert(base: Any, pegs: list[Any]) -> dict[str, Any]:
 
 
 def _pattern(base: Any, buttons: list[Any]) -> dict[str, Any]:
-    return {"answer": [_index(buttons, one) for one in base.selected_buttons]}
+    return {"answer": [_index(buttons, button) for button in base.selected_buttons]}
 
 
 def _route(base: Any, targets: list[Any]) -> dict[str, Any]:
-    route = [_index(targets, one) for one in base.selected_buttons]
+    route = [_index(targets, button) for button in base.selected_buttons]
     return {"answer": [route, [str(turn) for turn in base.swing_directions]]}
 
 
@@ -133,13 +133,13 @@ def _swapped(base: Any, targets: list[Any]) -> list[Any]:
     """Return the swap of two targets, if there is one."""
     if base.swap_target_a is None:
         return []
-    pair = [_index(targets, one) for one in (base.swap_target_a, base.swap_target_b)]
+    pair = [_index(targets, target) for target in (base.swap_target_a, base.swap_target_b)]
     return [[*pair, int(base.start_step), int(base.end_step)]]
 
 
 def _index(things: list[Any], thing: Any) -> int:
     """Return the number of a thing, by identity."""
-    return next(number for number, one in enumerate(things) if one is thing)
+    return next(number for number, candidate in enumerate(things) if candidate is thing)
 
 
 def _demonstration(env: Any) -> Any:

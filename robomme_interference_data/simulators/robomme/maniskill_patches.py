@@ -54,7 +54,7 @@ def apply_patches(folder: Path) -> list[str]:
 def _planner(solver: Any) -> list[str]:
     """Make the stick's planner pass its base class only the arguments that this accepts."""
     base = solver.__mro__[1]
-    signature, accepted = (inspect.signature(one.__init__) for one in (solver, base))
+    signature, accepted = (inspect.signature(kind.__init__) for kind in (solver, base))
     for name in ("visualize_target_grasp_pose", "joint_vel_limits"):
         if name not in signature.parameters:
             raise CannotPatch(f"its ManiSkill's {solver.__name__} takes no {name}")
@@ -95,7 +95,7 @@ def _camera(arm: Any, wrist: Any, what: str) -> list[str]:
     before, usual = arm._sensor_configs.fget, wrist._sensor_configs.fget
 
     def hand(configs: list[Any]) -> list[Any]:
-        return [one for one in configs if one.uid == CAMERA]
+        return [config for config in configs if config.uid == CAMERA]
 
     def sensors(self: Any) -> list[Any]:
         configs = list(before(self))
@@ -107,7 +107,7 @@ def _camera(arm: Any, wrist: Any, what: str) -> list[str]:
 
     # The property needs an arm in a scene; this stand-in suffices to list its cameras.
     nowhere = SimpleNamespace(robot=SimpleNamespace(links_map=defaultdict(lambda: None)))
-    sizes = [(one.width, one.height) for one in hand(before(nowhere))]
+    sizes = [(config.width, config.height) for config in hand(before(nowhere))]
     if sizes == [(SIDE, SIDE)]:
         return []
     if not hand(sensors(nowhere)):
@@ -127,7 +127,7 @@ class _Description:
     @property
     def links(self) -> dict[str, Any]:
         """Its links by name."""
-        return {one.get("name", ""): one for one in self._urdf.iter("link")}
+        return {link.get("name", ""): link for link in self._urdf.iter("link")}
 
     def take(self, link: str, other: "_Description") -> None:
         """Copy a link from another arm, and all links between it and the first common one.
@@ -135,7 +135,7 @@ class _Description:
         Materials are not copied: on RoboMME's fork the camera's body on the stick is white, too.
         """
         links = other.links
-        joints = {_end(one, "child"): one for one in other._urdf.iter("joint")}
+        joints = {_end(joint, "child"): joint for joint in other._urdf.iter("joint")}
         new: list[str] = []
         while link not in self.links:
             if link not in links or link not in joints:
@@ -144,22 +144,22 @@ class _Description:
             self._urdf.append(copy.deepcopy(joints[link]))
             self._urdf.append(copy.deepcopy(links[link]))
             link = _end(joints[link], "parent")
-        for one in other._srdf.iter("disable_collisions"):
-            pair = {one.get("link1"), one.get("link2")}
+        for rule in other._srdf.iter("disable_collisions"):
+            pair = {rule.get("link1"), rule.get("link2")}
             if pair & {*new} and pair <= self.links.keys():
-                self._srdf.append(copy.deepcopy(one))
+                self._srdf.append(copy.deepcopy(rule))
 
     def write(self, folder: Path) -> str:
         """Write both files beside links to the arm's other files; return the path of the URDF."""
-        urdf, srdf = (ET.tostring(one) for one in (self._urdf, self._srdf))
+        urdf, srdf = (ET.tostring(tree) for tree in (self._urdf, self._srdf))
         home = self._path.resolve().parent
         name = hashlib.sha256(b"\0".join([bytes(home), urdf, srdf])).hexdigest()
         out = folder / name
         if not out.is_dir():
             folder.mkdir(parents=True, exist_ok=True)
             partial = Path(tempfile.mkdtemp(prefix=f".{name}.", suffix=".partial", dir=folder))
-            for one in home.iterdir():
-                (partial / one.name).symlink_to(one)
+            for path in home.iterdir():
+                (partial / path.name).symlink_to(path)
             for path, text in ((self._path, urdf), (self._path.with_suffix(".srdf"), srdf)):
                 (partial / path.name).unlink()
                 (partial / path.name).write_bytes(text)

@@ -136,7 +136,11 @@ class OfficialSwaps(SwapScene, OfficialScene):
     def option(self, choice: int) -> Option:
         """Return the point of the thing that is at a place now."""
         actual = swapped_places(self.swaps)
-        [thing] = (one for one in range(self.count) if final_places(one, actual) == (choice,))
+        [thing] = (
+            candidate
+            for candidate in range(self.count)
+            if final_places(candidate, actual) == (choice,)
+        )
         return super().option(thing)
 
     def shown(self, moment: Moment) -> Iterable[int]:
@@ -194,7 +198,9 @@ class VideoPlaceButton(PlaceScene, OfficialSwaps):
         """Return the placement after which the cube lies on a target, and the swaps."""
         yield from super().shown(moment)
         for number, task in enumerate(self.tasks_of("drop the cube onto target")):
-            later = (one for one in self.tasks_of("pick up the cube") if one > task)
+            later = (
+                later_task for later_task in self.tasks_of("pick up the cube") if later_task > task
+            )
             if task <= moment.task < next(later, task + 1):
                 yield number
 
@@ -326,7 +332,7 @@ def read_scene(family: str, recorded: str, difficulty: str) -> OfficialScene:
 @cache
 def _swap_series(count: int, swaps: int) -> dict[tuple[Pair, ...], tuple[str, ...]]:
     series = product(combinations(range(count), 2), repeat=swaps)
-    return {one: swap_texts(one) for one in series}
+    return {swaps_made: swap_texts(swaps_made) for swaps_made in series}
 
 
 def _direction(rows: int, columns: int) -> str:

@@ -18,9 +18,9 @@ from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.episode import (
     ACTION_SIZE,
     CAMERAS,
-    Begun,
     Demonstration,
     EpisodeInfo,
+    EpisodeStart,
     Observation,
     choose_cameras,
 )
@@ -159,13 +159,13 @@ class RoboMMESimulator(Simulator):
         super().close()
         self._process.end()
 
-    def _begin(self, episode: EpisodeId, every: int) -> Begun:
+    def _begin(self, episode: EpisodeId, frame_step: int) -> EpisodeStart:
         if episode.answer is not None:
             raise UnknownNameError(
                 f"{episode}: RoboMME cannot combine a scene with another answer",
                 f"Use the episode {episode.scene}, or the simulator tabletop.",
             )
-        families = [one for one in self._process.families if one in FAMILIES]
+        families = [family for family in self._process.families if family in FAMILIES]
         if episode.family not in families:
             raise UnknownNameError.among("family", episode.family, self.name, families)
         most = EPISODES if self._cameras or self._subgoals else 5 * EPISODES
@@ -180,12 +180,12 @@ class RoboMMESimulator(Simulator):
             index=episode.index,
             max_steps=MAX_STEPS,
             cameras=self._cameras,
-            every=every,
+            frame_step=frame_step,
             subgoals=self._subgoals,
         )
         self._subgoal = facts["subgoal"]
         first = self._observation(arrays, self._cameras)
-        images = {camera: arrays[camera][:-1] for camera in self._cameras if every}
+        images = {camera: arrays[camera][:-1] for camera in self._cameras if frame_step}
         no_actions = np.empty((0, ACTION_SIZE), np.float32)
         evidence = self._read_facts(facts, episode.family, arrays)
         lesson = Demonstration(images, arrays["states"][:-1], no_actions, *evidence)

@@ -193,7 +193,7 @@ class _Pattern(Steps):
         y = _ACROSS.get((named and named[2]) or "", 0.0)
         if not x and not y:
             return None
-        spots = np.array([one.pose.p[0][:2].tolist() for one in self.base.buttons_grid])
+        spots = np.array([button.pose.p[0][:2].tolist() for button in self.base.buttons_grid])
         spacing = float(np.abs(spots[1] - spots[0]).max())
         goal = spots[self.nearest(spots)] + spacing * np.array([x, y])
         return self.go_to(int(((spots - goal) ** 2).sum(axis=1).argmin()))
@@ -216,7 +216,7 @@ class _Route(Steps):
         if side is None or turn is None:
             return None
         targets = [self.base.buttons_grid[number] for number in self.base.route_button_indices]
-        at = self.nearest(np.array([one.pose.p[0][:2].tolist() for one in targets]))
+        at = self.nearest(np.array([target.pose.p[0][:2].tolist() for target in targets]))
         to = min(max(at + int(_ACROSS[side[0]]), 0), len(targets) - 1)
         return self.go_to(to, turn[0])
 

@@ -106,7 +106,7 @@ class Episodes:
         index: int,
         max_steps: int,
         cameras: list[str],
-        every: int,
+        frame_step: int,
         subgoals: bool,
     ) -> Answer:
         """Play a demonstration; return the facts about the episode, its frames and its states.
@@ -126,10 +126,10 @@ class Episodes:
         self._env = builder.make_env_for_episode(index)
         self._cameras, self._subgoals = cameras, subgoals
         self._rendering.needs_front = self._must_locate if subgoals else bool
-        self._select_cameras(every > 0)
+        self._select_cameras(frame_step > 0)
         log = _facts.LessonLog(self._env, family)
-        kept = _rendering.KeptFrames(self._env.unwrapped, every)
-        self._rendering.keep = kept if every else _rendering.always
+        kept = _rendering.KeptFrames(self._env.unwrapped, frame_step)
+        self._rendering.keep = kept if frame_step else _rendering.always
         observations, info = self._env.reset()
         self._rendering.keep = _rendering.always
         goals = info["task_goal"]
@@ -148,11 +148,11 @@ class Episodes:
         except Exception as error:
             traceback.print_exc()
             facts |= {"scene": None, "unreadable": _text(error)}
-        lesson = self._frames(observations) if every else {}
+        lesson = self._frames(observations) if frame_step else {}
         if lesson:
             kept.check(_facts.kept_steps(self._env)[:-1])
         for camera, image in self._rendering.images(self._env, cameras).items():
-            arrays[camera] = [*lesson.get(camera, [])[: -1 : every or 1], image]
+            arrays[camera] = [*lesson.get(camera, [])[: -1 : frame_step or 1], image]
         return facts, arrays
 
     def step(self, action: list[float], observe: bool) -> Answer:

@@ -59,7 +59,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
 
     Attributes:
         demonstrated: Cameras that render the demonstration.
-        every: They render every n-th frame of it.
+        frame_step: They render every n-th frame of it.
         demonstrating: Whether a reset plays the demonstration at all.
         shift: Shift of the live scene.
     """
@@ -71,7 +71,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         self.family = family
         self.drawing = render
         self.demonstrated: Sequence[str] = CAMERAS
-        self.every = 1
+        self.frame_step = 1
         self.demonstrating = False
         self.shift: Shift | None = None
         for name, values in (_POSSIBLE if render else _POSSIBLE_BLIND).items():
@@ -231,17 +231,19 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         seen, actions, shown = [], [], []
         for number, _ in enumerate(self.episode.demonstrate(self.arm, self.answer)):
             shown.append(self.episode.showing)
-            seen.append(self.observe(() if number % self.every else self.demonstrated))
+            seen.append(self.observe(() if number % self.frame_step else self.demonstrated))
             actions.append(self.arm.action.copy())
             super()._step_action(actions[-1])
         self.builder.restore()
         self._rest()
         return Demonstration(
             {
-                name: np.stack([one.images[name] for one in seen[:: self.every]])
+                name: np.stack(
+                    [observation.images[name] for observation in seen[:: self.frame_step]]
+                )
                 for name in seen[0].images
             },
-            np.stack([one.state for one in seen]),
+            np.stack([observation.state for observation in seen]),
             np.stack(actions),
             spans_of_parts(shown, self.episode.parts(self.answer)),
         )

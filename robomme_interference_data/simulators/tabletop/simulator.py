@@ -15,8 +15,8 @@ from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.episode import (
     CAMERAS,
-    Begun,
     EpisodeInfo,
+    EpisodeStart,
     Observation,
     choose_cameras,
 )
@@ -72,7 +72,7 @@ class TabletopSimulator(Simulator):
         return episode_ids()
 
     @classmethod
-    def further_episodes(cls) -> list[EpisodeId]:
+    def extra_episodes(cls) -> list[EpisodeId]:
         """Return the suite's further train episodes."""
         return further_ids()
 
@@ -111,11 +111,11 @@ class TabletopSimulator(Simulator):
         super().close()
         self.env.close()
 
-    def _begin(self, episode: EpisodeId, every: int) -> Begun:
+    def _begin(self, episode: EpisodeId, frame_step: int) -> EpisodeStart:
         seed = seed_of(episode)
         self.env.family = episode.family
-        self.env.demonstrated = self._cameras if every else ()
-        self.env.every = every or 1
+        self.env.demonstrated = self._cameras if frame_step else ()
+        self.env.frame_step = frame_step or 1
         options = {} if episode.answer is None else {"answer": episode.answer}
         _, info = self.env.reset(seed=seed, options=options)
         about = EpisodeInfo(info["goals"], info["difficulty"], seed, self.name)

@@ -51,8 +51,8 @@ class SubgoalFollower:
         if number is None:
             return  # not understood: continue
         matching = self._matching(subgoal, number)
-        self._left = [one for one in self._left if one in matching] or [
-            one for one in self._answers if one in matching
+        self._left = [answer for answer in self._left if answer in matching] or [
+            answer for answer in self._answers if answer in matching
         ]
         doing = self._left[0], number
         if doing != self._doing:
@@ -71,7 +71,7 @@ class SubgoalFollower:
         last = self._scene.steps - 1
         now = min(self._scene.progress(), last)
         wording, known = _plain(subgoal.simple), dict[str, int]()
-        for number in sorted(range(last + 1), key=lambda one: abs(one - now)):
+        for number in sorted(range(last + 1), key=lambda candidate: abs(candidate - now)):
             for answer in self._answers:
                 known.setdefault(self._words(answer, number), number)
             if wording in known:
@@ -85,11 +85,15 @@ class SubgoalFollower:
         groups: dict[tuple[Any, ...], list[Any]] = {}
         for answer in self._answers:
             if self._words(answer, number) == self._matched:
-                at = tuple(tuple(map(float, one)) for one in self._scene.step(answer, number).at)
+                at = tuple(
+                    tuple(map(float, point)) for point in self._scene.step(answer, number).at
+                )
                 groups.setdefault(at, []).append(answer)
         distance = {at: sum(map(math.dist, self._to_pixels(at), subgoal.points)) for at in groups}
         nearest = min(distance.values())
-        return {one for at, group in groups.items() if distance[at] == nearest for one in group}
+        return {
+            answer for at, group in groups.items() if distance[at] == nearest for answer in group
+        }
 
     def _words(self, answer: Any, number: int) -> str:
         return _plain(without_points(self._scene.step(answer, number).text))
