@@ -151,9 +151,9 @@ PLAN = [
 
 def row(item: WorkItem, status: str) -> Rollout:
     letter = next(letter for letter, name in STATUS.items() if name == status)
-    made = scored_row("mine", item.condition, item.episode.family, item.episode.index, letter)
+    made = scored_row("mine", item.condition, "MoveCube", item.episode.index, letter)
     error = "it \x1b[2Jbroke" if status == "error" else None
-    return replace(made, simulator="world", steps=0, history_frames=0, error=error)
+    return replace(made, simulator="world", family=item.episode.family, error=error)
 
 
 def test_nine_families_and_five_conditions_fit_in_80_columns() -> None:
