@@ -54,7 +54,8 @@ from robomme_interference_data.runtime.executor import WorkerPool
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.registry import simulator_class, simulator_versions
 
-from .checks import check_plan, check_settings, check_system, default_system
+from .checks import check_plan, check_settings, check_system
+from .names import default_system
 from .worker import RolloutTask, StartServer, StartSimulator
 
 

@@ -36,11 +36,8 @@ from robomme_interference_data.evaluate.language.subgoal_writer import OracleWri
 from robomme_interference_data.evaluate.language.subgoal_writers import make_writer
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.evaluate.policies.registry import make_policy
-from robomme_interference_data.evaluate.rollout.checks import (
-    check_settings,
-    check_system,
-    default_system,
-)
+from robomme_interference_data.evaluate.rollout.checks import check_settings, check_system
+from robomme_interference_data.evaluate.rollout.names import default_system
 from robomme_interference_data.evaluate.run.history import HistoryReader
 from robomme_interference_data.runtime.executor import Executor, Processes, Serial
 from robomme_interference_data.schema.subgoal import Subgoal
