@@ -86,7 +86,7 @@ def compare(
         contrasts += own
         repeated = a.repeats(b, a_rows, b_rows) and not conditions
         if repeated and measure is Measure.SUCCESS:
-            overall = {one.condition: one.pairs for one in own if not one.family}
+            overall = {each.condition: each.pairs for each in own if not each.family}
             notes += noise_floor(a, b, overall)
     if not contrasts:
         paths = " and ".join(str(path) for path in (first, second) if path)
