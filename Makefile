@@ -36,6 +36,7 @@ bare: setup  ## Install the wheel without pins, newest and lowest versions, and 
 check: setup types  ## Lint; check the format, the types and who imports whom.
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
+	@$(BIN)/python scripts/plain_code.py
 	@$(BIN)/mypy build/typecheck/robomme_interference_data
 	@cd build/typecheck && $(CURDIR)/$(BIN)/lint-imports --config $(CURDIR)/pyproject.toml --no-logo
 

@@ -25,17 +25,15 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.data.embeddings import (
+from robomme_interference_data.data.embeddings import EmbeddingIndex, center_of, normalized
+from robomme_interference_data.data.index_layout import (
     CENTER_FILE,
     INDEX_SUMS,
-    EmbeddingIndex,
     EncoderRecord,
     IndexHeader,
-    center_of,
     encoder_id,
     episode_file,
     index_folder,
-    normalized,
 )
 from robomme_interference_data.errors import (
     BuildError,

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.data.embeddings import BufferSetIndex, index_folder
+from robomme_interference_data.data.embeddings import BufferSetIndex
+from robomme_interference_data.data.index_layout import index_folder
 from robomme_interference_data.data.views import live_embedding
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.schema.shifts import Shift

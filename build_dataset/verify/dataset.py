@@ -30,13 +30,9 @@ from robomme_interference_data.constants import (
     Unit,
 )
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.data.embeddings import (
-    IndexHeader,
-    index_folder,
-    normalized,
-    open_index,
-)
+from robomme_interference_data.data.embeddings import normalized, open_index
 from robomme_interference_data.data.fetched_copy import FetchedCopy
+from robomme_interference_data.data.index_layout import IndexHeader, index_folder
 from robomme_interference_data.errors import InterferenceError, visible
 from robomme_interference_data.retrieval.segment import typical_cosine
 from robomme_interference_data.runtime.progress import WorkProgress

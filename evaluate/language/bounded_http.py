@@ -32,7 +32,7 @@ class BoundedClient(httpx.Client):
         request.extensions = {**request.extensions, "trace": self._keep_stream}
         with shutdown_after(self._answer_s, self._sockets) as expired:
             try:
-                response = _read(super().send(request, **{**options, "stream": True}))
+                response = _read(super().send(request, **options | {"stream": True}))
             except httpx.TransportError:
                 if not expired.is_set():
                     raise

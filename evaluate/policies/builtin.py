@@ -134,7 +134,7 @@ def follow(
             targets.append(np.append(joints, grip))
         if not whole and next_grip != grip:
             grip = next_grip
-            targets += [np.append(state[:7], grip)] * GRIP_STEPS
+            targets += [np.append(state[:7], grip) for _ in range(GRIP_STEPS)]
         at, index = state, seen
     return np.array(targets[1:] or targets, np.float32)
 

@@ -269,6 +269,7 @@ def _row(
             error = RuntimeError(f"its row cannot be stored: {first_line(unstorable)}")
     if error is not None:
         query = buffer_set.query(item.episode)
+        columns: dict[str, Any] = {"steps": 0} | dict(outcome.progress)
         row = run.row(
             item,
             Status.ERROR,
@@ -279,7 +280,7 @@ def _row(
             lesson_frames=0,
             lesson_share=None,
             error=_error_text(error),
-            **{"steps": 0, **outcome.progress},
+            **columns,
         )
     (log.folder / item.clip).unlink(missing_ok=True)  # of an earlier attempt
     # Rows matter more than clips: a full disk costs a clip only.

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import PAPER_ENCODER
-from robomme_interference_data.data.embeddings import EncoderRecord, encoder_id
+from robomme_interference_data.data.index_layout import EncoderRecord, encoder_id
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.runtime.specs import Kind, Registry
 from robomme_interference_data.storage.files import digest_json

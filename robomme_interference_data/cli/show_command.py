@@ -197,7 +197,7 @@ def _write_page(
 ) -> None:
     """Write the page of a buffer, with what retrieval chooses by each encoder that has an index."""
     from robomme_interference_data.constants import DISTRACTORS
-    from robomme_interference_data.data.embeddings import indexed_encoders
+    from robomme_interference_data.data.index_layout import indexed_encoders
     from robomme_interference_data.data.views import live_embedding
     from robomme_interference_data.retrieval.encoders import published_threshold
     from robomme_interference_data.retrieval.explain import explain

@@ -351,7 +351,7 @@ def _paths(
         yield from dataset.files_of(index, cameras)
     if encoder is None:
         return
-    from .embeddings import CENTER_FILE, INDEX_SUMS, episode_file, index_folder
+    from .index_layout import CENTER_FILE, INDEX_SUMS, episode_file, index_folder
 
     for camera in cameras:
         folder = index_folder(encoder, camera)

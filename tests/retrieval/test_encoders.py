@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robomme_interference_data.constants import PAPER_ENCODER
-from robomme_interference_data.data.embeddings import encoder_id, index_folder
+from robomme_interference_data.data.index_layout import encoder_id, index_folder
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.retrieval.encoders import encoder_name, published_threshold
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail

@@ -12,7 +12,8 @@ from support.damage import flipped_bits
 from support.retrieval import change_header, make_index
 
 from robomme_interference_data import load_buffer, load_buffer_set
-from robomme_interference_data.data.embeddings import BufferSetIndex, episode_file, open_index
+from robomme_interference_data.data.embeddings import BufferSetIndex, open_index
+from robomme_interference_data.data.index_layout import episode_file
 from robomme_interference_data.errors import FormatError, InterferenceError, MissingFileError
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.select import measure

@@ -12,7 +12,7 @@ from support.buffer_sets import QUERIES, with_sessions
 
 from robomme_interference_data import Buffer, EpisodeId, Session, SessionEntry, load_buffer_set
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS
-from robomme_interference_data.data.embeddings import IndexHeader
+from robomme_interference_data.data.index_layout import IndexHeader
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.segment import (

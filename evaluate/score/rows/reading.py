@@ -197,7 +197,6 @@ class _Checks:
             reason = "the same rollout as {}"
             if contradicted:
                 reason += "; its rows contradict each other"
-            if contradicted:
                 self._refuse([(first, reason.format(self.locate(repeats[0])))])
             self._refuse((at, reason.format(self.locate(first))) for at in repeats)
 
