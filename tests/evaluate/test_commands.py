@@ -217,7 +217,7 @@ def test_errors_are_listed_beside_the_rate() -> None:
     other = WorkItem("no-history", EpisodeId("MoveCube", "test", 0))
     table = rate_table([*rows, row(other, "error")])
     assert [*table.columns] == ["family", "no-history", "k0"]
-    assert table.rows == (
+    assert tuple(table.rows) == (
         ("VideoRepick", "", "3/5 60%, 1 broke"),
         ("MoveCube", "1 broke", ""),
         ("all", "1 broke", "3/5 60%, 1 broke"),
