@@ -29,10 +29,10 @@ from nothing import Nothing
 from evaluate import seconds_a_rollout
 from robomme_interference_data.constants import FAMILIES, MAX_STEPS
 from robomme_interference_data.evaluate.run.config import RunConfig
-from robomme_interference_data.evaluate.run.kind import Run
 from robomme_interference_data.evaluate.run.log import open_log
 from robomme_interference_data.evaluate.run.plan import WorkItem, shuffle_work
 from robomme_interference_data.evaluate.run.progress import RunProgress
+from robomme_interference_data.evaluate.run.runner import RunContext
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Processes
@@ -65,7 +65,7 @@ def drive(rollouts: int, workers: int) -> list[str]:
         RunProgress() as shown,
     ):
         shown.start(todo, [])
-        task = Nothing(Run(config, "noop", SystemFacts(), "none", "none"))
+        task = Nothing(RunContext(config, "noop", SystemFacts(), "none", "none"))
         memory: list[int] = []
         with closing(RayWorkers(workers, "local").run(task, todo)) as outcomes:
             next(outcomes)

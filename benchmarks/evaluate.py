@@ -22,9 +22,9 @@ from robomme_interference_data import BufferSet, DecodedCache, load_buffer_set
 from robomme_interference_data.evaluate import RunConfig, run_evaluation
 from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
 from robomme_interference_data.evaluate.rollout.rollout import run_rollout
-from robomme_interference_data.evaluate.run.kind import Run
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout
+from robomme_interference_data.evaluate.run.runner import RunContext
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Executor
@@ -125,7 +125,7 @@ def overhead(
     actions = oracle_actions(episode, simulator)
     policy = Recorded(actions)
     config = RunConfig("python:recorded", Path(buffer_set.location), Path("nowhere"))
-    run = Run(config, "recorded", SystemFacts(), buffer_set.name, buffer_set.revision)
+    run = RunContext(config, "recorded", SystemFacts(), buffer_set.name, buffer_set.revision)
 
     def bare() -> None:
         simulator.reset(str(episode), demonstration=False)

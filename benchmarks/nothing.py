@@ -1,9 +1,9 @@
 """A rollout that does nothing, in a module of its own: workers import it."""
 
 from robomme_interference_data.evaluate.run.config import RunConfig
-from robomme_interference_data.evaluate.run.kind import Run
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout
+from robomme_interference_data.evaluate.run.runner import RunContext
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.rollouts import Status
 
@@ -11,7 +11,7 @@ from robomme_interference_data.schema.rollouts import Status
 class Nothing:
     """Ends a rollout at once."""
 
-    def __init__(self, run: Run[RunConfig]):
+    def __init__(self, run: RunContext[RunConfig]):
         self._run = run
 
     def __call__(self, task: WorkItem, worker: Worker) -> Rollout:

@@ -88,7 +88,7 @@ def results_facts(results: Score | Path) -> Facts:
     ]
     statuses = Counter(row.status for row in found.rows)
     what = "Action errors of" if offline else "Rollouts of"
-    starts = run.starts if run is not None else ()
+    starts = run.invocations if run is not None else ()
     return Facts(
         kind="results",
         title="RoboMME-Interference results",
@@ -192,13 +192,13 @@ def _provenance(found: Score, run: RunHeader | None, table: Path) -> ProvenanceR
     )
     for simulator, revision in sorted(found.rows.revisions.items()):
         rows.append((f"revision of the buffer set, {escape(simulator)}", code(revision)))
-    if found.rows.unpinned:
+    if found.rows.without_revision:
         rows.append(("revision of the buffer set", "not in the rows"))
     rows.append((f"SHA-256 of `{table.name}`", code(sha256_file(table))))
     if run is not None:
         policy = run.identity.get("policy")
         rows.append(("policy", code(policy) if policy else "not recorded"))
-        for start in run.starts[-1:]:
+        for start in run.invocations[-1:]:
             rows += [("git", code(start.git))] if start.git else []
             versions = (f"{name} {version}" for name, version in sorted(start.versions.items()))
             rows.append(("versions of the last invocation", escape(", ".join(versions))))
@@ -210,7 +210,7 @@ def _details(run: RunHeader | None) -> dict[str, Any]:
     if run is None:
         return {}
     found: dict[str, Any] = {"Identity of the run": run.identity}
-    if commands := dict.fromkeys(line for start in run.starts for line in start.command):
+    if commands := dict.fromkeys(line for start in run.invocations for line in start.command):
         found["Commands"] = [*commands]
     return found
 

@@ -65,12 +65,15 @@ def ceiling(buffer_set: BufferSet, config: CeilingConfig) -> list[Ceiling]:
             f"Leave {NO_HISTORY} out: its ceiling is that of the memory without retrieval."
         )
     queries_with_evidence(buffer_set)
-    names = [one.name for one in in_order(config.conditions or buffer_set.conditions)]
+    names = [condition.name for condition in in_order(config.conditions or buffer_set.conditions)]
     buffer_set.check_tables(names)
     cells: dict[tuple[str, str], list[_Kept]] = {}
-    for buffer in (one for name in names for one in buffer_set.buffers(condition=name)):
-        if (given := _given(buffer_set, buffer, config)) is not None:
-            kept = _kept(buffer, memory, given, config.frames)
+    for name in names:
+        for buffer in buffer_set.buffers(condition=name):
+            received = _received(buffer_set, buffer, config)
+            if received is None:
+                continue
+            kept = _kept(buffer, memory, received, config.frames)
             for family in (buffer.episode_id.family, ALL):
                 cells.setdefault((family, buffer.condition), []).append(kept)
     return [
@@ -87,8 +90,8 @@ def queries_with_evidence(buffer_set: BufferSet) -> list[Query]:
     Raises:
         InvalidOptionError: There is none.
     """
-    queries = [buffer_set.query(one) for one in buffer_set.episode_ids]
-    known = [one for one in queries if one.record.evidence is not None]
+    queries = [buffer_set.query(episode) for episode in buffer_set.episode_ids]
+    known = [query for query in queries if query.record.evidence is not None]
     if not known:
         raise InvalidOptionError(
             f"the frames of {buffer_set.location} that show the answer are unknown",
@@ -97,14 +100,14 @@ def queries_with_evidence(buffer_set: BufferSet) -> list[Query]:
     return known
 
 
-def _kept(buffer: Buffer, memory: Memory, given: Sequence[int], frames: int) -> _Kept:
-    """Return what a memory keeps at the first step, given frames of a buffer.
+def _kept(buffer: Buffer, memory: Memory, received: Sequence[int], frames: int) -> _Kept:
+    """Return what a memory keeps at the first step, of the frames that it received of a buffer.
 
     A part of the answer is known from that many kept `frames` on.
     """
     if buffer.evidence is None:
         return None, None
-    kept = memory.kept(given)
+    kept = memory.kept(received)
     success = chance(buffer.query, known_parts(buffer.evidence, kept, frames))
     return evidence_kept(buffer.evidence, kept), success
 
@@ -119,7 +122,7 @@ def chance(query: Query, known: dict[int, str]) -> float | None:
     return (right in agreeing) / len(agreeing)
 
 
-def _given(buffer_set: BufferSet, buffer: Buffer, config: CeilingConfig) -> Sequence[int] | None:
+def _received(buffer_set: BufferSet, buffer: Buffer, config: CeilingConfig) -> Sequence[int] | None:
     """Return the frames that the memory gets; None if a retrieval step has no history."""
     if config.retrieval is None:
         return range(len(buffer))

@@ -121,7 +121,7 @@ class OpenAIModel(ChatModel):
     def metadata(self) -> dict[str, Any]:
         """Return the model's name, after checking that the endpoint serves it."""
         try:
-            known = [one.id for one in self._client.models.list()]
+            known = [model.id for model in self._client.models.list()]
         except openai.APIError as error:
             raise self._error(error) from error
         except _UNREADABLE as error:

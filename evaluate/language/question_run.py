@@ -9,34 +9,22 @@ from typing import Any
 
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.data.questions import Question, digest_questions, read_questions
-from robomme_interference_data.errors import (
-    InterferenceError,
-    InvalidOptionError,
-    UnknownNameError,
-    named,
-    nearest,
-)
-from robomme_interference_data.evaluate.run.config import (
-    AskConfig,
-    check_unused,
-    nothing_to_retrieve,
-    with_retrieval,
-)
-from robomme_interference_data.evaluate.run.kind import (
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, named, nearest
+from robomme_interference_data.evaluate.run.config import AskConfig, check_unused, with_retrieval
+from robomme_interference_data.evaluate.run.plan import RunPlan, WorkItem
+from robomme_interference_data.evaluate.run.row import Rollout
+from robomme_interference_data.evaluate.run.runner import (
     Job,
-    Run,
-    RunKind,
+    RunContext,
+    Runner,
     RunTask,
     history_columns,
     retrieval_text,
     short_digest,
 )
-from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
-from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.systems import SYSTEMS, SystemFacts, name_system
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
-from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.evidence import known_parts
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.sampling import Memory
@@ -48,7 +36,7 @@ from .models import MODELS, model_identity
 from .responders import CONTROLS, OWN, ModelResponder, Prompted
 
 
-class Questions(RunKind[AskConfig]):
+class Questions(Runner[AskConfig]):
     """Multiple-choice questions about what history buffers show."""
 
     def prepare(self) -> None:
@@ -77,13 +65,7 @@ class Questions(RunKind[AskConfig]):
             reference=own,
         )
 
-    def refusal(self, condition: str) -> InterferenceError | None:
-        """Return why a condition does not apply, or None."""
-        if self.config.retrieval is None or condition != NO_HISTORY:
-            return None
-        return nothing_to_retrieve(f"Leave {NO_HISTORY} out of {named('conditions')}.")
-
-    def check(self, plan: Plan, items: Sequence[WorkItem]) -> None:
+    def check(self, plan: RunPlan, items: Sequence[WorkItem]) -> None:
         """Check that the images fit, and that the ideal observer knows the possible answers."""
         config = self.config
         if config.model == "recall":
@@ -107,11 +89,11 @@ class Questions(RunKind[AskConfig]):
                     f"{named('memory')}.",
                 )
 
-    def task(self, run: Run[AskConfig]) -> "AskTask":
+    def task(self, run: RunContext[AskConfig]) -> "AskTask":
         """Return the function that asks questions."""
         return AskTask(run)
 
-    def identity(self, plan: Plan) -> dict[str, Any]:
+    def identity(self, plan: RunPlan) -> dict[str, Any]:
         """Return what of questions and model can change an answer."""
         config = self.config
         return {
@@ -174,7 +156,7 @@ def _name(config: AskConfig) -> str:
 class AskTask(RunTask[AskConfig]):
     """Asks questions; makes the model at the first one, and again after an error."""
 
-    def __init__(self, run: Run[AskConfig]):
+    def __init__(self, run: RunContext[AskConfig]):
         super().__init__(run)
         self._responder: ModelResponder | None = None
 
@@ -202,11 +184,11 @@ class AskTask(RunTask[AskConfig]):
             self._responder = ModelResponder(config)
         buffer = self.buffer_set.load(item.episode, item.condition)
         question, query = self.questions[item.episode], buffer.query
-        given: Sequence[int] = range(len(buffer))
+        received: Sequence[int] = range(len(buffer))
         if self.selector is not None and len(buffer):
-            given = self.selector.select(buffer, query.frame(self.selector.camera)).tolist()
+            received = self.selector.select(buffer, query.frame(self.selector.camera)).tolist()
         memory = Memory.parse(config.memory)
-        kept = memory.kept(given)
+        kept = memory.kept(received)
         known = None if buffer.evidence is None else known_parts(buffer.evidence, kept)
         history = HistoryFrames(buffer, kept, self.history)
         prompted = Prompted(question, query, config.model_seed, known, history)
@@ -233,7 +215,7 @@ class AskTask(RunTask[AskConfig]):
             difficulty=query.difficulty,
             goal=query.goal,
             steps=0,
-            **history_columns(buffer, given, memory, retrieved=self.selector is not None),
+            **history_columns(buffer, received, memory, retrieved=self.selector is not None),
             answer=letter,
             chance=question.chance,
             **columns,

@@ -154,13 +154,13 @@ class SubgoalPrompt(Prompt):
     def _pixel(self, numbers: Mapping[str, int], size: tuple[int, int]) -> Pixel:
         pixel = []
         for axis, side in zip("yx", size, strict=True):
-            given = [value for name, value in numbers.items() if name[2:].startswith(axis)]
+            values = [value for name, value in numbers.items() if name[2:].startswith(axis)]
             top = self.grid or side - 1
-            if max(given) > top:
+            if max(values) > top:
                 raise InvalidOptionError.expected(
                     "a point of the answer", dict(numbers), f"numbers from 0 to {top}"
                 )
-            pixels = [_to_pixel(value, side, self.grid) for value in given]
+            pixels = [_to_pixel(value, side, self.grid) for value in values]
             pixel.append(sum(pixels) // len(pixels))
         return pixel[0], pixel[1]
 
@@ -187,15 +187,15 @@ def _json_object(text: str) -> dict[str, Any]:
     return value
 
 
-def _places(given: Any, shown: int) -> tuple[int, ...]:
+def _places(numbers: Any, shown: int) -> tuple[int, ...]:
     """Return numbers of frames, from 0, of an answer, which counts them from 1."""
-    if not isinstance(given, list) or any(
-        type(number) is not int or not 1 <= number <= shown for number in given
+    if not isinstance(numbers, list) or any(
+        type(number) is not int or not 1 <= number <= shown for number in numbers
     ):
         raise InvalidOptionError.expected(
-            "its frames to keep", given, f"numbers from 1 to {shown}, the recent frames shown"
+            "its frames to keep", numbers, f"numbers from 1 to {shown}, the recent frames shown"
         )
-    return tuple(number - 1 for number in given)
+    return tuple(number - 1 for number in numbers)
 
 
 def merge_near(frames: Sequence[int], distance: int) -> list[int]:

@@ -10,7 +10,7 @@ from robomme_interference_data.constants import ORACLE
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.policies.registry import policy_options
 from robomme_interference_data.evaluate.run.config import RunConfig
-from robomme_interference_data.evaluate.run.kind import short_digest
+from robomme_interference_data.evaluate.run.runner import short_digest
 from robomme_interference_data.runtime.specs import bind_options
 
 from .model_writer import ModelWriter
@@ -20,9 +20,9 @@ from .subgoal_prompt import DEFAULT_PROMPT
 from .subgoal_writer import OracleWriter, SubgoalWriter
 
 _WRITER_OPTIONS = [
-    one.name
-    for one in inspect.signature(ModelWriter).parameters.values()
-    if one.kind is inspect.Parameter.KEYWORD_ONLY
+    parameter.name
+    for parameter in inspect.signature(ModelWriter).parameters.values()
+    if parameter.kind is inspect.Parameter.KEYWORD_ONLY
 ]
 
 
@@ -56,8 +56,8 @@ def with_published(config: RunConfig) -> RunConfig:
             f"{config.system} sends its history as a video, and {text} takes images",
             "Serve the model behind an endpoint: see docs/how-to/paper-systems.md.",
         )
-    given = {one.partition("=")[0] for one in config.subgoal_options}
-    added = [f"{name}={value}" for name, value in published.options.items() if name not in given]
+    names = {option.partition("=")[0] for option in config.subgoal_options}
+    added = [f"{name}={value}" for name, value in published.options.items() if name not in names]
     config = replace(config, subgoal_options=(*config.subgoal_options, *added))
     writer_options, model_options = _split(config)
     options = writer_options | MODELS.options(text, model_options, _WRITER_OPTIONS)
@@ -98,7 +98,9 @@ def subgoals_text(config: RunConfig, metadata: Mapping[str, Any]) -> str | None:
 
 def _split(config: RunConfig) -> tuple[dict[str, Any], Sequence[str]]:
     """Return the options of `ModelWriter`, defaults included, and those of the model."""
-    own = [one for one in config.subgoal_options if one.partition("=")[0] in _WRITER_OPTIONS]
+    own = [
+        option for option in config.subgoal_options if option.partition("=")[0] in _WRITER_OPTIONS
+    ]
     what = f"model {config.subgoals!r}"
     bound = bind_options(what, ModelWriter, {"model": None, "prompt": ""}, own)
-    return bound, [one for one in config.subgoal_options if one not in own]
+    return bound, [option for option in config.subgoal_options if option not in own]

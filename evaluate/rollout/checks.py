@@ -1,7 +1,6 @@
 """Checks of a run of rollouts before the first one."""
 
 import math
-import re
 from collections.abc import Sequence
 
 from robomme_interference_data.constants import (
@@ -14,84 +13,23 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.errors import (
-    InterferenceError,
-    InvalidOptionError,
-    UnknownNameError,
-    named,
-)
-from robomme_interference_data.evaluate.policies.capabilities import PolicyKind, Role
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, named
+from robomme_interference_data.evaluate.policies.capabilities import PolicyKind
 from robomme_interference_data.evaluate.policies.policy import BATCH_METHODS, Policy
-from robomme_interference_data.evaluate.policies.registry import (
-    POLICIES,
-    policy_kind,
-    policy_memory,
-    policy_options,
-)
-from robomme_interference_data.evaluate.run.config import (
-    RunConfig,
-    check_unused,
-    nothing_to_retrieve,
-    with_retrieval,
-)
-from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
-from robomme_interference_data.evaluate.systems import (
-    SYSTEMS,
-    System,
-    SystemFacts,
-    check_history,
-    name_system,
-)
-from robomme_interference_data.retrieval.select import Rule
+from robomme_interference_data.evaluate.policies.registry import POLICIES, policy_kind
+from robomme_interference_data.evaluate.run.config import RunConfig, check_unused
+from robomme_interference_data.evaluate.run.plan import RunPlan, WorkItem
+from robomme_interference_data.evaluate.systems import System, check_history, name_system
 from robomme_interference_data.runtime.executor import Resources
-from robomme_interference_data.schema.conditions import NO_HISTORY
-from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.simulators.registry import SIMULATORS, check_shift, simulator_class
 
+from .names import check_name
 from .worker import used_cameras
-
-
-def default_system(config: RunConfig) -> str:
-    """Return the label of rows if none is set: the policy's text, and what changes its results.
-
-    Such as `replay-window-extrapolate`, `follow-subgoals-oracle` with the simulator's subgoals, or
-    `retrieval-replay-window-joined`.
-    """
-    spec, kind = POLICIES.parse(config.policy), policy_kind(config.policy)
-    unidentified = config.subgoals if kind.identified else config.policy
-    if unidentified not in (None, ORACLE):
-        raise InvalidOptionError(
-            f"the rows of {unidentified} need a name: its text does not identify it",
-            f"Set {named('system')}, such as perceptual-framesamp-modul, or a name of your own: "
-            "see docs/how-to/paper-systems.md.",
-        )
-    memory = policy_memory(config.policy)
-    parts = [spec.target if memory is None else Memory.parse(memory).label]
-    if kind.role is not Role.OWN:
-        parts.insert(0, spec.kind)
-    if config.subgoals is not None:
-        parts.append(config.subgoals)
-    parts += _option_labels(config, kind)
-    name = re.sub(r"[^A-Za-z0-9._-]+", "-", "-".join(filter(None, parts))).strip("-")
-    return with_retrieval(name, config)
-
-
-def _option_labels(config: RunConfig, kind: PolicyKind) -> list[str]:
-    """Return what options that make another system add to the label of rows."""
-    if not kind.option_labels:
-        return []
-    usual = policy_options(config.policy)
-    options = policy_options(config.policy, config.policy_options)
-    return [
-        label.format(options[name])
-        for name, label in kind.option_labels.items()
-        if options[name] != usual[name]
-    ]
 
 
 def check_system(config: RunConfig, system: str) -> None:
     """Check that policy and subgoals are those that a label of rows means, and fit each other."""
-    _check_name(config, name_system(system))
+    check_name(config, name_system(system))
     _check_subgoals(config)
 
 
@@ -182,25 +120,15 @@ def _check_policies(config: RunConfig, kind: PolicyKind, policy: Policy) -> None
     else:
         own = "policies on this machine, which share its GPUs"
         check_unused(config, ("policy_resources",), own, f"Set {named('executor', 'ray')}.")
-    for name, valid, expected in (
-        (
-            "policies",
-            1 <= config.policies <= config.workers,
-            f"1 to {named('workers')}, {config.workers}",
-        ),
-        ("max_batch_size", config.max_batch_size >= 1, "1 or more"),
-        ("batch_wait_timeout_s", 0 <= config.batch_wait_timeout_s < math.inf, "0 or more"),
-    ):
-        if not valid:
-            raise InvalidOptionError.expected(name, getattr(config, name), expected)
-    missing = [f"{name}()" for name in BATCH_METHODS if not callable(getattr(policy, name, None))]
-    fault = None
-    if kind.server is not None and kind.server.one_client:
-        fault = "its server holds one memory"
-    elif policy.privileged:
-        fault = "it needs the simulator, which runs in the worker"
-    elif missing:
-        fault = f"it has no {' and no '.join(missing)}"
+    if not 1 <= config.policies <= config.workers:
+        expected = f"1 to {named('workers')}, {config.workers}"
+        raise InvalidOptionError.expected("policies", config.policies, expected)
+    if config.max_batch_size < 1:
+        raise InvalidOptionError.expected("max_batch_size", config.max_batch_size, "1 or more")
+    wait_s = config.batch_wait_timeout_s
+    if not 0 <= wait_s < math.inf:
+        raise InvalidOptionError.expected("batch_wait_timeout_s", wait_s, "0 or more")
+    fault = _fault_of_sharing(kind, policy)
     if fault is not None:
         raise InvalidOptionError(
             f"the policy {config.policy} cannot be shared by workers ({named('policies')}): "
@@ -210,39 +138,14 @@ def _check_policies(config: RunConfig, kind: PolicyKind, policy: Policy) -> None
         )
 
 
-def _check_name(config: RunConfig, system: System) -> None:
-    """Reject the name of a published system or control for a run of another one."""
-    kind, retrieval = policy_kind(config.policy), config.retrieval is not None
-    fault = None
-    if not system.paper:
-        if system.name in SYSTEMS and (
-            kind.role not in (Role.CONTROL, Role.REFERENCE) or default_system(config) != system.name
-        ):
-            fault = f"the policy {config.policy} is not the control {system.name}"
-            fault += " with a retrieval step in front" if retrieval else ""
-    elif not kind.published:
-        fault = f"the policy {config.policy} is not the paper's system {system.name}"
-    # Code of the user may write the subgoals itself.
-    elif (system.facts.subgoals is None) is (
-        config.subgoals is not None
-    ) and kind.role is not Role.OWN:
-        acts_on_none = system.facts.subgoals is None
-        needs = "no subgoals" if acts_on_none else f"subgoals of a model ({named('subgoals')})"
-        fault = (
-            f"system {system.name} acts on {needs}, and {named('subgoals')} is {config.subgoals}"
-        )
-    elif config.subgoals == ORACLE:
-        fault = f"system {system.name} has subgoals of a model, and {ORACLE} knows the answer"
-    elif (system.facts.retrieval is not None) != retrieval:
-        expected = "a" if system.facts.retrieval else "no"
-        fault = f"system {system.name} has {expected} retrieval step, and {named('retrieval')} is "
-        fault += str(config.retrieval)
-    elif retrieval and Rule.parse(config.retrieval_rule).method != "max":
-        fault = f"the retrieval step of {system.name} has the rule max, not {config.retrieval_rule}"
-    if fault is not None:
-        raise InvalidOptionError(
-            fault, f"Set {named('system')} to a name of your own: see docs/how-to/paper-systems.md."
-        )
+def _fault_of_sharing(kind: PolicyKind, policy: Policy) -> str | None:
+    """Return why several workers cannot share a policy, or None."""
+    if kind.server is not None and kind.server.one_client:
+        return "its server holds one memory"
+    if policy.privileged:
+        return "it needs the simulator, which runs in the worker"
+    missing = [f"{name}()" for name in BATCH_METHODS if not callable(getattr(policy, name, None))]
+    return f"it has no {' and no '.join(missing)}" if missing else None
 
 
 def _check_subgoals(config: RunConfig) -> None:
@@ -264,7 +167,11 @@ def _check_subgoals(config: RunConfig) -> None:
 
 
 def check_plan(
-    config: RunConfig, system: System, buffer_set: BufferSet, plan: Plan, items: Sequence[WorkItem]
+    config: RunConfig,
+    system: System,
+    buffer_set: BufferSet,
+    plan: RunPlan,
+    items: Sequence[WorkItem],
 ) -> None:
     """Check every rollout of a plan."""
     kind, simulator = policy_kind(config.policy), simulator_class(config.simulator)
@@ -280,12 +187,16 @@ def check_plan(
             )
         recorded = record.simulator
         if simulator.own_episodes and recorded not in (None, config.simulator):
+            if recorded in SIMULATORS:
+                hint = f"Set {named('simulator', recorded)}, or give a buffer set of "
+                hint += f"{config.simulator}."
+            else:
+                hint = (
+                    "No simulator plays the episodes of this buffer set: give one whose "
+                    f"demonstrations are of {' or '.join(SIMULATORS)}, or your own simulator."
+                )
             raise InvalidOptionError(
-                f"{episode} was recorded on {recorded!r}, the run is on {config.simulator!r}",
-                f'Set simulator="{recorded}", or give a buffer set of {config.simulator}.'
-                if recorded in SIMULATORS
-                else "No simulator plays the episodes of this buffer set: give one whose "
-                f"demonstrations are of {' or '.join(SIMULATORS)}, or your own simulator.",
+                f"{episode} was recorded on {recorded!r}, the run is on {config.simulator!r}", hint
             )
         if families and episode.family not in families:
             raise InvalidOptionError(
@@ -301,17 +212,3 @@ def check_plan(
             if WorkItem(name, manifest.episode_id) in planned:
                 longest[name] = max(manifest.history_frames, longest[name])
         check_history(system, longest)
-
-
-def condition_refusal(facts: SystemFacts, condition: str) -> InterferenceError | None:
-    """Return why a condition does not apply to a system, or None."""
-    if facts.applies(condition):
-        return None
-    if condition == NO_HISTORY:
-        return nothing_to_retrieve(
-            f"Run {NO_HISTORY} without {named('retrieval')}: it is the same system there."
-        )
-    return InvalidOptionError(
-        f"the system takes no history, so {condition} has no effect",
-        f"Set {named('conditions')} to {NO_HISTORY}.",
-    )

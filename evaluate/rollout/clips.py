@@ -1,4 +1,4 @@
-"""Clips of rollouts: the lesson, the history that was given, and the live views, side by side."""
+"""Clips of rollouts: the lesson, the received history and the live views, side by side."""
 
 import traceback
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -73,13 +73,13 @@ class Clip:
 
     @_harmless
     def begin(
-        self, buffer: Buffer, given: Sequence[int], first: Observation, info: EpisodeInfo
+        self, buffer: Buffer, received: Sequence[int], first: Observation, info: EpisodeInfo
     ) -> None:
-        """Draw the first picture, with the history frames that were given."""
+        """Draw the first picture, with the history frames that were received."""
         self._goal, self._fps = info.goal, max(1, round(buffer.query.dataset.fps))
-        if given:
-            self._history = f"history given: {counted(len(given), 'frame')}"
-        self._history_picture = history_picture(buffer, given)
+        if received:
+            self._history = f"history given: {counted(len(received), 'frame')}"
+        self._history_picture = history_picture(buffer, received)
         self._cameras = sorted(first.images)[:_LIVE_CAMERAS]
         self._pointed = buffer.query.dataset.camera()
         self._lesson = self._resources.enter_context(closing(_lesson_of(buffer)))
@@ -134,8 +134,8 @@ class Clip:
 def _lesson_of(buffer: Buffer) -> Generator[NDArray[np.uint8]]:
     """Yield the frames of a buffer's lesson, `(H, W, 3) uint8`, of the first camera."""
     camera = buffer.query.dataset.camera()
-    lesson = [one for one in buffer.sessions if one.role == "lesson"]
-    indices = [index for one in lesson for index in range(one.start, one.stop)]
+    lessons = [session for session in buffer.sessions if session.role == "lesson"]
+    indices = [index for session in lessons for index in range(session.start, session.stop)]
     for chunk in buffer.stream(1, (camera,), indices):
         yield chunk.frames[camera][0]
 
@@ -150,13 +150,13 @@ def _with_crosses(view: NDArray[np.uint8], points: Sequence[Pixel]) -> NDArray[n
     return marked
 
 
-def history_picture(buffer: Buffer, given: Sequence[int]) -> NDArray[np.uint8]:
+def history_picture(buffer: Buffer, received: Sequence[int]) -> NDArray[np.uint8]:
     """Return 64 evenly spread history frames, `(256, 256, 3) uint8`, underlined by session."""
     picture = np.full((VIEW, VIEW, 3), 255, np.uint8)
     colors, sessions = session_colors(buffer.sessions), buffer.session_index
     camera = buffer.query.dataset.camera()
-    for place, chosen in enumerate(spread(0, len(given), _COLUMNS * _COLUMNS)):
-        index = given[chosen]
+    for place, chosen in enumerate(spread(0, len(received), _COLUMNS * _COLUMNS)):
+        index = received[chosen]
         y, x = (_THUMB * part for part in divmod(place, _COLUMNS))
         frame = buffer.frame(index, camera)
         step = max(1, frame.shape[0] // _SMALL)

@@ -40,9 +40,9 @@ def check_episode(
         "goal": (query.goal, query.goal if query.goal in info.goals else info.goal),
     }
     wrong = [
-        f"{name} is {recorded!r} in the dataset, {given!r} in the simulator"
-        for name, (recorded, given) in compared.items()
-        if recorded is not None and recorded != given
+        f"{name} is {recorded!r} in the dataset, {played_value!r} in the simulator"
+        for name, (recorded, played_value) in compared.items()
+        if recorded is not None and recorded != played_value
     ]
     distance = float(np.abs(query.state() - first.state).max())
     if not distance <= STATE_TOLERANCE:

@@ -21,9 +21,9 @@ from robomme_interference_data.evaluate.language.subgoal_writer import SubgoalWr
 from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.history import HistoryReader
-from robomme_interference_data.evaluate.run.kind import Run, history_columns
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout
+from robomme_interference_data.evaluate.run.runner import RunContext, history_columns
 from robomme_interference_data.evaluate.systems import check_history, name_system
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.evidence import evidence_among
@@ -58,7 +58,7 @@ class _Clock(dict[str, float]):
 
 
 def run_rollout(
-    run: Run[RunConfig],
+    run: RunContext[RunConfig],
     item: WorkItem,
     *,
     simulator: Simulator,
@@ -80,12 +80,12 @@ def run_rollout(
     reader = history or HistoryReader(buffer_set.datasets)
     cameras = policy.history_cameras if selector is None else ()  # the selection comes later
     buffer = buffer_set.load(item.episode, item.condition, cameras=cameras)
-    given: Sequence[int] = range(len(buffer))
+    received: Sequence[int] = range(len(buffer))
     with ExitStack() as stack:
         chunks = None
         # A simulator in this process holds Python's lock: decoding beside it slows both down.
         if selector is None and getattr(simulator, "remote", False):
-            chunks = stack.enter_context(_decode(reader, buffer, given, policy, config))
+            chunks = stack.enter_context(_decode(reader, buffer, received, policy, config))
         limit = worker.limit(config.simulator_timeout_s, "the simulator's reset")
         with clock.part("reset_s"), limit:
             demonstration, first, info = simulator.reset(
@@ -98,24 +98,25 @@ def run_rollout(
         with clock.part("history_s"):
             if selector is not None and len(buffer):
                 camera = buffer.query.dataset.camera(selector.camera)
-                given = selector.select(buffer, first.images[camera]).tolist()
-                check_history(name_system(run.system), {item.condition: len(given)})
+                received = selector.select(buffer, first.images[camera]).tolist()
+                check_history(name_system(run.system), {item.condition: len(received)})
         if clip is not None:
-            clip.begin(buffer, given, first, info)
+            clip.begin(buffer, received, first, info)
         with clock.part("history_s"):
             if chunks is None:
-                chunks = stack.enter_context(_decode(reader, buffer, given, policy, config))
-            privileged: tuple[Any, ...] = ()
+                chunks = stack.enter_context(_decode(reader, buffer, received, policy, config))
+            rollout_info = RolloutInfo(info.goal, len(received), config.model_seed)
             if policy.privileged:
-                evidence = buffer.evidence and evidence_among(buffer.evidence, given)
-                privileged = simulator, evidence, answer
-            rollout_info = RolloutInfo(info.goal, len(given), config.model_seed, *privileged)
+                evidence = buffer.evidence and evidence_among(buffer.evidence, received)
+                rollout_info = replace(
+                    rollout_info, simulator=simulator, evidence=evidence, answer=answer
+                )
             policy.reset(rollout_info)
             for chunk in chunks:
-                policy.add_history(chunk.frames, chunk.states, len(given))
+                policy.add_history(chunk.frames, chunk.states, len(received))
         if writer is not None:
             with clock.part("model_s"):
-                writer.start(HistoryFrames(buffer, given, reader), rollout_info, simulator)
+                writer.start(HistoryFrames(buffer, received, reader), rollout_info, simulator)
     live = _Live(run.config, policy, simulator, writer, clock, clip, worker)
     try:
         status = live.run(first, info.goal)
@@ -135,7 +136,7 @@ def run_rollout(
         difficulty=info.difficulty,
         goal=info.goal,
         steps=live.steps,
-        **history_columns(buffer, given, memory, retrieved=selector is not None),
+        **history_columns(buffer, received, memory, retrieved=selector is not None),
         **_model_columns(writer),
         **(simulator.columns() if isinstance(simulator, Simulator) else {}),
         **times,
@@ -166,11 +167,13 @@ class _Live:
         actions: NDArray[np.float32] = np.empty((0, ACTION_SIZE), np.float32)
         while True:
             # A policy of single actions gets subgoals as often as one of whole chunks.
-            due = written is None or len(actions) > 1 or self.steps - written >= ACTION_CHUNK
+            needs_subgoal = (
+                written is None or len(actions) > 1 or self.steps - written >= ACTION_CHUNK
+            )
             if self.writer is not None:
                 with self.clock.part("model_s"):
                     self.writer.watch(seen)
-                    if due:
+                    if needs_subgoal:
                         subgoal, written = self.writer.next(seen[-1], self.steps), self.steps
                 seen[-1] = replace(seen[-1], subgoal=subgoal)
             actions = self._decide(seen, goal)[: MAX_STEPS - self.steps]
@@ -197,9 +200,10 @@ class _Live:
         watched = seen if policy.every_frame else seen[-1:]
         with self.clock.part("policy_s"):
             frames = {
-                name: np.stack([one.images[name] for one in watched]) for name in policy.cameras
+                name: np.stack([observation.images[name] for observation in watched])
+                for name in policy.cameras
             }
-            policy.observe(frames, np.stack([one.state for one in watched]))
+            policy.observe(frames, np.stack([observation.state for observation in watched]))
             size = getattr(self.simulator, "action_size", ACTION_SIZE)
             return _checked(policy.act(seen[-1], goal), size)
 
@@ -224,11 +228,15 @@ def _model_columns(writer: SubgoalWriter | None) -> dict[str, Any]:
 
 
 def _decode(
-    reader: HistoryReader, buffer: Buffer, given: Sequence[int], policy: Policy, config: RunConfig
+    reader: HistoryReader,
+    buffer: Buffer,
+    received: Sequence[int],
+    policy: Policy,
+    config: RunConfig,
 ) -> AbstractContextManager[Iterator[Chunk]]:
     """Start to decode the history frames of a policy; give them in chunks, in order."""
     size, cameras = config.history_chunk, tuple(policy.history_cameras)
-    return read_ahead(reader.stream(buffer, size, cameras, given), max(1, _FRAMES_AHEAD // size))
+    return read_ahead(reader.stream(buffer, size, cameras, received), max(1, _FRAMES_AHEAD // size))
 
 
 @contextmanager
@@ -241,13 +249,13 @@ def read_ahead[T](items: Generator[T], depth: int) -> Iterator[Iterator[T]]:
     pool = ThreadPoolExecutor(1, "read-ahead")  # one thread: a stream is made in its order
     made = deque(pool.submit(next, items, None) for _ in range(depth))
 
-    def given() -> Iterator[T]:
+    def in_order() -> Iterator[T]:
         while (item := made.popleft().result()) is not None:
             made.append(pool.submit(next, items, None))
             yield item
 
     try:
-        yield given()
+        yield in_order()
     finally:
         pool.shutdown(cancel_futures=True)
         items.close()

@@ -23,9 +23,9 @@ from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import make_policy, starts_server
 from robomme_interference_data.evaluate.policies.shared import Address, SharedPolicy
 from robomme_interference_data.evaluate.run.config import RunConfig
-from robomme_interference_data.evaluate.run.kind import Job, Run, RunTask
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout
+from robomme_interference_data.evaluate.run.runner import Job, RunContext, RunTask
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
@@ -47,14 +47,18 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Opening:
-    """What a worker opens before the first job: the `simulator`, or the policy's `server`.
+class StartServer:
+    """Start the policy's server, before the first job."""
 
-    A simulator of the user begins an episode, so that a mistake in it shows.
+
+@dataclass(frozen=True)
+class StartSimulator:
+    """Start the simulator, before the first job; a simulator of the user begins an `episode`.
+
+    So a mistake in it shows once, instead of in every row.
     """
 
-    what: str
-    episode: EpisodeId | None = None
+    episode: EpisodeId | None
 
 
 class RolloutTask(RunTask[RunConfig]):
@@ -67,7 +71,7 @@ class RolloutTask(RunTask[RunConfig]):
 
     def __init__(
         self,
-        run: Run[RunConfig],
+        run: RunContext[RunConfig],
         answers: Answers | None = None,
         addresses: Sequence[Address] = (),
         policy: Policy | None = None,
@@ -80,22 +84,27 @@ class RolloutTask(RunTask[RunConfig]):
         self._writer: SubgoalWriter | None = None
         self._logs: dict[str, bytes] = {}
 
-    def work(self, task: Job | Opening, worker: Worker) -> Any:
-        """Run a rollout; return its row, and the problem of its clip or None. Or open something."""
-        return self._open(task, worker) if isinstance(task, Opening) else self._run(task, worker)
+    def work(self, task: Job | StartServer | StartSimulator, worker: Worker) -> Any:
+        """Run a rollout; return its row, and a problem of its clip. Or start something."""
+        if isinstance(task, StartServer):
+            return self._start_server(worker)
+        if isinstance(task, StartSimulator):
+            return self._start_simulator(task.episode, worker)
+        return self._run(task, worker)
 
-    def _open(self, opening: Opening, worker: Worker) -> Any:
-        """Open the simulator; or the policy, and return its metadata and whether it keeps frames.
+    def _start_simulator(self, episode: EpisodeId | None, worker: Worker) -> None:
+        policy = self._open_policy(worker)
+        simulator = self._open_simulator(policy, worker)
+        if episode is not None:
+            cameras = used_cameras(self.run.config, policy.cameras, self._demonstrations)
+            self._try_out(simulator, episode, cameras, worker)
+
+    def _start_server(self, worker: Worker) -> tuple[dict[str, Any], bool | None]:
+        """Return the metadata of the policy's server, and whether it keeps frames.
 
         The latter is None if it is unknown whether it should.
         """
         policy = self._open_policy(worker)
-        if opening.what == "simulator":
-            simulator = self._open_simulator(policy, worker)
-            if opening.episode is not None:
-                cameras = used_cameras(self.run.config, policy.cameras, self._demonstrations)
-                self._try_out(simulator, opening.episode, cameras, worker)
-            return None
         from robomme_interference_data.evaluate.policies.identity import policy_metadata
 
         known = name_system(self.run.system).keeps_frames is not None
@@ -241,7 +250,8 @@ class RolloutTask(RunTask[RunConfig]):
             return
         from robomme_interference_data.evaluate.run.identity import plain
 
-        reported, first = (one["server_metadata"] for one in (plain(policy.metadata()), metadata))
+        reported = plain(policy.metadata())["server_metadata"]
+        first = metadata["server_metadata"]
         if reported != first:
             raise WorkerRetiredError(
                 f"a worker's policy server reports {reported}; the run began with {first}",

@@ -12,11 +12,14 @@ from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import (
     InterferenceError,
+    InvalidOptionError,
     ServerDiedError,
     ServerKeepaliveError,
     SimulatorCrashError,
     first_line,
+    named,
 )
+from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.runtime.executor import (
     Executor,
     Outcome,
@@ -25,15 +28,16 @@ from robomme_interference_data.runtime.executor import (
     make_executor,
 )
 from robomme_interference_data.schema.codec import arrow_schema, to_pandas, to_table
+from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.storage.files import atomic_path
 
-from .config import AskConfig, RunConfig, check_shared, with_camera
+from .config import AskConfig, RunConfig, check_shared, nothing_to_retrieve, with_camera
 from .identity import invocation, now, plain, run_identity
-from .kind import Job, Run, RunKind
 from .log import RunLog, count_statuses, is_done, open_log, read_record, row_line, row_of
-from .plan import Plan, WorkItem, plan_work, shuffle_work
+from .plan import RunPlan, WorkItem, plan_work, shuffle_work
 from .row import Rollout
+from .runner import Job, RunContext, Runner
 from .tracking import Tracking, open_tracker
 
 if TYPE_CHECKING:
@@ -120,38 +124,40 @@ def run_evaluation(
     check_shared(config)  # before anything is loaded
     buffer_set, folder = load_buffer_set(config.buffer_set), Path(config.out)
     config = with_camera(config, buffer_set)
-    kind = _kind(dataclasses.replace(config, buffer_set=buffer_set.location), buffer_set)
-    with kind.lock(folder), ExitStack() as stack:
-        kind.prepare()
-        config = kind.config
-        plan, items = plan_run(kind)
+    runner = _runner(dataclasses.replace(config, buffer_set=buffer_set.location), buffer_set)
+    with runner.lock(folder), ExitStack() as stack:
+        runner.prepare()
+        config = runner.config
+        plan, items = plan_run(runner)
         existing = read_record(folder)
         todo = [item for item in items if item not in existing or not is_done(existing[item])]
         executor = executor or make_executor(config)
-        run: Run[Any] = Run(config, kind.system, kind.facts(), buffer_set.name, buffer_set.revision)
+        run: RunContext[Any] = RunContext(
+            config, runner.system, runner.facts(), buffer_set.name, buffer_set.revision
+        )
         pool: WorkerPool | None = None
-        if kind.needs_workers(todo):
-            stack.enter_context(kind.shared())
-            pool = stack.enter_context(executor.pool(kind.task(run)))
-            kind.open(pool, todo)
-        identity = run_identity(kind, plan)
+        if runner.needs_workers(todo):
+            stack.enter_context(runner.shared())
+            pool = stack.enter_context(executor.pool(runner.task(run)))
+            runner.open(pool, todo)
+        identity = run_identity(runner, plan)
         with open_log(folder, identity, buffer_set.name, resume=not config.no_resume) as log:
-            log.begin(invocation(kind, plan, command))
+            log.begin(invocation(runner, plan, command))
             # The buffer set may have moved to another folder: its label in rows stays the same.
             # And what a server reports is known since `open`.
-            run = dataclasses.replace(run, facts=kind.facts(), buffer_set=log.header.buffer_set)
+            run = dataclasses.replace(run, facts=runner.facts(), buffer_set=log.header.buffer_set)
             callbacks = [] if progress is None else [progress]
             if config.track is not None:
                 opened = partial(open_tracker, config.track, folder, plain(identity))
                 callbacks.append(stack.enter_context(Tracking(config.track, opened)))
-            return _run_items(run, kind, pool, items, log, callbacks)
+            return _run_items(run, runner, pool, items, log, callbacks)
 
 
-def plan_run(kind: RunKind[Any]) -> tuple[Plan, tuple[WorkItem, ...]]:
+def plan_run(runner: Runner[Any]) -> tuple[RunPlan, tuple[WorkItem, ...]]:
     """Return the plan of a prepared run and its work items, and check them."""
-    config, buffer_set = kind.config, kind.buffer_set
+    config, buffer_set, facts = runner.config, runner.buffer_set, runner.facts()
     conditions = config.conditions or tuple(
-        name for name in buffer_set.conditions if kind.refusal(name) is None
+        name for name in buffer_set.conditions if facts.applies(name)
     )
     plan = plan_work(
         buffer_set.episodes_under(conditions),
@@ -163,26 +169,40 @@ def plan_run(kind: RunKind[Any]) -> tuple[Plan, tuple[WorkItem, ...]]:
     )
     items = plan.items()
     for condition in plan.conditions:
-        if (refusal := kind.refusal(condition)) is not None:
-            raise refusal
+        _check_condition(facts, condition)
     buffer_set.check_tables(plan.conditions)
-    kind.check(plan, items)
+    runner.check(plan, items)
     return plan, items
 
 
-def _kind(config: RunConfig | AskConfig, buffer_set: BufferSet) -> RunKind[Any]:
+def _check_condition(facts: SystemFacts, condition: str) -> None:
+    """Reject a condition that does not apply to a system."""
+    if facts.applies(condition):
+        return
+    if condition == NO_HISTORY:
+        raise nothing_to_retrieve(
+            f"Leave {NO_HISTORY} out of {named('conditions')}: without history, the system is the "
+            "one without a retrieval step."
+        )
+    raise InvalidOptionError(
+        f"the system takes no history, so {condition} has no effect",
+        f"Set {named('conditions')} to {NO_HISTORY}.",
+    )
+
+
+def _runner(config: RunConfig | AskConfig, buffer_set: BufferSet) -> Runner[Any]:
     if isinstance(config, AskConfig):
         from robomme_interference_data.evaluate.language.question_run import Questions
 
         return Questions(config, buffer_set)
-    from robomme_interference_data.evaluate.rollout.kind import Offline, Rollouts
+    from robomme_interference_data.evaluate.rollout.runner import Offline, Rollouts
 
     return (Offline if config.offline else Rollouts)(config, buffer_set)
 
 
 def _run_items(
-    run: Run[Any],
-    kind: RunKind[Any],
+    run: RunContext[Any],
+    runner: Runner[Any],
     pool: WorkerPool | None,
     items: Sequence[WorkItem],
     log: RunLog,
@@ -198,14 +218,14 @@ def _run_items(
         outcomes: Any = ()
         if pool is not None:
             outcomes = pool.run(
-                [Job(one, kind.metadata) for one in shuffle_work(set(items) - done.keys())],
+                [Job(item, runner.metadata) for item in shuffle_work(set(items) - done.keys())],
                 time_limit=run.config.rollout_timeout_s,
                 again=(SimulatorCrashError, ServerKeepaliveError, ServerDiedError),
             )
             stack.callback(outcomes.close)
         try:
             for outcome in outcomes:
-                row, trace = _row(run, outcome, kind.buffer_set, log)
+                row, trace = _row(run, outcome, runner.buffer_set, log)
                 log.append(row, trace)
                 for callback in callbacks:
                     callback.row(row, outcome.node)
@@ -223,16 +243,16 @@ def _run_items(
             raise
         finally:
             stack.close()
-            *earlier, last = log.header.starts
+            *earlier, last = log.header.invocations
             last = dataclasses.replace(last, ended=now(), stopped=stopped)
             if not full:
-                log.end(dataclasses.replace(log.header, starts=(*earlier, last)))
+                log.end(dataclasses.replace(log.header, invocations=(*earlier, last)))
     rows = tuple(log.rows[item] for item in items if item in log.rows)
     return RunResult(log.folder, rows, len(items), count_statuses(rows), stopped)
 
 
 def _row(
-    run: Run[Any], outcome: Outcome, buffer_set: BufferSet, log: RunLog
+    run: RunContext[Any], outcome: Outcome, buffer_set: BufferSet, log: RunLog
 ) -> tuple[Rollout, str | None]:
     """Write the files of an outcome; return its row, and the traceback of an error or None.
 
@@ -264,7 +284,8 @@ def _row(
         )
     (log.folder / item.clip).unlink(missing_ok=True)  # of an earlier attempt
     # Rows matter more than clips: a full disk costs a clip only.
-    lost = [problem for one in outcome.files.items() if (problem := _write(log.folder, *one))]
+    problems = [_write(log.folder, path, data) for path, data in outcome.files.items()]
+    lost = [problem for problem in problems if problem is not None]
     row = dataclasses.replace(
         row,
         video=item.clip if (log.folder / item.clip).exists() else None,

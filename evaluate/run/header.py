@@ -8,7 +8,7 @@ from robomme_interference_data.constants import MOST_ROW_BYTES
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.storage.files import read_bytes
 
-from .plan import Plan, WorkItem
+from .plan import RunPlan, WorkItem
 
 _MOST_ROLLOUTS = 1 << 20
 """Maximum rollouts of all plans of a run: the paper's grid has 25,200."""
@@ -30,7 +30,7 @@ class Invocation:
 
     command: tuple[str, ...]
     settings: dict[str, Any]
-    plan: Plan
+    plan: RunPlan
     versions: dict[str, str]
     git: str | None
     machine: str
@@ -51,18 +51,18 @@ class RunHeader:
         status: `running`, `complete`, or, if something is missing or broke, `incomplete`.
         planned: Rollouts of all plans together.
         counts: Rows by status.
-        starts: The invocations.
+        invocations: One for each time that the command was started or resumed.
         merged: Names of the folders that a merged run is made of.
     """
 
     format_version: int
     identity: dict[str, Any]
     buffer_set: str
-    plans: tuple[Plan, ...] = ()
+    plans: tuple[RunPlan, ...] = ()
     status: str = "running"
     planned: int = 0
     counts: dict[str, int] = field(default_factory=dict)
-    starts: tuple[Invocation, ...] = ()
+    invocations: tuple[Invocation, ...] = ()
     merged: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -20,21 +20,21 @@ class HistoryReader:
         self._verified: set[tuple[SessionEntry, tuple[str, ...]]] = set()
 
     def stream(
-        self, buffer: Buffer, size: int, cameras: Sequence[str], given: Sequence[int]
+        self, buffer: Buffer, size: int, cameras: Sequence[str], indices: Sequence[int]
     ) -> Generator[Chunk]:
-        """Decode the given frames of a buffer in chunks of at most `size` frames.
+        """Decode frames of a buffer, by their indices, in chunks of at most `size` frames.
 
         Raises `HashMismatchError` if states or frames of a session are not the recorded ones. So
-        sessions that were not compared yet are decoded whole, even if only a few frames are given.
+        sessions that were not compared yet are decoded whole, even for a few of their frames.
         """
-        frames = np.asarray(given, np.int64)
+        frames = np.asarray(indices, np.int64)
         new = {}
         for session in buffer.sessions:
             key = session.entry, tuple(sorted(cameras))
             read = ((frames >= session.start) & (frames < session.stop)).any()
             if read and key not in self._verified:
                 new[key] = session, FeatureDigests()
-        decoded = [frames, *(np.arange(one.start, one.stop) for one, _ in new.values())]
+        decoded = [frames, *(np.arange(session.start, session.stop) for session, _ in new.values())]
         for chunk in buffer.stream(size, cameras, np.unique(np.concatenate(decoded)).tolist()):
             for key in [*new]:
                 session, digests = new[key]
@@ -70,7 +70,7 @@ class HistoryReader:
         if not wrong and combine(recorded) == entry.sha256:
             return
         features = wrong or [*digests]
-        files = dataset.files_of(entry.episode_index, [one for one in features if one != STATE])
+        files = dataset.files_of(entry.episode_index, [name for name in features if name != STATE])
         files = files if STATE in features else files[1:]  # the first one holds the vectors
         raise HashMismatchError.damaged(
             f"{', '.join(files)} in {dataset.files.describe()}: {', '.join(features)} of the "

@@ -17,51 +17,51 @@ from robomme_interference_data.constants import PROTOCOL_VERSION
 from robomme_interference_data.schema.codec import to_dict
 
 from .header import Invocation
-from .kind import RunKind, make_selector, package_versions
-from .plan import Plan
+from .plan import RunPlan
+from .runner import Runner, make_selector, package_versions
 
 _DEEPEST = 20
 """Maximum depth of lists and maps in metadata that is recorded as such."""
 
 
-def run_identity(kind: RunKind[Any], plan: Plan) -> dict[str, Any]:
+def run_identity(runner: Runner[Any], plan: RunPlan) -> dict[str, Any]:
     """Return what can change a result, as plain values: it identifies the run."""
-    config = kind.config
+    config = runner.config
     return {
-        "system": kind.system,
-        "facts": to_dict(kind.facts()),
+        "system": runner.system,
+        "facts": to_dict(runner.facts()),
         "simulator": config.simulator,
-        "revision": kind.buffer_set.revision,
+        "revision": runner.buffer_set.revision,
         "split": config.split,
         "shift": config.shift,
         "model_seed": config.model_seed,
-        "retrieval_index": _retrieval_index(kind, plan),
+        "retrieval_index": _retrieval_index(runner, plan),
         "protocol_version": PROTOCOL_VERSION,
-        **kind.identity(plan),
+        **runner.identity(plan),
     }
 
 
-def _retrieval_index(kind: RunKind[Any], plan: Plan) -> Any:
+def _retrieval_index(runner: Runner[Any], plan: RunPlan) -> Any:
     """Return what the retrieval step depends on; raise if a planned condition lacks its index."""
-    selector = make_selector(kind.config)
+    selector = make_selector(runner.config)
     if selector is None:
         return None
     index = None  # the same for all: the buffers of a condition need the same datasets
     for name in plan.conditions:
-        index = selector.identity(next(kind.buffer_set.buffers(condition=name)))
+        index = selector.identity(next(runner.buffer_set.buffers(condition=name)))
     return plain(index)
 
 
-def invocation(kind: RunKind[Any], plan: Plan, command: Sequence[str]) -> Invocation:
+def invocation(runner: Runner[Any], plan: RunPlan, command: Sequence[str]) -> Invocation:
     """Return the record of an invocation that begins now."""
     return Invocation(
         command=tuple(map(plain, command)),
-        settings=plain(dataclasses.asdict(kind.config)),
+        settings=plain(dataclasses.asdict(runner.config)),
         plan=plan,
-        versions=package_versions(kind.config) | dict(kind.versions),
+        versions=package_versions(runner.config) | dict(runner.versions),
         git=_git(),
         machine=platform.machine(),
-        policy=dict(kind.metadata),
+        policy=dict(runner.metadata),
         started=now(),
     )
 

@@ -56,7 +56,7 @@ class RunLog:
         """Record an invocation."""
         plans = self.header.plans
         plans += () if start.plan in plans else (start.plan,)
-        header = replace(self.header, plans=plans, starts=(*self.header.starts, start))
+        header = replace(self.header, plans=plans, invocations=(*self.header.invocations, start))
         self._write_header(with_counts(header, self.rows, "running"))
 
     def append(self, row: Rollout, trace: str | None = None) -> None:

@@ -59,17 +59,17 @@ def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
     for folder, (_, rows) in zip(folders, runs, strict=True):
         for item, stored in rows.items():
             row = replace(stored, buffer_set=first.buffer_set)
-            other = merged[item][0] if item in merged else None
-            if other is None or (is_done(row) and not is_done(other)):
+            earlier = merged[item][0] if item in merged else None
+            if earlier is None or (is_done(row) and not is_done(earlier)):
                 merged[item] = row, folder
             elif is_done(row):
-                conflicts[item] = conflicts.get(item, False) or _result(row) != _result(other)
+                conflicts[item] = conflicts.get(item, False) or _result(row) != _result(earlier)
     headers = [header for header, _ in runs]
     plans = [replace(plan, shard="1/1") for header in headers for plan in header.plans]
     joined = replace(
         first,
         plans=tuple(plan for place, plan in enumerate(plans) if plan not in plans[:place]),
-        starts=tuple(start for header in headers for start in header.starts),
+        invocations=tuple(start for header in headers for start in header.invocations),
         merged=tuple(folder.name for folder in folders),
     )
     videos = [(folder, row.video) for row, folder in merged.values() if row.video]

@@ -43,10 +43,10 @@ class WorkItem:
         """Path of its clip inside the run's folder."""
         return f"videos/{self.file_name}.mp4"
 
-    def transcript(self, kind: str, lines: Iterable[Mapping[str, Any]]) -> tuple[str, bytes]:
+    def transcript(self, folder: str, lines: Iterable[Mapping[str, Any]]) -> tuple[str, bytes]:
         """Return path and bytes of what models were asked and answered."""
         text = "".join(canonical_json(dict(line)) + "\n" for line in lines)
-        return f"{kind}/{self.file_name}.jsonl", text.encode("utf-8", "backslashreplace")
+        return f"{folder}/{self.file_name}.jsonl", text.encode("utf-8", "backslashreplace")
 
     def __lt__(self, other: "WorkItem") -> bool:
         first, second = (
@@ -57,7 +57,7 @@ class WorkItem:
 
 
 @dataclass(frozen=True)
-class Plan:
+class RunPlan:
     """The planned rollouts, as `run.json` has them.
 
     Attributes:
@@ -97,7 +97,7 @@ class Plan:
             for index in parse_numbers(numbers)
         ]
         episodes = sorted(sorted(known, key=_shuffle_key)[number - 1 :: of])
-        names = [one.name for one in in_order(self.conditions)]
+        names = [condition.name for condition in in_order(self.conditions)]
         return tuple(WorkItem(name, episode) for episode in episodes for name in names)
 
 
@@ -118,11 +118,11 @@ def plan_work(
     episodes: str | None = None,
     split: str = "test",
     shard: str = "1/1",
-) -> Plan:
+) -> RunPlan:
     """Return the plan of a run over a buffer set's query episodes, `known`; see `RunConfig`."""
-    every = sorted(known)
-    available: dict[str, list[int]] = {episode.family: [] for episode in every}
-    for episode in every:
+    episode_ids = sorted(known)
+    available: dict[str, list[int]] = {episode.family: [] for episode in episode_ids}
+    for episode in episode_ids:
         if episode.split == split:
             available[episode.family].append(episode.index)
     for family in families:
@@ -142,14 +142,14 @@ def plan_work(
             )
         if numbers:
             planned[group] = format_numbers(selected or numbers)
-    names = tuple(one.name for one in in_order(conditions))
+    names = tuple(condition.name for condition in in_order(conditions))
     if not planned:
-        splits = sorted({one.split for one in every})
+        splits = sorted({episode.split for episode in episode_ids})
         raise InvalidOptionError(
             f"the buffer set has no {split} episode to run",
             f"Set {named('split')} to one of {', '.join(splits)}.",
         )
-    return Plan(planned, names, shard)
+    return RunPlan(planned, names, shard)
 
 
 def shuffle_work(items: Iterable[WorkItem]) -> tuple[WorkItem, ...]:

@@ -169,9 +169,15 @@ def _table(ended: Mapping[Cell, Counter[str]]) -> Table:
 
 def _lines(cells: Mapping[Cell, Any], empty: Any) -> tuple[list[str], list[tuple[str, list[Any]]]]:
     """Return the conditions, and each family with its cells; of several families, also all."""
-    families = sorted({family for family, _ in cells}, key=lambda one: EpisodeId(one, "test", 0))
-    conditions = sorted({name for _, name in cells}, key=lambda one: parse_condition(one).sort_key)
-    lines = [(one, [cells.get((one, name), empty) for name in conditions]) for one in families]
+    families = sorted(
+        {family for family, _ in cells}, key=lambda family: EpisodeId(family, "test", 0)
+    )
+    conditions = sorted(
+        {name for _, name in cells}, key=lambda name: parse_condition(name).sort_key
+    )
+    lines = [
+        (family, [cells.get((family, name), empty) for name in conditions]) for family in families
+    ]
     if len(lines) > 1:
         columns = zip(*(line for _, line in lines), strict=True)
         lines.append(("all", [sum(column, empty) for column in columns]))

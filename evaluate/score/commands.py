@@ -21,7 +21,7 @@ from robomme_interference_data.errors import InvalidOptionError
 from .config import Settings
 
 if TYPE_CHECKING:
-    from .rows.reading import Rows
+    from .rows.reading import CheckedRows
 
 
 _OUTPUT = "Output"
@@ -219,7 +219,7 @@ def _look(text: str) -> tuple[int, int]:
     return look, of
 
 
-def _print_notes(runs: "Sequence[Rows]", notes: Sequence[str]) -> None:
+def _print_notes(runs: "Sequence[CheckedRows]", notes: Sequence[str]) -> None:
     for rows in runs:
         for refusal in rows.refusals:
             print_status(f"left out: {refusal}")

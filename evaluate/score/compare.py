@@ -14,7 +14,7 @@ from robomme_interference_data.stats.signs import sign_flips
 from robomme_interference_data.viz.tables import Table
 
 from .outcomes import mean_errors
-from .rows.reading import Rows, read_rows
+from .rows.reading import CheckedRows, read_rows
 from .sides import (
     Side,
     check_scenes,
@@ -51,7 +51,7 @@ class RunComparison:
 
     table: Table
     notes: tuple[str, ...]
-    runs: tuple[Rows, ...]
+    runs: tuple[CheckedRows, ...]
 
 
 def compare(
@@ -86,7 +86,7 @@ def compare(
         contrasts += own
         repeated = a.repeats(b, a_rows, b_rows) and not conditions
         if repeated and measure is Measure.SUCCESS:
-            overall = {one.condition: one.pairs for one in own if not one.family}
+            overall = {each.condition: each.pairs for each in own if not each.family}
             notes += noise_floor(a, b, overall)
     if not contrasts:
         paths = " and ".join(str(path) for path in (first, second) if path)
@@ -125,7 +125,7 @@ def compare(
     return RunComparison(replace(table, note=" ".join(note)), tuple(notes), runs)
 
 
-def _measure(runs: Sequence[Rows]) -> Measure:
+def _measure(runs: Sequence[CheckedRows]) -> Measure:
     """Return what is compared; the rows of all runs must be of one kind."""
     offline = {row.simulator == RECORDINGS for rows in runs for row in rows}
     if len(offline) > 1:
@@ -213,7 +213,7 @@ def _check_arguments(
         raise InvalidOptionError(f"{first} is given twice", hint, command)
 
 
-def _two_conditions(path: Path, rows: Rows) -> tuple[str, str | None]:
+def _two_conditions(path: Path, rows: CheckedRows) -> tuple[str, str | None]:
     """Return a hint and a command that compare two conditions of a run, if it holds two."""
     held = sorted(rows.names("condition"), key=lambda name: parse_condition(name).sort_key)
     names = ", ".join(held) or "no rows"

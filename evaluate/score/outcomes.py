@@ -19,7 +19,7 @@ from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.stats.intervals import effective_n, wilson
 
 from .config import Expected
-from .rows.reading import Rows
+from .rows.reading import CheckedRows
 from .rows.values import Row
 
 STATUSES = (Status.SUCCESS, Status.FAIL, Status.TIMEOUT, Status.ERROR, Status.MEASURED)
@@ -199,16 +199,18 @@ def rate_of(status: Statuses) -> SuccessRate:
     return SuccessRate(n, value, effective_n(float(rates.mean()), spread, n, int(of.sum())))
 
 
-def outcomes_of(rows: Rows, expected: Expected) -> dict[str, Outcomes]:
+def outcomes_of(rows: CheckedRows, expected: Expected) -> dict[str, Outcomes]:
     """Return the outcomes of each simulator, by its name; recordings have none."""
     return {
-        name: _outcomes([r for r in rows if r.simulator == name], name, expected, rows.unpinned)
+        name: _outcomes(
+            [r for r in rows if r.simulator == name], name, expected, rows.without_revision
+        )
         for name in rows.names("simulator")
         if name != RECORDINGS
     }
 
 
-def offline_outcomes(rows: Rows) -> Outcomes | None:
+def offline_outcomes(rows: CheckedRows) -> Outcomes | None:
     """Return the outcomes of offline runs, or None without any.
 
     Recordings have no grid: the expected episodes are those that occur in any row or in the plan
@@ -223,7 +225,7 @@ def offline_outcomes(rows: Rows) -> Outcomes | None:
         if run is not None and run.identity.get("simulator") == RECORDINGS
         for item in run.items
     }
-    outcomes = _outcomes(measured, RECORDINGS, Expected.OBSERVED, rows.unpinned, planned)
+    outcomes = _outcomes(measured, RECORDINGS, Expected.OBSERVED, rows.without_revision, planned)
     return replace(outcomes, due=outcomes.has_rows)
 
 

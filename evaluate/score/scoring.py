@@ -13,7 +13,7 @@ from robomme_interference_data.viz.tables import Table, percent
 from .config import Against, Expected, Settings
 from .outcomes import Outcomes, offline_outcomes, outcomes_of
 from .partners import base_of, ceilings_of
-from .rows.reading import Rows, read_rows
+from .rows.reading import CheckedRows, read_rows
 from .tables import effects, families, ranks, slopes
 from .tables.cells import SuccessCell, cells_of, main_grids, main_table, parts_table
 from .tables.contrast import Contrast
@@ -62,7 +62,7 @@ class Score:
 
     settings: Settings
     draws: int
-    rows: Rows
+    rows: CheckedRows
     notes: tuple[str, ...]
     outcomes: Mapping[str, Outcomes]
     recordings: Outcomes | None
@@ -157,7 +157,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     )
 
 
-def _rows(settings: Settings) -> Rows:
+def _rows(settings: Settings) -> CheckedRows:
     """Read the rows, of which some must be valid and no errors."""
     rows = read_rows(settings.rows, settings.system, settings.lenient)
     sources = ", ".join(map(str, settings.rows))

@@ -11,7 +11,7 @@ from robomme_interference_data.viz.tables import percent
 
 from .config import Expected
 from .outcomes import Outcomes, offline_outcomes, outcomes_of
-from .rows.reading import Rows
+from .rows.reading import CheckedRows
 from .rows.values import unshifted
 from .tables.pairs import Pairs
 
@@ -34,7 +34,7 @@ class Side:
         whole = self.outcomes.complete[self.outcomes.cell(self.system, condition)]
         return bool(whole) and self.planned.get(condition, set()) <= self.counted(condition)
 
-    def repeats(self, other: "Side", rows: Rows, other_rows: Rows) -> bool:
+    def repeats(self, other: "Side", rows: CheckedRows, other_rows: CheckedRows) -> bool:
         """Whether another run's side is the same system with the same scenes and histories."""
         name = self.outcomes.simulator
         same = (self.system, name) == (other.system, other.outcomes.simulator)
@@ -52,7 +52,7 @@ Sides = dict[tuple[str, str], Side]
 """The systems of a run, by simulator and name."""
 
 
-def sides_of(rows: Rows) -> Sides:
+def sides_of(rows: CheckedRows) -> Sides:
     """Return the systems of a run, in the order of tables."""
     planned = defaultdict[str, set[EpisodeId]](set)
     for run in rows.sources.values():
@@ -69,7 +69,9 @@ def sides_of(rows: Rows) -> Sides:
     }
 
 
-def matched_sides(runs: Sequence[Rows], sides: Sequence[Sides]) -> Iterator[tuple[Side, Side]]:
+def matched_sides(
+    runs: Sequence[CheckedRows], sides: Sequence[Sides]
+) -> Iterator[tuple[Side, Side]]:
     """Yield the sides that are compared, in the order of tables."""
     first, second = (rows.names("simulator") for rows in runs)
     shared = {name: name for name in first if name in second}
@@ -96,7 +98,7 @@ def matched_sides(runs: Sequence[Rows], sides: Sequence[Sides]) -> Iterator[tupl
             yield a, b
 
 
-def check_scenes(rows: Rows, other_rows: Rows) -> None:
+def check_scenes(rows: CheckedRows, other_rows: CheckedRows) -> None:
     """Check that the two runs have the same seed for each episode."""
     known, others = (
         {
@@ -118,7 +120,9 @@ def check_scenes(rows: Rows, other_rows: Rows) -> None:
 # --- notes -------------------------------------------------------------------------------------
 
 
-def differing(rows: Rows, other_rows: Rows, matched: Iterable[tuple[Side, Side]]) -> Iterator[str]:
+def differing(
+    rows: CheckedRows, other_rows: CheckedRows, matched: Iterable[tuple[Side, Side]]
+) -> Iterator[str]:
     """Yield notes on what differs between two runs: shifts, and revisions of buffer sets."""
     names = dict.fromkeys((a.outcomes.simulator, b.outcomes.simulator) for a, b in matched)
     for first, second in names:

@@ -16,13 +16,13 @@ from vla_eval.types import Observation as ServerObservation
 from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import InvalidOptionError, RunError, UnknownNameError, counted
-from robomme_interference_data.evaluate.rollout.kind import Rollouts
+from robomme_interference_data.evaluate.rollout.runner import Rollouts
 from robomme_interference_data.evaluate.rollout.worker import RolloutTask
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.evaluation import plan_run
-from robomme_interference_data.evaluate.run.kind import Job, Run
 from robomme_interference_data.evaluate.run.log import row_line, row_of
 from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.evaluate.run.runner import Job, RunContext
 from robomme_interference_data.ids import EpisodeId, count_numbers, nth_number
 from robomme_interference_data.runtime.worker import Worker
 from robomme_interference_data.schema.codec import to_dict
@@ -137,8 +137,8 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
             system=system,
             **chosen,
         )
-        kind = Rollouts(config, opened)
-        kind.prepare()
+        runner = Rollouts(config, opened)
+        runner.prepare()
         with_history = [name for name in config.conditions if name != NO_HISTORY]
         if with_history and not send_video_history:
             raise InvalidOptionError(
@@ -146,10 +146,10 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
                 f"send_video_history, and {', '.join(with_history)} would be {NO_HISTORY}",
                 f"Set `conditions` to [{NO_HISTORY}], or serve a model with a memory.",
             )
-        self._plan, _ = plan_run(kind)
+        self._plan, _ = plan_run(runner)
         # Which server plays is not known here: without an identity, its rows are paired with none.
-        facts = replace(kind.facts(), policy="vla-eval", policy_id=None)
-        self._run = Run(kind.config, kind.system, facts, opened.name, opened.revision)
+        facts = replace(runner.facts(), policy="vla-eval", policy_id=None)
+        self._run = RunContext(runner.config, runner.system, facts, opened.name, opened.revision)
         self._policy = HarnessPolicy(**options)
         self._rollouts = RolloutTask(self._run, policy=self._policy)
         # A rollout asks its policy for actions, and vla-eval asks its benchmark for observations:

@@ -223,7 +223,7 @@ def test_results_name_the_buffer_set_that_the_run_names(tmp_path: Path) -> None:
     place = f"people/tiny@{COMMIT}"
     (tmp_path / "rollouts.jsonl").write_bytes((RUN / "rollouts.jsonl").read_bytes())
     header = json.loads((RUN / "run.json").read_text())
-    header["starts"][0]["settings"]["buffer_set"] = place
+    header["invocations"][0]["settings"]["buffer_set"] = place
     header["identity"]["policy"] = "a | `b`"
     write_json(tmp_path / "run.json", header)
     text = results_text(tmp_path, Publication("people/results", "1.0.0"))

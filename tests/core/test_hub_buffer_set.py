@@ -273,4 +273,4 @@ def test_a_run_on_a_repository_keeps_its_commit(
     assert rows[0].revision == rows[1].revision and rows[0].status == rows[1].status
     header = json.loads((tmp_path / "run-0" / "run.json").read_text(encoding="utf-8"))
     commit = hub.repositories[f"datasets/{BUFFER_SET}"].find().oid
-    assert header["starts"][0]["settings"]["buffer_set"] == f"{BUFFER_SET}@{commit}"
+    assert header["invocations"][0]["settings"]["buffer_set"] == f"{BUFFER_SET}@{commit}"

@@ -34,8 +34,8 @@ from robomme_interference_data.evaluate.rollout.checks import (
     check_plan,
     check_settings,
     check_system,
-    default_system,
 )
+from robomme_interference_data.evaluate.rollout.names import default_system
 from robomme_interference_data.evaluate.rollout.worker import simulator_options
 from robomme_interference_data.evaluate.run.plan import plan_work
 from robomme_interference_data.evaluate.systems import name_system

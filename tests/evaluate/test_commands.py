@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 import typer
 from support.runs import run_one
+from support.scoring import STATUS
+from support.scoring import row as scored_row
 from typer.testing import CliRunner
 
 from robomme_interference_data.constants import FAMILIES
@@ -148,12 +150,10 @@ PLAN = [
 
 
 def row(item: WorkItem, status: str) -> Rollout:
-    success = None if status == "error" else status == "success"
-    return Rollout(
-        *("mine", "world", "buffer_set", "r", item.episode.family, item.condition, "test"),
-        *(item.episode.index, "none", 0, 1, 7, "easy", "a goal", status, success, 0, 0, 0, None),
-        error="it \x1b[2Jbroke" if status == "error" else None,
-    )
+    letter = next(letter for letter, name in STATUS.items() if name == status)
+    made = scored_row("mine", item.condition, "MoveCube", item.episode.index, letter)
+    error = "it \x1b[2Jbroke" if status == "error" else None
+    return replace(made, simulator="world", family=item.episode.family, error=error)
 
 
 def test_nine_families_and_five_conditions_fit_in_80_columns() -> None:
@@ -217,7 +217,7 @@ def test_errors_are_listed_beside_the_rate() -> None:
     other = WorkItem("no-history", EpisodeId("MoveCube", "test", 0))
     table = rate_table([*rows, row(other, "error")])
     assert [*table.columns] == ["family", "no-history", "k0"]
-    assert table.rows == (
+    assert tuple(table.rows) == (
         ("VideoRepick", "", "3/5 60%, 1 broke"),
         ("MoveCube", "1 broke", ""),
         ("all", "1 broke", "3/5 60%, 1 broke"),

@@ -86,7 +86,7 @@ def test_another_run_is_an_error_that_names_the_difference(
 def test_other_settings_may_change_between_starts(tmp_path: Path) -> None:
     run_one(tmp_path / "run", history_chunk=7)
     run_one(tmp_path / "run", check_lesson=True, rollout_timeout_s=5.0, cache=True)
-    starts = header(tmp_path / "run")["starts"]
+    starts = header(tmp_path / "run")["invocations"]
     assert [one["settings"]["history_chunk"] for one in starts] == [7, 64]
     assert [one["settings"]["check_lesson"] for one in starts] == [False, True]
 
@@ -103,7 +103,9 @@ def test_the_address_of_a_server_may_change_but_not_its_model(tmp_path: Path) ->
         assert merged.missing == merged.duplicates == ()
         again = served("merged", second, policy_options=("response_s=30",))
         assert again.counts["fail"] == 2
-        addresses = {start["policy"]["server"] for start in header(tmp_path / "merged")["starts"]}
+        addresses = {
+            start["policy"]["server"] for start in header(tmp_path / "merged")["invocations"]
+        }
         assert addresses == {f"127.0.0.1:{first.port}", f"127.0.0.1:{second.port}"}
         first.metadata = {"checkpoint": "b"}
         difference = r"server_metadata\.checkpoint is 'a' there, 'b' here"
@@ -114,12 +116,12 @@ def test_the_address_of_a_server_may_change_but_not_its_model(tmp_path: Path) ->
 def test_a_privileged_policy_is_recorded(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     privileged = {"policy_options": ("name=privileged", "value=true")}
     run_one(tmp_path / "run", policy=f"{OWN}changed", **privileged)
-    metadata = header(tmp_path / "run")["starts"][0]["policy"]
+    metadata = header(tmp_path / "run")["invocations"][0]["policy"]
     assert metadata == {"policy": "still", "privileged": True}
     assert "own_policies:changed is privileged: it gets the simulator" in caplog.text
     caplog.clear()
     run_one(tmp_path / "other", policy=f"{OWN}says", policy_options=("what=array",))
-    metadata = header(tmp_path / "other")["starts"][0]["policy"]
+    metadata = header(tmp_path / "other")["invocations"][0]["policy"]
     assert metadata == {"policy": "still", "sizes": [0, 1, 2], "4": 5.0}
     assert "privileged" not in caplog.text
 

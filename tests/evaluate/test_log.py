@@ -20,14 +20,14 @@ GOLDEN = Path(__file__).parent.parent / "golden" / "run"
 
 HEADER, KNOWN = read_run(GOLDEN)
 ROWS = list(KNOWN.values())
-"""One of the lesson behind seven units, one with a retrieval step, and one that broke."""
+"""One of the lesson behind seven units, one with retrieved frames, and one that broke."""
 
 
 @pytest.mark.parametrize("name", ["run", "not-utf-8-\udcff"])
 def test_golden_files(tmp_path: Path, name: str) -> None:
     out = tmp_path / name
     with open_log(out, HEADER.identity, HEADER.buffer_set) as log:
-        log.begin(HEADER.starts[0])
+        log.begin(HEADER.invocations[0])
         for row in ROWS:
             log.append(row, trace="Traceback\n…" if row.error else None)
         log.end(log.header)
@@ -40,7 +40,7 @@ def test_golden_files(tmp_path: Path, name: str) -> None:
 def test_a_killed_run_has_the_status_of_its_record(tmp_path: Path) -> None:
     out = tmp_path / "run"
     with open_log(out, HEADER.identity, "my-buffers") as log:
-        log.begin(HEADER.starts[0])
+        log.begin(HEADER.invocations[0])
         for row in ROWS[:2]:
             log.append(row)
     assert json.loads((out / "run.json").read_text())["status"] == "running"
@@ -76,12 +76,12 @@ def test_a_run_can_read_everything_that_it_writes(
     columns = model_columns(1, tokens, 0)
     row = replace(ROWS[2], **columns, error=plain(text), finished_at=None)
     with open_log(out, {"policy_metadata": stored}, "my-buffers") as log:
-        log.begin(replace(HEADER.starts[0], policy=stored))
+        log.begin(replace(HEADER.invocations[0], policy=stored))
         log.append(row, text)
         log.end(log.header)
     header, rows = read_run(out)
     assert header.identity == {"policy_metadata": stored} and [*rows.values()] == [row]
-    assert header.starts[0].policy == stored
+    assert header.invocations[0].policy == stored
     stands = all(one >= 0 for one in tokens) and sum(tokens) < 1 << 63
     assert (columns["model_tokens"], columns["model_faults"]) == (
         sum(tokens) if tokens and stands else None,

@@ -35,7 +35,7 @@ def test_merged_shards_equal_the_whole_run(tmp_path: Path) -> None:
     for name in ("identity", "plans", "counts", "planned", "status", "buffer_set"):
         assert found[name] == one[name]
     assert found["merged"] == ["shard-1", "shard-2", "shard-3"]
-    assert len(found["starts"]) == 3
+    assert len(found["invocations"]) == 3
     # The merged run is a run: asked for the whole plan, it has nothing left to do.
     log = (tmp_path / "merged" / "rollouts.jsonl").read_bytes()
     assert untimed(run(tmp_path / "merged").rows) == untimed(whole.rows)

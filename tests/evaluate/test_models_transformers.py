@@ -114,7 +114,11 @@ def test_models_that_cannot_be_loaded(tiny: Path, tmp_path: Path) -> None:
 
 
 def test_a_run_of_questions(tiny: Path, tmp_path: Path) -> None:
-    settings: dict[str, Any] = {"model": f"transformers:{tiny}", "system": "tiny", "frames": 2}
+    settings: dict[str, Any] = {
+        "model": f"transformers:{tiny}",
+        "system": "tiny",
+        "memory": "framesamp:2",
+    }
     settings["families"] = ("MoveCube",)
     rows = ask(tmp_path / "run", **settings, model_options=("max_tokens=12",)).rows
     assert {row.status for row in rows} <= {"success", "fail"} and len(rows) == 2

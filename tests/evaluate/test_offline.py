@@ -15,10 +15,10 @@ from robomme_interference_data.build_dataset.sources import Frame
 from robomme_interference_data.errors import HashMismatchError, InterferenceError, PolicyError
 from robomme_interference_data.evaluate import Policy, RolloutInfo, RunConfig, run_evaluation
 from robomme_interference_data.evaluate.rollout.rollout import run_rollout
-from robomme_interference_data.evaluate.run.kind import Run
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.progress import error_table
 from robomme_interference_data.evaluate.run.row import Rollout
+from robomme_interference_data.evaluate.run.runner import RunContext
 from robomme_interference_data.evaluate.score.rows.reading import read_rows
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId
@@ -87,7 +87,7 @@ def walk(root: Path, policy: Policy, condition: str = "k1") -> Rollout:
     opened = load_buffer_set(root)
     config = RunConfig(policy="mine", buffer_set=str(root), out=Path("nowhere"), offline=True)
     return run_rollout(
-        Run(config, "mine", SystemFacts(), opened.name, opened.revision),
+        RunContext(config, "mine", SystemFacts(), opened.name, opened.revision),
         WorkItem(condition, EpisodeId.parse(DRAWER)),
         simulator=Recordings(str(root), policy.cameras),
         policy=policy,

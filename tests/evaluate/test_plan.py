@@ -13,7 +13,7 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.evaluate.run.header import RunHeader
-from robomme_interference_data.evaluate.run.plan import Plan, WorkItem, plan_work, shuffle_work
+from robomme_interference_data.evaluate.run.plan import RunPlan, WorkItem, plan_work, shuffle_work
 from robomme_interference_data.ids import EpisodeId
 
 KNOWN = [EpisodeId(f, "test", i) for f in ("MoveCube", "RouteStick") for i in (0, 1, 2, 5)]
@@ -24,7 +24,7 @@ def test_a_plan_is_in_canonical_order_and_keeps_an_episodes_conditions_together(
     plan = plan_work(
         KNOWN, families=["MoveCube"], episodes="5,0", conditions=("k7", "no-history", "k0")
     )
-    assert plan == Plan({"MoveCube/test": "0,5"}, ("no-history", "k0", "k7"), "1/1")
+    assert plan == RunPlan({"MoveCube/test": "0,5"}, ("no-history", "k0", "k7"), "1/1")
     episodes = EpisodeId("MoveCube", "test", 0), EpisodeId("MoveCube", "test", 5)
     assert plan.items() == tuple(
         WorkItem(condition, episode)
@@ -65,12 +65,12 @@ def test_invalid_plans_are_errors(
 @pytest.mark.parametrize("text", ["", "0/8", "2/8/1", "a/b"])
 def test_invalid_shards_are_errors(text: str) -> None:
     with pytest.raises(InvalidOptionError, match="NUMBER/OF"):
-        Plan({"MoveCube/test": "0"}, ("k0",), text)
+        RunPlan({"MoveCube/test": "0"}, ("k0",), text)
 
 
-def whole(episodes: int, shard: str = "1/1") -> Plan:
+def whole(episodes: int, shard: str = "1/1") -> RunPlan:
     names = ("no-history", "k0", "k7")
-    return Plan({"MoveCube/test": f"0-{episodes - 1}"}, names, shard)
+    return RunPlan({"MoveCube/test": f"0-{episodes - 1}"}, names, shard)
 
 
 @given(episodes=st.integers(1, 50), of=st.integers(1, 12))
@@ -87,7 +87,7 @@ def test_shards_are_even_and_together_the_plan(episodes: int, of: int) -> None:
 
 @given(st.permutations(range(12)))
 def test_the_shuffle_depends_only_on_the_episodes(order: list[int]) -> None:
-    plan = Plan({"MoveCube/test": "0-11"}, ("k0",)).items()
+    plan = RunPlan({"MoveCube/test": "0-11"}, ("k0",)).items()
     shuffled = shuffle_work([plan[index] for index in order])
     assert shuffled == shuffle_work(plan)
     # By the sha256 of "MoveCube/test/0" and so on, worked out apart.
@@ -98,7 +98,7 @@ def test_the_shuffle_depends_only_on_the_episodes(order: list[int]) -> None:
 
 def test_the_size_of_plans_is_limited() -> None:
     conditions = tuple(f"k{k}" for k in range(64))
-    plans = tuple(Plan({"MoveCube/test": f"0-{16_000 + n}"}, conditions) for n in range(2))
+    plans = tuple(RunPlan({"MoveCube/test": f"0-{16_000 + n}"}, conditions) for n in range(2))
     assert plans[0].most == 64 * 16_001
     assert RunHeader(1, {}, "buffer_set", plans[:1]).plans == plans[:1]
     with pytest.raises(FormatError, match="rollouts; expected at most"):

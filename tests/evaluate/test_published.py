@@ -181,7 +181,7 @@ def test_the_published_values_may_be_set_and_are_recorded(client: Path) -> None:
         given = settings("symbolic-simplesg", server.url, client / "api.py")
         run_one(client / "run", **given, subgoal_options=("fps=30", "repeats=1"))
         run_one(client / "run", **given)
-    recorded = header(client / "run")["starts"][0]["settings"]["subgoal_options"]
+    recorded = header(client / "run")["invocations"][0]["settings"]["subgoal_options"]
     assert {"fps=30", "frames=4096", "video=mp4", "max_tokens=128"} <= {*recorded}
 
 

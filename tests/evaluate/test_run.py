@@ -17,7 +17,7 @@ from support.worlds import World
 
 from robomme_interference_data.errors import HashMismatchError, RunError, SimulatorCrashError
 from robomme_interference_data.evaluate.rollout import worker
-from robomme_interference_data.evaluate.rollout.worker import Opening
+from robomme_interference_data.evaluate.rollout.worker import StartSimulator
 from robomme_interference_data.evaluate.run.log import read_record
 from robomme_interference_data.runtime.executor import Outcome, Serial
 
@@ -38,7 +38,7 @@ def test_a_run_writes_a_row_for_every_rollout(tmp_path: Path) -> None:
     assert (found["status"], found["planned"], found["counts"]) == ("complete", 6, result.counts)
     episodes = {"VideoRepick/test": "0", "MoveCube/test": "0"}
     assert found["plans"] == [{"episodes": episodes, "conditions": conditions, "shard": "1/1"}]
-    (start,) = found["starts"]
+    (start,) = found["invocations"]
     assert start["policy"] == {"policy": "cheat"} and start["started"] <= start["ended"]
     assert {"numpy", "python", "robomme-interference-data"} <= set(start["versions"])
     assert start["settings"]["conditions"] == ["k7", "no-history", "k0"]
@@ -56,7 +56,7 @@ def test_a_resumed_run_skips_finished_rollouts(tmp_path: Path) -> None:
     text = log.read_bytes()
     assert run(tmp_path / "run", workers=2).rows == first.rows
     assert log.read_bytes() == text
-    assert len(header(tmp_path / "run")["starts"]) == 2
+    assert len(header(tmp_path / "run")["invocations"]) == 2
     log.write_bytes(text[:-20])  # torn
     assert untimed(run(tmp_path / "run").rows) == untimed(first.rows)
     assert len(log.read_bytes().splitlines()) == 4
@@ -96,14 +96,14 @@ def test_the_header_states_the_status_from_the_start_and_after_ctrl_c(tmp_path: 
         run(out, progress=impatient)
     begun = impatient.seen
     assert (begun["status"], begun["planned"]) == ("running", 4)
-    assert set(begun["counts"].values()) == {0} and begun["starts"][0]["ended"] is None
+    assert set(begun["counts"].values()) == {0} and begun["invocations"][0]["ended"] is None
     found = header(out)
     assert (found["status"], sum(found["counts"].values())) == ("incomplete", 1)
-    assert found["starts"][0]["stopped"] == "interrupted"
+    assert found["invocations"][0]["stopped"] == "interrupted"
     assert pq.read_metadata(out / "rollouts.parquet").num_rows == 1
     assert len((out / "rollouts.csv").read_text().splitlines()) == 2
     run(out)
-    assert [one["stopped"] for one in header(out)["starts"]] == ["interrupted", None]
+    assert [one["stopped"] for one in header(out)["invocations"]] == ["interrupted", None]
 
 
 # --- what breaks -------------------------------------------------------------------------------
@@ -196,14 +196,14 @@ def test_a_run_without_workers_stops_with_the_reason(tmp_path: Path) -> None:
             yield self
 
         def run(self, tasks: Any, **_: Any) -> Generator[Outcome]:
-            if isinstance(tasks[0], Opening):
+            if isinstance(tasks[0], StartSimulator):
                 yield Outcome(tasks[0])
                 return
             raise SimulatorCrashError("nobody is left")
 
     with pytest.raises(SimulatorCrashError):
         run(tmp_path / "run", executor=Lost())
-    assert header(tmp_path / "run")["starts"][0]["stopped"] == "nobody is left"
+    assert header(tmp_path / "run")["invocations"][0]["stopped"] == "nobody is left"
 
 
 # --- folders -----------------------------------------------------------------------------------

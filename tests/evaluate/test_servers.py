@@ -202,7 +202,7 @@ def test_a_worker_starts_its_server_and_ends_it(tmp_path: Path) -> None:
     assert not any(psutil.pid_exists(int(pid)) for pid in pids)
     (log,) = (tmp_path / "run" / "servers").iterdir()
     assert log.name.endswith("-0.log") and log.read_text().startswith("serving at 18")
-    (start,) = header(tmp_path / "run")["starts"]
+    (start,) = header(tmp_path / "run")["invocations"]
     line = command("--pids", tmp_path / "pids")
     assert start["settings"]["policy"] == f"websocket:{line}"
     assert start["policy"]["server"] == line

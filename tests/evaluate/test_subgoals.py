@@ -36,11 +36,8 @@ from robomme_interference_data.evaluate.language.subgoal_writer import OracleWri
 from robomme_interference_data.evaluate.language.subgoal_writers import make_writer
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.evaluate.policies.registry import make_policy
-from robomme_interference_data.evaluate.rollout.checks import (
-    check_settings,
-    check_system,
-    default_system,
-)
+from robomme_interference_data.evaluate.rollout.checks import check_settings, check_system
+from robomme_interference_data.evaluate.rollout.names import default_system
 from robomme_interference_data.evaluate.run.history import HistoryReader
 from robomme_interference_data.runtime.executor import Executor, Processes, Serial
 from robomme_interference_data.schema.subgoal import Subgoal
@@ -250,7 +247,7 @@ def test_the_prompt_and_the_model_identify_the_run(tmp_path: Path) -> None:
                 run_one(tmp_path / "run", **behind(server, **changes))
         with pytest.raises(RunError, match="subgoals"):
             run_one(tmp_path / "run", policy=TOLD)
-    start = header(tmp_path / "run")["starts"][0]
+    start = header(tmp_path / "run")["invocations"][0]
     assert start["policy"]["subgoals"]["model"] == {"model": "tiny"}
 
 

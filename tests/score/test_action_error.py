@@ -13,7 +13,7 @@ from support.scoring import OWN
 from support.scoring import recording as row
 
 from robomme_interference_data.errors import FormatError, InvalidOptionError, RunError
-from robomme_interference_data.evaluate.run.plan import Plan
+from robomme_interference_data.evaluate.run.plan import RunPlan
 from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.score.compare import compare
 from robomme_interference_data.evaluate.score.plots.figures import draw_error_figure
@@ -128,7 +128,7 @@ def test_broken_recordings_are_counted(broken: Path) -> None:
 
 def test_planned_recordings_are_expected(tmp_path: Path) -> None:
     """A run that stopped early: three of its five planned recordings have rows."""
-    plan = Plan({"OpenDrawer/test": "0-4"}, ("k0",))
+    plan = RunPlan({"OpenDrawer/test": "0-4"}, ("k0",))
     given = [row("k0", number, (0.1,)) for number in range(3)]
     run = made.write_run(tmp_path / "run", given, plans=(plan,))
     header = json.loads((run / "run.json").read_text())

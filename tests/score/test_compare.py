@@ -9,7 +9,7 @@ from support import scoring as made
 from support.scoring import BASE, OWN, cells, run
 
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evaluate.run.plan import Plan
+from robomme_interference_data.evaluate.run.plan import RunPlan
 from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.score.compare import RunComparison, compare
 from robomme_interference_data.stats.intervals import newcombe_paired, wilson
@@ -112,7 +112,7 @@ def test_what_cannot_be_paired_is_not_compared(
 
 
 def test_a_run_that_was_stopped_is_marked(tmp_path: Path) -> None:
-    plan = Plan({"MoveCube/test": "0-9"}, ("k0", "k7"))
+    plan = RunPlan({"MoveCube/test": "0-9"}, ("k0", "k7"))
     both = own(k0="ssssss", k7="sfffff")
     stopped = made.write_run(tmp_path / "stopped", both, plans=(plan,), status="incomplete")
     found = compare(stopped, conditions=("k0", "k7"))

@@ -70,6 +70,20 @@ HEADLINES = {
         {("oracle", "k0"): "s", (OWN, "k0"): "f"},
         ("my-memory succeeds in 0.0% of 1",),
     ),
+    "references above the highest rate are named": (
+        {
+            ("a", "k0"): "sss",
+            ("a", "k7"): "fff",
+            ("b", "k0"): "ssf",
+            ("b", "k7"): "sff",
+            ("oracle", "k7"): "sss",
+            ("guess", "k7"): "fff",
+        },
+        (
+            "The highest rate at k7 is 33.3%, of b, without the references, of which Oracle is "
+            "higher.",
+        ),
+    ),
     "a reference alone": ({("oracle", "k0"): "s"}, ("Oracle succeeds in 100.0% of 1 episodes",)),
 }
 

@@ -16,7 +16,7 @@ from support.browser import open_page
 from support.scoring import BASE, OWN, RETRIEVAL, cells
 
 from robomme_interference_data.evaluate.run.header import Invocation
-from robomme_interference_data.evaluate.run.plan import Plan
+from robomme_interference_data.evaluate.run.plan import RunPlan
 from robomme_interference_data.evaluate.score.plots.data import Data
 from robomme_interference_data.evaluate.score.plots.figures import (
     FIGURES,
@@ -45,7 +45,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         Invocation(
             command=(f"robomme-interference evaluate --out 'my run' --shard {shard}/2",),
             settings={},
-            plan=Plan({"MoveCube/test": "0-5"}, ("k0",)),
+            plan=RunPlan({"MoveCube/test": "0-5"}, ("k0",)),
             versions={"python": "3.12.0", "numpy": "2.2.0"},
             git="0" * 40,
             machine="x86_64",
@@ -54,7 +54,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         )
         for shard in (1, 2)
     )
-    made.write_run(folder, rows, status="complete", starts=starts)
+    made.write_run(folder, rows, status="complete", invocations=starts)
     (folder / VIDEO).parent.mkdir(parents=True)
     (folder / VIDEO).write_bytes(b"video")
     return folder

@@ -18,12 +18,12 @@ from robomme_interference_data.errors import FormatError, InvalidOptionError, Mi
 from robomme_interference_data.evaluate.score.compare import compare
 from robomme_interference_data.evaluate.score.rows import files
 from robomme_interference_data.evaluate.score.rows.export import export
-from robomme_interference_data.evaluate.score.rows.reading import Rows, read_rows
+from robomme_interference_data.evaluate.score.rows.reading import CheckedRows, read_rows
 
 COLUMNS = ("simulator", "system", "condition", "family", "episode", "model_seed", "status")
 
 
-def told(rows: Rows, *columns: str) -> list[tuple[Any, ...]]:
+def told(rows: CheckedRows, *columns: str) -> list[tuple[Any, ...]]:
     """What the rows hold, sorted."""
     return sorted((tuple(getattr(row, c) for c in columns or COLUMNS) for row in rows), key=repr)
 

@@ -11,10 +11,10 @@ from support import worlds
 
 from robomme_interference_data.evaluate import RunConfig, RunResult, run_evaluation
 from robomme_interference_data.evaluate.rollout.rollout import run_rollout
-from robomme_interference_data.evaluate.run.kind import Run
 from robomme_interference_data.evaluate.run.log import read_record
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout
+from robomme_interference_data.evaluate.run.runner import RunContext
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Executor, Serial
@@ -65,7 +65,7 @@ def roll(condition: str, policy: Any, *, simulator: Any = None, **changes: Any) 
     system, facts = changes.pop("system", "mine"), changes.pop("facts", SystemFacts())
     buffer_set = worlds.buffer_set_here()
     return run_rollout(
-        Run(config(**changes), system, facts, buffer_set.name, buffer_set.revision),
+        RunContext(config(**changes), system, facts, buffer_set.name, buffer_set.revision),
         WorkItem(condition, EPISODE),
         simulator=simulator or worlds.World(),
         policy=policy,

@@ -42,7 +42,8 @@ print(len({names!r}), sorted(heavy & set(sys.modules)))
 
 def core_modules() -> list[str]:
     """All of it but the areas, the simulators, and the cluster, which are loaded at use."""
-    others = {*MAPPING, f"{PACKAGE}.simulators", f"{PACKAGE}.runtime.ray_cluster"} - {PACKAGE}
+    cluster = {f"{PACKAGE}.runtime.ray_cluster", f"{PACKAGE}.runtime.ray_actors"}
+    others = {*MAPPING, f"{PACKAGE}.simulators", *cluster} - {PACKAGE}
     return sorted(
         name for name in MODULES if not any(f"{name}.".startswith(f"{one}.") for one in others)
     )

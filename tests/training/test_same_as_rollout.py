@@ -16,8 +16,8 @@ from support.worlds import BUFFER_SET
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.evaluate import Observation, Policy, RolloutInfo
 from robomme_interference_data.evaluate.rollout.rollout import run_rollout
-from robomme_interference_data.evaluate.run.kind import Run
 from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.evaluate.run.runner import RunContext
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.retrieval.selector import Selector
@@ -89,7 +89,7 @@ def test_same_frames_states_and_positions(
     monkeypatch.setenv(BUFFER_SET, str(buffers))
     buffer_set, policy = load_buffer_set(buffers), Watching(memory)
     run_rollout(
-        Run(config(), "mine", SystemFacts(), buffer_set.name, buffer_set.revision),
+        RunContext(config(), "mine", SystemFacts(), buffer_set.name, buffer_set.revision),
         WorkItem(condition, EPISODE),
         simulator=Recordings(str(buffers), CAMERAS),
         policy=policy,

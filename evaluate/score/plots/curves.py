@@ -36,21 +36,25 @@ def curve(
     the system's last rate in percent, if there is one.
     """
     style = data.styles[system]
-    found = [c for one in data.conditions if (c := data.cells.get((system, one.name, part)))]
-    if not found:
+    cells = [
+        cell
+        for condition in data.conditions
+        if (cell := data.cells.get((system, condition.name, part)))
+    ]
+    if not cells:
         return {}
     points = [
         (data.x(c.condition) + shift, 100 * c.rate, *(100 * bound for bound in c.interval))
-        for c in found
+        for c in cells
     ]
     drawn = []
     for kind, places in groupby(
-        range(len(found)), lambda place: parse_condition(found[place].condition).kind
+        range(len(cells)), lambda place: parse_condition(cells[place].condition).kind
     ):
         xs, ys = zip(*(points[place][:2] for place in places), strict=True)
         if kind.counted:
             drawn += axes.plot(xs, ys, **style.stroke)
-    if found[0].condition == NO_HISTORY and style.line != "none":
+    if cells[0].condition == NO_HISTORY and style.line != "none":
         if len(points) > 1:
             xs, ys = zip(*(point[:2] for point in points[:2]), strict=True)
             drawn += axes.plot(xs, ys, ":", color=style.color, linewidth=0.7)
@@ -58,7 +62,7 @@ def curve(
             floor = {"linewidth": 0.8, "linestyle": "--", "zorder": 0}
             drawn.append(axes.axhline(points[0][1], color=style.color, **floor))
     mark(drawn, system)
-    draw_points(axes, points, style, system, [cell.complete for cell in found], bars=bars)
+    draw_points(axes, points, style, system, [cell.complete for cell in cells], bars=bars)
     return {system: points[-1][1]}
 
 
@@ -89,7 +93,7 @@ def draw_points(
         lines, width = (axes.hlines, 1.5) if lying else (axes.vlines, 0.9)
         drawn.append(lines(places, low, high, color=style.color, linewidth=width, alpha=0.8))
     for whole, face in ((True, style.color), (False, "white")):
-        chosen = [p[:2] for p, one in zip(points, complete, strict=True) if one is whole]
+        chosen = [p[:2] for p, done in zip(points, complete, strict=True) if done is whole]
         if chosen:
             ends = zip(*(point[::-1] if lying else point for point in chosen), strict=True)
             shape = style.point | {"markerfacecolor": face, "linestyle": "none"}
@@ -126,7 +130,7 @@ def set_axes(axes: Any, data: Data, systems: Sequence[str], ylabel: str) -> None
     tidy(axes)
     conditions = data.shown(systems)
     # Conditions of several kinds with equal k share a place, which is labeled once.
-    places = dict(sorted((data.x(one), short(one).rpartition("-")[2]) for one in conditions))
+    places = dict(sorted((data.x(name), short(name).rpartition("-")[2]) for name in conditions))
     axes.set_xticks(list(places), list(places.values()))
     axes.set_xlim(min(places) - 0.4, max(places) + 0.4)
     axes.set_ylim(0, min(max(axes.get_ylim()[1], 10), 103))
@@ -142,7 +146,7 @@ def short(condition: str) -> str:
 def explained(data: Data, systems: Sequence[str], parts: Sequence[str], *notes: str) -> str:
     """Explain hollow points and dashes, where they occur."""
     drawn = [(s, c) for (s, _, part), c in data.cells.items() if s in systems and part in parts]
-    hollow = any(not one.complete for _, one in drawn)
+    hollow = any(not cell.complete for _, cell in drawn)
     dashes = any(system in (*data.absent, *data.beside) for system, _ in drawn)
     marks = []
     if hollow:

@@ -55,7 +55,7 @@ class Data:
         own = [cell for cell in score.cells if cell.simulator == simulator and cell.n]
         self.systems = list(dict.fromkeys(cell.system for cell in own))
         self.bases = {system: base_of(outcomes, system) for system in self.systems}
-        self.contrasts = [one for one in score.contrasts if one.simulator == simulator]
+        self.contrasts = [each for each in score.contrasts if each.simulator == simulator]
         repeated, flips = outcomes.repeat_flips
         self.flips = flips / repeated if repeated else None
         self.distinguishable = {
@@ -82,7 +82,7 @@ class Data:
         self._add_published(score, bases)
         conditions = {condition for _, condition, _ in self.cells}
         self.conditions: Sequence[Condition] = in_order(conditions) if conditions else ()
-        self.least = min((one.k for one in self.conditions if one.kind.counted), default=0)
+        self.least = min((each.k for each in self.conditions if each.kind.counted), default=0)
 
     def _add_published(self, score: Score, bases: Sequence[str]) -> None:
         """Add the published cells of its systems, and of the systems without retrieval."""

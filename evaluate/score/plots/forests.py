@@ -54,7 +54,7 @@ def _forest(
     rows: Mapping[str, str],
     title: str,
     *notes: str,
-    value: Callable[[Contrast], Interval] = lambda one: one.pairs.change,
+    value: Callable[[Contrast], Interval] = lambda contrast: contrast.pairs.change,
     scale: float = 100,
     guides: Sequence[float] = (0,),
     band: float = 0.0,
@@ -71,16 +71,16 @@ def _forest(
             axes.axvspan(-band, band, color=GRAY, alpha=0.2, linewidth=0, zorder=0)
         for guide, line in zip(guides, ("-", "--"), strict=False):
             axes.axvline(guide, color=GRAY, linewidth=0.8, linestyle=line, zorder=0)
-        for key, one in group.items():
-            point = (places[key], *(scale * number for number in value(one)))
-            style = data.styles[one.system]
-            draw_points(axes, [point], style, one.system, [one.complete], lying=True)
+        for key, contrast in group.items():
+            point = (places[key], *(scale * number for number in value(contrast)))
+            style = data.styles[contrast.system]
+            draw_points(axes, [point], style, contrast.system, [contrast.complete], lying=True)
         tidy(axes)
         axes.set_title(fill(name, 26), size=HEADING, color=INK)
     grid[0].set_yticks(range(len(rows)), list(rows.values()))
     grid[0].set_ylim(len(rows) - 0.4, -0.6)
     figure.suptitle(title, size=TITLE, color=INK)
-    hollow = not all(one.complete for group in panels.values() for one in group.values())
+    hollow = not all(contrast.complete for group in panels.values() for contrast in group.values())
     lines = [note for note in notes if note]
     if hollow:
         lines.append("hollow: incomplete cell")
@@ -93,7 +93,7 @@ def _by_system(
     """Draw a panel for each comparison and a row for each system, sorted by the last common one."""
     most = max(map(len, groups.values()))
     leading = next(group for group in reversed([*groups.values()]) if len(group) == most)
-    systems = [one for one in data.systems if any(one in group for group in groups.values())]
+    systems = [name for name in data.systems if any(name in group for group in groups.values())]
     systems.sort(key=lambda s: -leading[s].pairs.change.value if s in leading else math.inf)
     figure.set_size_inches(WIDTH, 1.5 + 0.27 * max(3, len(systems)))
     rows = {system: data.styles[system].label for system in systems}
@@ -106,63 +106,63 @@ def effects(figure: Any, data: Data) -> bool:
         c for c in data.contrasts if c.pairs.n and parse_condition(c.condition).kind.name == "k"
     ]
     last = max((parse_condition(c.condition).k for c in counted), default=0)
-    found: _Groups = {}
-    for one in counted:
+    groups: _Groups = {}
+    for contrast in counted:
         name = ""
-        if one.role is Role.HISTORY and one.condition == START:
-            name = f"{START} − {short(one.against[1])}"
-        elif one.role is Role.SESSIONS:
-            name = f"{one.condition} − {START}"
-        elif one.role is Role.RETRIEVAL and parse_condition(one.condition).k == last:
-            name = f"{one.condition}, with − without retrieval"
+        if contrast.role is Role.HISTORY and contrast.condition == START:
+            name = f"{START} − {short(contrast.against[1])}"
+        elif contrast.role is Role.SESSIONS:
+            name = f"{contrast.condition} − {START}"
+        elif contrast.role is Role.RETRIEVAL and parse_condition(contrast.condition).k == last:
+            name = f"{contrast.condition}, with − without retrieval"
         if name:
-            found.setdefault(name, {})[one.system] = one
-    if not found:
+            groups.setdefault(name, {})[contrast.system] = contrast
+    if not groups:
         return False
     flips = _FLIPS if data.flips is None else data.flips
     source = "assumed without repeats" if data.flips is None else "measured between repeats"
-    most = max(c.pairs.n for group in found.values() for c in group.values())
+    most = max(c.pairs.n for group in groups.values() for c in group.values())
     band = 196 * math.sqrt(flips / most)
     note = (
         f"gray: ±{band:.1f} points, the 95% range of noise for {most} episodes if "
         f"{100 * flips:.0f}% of outcomes flip between repeats ({source})"
     )
     title = f"Effect of each condition, paired over episodes, {data.simulator}"
-    _by_system(figure, data, found, title, f"points; {_BARS}", note, band=band)
+    _by_system(figure, data, groups, title, f"points; {_BARS}", note, band=band)
     return True
 
 
 def ceiling(figure: Any, data: Data) -> bool:
     """Draw how far systems are below the ideal observer with their memory."""
-    found: _Groups = {}
-    for one in data.contrasts:
-        if one.role is Role.CEILING and one.pairs.n:
-            found.setdefault(one.condition, {})[one.system] = one
-    if not found:
+    groups: _Groups = {}
+    for contrast in data.contrasts:
+        if contrast.role is Role.CEILING and contrast.pairs.n:
+            groups.setdefault(contrast.condition, {})[contrast.system] = contrast
+    if not groups:
         return False
     title = f"Gap to the ideal observer with the same memory, {data.simulator}"
-    _by_system(figure, data, found, title, f"system − ideal observer, points; {_BARS}")
+    _by_system(figure, data, groups, title, f"system − ideal observer, points; {_BARS}")
     return True
 
 
 def retention(figure: Any, data: Data) -> bool:
     """Draw the share of each system's lift that is left at the most sessions."""
-    found = [
-        one
-        for one in data.contrasts
-        if one.role is Role.HISTORY and not math.isnan(one.retention.value)
+    lifts = [
+        contrast
+        for contrast in data.contrasts
+        if contrast.role is Role.HISTORY and not math.isnan(contrast.retention.value)
     ]
-    if not found:
+    if not lifts:
         return False
-    last = max((c.condition for c in found), key=lambda name: parse_condition(name).k)
-    found = sorted(
-        (c for c in found if c.condition == last),
+    last = max((c.condition for c in lifts), key=lambda name: parse_condition(name).k)
+    lifts = sorted(
+        (c for c in lifts if c.condition == last),
         key=lambda c: (not c.complete, -c.retention.value),
     )
     rows = {}
-    for one in found:
-        label = data.styles[one.system].label
-        rows[one.system] = label if one.complete else f"{label} †"
+    for contrast in lifts:
+        label = data.styles[contrast.system].label
+        rows[contrast.system] = label if contrast.complete else f"{label} †"
     absent = [data.styles[system].label for system in data.systems if system not in rows]
     note = ""
     if absent:
@@ -170,16 +170,16 @@ def retention(figure: Any, data: Data) -> bool:
             f"Not shown (no lift at k0 with p < {ALPHA}, or rows missing at {last}): "
             f"{', '.join(absent)}"
         )
-    figure.set_size_inches(WIDTH, 1.6 + 0.3 * max(2, len(found)))
+    figure.set_size_inches(WIDTH, 1.6 + 0.3 * max(2, len(lifts)))
     _forest(
         figure,
         data,
-        {"": {one.system: one for one in found}},
+        {"": {contrast.system: contrast for contrast in lifts}},
         rows,
         f"Retention at {last}, {data.simulator}",
         f"({last} − no history) / (k0 − no history); 0: nothing left, 1: all; {_BARS}",
         note,
-        value=lambda one: one.retention,
+        value=lambda contrast: contrast.retention,
         scale=1,
         guides=(0, 1),
     )
@@ -188,11 +188,11 @@ def retention(figure: Any, data: Data) -> bool:
 
 def interference(figure: Any, data: Data) -> bool:
     """Draw the effect of each kind of interference, at equally many sessions."""
-    asked = {one.system for one in data.contrasts if one.asks and one.pairs.n}
+    asked = {contrast.system for contrast in data.contrasts if contrast.asks and contrast.pairs.n}
     systems = [system for system in data.systems if system in asked]
     if not systems:
         return False
-    groups = _most_common([one for one in data.contrasts if one.system in asked])
+    groups = _most_common([contrast for contrast in data.contrasts if contrast.system in asked])
     panels = {
         data.styles[system].label: {
             name: group[system] for name, group in groups.items() if system in group
@@ -211,26 +211,26 @@ def _most_common(contrasts: Sequence[Contrast]) -> _Groups:
     It is the number that most comparisons have, the larger if several; a comparison without it
     has its own largest number.
     """
-    found: dict[str, dict[int, list[Contrast]]] = {}
-    for one in contrasts:
-        condition = parse_condition(one.condition)
-        asks = condition.kind.asks if one.role is Role.SESSIONS else one.asks
-        if asks and one.pairs.n:
-            found.setdefault(asks, {}).setdefault(condition.k, []).append(one)
-    counts = Counter(k for by_k in found.values() for k in by_k)
+    by_question: dict[str, dict[int, list[Contrast]]] = {}
+    for contrast in contrasts:
+        condition = parse_condition(contrast.condition)
+        asks = condition.kind.asks if contrast.role is Role.SESSIONS else contrast.asks
+        if asks and contrast.pairs.n:
+            by_question.setdefault(asks, {}).setdefault(condition.k, []).append(contrast)
+    counts = Counter(k for by_k in by_question.values() for k in by_k)
     most = max(counts, key=lambda k: (counts[k], k))
     shown = {}
-    for asks in (KINDS["k"].asks, *(one.asks for one in COMPARISONS.values())):
-        if by_k := found.get(asks):
+    for asks in (KINDS["k"].asks, *(comparison.asks for comparison in COMPARISONS.values())):
+        if by_k := by_question.get(asks):
             chosen = by_k.get(most) or by_k[max(by_k)]
             name = f"{asks}\n{chosen[0].condition} − {chosen[0].against[1]}"
-            shown[name] = {one.system: one for one in chosen}
+            shown[name] = {contrast.system: contrast for contrast in chosen}
     return shown
 
 
 def by_evidence_kept(figure: Any, data: Data) -> bool:
     """Draw success where all, some and none of the evidence was kept, by system."""
-    names = {one.name for one in data.conditions}
+    names = {condition.name for condition in data.conditions}
     rows = [row for row in data.by_evidence_kept if row["condition"] in names]
     systems = list(dict.fromkeys(row["system"] for row in rows))
     if not systems:

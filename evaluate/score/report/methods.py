@@ -24,14 +24,14 @@ def methods(score: Score) -> tuple[str, str]:
 
     It names only methods that a table of the score uses.
     """
-    successes = [one for one in score.contrasts if one.measure is Measure.SUCCESS]
+    successes = [each for each in score.contrasts if each.measure is Measure.SUCCESS]
     values: dict[str, Any] = {
         "parts": [_part(score, outcomes) for outcomes in score.outcomes.values()],
         "offline": None if score.recordings is None else _offline(score, score.recordings),
         "repeats": any(outcomes.repeat_flips[0] for outcomes in score.outcomes.values()),
         "tables": set(score.tables),
-        "intervals": {one.pairs.method for one in successes},
-        "retention": any(not math.isnan(one.retention.value) for one in successes),
+        "intervals": {contrast.pairs.method for contrast in successes},
+        "retention": any(not math.isnan(each.retention.value) for each in successes),
         "margin": score.settings.margin,
         "draws": score.draws,
         "family_draws": families.DRAWS,

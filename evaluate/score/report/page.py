@@ -20,7 +20,7 @@ from robomme_interference_data.evaluate.score.config import Expected
 from robomme_interference_data.evaluate.score.outcomes import STATUSES, mean_errors, success
 from robomme_interference_data.evaluate.score.plots.data import FEW
 from robomme_interference_data.evaluate.score.plots.figures import FIGURES
-from robomme_interference_data.evaluate.score.rows.reading import Rows
+from robomme_interference_data.evaluate.score.rows.reading import CheckedRows
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.contrast import START
 from robomme_interference_data.evaluate.systems import SYSTEMS, display_name
@@ -209,7 +209,7 @@ def _outcome(counts: Sequence[int], action_l1: float) -> str:
     return f"{won}/{scored}" if scored else "error" if errors else ""
 
 
-def _videos(rows: Rows) -> dict[tuple[str, ...], Path]:
+def _videos(rows: CheckedRows) -> dict[tuple[str, ...], Path]:
     """Return the existing videos of the lowest model seeds, by rollout."""
     videos: dict[tuple[str, ...], Path] = {}
     for row in sorted(rows, key=lambda row: row.model_seed):
@@ -227,7 +227,7 @@ def _source(path: Path, run: RunHeader | None) -> dict[str, list[str]]:
     """Return the facts about a file: its checksum, commands, and `run.json`."""
     facts = {"SHA-256": [sha256_file(path)]}
     if run is not None:
-        lines = [line for start in run.starts for line in start.command]
+        lines = [line for start in run.invocations for line in start.command]
         facts |= {"command": [*dict.fromkeys(lines)]} if lines else {}
         facts["run.json"] = [json.dumps(to_dict(run), indent=2, sort_keys=True, ensure_ascii=False)]
     return facts

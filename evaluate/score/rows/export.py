@@ -11,7 +11,7 @@ from robomme_interference_data.errors import InvalidOptionError, counted
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.storage.files import atomic_path
 
-from .reading import Rows
+from .reading import CheckedRows
 from .values import RELEASED_SIMULATOR, Row
 
 RELEASED_COLUMNS = {
@@ -31,7 +31,7 @@ RELEASED_COLUMNS = {
 """The columns of the released retrieval rows, in their order, to those of a run."""
 
 
-def export(rows: Rows, folder: Path) -> list[Path]:
+def export(rows: CheckedRows, folder: Path) -> list[Path]:
     """Write rows in the released layout, a file `<system>-<simulator>_rollouts.csv` each.
 
     The released columns name no system, buffer set or revision; rows of a simulator other than

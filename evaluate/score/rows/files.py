@@ -37,7 +37,7 @@ _MAX_ROWS = 1 << 20
 
 
 @dataclass(frozen=True)
-class Part:
+class FileColumns:
     """The columns of one file, the line of each row, and why other lines are not rows."""
 
     columns: Mapping[str, Sequence[Any]]
@@ -51,14 +51,16 @@ def find_sources(paths: Sequence[Path]) -> "dict[Path, RunHeader | None]":
     In a run's folder the file is the record.
     """
     sources: dict[Path, RunHeader | None] = {}
-    for source in paths:
-        path = source / RUN_RECORD if source.is_dir() else source
+    for path_or_folder in paths:
+        path = path_or_folder
+        if path.is_dir():
+            path = path / RUN_RECORD
         if not path.is_file():
             raise MissingFileError(
                 f"there is no file {path}",
                 "Give folders of runs, .csv, .parquet or .jsonl files, or .json of vla-eval.",
             )
-        if any(path.samefile(other) for other in sources):
+        if any(path.samefile(source) for source in sources):
             raise InvalidOptionError(f"{path} is given twice", "Give each file once.")
         header = path.parent / RUN_HEADER
         of_run = path.name in (RUN_RECORD, *RUN_TABLES) and header.is_file()
@@ -79,7 +81,7 @@ def system_of(path: Path) -> str | None:
     return match[1] if match else None
 
 
-def read_file(path: Path, names: Sequence[str], has_system: bool) -> Part:
+def read_file(path: Path, names: Sequence[str], has_system: bool) -> FileColumns:
     """Read those of the named columns that a file has.
 
     The file must have a column `system` unless the system is known otherwise (`has_system`).
@@ -133,7 +135,7 @@ def _columns(path: Path, table: pa.Table) -> dict[str, list[Any]]:
     return {name: table[name].to_pylist() for name in table.column_names}
 
 
-def _read_parquet(path: Path, names: Sequence[str], has_system: bool) -> Part:
+def _read_parquet(path: Path, names: Sequence[str], has_system: bool) -> FileColumns:
     # Only for these files: a run is read from its record.
     from robomme_interference_data.storage.parquet import open_parquet, read_table
 
@@ -142,12 +144,12 @@ def _read_parquet(path: Path, names: Sequence[str], has_system: bool) -> Part:
         selected = _select(path, file.schema_arrow.names, names, has_system)
         table = read_table(file, path, list(selected.values()))
     columns = _columns(path, table)
-    return Part(
+    return FileColumns(
         {name: columns[column] for name, column in selected.items()}, range(1, len(table) + 1)
     )
 
 
-def _read_csv(path: Path, names: Sequence[str], has_system: bool) -> Part:
+def _read_csv(path: Path, names: Sequence[str], has_system: bool) -> FileColumns:
     text = read_bytes(path, MOST_ROW_BYTES).removeprefix(codecs.BOM_UTF8).decode()
     csv.field_size_limit(len(text) + 1)
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
@@ -171,10 +173,10 @@ def _read_csv(path: Path, names: Sequence[str], has_system: bool) -> Part:
         for name, column in selected.items()
         for at in [header.index(column)]
     }
-    return Part(columns, list(rows), malformed)
+    return FileColumns(columns, list(rows), malformed)
 
 
-def _read_record(path: Path, names: Sequence[str], has_system: bool) -> Part:
+def _read_record(path: Path, names: Sequence[str], has_system: bool) -> FileColumns:
     """Read a run's record: every finished row, and of other rollouts the last row.
 
     The types are those of a rollout's row; a row object for each line would take ten times as long.
@@ -183,7 +185,7 @@ def _read_record(path: Path, names: Sequence[str], has_system: bool) -> Part:
 
     data = whole_lines(path)
     if not data:
-        return Part({}, [])
+        return FileColumns({}, [])
     _check_count(data.count(b"\n"))
     columns = _columns(path, _parse_record(path, data, record_schema({*names, *KEY_COLUMNS})))
     keys = [*zip(*(columns[name] for name in KEY_COLUMNS), strict=True)]
@@ -193,7 +195,7 @@ def _read_record(path: Path, names: Sequence[str], has_system: bool) -> Part:
         for at, (key, status) in enumerate(zip(keys, columns["status"], strict=True))
         if status != Status.ERROR or last[key] == at
     ]
-    return Part(
+    return FileColumns(
         {name: [columns[name][at] for at in kept] for name in names}, [at + 1 for at in kept]
     )
 
@@ -230,7 +232,7 @@ def _parse_record(path: Path, data: bytes, schema: pa.Schema) -> pa.Table:
         raise
 
 
-def _read_vla_eval(path: Path, names: Sequence[str], has_system: bool) -> Part:
+def _read_vla_eval(path: Path, names: Sequence[str], has_system: bool) -> FileColumns:
     """Read the results of `vla-eval run` with the benchmark of `evaluate.vla_eval`.
 
     An episode's metrics are a row. One that has a reason of a failure instead is an error: it says
@@ -240,7 +242,7 @@ def _read_vla_eval(path: Path, names: Sequence[str], has_system: bool) -> Part:
     rows: dict[int, list[Any]] = {}
     malformed: dict[int, str] = {}
     try:
-        episodes = [one for task in results["tasks"] for one in task["episodes"]]
+        episodes = [episode for task in results["tasks"] for episode in task["episodes"]]
         _check_count(len(episodes))
         for line, episode in enumerate(episodes, 1):
             row = episode["metrics"]
@@ -259,4 +261,4 @@ def _read_vla_eval(path: Path, names: Sequence[str], has_system: bool) -> Part:
             "Expected a file of `vla-eval run` or `vla-eval export`: see docs/how-to/vla-eval.md.",
         ) from None
     columns = {name: [row[at] for row in rows.values()] for at, name in enumerate(names)}
-    return Part(columns, list(rows), malformed)
+    return FileColumns(columns, list(rows), malformed)

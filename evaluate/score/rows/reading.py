@@ -18,7 +18,7 @@ from robomme_interference_data.evaluate.systems import FACT_COLUMNS, SYSTEMS, na
 from robomme_interference_data.schema.rollouts import FINAL, Status, success_of
 from robomme_interference_data.schema.shifts import NO_SHIFT
 
-from .files import Part, find_sources, read_file, system_of
+from .files import FileColumns, find_sources, read_file, system_of
 from .values import DEFAULTS, Row, parse, shifted
 
 if TYPE_CHECKING:
@@ -26,20 +26,20 @@ if TYPE_CHECKING:
 
 _SHOWN = 10  # bad rows that are listed; the others are counted
 
-_SUCCESS = {str(one): success_of(one) for one in FINAL}
+_SUCCESS = {str(status): success_of(status) for status in FINAL}
 _EPISODE = ("simulator", "family", "split", "episode")
 _ROLLOUT = ("system", "condition", "model_seed", *_EPISODE)
 
 
 @dataclass(frozen=True)
-class Rows:
+class CheckedRows:
     """Rows that passed every check, in the order of their files.
 
     Attributes:
         rows: The rows.
         sources: The files that were read (see `files.find_sources`).
         revisions: Simulator to the revision of its buffer set, where rows name one.
-        unpinned: Simulator and system of rows that name no revision, such as released ones.
+        without_revision: Simulator and system of rows that name no revision, such as released ones.
         refusals: The first bad rows that were left out: location and reason.
         refused: The number of bad rows.
     """
@@ -47,7 +47,7 @@ class Rows:
     rows: tuple[Row, ...]
     sources: "Mapping[Path, RunHeader | None]"
     revisions: Mapping[str, str] = field(default_factory=dict)
-    unpinned: frozenset[tuple[str, str]] = frozenset()
+    without_revision: frozenset[tuple[str, str]] = frozenset()
     refusals: tuple[str, ...] = ()
     refused: int = 0
 
@@ -62,7 +62,9 @@ class Rows:
         return sorted({getattr(row, column) for row in self.rows})
 
 
-def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = False) -> Rows:
+def read_rows(
+    paths: Sequence[Path], system: str | None = None, lenient: bool = False
+) -> CheckedRows:
     """Read rows from folders of runs and files, and check each of them.
 
     Args:
@@ -92,17 +94,19 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
         raise FormatError("\n".join(lines), "Correct them, or leave them out with lenient=True.")
     rows = tuple(checks.sound.values())
     cells = {(row.simulator, row.system, row.revision) for row in rows}
-    unpinned = frozenset((simulator, name) for simulator, name, revision in cells if not revision)
+    without_revision = frozenset(
+        (simulator, name) for simulator, name, revision in cells if not revision
+    )
     revisions = {simulator: revision for simulator, _, revision in cells if revision}
-    for simulator, name, revision in sorted(cells - {(*cell, None) for cell in unpinned}):
-        if (simulator, name) in unpinned:  # protocol, rule 5
+    for simulator, name, revision in sorted(cells - {(*cell, None) for cell in without_revision}):
+        if (simulator, name) in without_revision:  # protocol, rule 5
             raise InvalidOptionError(
                 f"some rows of {name} in {simulator} have the revision {revision} of a buffer "
                 "set, others name no revision, like released rows",
                 "Their histories may differ: score the files separately, or compare them.",
             )
     shown = tuple(refusals[:_SHOWN])
-    return Rows(rows, sources, revisions, unpinned, shown, len(refusals))
+    return CheckedRows(rows, sources, revisions, without_revision, shown, len(refusals))
 
 
 _Location = tuple[int, int]
@@ -117,7 +121,7 @@ class _Checks:
         self.reasons: dict[_Location, str] = {}
         self._paths: list[Path] = []
 
-    def add(self, path: Path, part: Part, system: str | None, run: Path | None) -> None:
+    def add(self, path: Path, part: FileColumns, system: str | None, run: Path | None) -> None:
         """Add the rows of a file, checking each by itself; videos are relative to `run`."""
         number = len(self._paths)
         self._paths.append(path)
@@ -188,13 +192,13 @@ class _Checks:
         ):
             groups[key].append(at)
         for locations in [group for group in groups.values() if len(group) > 1]:
-            first, *others = locations
+            first, *repeats = locations
             contradicted = len({self.sound[at].status for at in locations}) > 1
             reason = "the same rollout as {}"
             if contradicted:
                 reason += "; its rows contradict each other"
-                self._refuse([(first, reason.format(self.locate(others[0])))])
-            self._refuse((at, reason.format(self.locate(first))) for at in others)
+                self._refuse([(first, reason.format(self.locate(repeats[0])))])
+            self._refuse((at, reason.format(self.locate(first))) for at in repeats)
 
     def _refuse(self, rows: Iterable[tuple[_Location, str]]) -> None:
         for at, reason in list(rows):

@@ -179,7 +179,7 @@ _CHECKS: dict[str, Callable[[str], object]] = {
     "shift": parse_shift,
     "simulator": _check_simulator,
     "family": lambda text: EpisodeId(text, "test", 0),
-    "action_l1_values": lambda text: [_number(one, _LARGEST) for one in text.split()],
+    "action_l1_values": lambda text: [_number(value, _LARGEST) for value in text.split()],
 }
 
 

@@ -80,7 +80,7 @@ def effects_table(contrasts: Iterable[Contrast]) -> Table:
     for contrast in contrasts:
         if contrast.role in TESTED_TOGETHER:
             groups[TESTED_TOGETHER[contrast.role]].append(contrast)
-    table = comparison_table(EFFECTS, [one for group in groups.values() for one in group])
+    table = comparison_table(EFFECTS, [contrast for group in groups.values() for contrast in group])
     notes = [detectable(group, _group, effect) for effect, group in groups.items()]
     return replace(table, note=" ".join([table.note, *filter(None, notes)]))
 

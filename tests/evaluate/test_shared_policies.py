@@ -1,4 +1,4 @@
-"""Shared policies without their processes: how workers find a host, and what it answers."""
+"""Shared policies without processes: the rule of batches, how workers find a host, its answers."""
 
 import os
 import pickle
@@ -14,8 +14,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from robomme_interference_data.errors import PolicyError, ServerDiedError
+from robomme_interference_data.evaluate.policies.batching import Batcher
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.evaluate.policies.process import (
     ServePolicy,
@@ -26,6 +29,168 @@ from robomme_interference_data.evaluate.policies.shared import PolicyHost, Share
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.runtime.worker import Worker
 from robomme_interference_data.simulators.episode import Observation
+
+Calls = list[tuple[int, str, int]]
+
+
+class Adding:
+    """Sessions keep a list; `act` returns it with the goal. The goal "bad" raises."""
+
+    def __init__(self) -> None:
+        self.memory: list[Any] = []
+        self.batches: list[list[str]] = []
+        self.closed = 0
+
+    def session(self) -> "Adding":
+        return Adding()
+
+    def add(self, number: int) -> None:
+        self.memory.append(number)
+
+    def act(self, observation: Any, goal: str) -> Any:
+        if goal == "bad":
+            raise ValueError("a bad goal")
+        self.memory.append((observation, goal))
+        return [*self.memory]
+
+    def act_batch(self, sessions: Any, observations: Any, goals: Any) -> Any:
+        self.batches.append([*goals])
+        if "bad" in goals:
+            raise ValueError("a bad goal in a batch")
+        pairs = zip(sessions, observations, goals, strict=True)
+        return [session.act(*request) for session, *request in pairs]
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def batcher(policy: Any, size: int = 3, timeout_s: float = 1.0) -> Batcher[int]:
+    return Batcher(lambda: policy, size, timeout_s)
+
+
+def ask(batches: Batcher[int], key: int, goal: str = "go") -> None:
+    assert batches.call(key, ("act", (0, goal))) is None
+
+
+def test_a_batch_is_due_when_it_is_full_when_no_more_can_come_or_in_time() -> None:
+    policy = Adding()
+    batches = batcher(policy, size=3, timeout_s=1.0)
+    assert batches.due_s(0.0) is None
+    for key in range(5):
+        batches.open(key)
+    ask(batches, 0, "a")
+    assert batches.due_s(10.0) == 1.0
+    ask(batches, 1, "b")
+    assert batches.due_s(10.5) == 0.5  # from the oldest request
+    assert batches.due_s(11.5) == 0.0
+    ask(batches, 2, "c")
+    ask(batches, 3, "d")
+    assert batches.due_s(10.75) == 0.0  # full
+    assert [*batches.act()] == [0, 1, 2]
+    assert batches.due_s(12.0) == 1.0  # from the end of the batch
+    assert batches.due_s(12.25) == 0.75
+    for key in (0, 1, 2, 4):
+        batches.drop(key)
+    assert batches.due_s(12.25) == 0.0  # no other session is open
+    assert batches.act() == {3: ([(0, "d")], None)}
+    ask(batches, 3)
+    batches.drop(3)  # its worker is gone, and its request with it
+    assert batches.due_s(12.25) is None
+    assert policy.batches == [["a", "b", "c"]]  # alone, it is no batch
+    batches.close()
+    assert policy.closed == 1
+
+
+def test_one_bad_request_fails_alone(caplog: pytest.LogCaptureFixture) -> None:
+    policy = Adding()
+    batches = batcher(policy)
+    for _ in range(2):
+        for key, goal in enumerate(["go", "bad", "stay"]):
+            batches.open(key)
+            ask(batches, key, goal)
+        answers = batches.act()
+        assert answers[0] == ([(0, "go")], None) and answers[2] == ([(0, "stay")], None)
+        assert answers[1][0] is None and str(answers[1][1]) == "a bad goal"
+    assert caplog.text.count("repeated one by one") == 1
+
+
+def test_a_batch_with_missing_results_is_repeated_one_by_one() -> None:
+    policy = Adding()
+    policy.act_batch = lambda *_: [["wrong"]]  # type: ignore[method-assign]
+    batches = batcher(policy)
+    for key in (0, 1):
+        batches.open(key)
+        ask(batches, key)
+    assert batches.act() == {0: ([(0, "go")], None), 1: ([(0, "go")], None)}
+
+
+def test_a_policy_that_cannot_be_made_is_made_again_for_the_next_session() -> None:
+    made: list[Any] = [Adding(), OSError("busy")]
+
+    def make() -> Any:
+        if isinstance(one := made.pop(), Exception):
+            raise one
+        return one
+
+    batches: Batcher[int] = Batcher(make, 2, 0.0)
+    with pytest.raises(OSError, match="busy"):
+        batches.open(0)
+    assert isinstance(batches.open(0), Adding)
+
+
+@st.composite
+def interleavings(draw: st.DrawFn) -> tuple[list[list[str]], list[int]]:
+    """The calls of each session, and whose turn it is."""
+    calls = st.lists(st.sampled_from(["add", "act", "bad"]), max_size=6)
+    sessions = draw(st.lists(calls, min_size=1, max_size=5))
+    turns = [number for number, own in enumerate(sessions) for _ in own]
+    return sessions, draw(st.permutations(turns))
+
+
+@given(interleavings(), st.integers(1, 6), st.floats(0, 3))
+def test_sessions_never_mix(
+    drawn: tuple[list[list[str]], list[int]], size: int, timeout_s: float
+) -> None:
+    sessions, turns = drawn
+    policy = Adding()
+    batches = batcher(policy, size, timeout_s)
+    answers: dict[int, list[Any]] = {number: [] for number in range(len(sessions))}
+    lefts = [[*own] for own in sessions]
+    waiting: set[int] = set()
+
+    def answer() -> None:
+        for key, (value, error) in batches.act().items():
+            answers[key].append(value if error is None else str(error))
+            waiting.remove(key)
+
+    for key in answers:
+        batches.open(key)
+    for now, turn in enumerate(turns):
+        while turn in waiting:  # a worker waits for its answer
+            answer()
+        call = lefts[turn].pop(0)
+        if call == "add":
+            assert batches.call(turn, ("add", (now,))) == (None, None)
+        else:
+            ask(batches, turn, "bad" if call == "bad" else f"goal {turn}")
+            waiting.add(turn)
+        if batches.due_s(now) == 0:
+            answer()
+    while waiting:
+        answer()
+    # The same calls, one session after the other, each alone.
+    times = {
+        number: [now for now, turn in enumerate(turns) if turn == number] for number in answers
+    }
+    for number, own in enumerate(sessions):
+        alone, expected = Adding(), []
+        for now, call in zip(times[number], own, strict=True):
+            if call == "add":
+                alone.add(now)
+            else:
+                expected.append("a bad goal" if call == "bad" else alone.act(0, f"goal {number}"))
+        assert answers[number] == expected
+    assert all(2 <= len(one) <= size for one in policy.batches)
 
 
 def config(policy: str, **changes: Any) -> RunConfig:

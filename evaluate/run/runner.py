@@ -14,7 +14,6 @@ from robomme_interference_data.constants import DEMONSTRATIONS, PROTOCOL_VERSION
 from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import load_buffer_set
-from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.evaluate.policies.registry import policy_kind
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.retrieval.columns import retrieval_columns
@@ -32,7 +31,7 @@ from robomme_interference_data.storage.files import digest_json
 
 from .config import AskConfig, RetrievalConfig, RunConfig
 from .history import HistoryReader
-from .plan import Plan, WorkItem
+from .plan import RunPlan, WorkItem
 from .row import Rollout
 
 if TYPE_CHECKING:
@@ -48,7 +47,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Run[C: RunConfig | AskConfig]:
+class RunContext[C: RunConfig | AskConfig]:
     """A run with checked settings: what its workers need, and what all its rows share.
 
     Attributes:
@@ -138,26 +137,26 @@ def package_versions(config: RunConfig | AskConfig) -> dict[str, str]:
 
 
 def history_columns(
-    buffer: Buffer, given: Sequence[int], memory: Memory | None, *, retrieved: bool
+    buffer: Buffer, received: Sequence[int], memory: Memory | None, *, retrieved: bool
 ) -> dict[str, Any]:
-    """Return the columns about the frames of a buffer that a policy or model was given.
+    """Return the columns about the frames of a buffer that a policy or model received.
 
     Args:
         buffer: The history.
-        given: The frames, as ascending indices.
+        received: The frames, as ascending indices.
         memory: What of them the memory keeps; None if unknown.
-        retrieved: Whether a retrieval step chose them; if not, all frames were given.
+        retrieved: Whether a retrieval step chose them; if not, the policy received all.
     """
-    share = lesson_share(buffer.sessions, given) if given else None
+    share = lesson_share(buffer.sessions, received) if received else None
     columns: dict[str, Any] = {
-        "history_frames": len(given),
-        "lesson_frames": lesson_frames(buffer.sessions, given),
+        "history_frames": len(received),
+        "lesson_frames": lesson_frames(buffer.sessions, received),
         "lesson_share": share,
     }
     if retrieved and share is not None:
-        columns |= retrieval_columns(given, share)
+        columns |= retrieval_columns(received, share)
     if memory is not None and buffer.evidence is not None:
-        columns["evidence_kept"] = evidence_kept(buffer.evidence, memory.kept(given))
+        columns["evidence_kept"] = evidence_kept(buffer.evidence, memory.kept(received))
     return columns
 
 
@@ -167,7 +166,7 @@ class RunTask[C: RunConfig | AskConfig](ABC):
     After an exception it closes and makes anew everything else that it uses.
     """
 
-    def __init__(self, run: Run[C]):
+    def __init__(self, run: RunContext[C]):
         self.run = run
 
     @cached_property
@@ -209,7 +208,7 @@ class RunTask[C: RunConfig | AskConfig](ABC):
         """Release everything that may be broken after an exception."""
 
 
-class RunKind[C: RunConfig | AskConfig](ABC):
+class Runner[C: RunConfig | AskConfig](ABC):
     """Rollouts or questions: `evaluation.run_evaluation` calls the methods in their order here.
 
     Attributes:
@@ -240,11 +239,7 @@ class RunKind[C: RunConfig | AskConfig](ABC):
         """Return what the system is; after `open`, with what its servers report."""
 
     @abstractmethod
-    def refusal(self, condition: str) -> InterferenceError | None:
-        """Return why a condition does not apply, or None."""
-
-    @abstractmethod
-    def check(self, plan: Plan, items: Sequence[WorkItem]) -> None:
+    def check(self, plan: RunPlan, items: Sequence[WorkItem]) -> None:
         """Check the plan."""
 
     def shared(self) -> AbstractContextManager[None]:
@@ -252,7 +247,7 @@ class RunKind[C: RunConfig | AskConfig](ABC):
         return nullcontext()
 
     @abstractmethod
-    def task(self, run: Run[C]) -> RunTask[C]:
+    def task(self, run: RunContext[C]) -> RunTask[C]:
         """Return the function of the workers."""
 
     def needs_workers(self, todo: Sequence[WorkItem]) -> bool:
@@ -263,5 +258,5 @@ class RunKind[C: RunConfig | AskConfig](ABC):
         """Let a worker open what the run uses, and check it."""
 
     @abstractmethod
-    def identity(self, plan: Plan) -> dict[str, Any]:
+    def identity(self, plan: RunPlan) -> dict[str, Any]:
         """Return what can change a result, as plain values."""

@@ -1,7 +1,7 @@
 """Rollouts as kinds of runs, simulated and offline: the checks before one, and its identity."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
@@ -42,18 +42,24 @@ from robomme_interference_data.evaluate.policies.registry import (
 )
 from robomme_interference_data.evaluate.policies.shared import Address
 from robomme_interference_data.evaluate.run.config import RunConfig, check_unused
-from robomme_interference_data.evaluate.run.kind import Run, RunKind, retrieval_text, short_digest
-from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
+from robomme_interference_data.evaluate.run.plan import RunPlan, WorkItem
+from robomme_interference_data.evaluate.run.runner import (
+    RunContext,
+    Runner,
+    retrieval_text,
+    short_digest,
+)
 from robomme_interference_data.evaluate.systems import SystemFacts, name_system
 from robomme_interference_data.runtime.executor import WorkerPool
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.registry import simulator_class, simulator_versions
 
-from .checks import check_plan, check_settings, check_system, condition_refusal, default_system
-from .worker import Opening, RolloutTask
+from .checks import check_plan, check_settings, check_system
+from .names import default_system
+from .worker import RolloutTask, StartServer, StartSimulator
 
 
-class Rollouts(RunKind[RunConfig]):
+class Rollouts(Runner[RunConfig]):
     """Rollouts of a policy in a simulator."""
 
     def __init__(self, config: RunConfig, buffer_set: BufferSet):
@@ -98,11 +104,7 @@ class Rollouts(RunKind[RunConfig]):
             or (policy_kind(config.policy).role is Role.REFERENCE and config.subgoals is None),
         )
 
-    def refusal(self, condition: str) -> InterferenceError | None:
-        """Return why a condition does not apply to the system and its policy, or None."""
-        return condition_refusal(self.facts(), condition)
-
-    def check(self, plan: Plan, items: Sequence[WorkItem]) -> None:
+    def check(self, plan: RunPlan, items: Sequence[WorkItem]) -> None:
         """Check every rollout."""
         check_plan(self.config, self._system, self.buffer_set, plan, items)
         if policy_kind(self.config.policy).acts_out_answers:
@@ -120,7 +122,7 @@ class Rollouts(RunKind[RunConfig]):
         with policy_processes(self.config) as self._addresses:
             yield
 
-    def task(self, run: Run[RunConfig]) -> RolloutTask:
+    def task(self, run: RunContext[RunConfig]) -> RolloutTask:
         """Return the function that runs rollouts."""
         return RolloutTask(run, self._answers, self._addresses)
 
@@ -132,7 +134,7 @@ class Rollouts(RunKind[RunConfig]):
         """Let a worker start the policy's server, and the simulator, before the first rollout."""
         config = self.config
         if starts_server(config.policy):
-            self._policy_metadata, keeps = _opened(pool, Opening("server"), None)
+            self._policy_metadata, keeps = _run_first(pool, StartServer(), None, _server_fault)
             options = policy_options(config.policy, config.policy_options)
             check_metadata([self._policy_metadata], options["checkpoint"])
             if keeps is not None:
@@ -142,11 +144,11 @@ class Rollouts(RunKind[RunConfig]):
             simulator = simulator_class(config.simulator)
             # Of a function that declares no class nothing is known, not even how it begins.
             tried = simulator.try_out and simulator is not Simulator
-            opening = Opening("simulator", todo[0].episode if tried else None)
-            _opened(pool, opening, config.simulator_timeout_s)
+            start = StartSimulator(todo[0].episode if tried else None)
+            _run_first(pool, start, config.simulator_timeout_s, _simulator_fault)
             check_servers_memory(config.policy, config.policy_options, self._system)
 
-    def identity(self, plan: Plan) -> dict[str, Any]:
+    def identity(self, plan: RunPlan) -> dict[str, Any]:
         """Return what of simulator, policy and subgoals can change a result."""
         config = self.config
         return {
@@ -176,7 +178,7 @@ class Offline(Rollouts):
             )
         super().__init__(dataclasses.replace(config, simulator=RECORDINGS), buffer_set)
 
-    def check(self, plan: Plan, items: Sequence[WorkItem]) -> None:
+    def check(self, plan: RunPlan, items: Sequence[WorkItem]) -> None:
         """Check every item, and that its episode has an execution."""
         super().check(plan, items)
         executions = open_dataset(self.buffer_set, EXECUTIONS)
@@ -184,16 +186,26 @@ class Offline(Rollouts):
             executions.index_of(episode)  # raises
 
 
-def _opened(pool: WorkerPool, opening: Opening, time_limit: float | None) -> Any:
-    (outcome,) = pool.run([opening], time_limit=time_limit, attempts=1)
+def _run_first(
+    pool: WorkerPool,
+    task: StartServer | StartSimulator,
+    time_limit: float | None,
+    fault: Callable[[object], InterferenceError],
+) -> Any:
+    """Run a task before all jobs; raise its error, or what `fault` makes of an unexpected one."""
+    (outcome,) = pool.run([task], time_limit=time_limit, attempts=1)
     if isinstance(outcome.error, InterferenceError):
         raise outcome.error
-    if outcome.error is not None and opening.what == "server":
-        raise PolicyServerError(f"the policy's server cannot be started: {outcome.error}")
     if outcome.error is not None:
-        raise SimulatorCrashError(
-            f"the simulator cannot be started: {outcome.error}",
-            "Check what works on this machine.",
-            "doctor",
-        )
+        raise fault(outcome.error)
     return outcome.value
+
+
+def _server_fault(error: object) -> InterferenceError:
+    return PolicyServerError(f"the policy's server cannot be started: {error}")
+
+
+def _simulator_fault(error: object) -> InterferenceError:
+    return SimulatorCrashError(
+        f"the simulator cannot be started: {error}", "Check what works on this machine.", "doctor"
+    )
