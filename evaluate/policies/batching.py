@@ -74,6 +74,7 @@ class Batcher[K: Hashable]:
             return None
         if self._since is None:
             self._since = now
+        # If every session waits, nobody is left who could make the batch larger.
         if len(self._waiting) >= min(self._size, len(self._sessions)):
             return 0.0
         return max(0.0, self._since + self._timeout_s - now)
@@ -96,6 +97,7 @@ class Batcher[K: Hashable]:
                 problem = error or f"it returned {len(actions)} results"
                 logger.warning("A batch of %d is repeated one by one: %s", len(keys), problem)
                 self._warned = True
+        # Alone, a request needs no batch, and one that raises fails alone.
         pairs = zip(sessions, requests, strict=True)
         answers = [attempt(session.act, *request) for session, request in pairs]
         return dict(zip(keys, answers, strict=True))

@@ -177,7 +177,8 @@ def _local_processes(config: RunConfig) -> Iterator[Sequence[Address]]:
     """Run the processes on this machine in the block."""
     count = config.policies or 0
     failures = list[WorkerError]()
-    folder = Path(tempfile.mkdtemp(prefix="policies-"))  # which other users cannot enter
+    # Not below the run: the path of a socket holds about 100 bytes. Other users cannot enter it.
+    folder = Path(tempfile.mkdtemp(prefix="policies-"))
     key = secrets.token_bytes(_KEY_BYTES)
     addresses = tuple(SocketAddress(folder / str(n), key, n) for n in range(count))
     with make_executor(replace(config, workers=count)).pool(ServePolicy(config)) as pool:

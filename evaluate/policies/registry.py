@@ -52,6 +52,7 @@ def one_client(text: str) -> bool:
 def check_workers(text: str, workers: int) -> None:
     """Refuse more workers than servers that hold the memory of one rollout each."""
     servers = server_addresses(text)
+    # Without addresses each worker starts its own server.
     if 0 < len(servers) < workers:
         server = policy_kind(text).server
         startable = server is not None and server.starter is not None
@@ -65,13 +66,14 @@ def check_workers(text: str, workers: int) -> None:
 
 def make_policy(text: str, options: Sequence[str] = (), *, worker: int = 0) -> Policy:
     """Make the policy of a worker in this process; most servers are connected at first use."""
-    factory, given = _factory(text, worker)
-    bound = bind_options(f"policy {text!r}", factory, given, options)
+    factory, arguments = _factory(text, worker)
+    bound = bind_options(f"policy {text!r}", factory, arguments, options)
     try:
-        policy = factory(**given, **bound)
+        policy = factory(**arguments, **bound)
     except InterferenceError:
         raise
     except Exception as error:
+        # Without the frame of this function, the traceback shows the user's code only.
         trace = error.__traceback__ and error.__traceback__.tb_next
         raise PolicyError(
             f"policy {text!r}: its factory raised {type(error).__name__}: {error}",
@@ -83,8 +85,8 @@ def make_policy(text: str, options: Sequence[str] = (), *, worker: int = 0) -> P
 
 def policy_options(text: str, options: Sequence[str] = ()) -> dict[str, Any]:
     """Return all options that a policy is made with, defaults included."""
-    factory, given = _factory(text, 0)
-    return bind_options(f"policy {text!r}", factory, given, options)
+    factory, arguments = _factory(text, 0)
+    return bind_options(f"policy {text!r}", factory, arguments, options)
 
 
 def _factory(text: str, worker: int) -> tuple[Factory, dict[str, Any]]:
@@ -93,6 +95,7 @@ def _factory(text: str, worker: int) -> tuple[Factory, dict[str, Any]]:
     kind = POLICIES.kinds[spec.kind]
     if kind.role is Role.OWN:
         factory = import_factory(f"policy {str(spec)!r}", spec.target)
+        # A policy of the user may choose a server or a GPU by its worker's number.
         takes_worker = "worker" in signature_of(factory).parameters
         return factory, {"worker": worker} if takes_worker else {}
     if kind.server is not None and starts_server(text):

@@ -104,6 +104,7 @@ class Scheduler[H: Handle](ABC):
                     starting = [worker for worker in self.workers if not worker.ready]
                 for worker in self.wait([*busy, *starting]):
                     outcome, queued = worker.receive(), busy.pop(worker)
+                    # The task is not at fault, such as where a node's policy server is gone.
                     if isinstance(outcome.error, WorkerRetiredError):
                         waiting.appendleft(queued)
                         self._drop(worker, replaced=False)
@@ -111,13 +112,14 @@ class Scheduler[H: Handle](ABC):
                             raise outcome.error
                         continue
                     if outcome.worker != "alive":
-                        self._drop(worker)
+                        self._drop(worker)  # its number is free for the one that replaces it
                     if queued.needs_retry(outcome, attempts, again):
                         waiting.append(queued)
                     else:
                         count = queued.failures + queued.losses
                         yield replace(outcome, task=queued.task, attempts=count)
         finally:
+            # The caller wants no more outcomes; idle workers stay for its next tasks.
             for worker in busy:
                 self._drop(worker)
 

@@ -95,6 +95,7 @@ class Registry[K: Kind]:
         match = re.fullmatch(kind.target, target, re.DOTALL)
         if match is None or bool(colon) > bool(target) or not kind.valid(target):
             raise InvalidOptionError.expected(self._what, text, kind.form)
+        # All that is recorded has the one spelling, so that equal runs look equal.
         if kind.spelled(target) != target:
             return self.parse(f"{name}:{kind.spelled(target)}")
         return Spec(name, target, {**kind.arguments, **match.groupdict()})
@@ -180,6 +181,7 @@ def bind_options(
     values: dict[str, Any] = {}
     for name, text in _split_options(what, options).items():
         kinds = declared.get(name)
+        # `checkpoint=7` is text where text is declared: only the factory knows what it is.
         value = text if kinds and str in kinds else _parse_json(text)
         if kinds and float in kinds and type(value) is int:
             value = float(value)

@@ -141,7 +141,9 @@ def test_each_worker_of_a_node_starts_its_server(cluster: Any, tmp_path: Path) -
 
 def test_a_policy_is_shared_on_a_cluster_and_started_again(cluster: Any, tmp_path: Path) -> None:
     policy = "python:support.shared_policies:Remembering"
-    runs.run(tmp_path / "own", policy=policy, conditions=CONDITIONS)
+    # Without its file the fault does nothing; options are part of what the rows say.
+    options = ("fault=die",)
+    runs.run(tmp_path / "own", policy=policy, policy_options=options, conditions=CONDITIONS)
     Path(os.environ[FAULT], "die").touch()
     shared = f"--policy {policy} --policy-option fault=die --workers 2 --policies 1"
     running = driver(tmp_path / "run", cluster.address, shared)
