@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 from robomme_interference_data.errors import FormatError, RunError, counted
@@ -15,7 +16,7 @@ from .outcomes import Outcomes, offline_outcomes, outcomes_of
 from .partners import base_of, ceilings_of
 from .rows.reading import CheckedRows, read_rows
 from .tables import effects, families, ranks, slopes
-from .tables.cells import SuccessCell, cells_of, main_grids, main_table, parts_table
+from .tables.cells import SuccessCell, cells_of, main_table, parts_table
 from .tables.contrast import Contrast
 
 if TYPE_CHECKING:
@@ -57,7 +58,6 @@ class Score:
         cells: System × condition, over all episodes, by family and by difficulty.
         error_cells: The same of offline runs, over all episodes and by family.
         tables: All tables with rows by name, except the paper's main table.
-        grids: The paper's main table for each simulator, and one of action errors.
     """
 
     settings: Settings
@@ -71,13 +71,22 @@ class Score:
     cells: Sequence[SuccessCell]
     error_cells: Sequence["ErrorCell"]
     tables: Mapping[str, Table]
-    grids: Sequence[Table]
 
     @property
     def all_outcomes(self) -> list[Outcomes]:
         """The outcomes of each simulator, and of recordings."""
         recordings = [] if self.recordings is None else [self.recordings]
         return [*self.outcomes.values(), *recordings]
+
+    @cached_property
+    def grids(self) -> list[Table]:
+        """The paper's main table for each simulator, and one of action errors."""
+        from .tables.grids import error_grid, main_grids  # for pages, not for numbers
+
+        grids = main_grids(self.cells)
+        if self.recordings is not None:
+            grids.append(error_grid(self.recordings, self.error_cells))
+        return grids
 
     def is_reference(self, simulator: str, system: str) -> bool:
         """Whether a system is only a reference in a simulator, which is never ranked."""
@@ -106,7 +115,6 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         families.families_table(simulated, contrasts),
         ranks.matrix_table(contrasts),
     ]
-    grids = main_grids(cells)
     error_cells = list["ErrorCell"]()
     published: Sequence[SuccessCell] = ()
     # The tables below are for some rows or settings only: what is not used is not imported.
@@ -125,7 +133,6 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         errors = action_error_effects.error_contrasts(recordings, draws)
         tables.append(action_error.error_table(error_cells))
         tables.append(action_error_effects.error_effects_table(errors))
-        grids.append(action_error.error_grid(recordings, error_cells))
         contrasts += errors
         notes += _not_compared_offline(recordings)
     if settings.against is Against.PAPER:
@@ -153,7 +160,6 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         cells,
         error_cells,
         {table.name: table for table in sorted(filled, key=lambda t: TABLES.index(t.name))},
-        grids,
     )
 
 

@@ -1,13 +1,11 @@
 """Action errors of offline runs: their means, over all episodes and by family."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from robomme_interference_data.evaluate.score.outcomes import Flags, Outcomes, mean_errors
-from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.stats.bootstrap import (
     MIN_EPISODES,
     Interval,
@@ -16,10 +14,10 @@ from robomme_interference_data.stats.bootstrap import (
 )
 from robomme_interference_data.viz.tables import Columns, Table
 
-from .cells import EPISODES, NOT_EXPECTED, Coverage, coverage_of, episodes_record
+from .cells import EPISODES, Coverage, coverage_of, episodes_record
 from .comparison import record_table
 
-_NOTE = (
+NOTE = (
     "Mean absolute difference of actions to the recorded ones over the n episodes that count, in "
     f"the actions' units, with 95% BCa bootstrap intervals if at least {MIN_EPISODES} episodes "
     "differ; repeats of an episode count with their mean. An error does not count. †: an "
@@ -99,31 +97,4 @@ def error_table(cells: Sequence[ErrorCell]) -> Table:
             "complete": cell.complete,
         }
         records.append(record | episodes_record(cell, listed=bool(cell.part)))
-    return record_table("action_error", "Action error offline", _COLUMNS, records, _NOTE)
-
-
-def error_grid(outcomes: Outcomes, cells: Sequence[ErrorCell]) -> Table:
-    """Return a row for each system and a column for each condition."""
-    at = {(cell.system, cell.condition): cell for cell in cells if not cell.part}
-    rows = []
-    for system in outcomes.systems:
-        texts = [_shown(at.get((system, condition))) for condition in outcomes.conditions]
-        rows.append([display_name(system), *texts])
-    return Table(
-        outcomes.simulator,
-        f"Action error by system and condition, {outcomes.simulator}",
-        dict.fromkeys(["system", *outcomes.conditions], "text"),
-        rows,
-        f"{_NOTE} {NOT_EXPECTED}: no rows.",
-    )
-
-
-def _shown(cell: ErrorCell | None) -> str:
-    if cell is None:
-        return NOT_EXPECTED
-    errors = f", errors: {cell.errors}" if cell.errors else ""
-    if not cell.n:
-        return f"no result†{errors}"
-    mean, low, high = cell.error
-    bounds = "" if math.isnan(low) else f" [{low:.4f}, {high:.4f}]"
-    return f"{mean:.4f}{cell.mark}{bounds} n={cell.n}{errors}"
+    return record_table("action_error", "Action error offline", _COLUMNS, records, NOTE)

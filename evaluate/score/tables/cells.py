@@ -4,7 +4,6 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -17,13 +16,11 @@ from robomme_interference_data.evaluate.score.outcomes import (
     SuccessRate,
     rate_of,
 )
-from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.ids import EpisodeId, format_numbers
-from robomme_interference_data.schema.conditions import in_order
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.stats.bootstrap import Interval
 from robomme_interference_data.stats.intervals import stratified_n, wilson
-from robomme_interference_data.viz.tables import Columns, Table, percent
+from robomme_interference_data.viz.tables import Columns, Table
 
 from .comparison import record_table
 from .ranks import Standing, all_pairs, standings
@@ -31,12 +28,12 @@ from .ranks import Standing, all_pairs, standings
 _FAIL = np.int8(STATUSES.index(Status.FAIL))
 _ERROR = np.int8(STATUSES.index(Status.ERROR))
 
-_NOTE = (
+NOTE = (
     "Rates with 95% Wilson intervals. n: episodes that count; an error is neither success nor "
     "failure. †: the cell lacks episodes, or has episodes outside the grid, and is not ranked; a "
     "cell without any rollout is missing."
 )
-_BEST = (
+BEST = (
     "Best (bold, in text *): above zero, and no other system is significantly better, by p after "
     "Holm's correction over all pairs of systems."
 )
@@ -56,9 +53,6 @@ _PARTS_NOTE = (
     "is not an error. With "
     "repeats, one that does not count with every model seed of the condition is missing."
 )
-
-NOT_EXPECTED = "n/a"
-"""A cell of a grid that nobody expects, unlike a missing one."""
 
 
 @dataclass(frozen=True)
@@ -263,7 +257,7 @@ PARTS: Columns = _CELL | {"by": "text", "part": "text"} | _RATE | _COUNTS | EPIS
 def main_table(cells: Sequence[SuccessCell]) -> Table:
     """Return a row for each cell over all episodes."""
     records = [_record(cell) | _standing(cell) for cell in cells if not cell.part]
-    note = f"{_NOTE} {_BEST} {_MAIN_NOTE}"
+    note = f"{NOTE} {BEST} {_MAIN_NOTE}"
     return record_table("main", "Success by system and condition", MAIN, records, note)
 
 
@@ -277,7 +271,7 @@ def parts_table(cells: Sequence[SuccessCell]) -> Table:
         elif cell.part:
             record = _record(cell) | episodes_record(cell, listed=True)
             families.append(record | {"by": "family"})
-    note = f"{_NOTE} {_BEST} {_PARTS_NOTE}"
+    note = f"{NOTE} {BEST} {_PARTS_NOTE}"
     title = "Success by family and by difficulty"
     return record_table("parts", title, PARTS, families + difficulties, note)
 
@@ -339,58 +333,3 @@ def _numbers(episodes: Iterable[EpisodeId]) -> str:
     for episode in episodes:
         by_split.setdefault(episode.split, []).append(episode.index)
     return "; ".join(f"{split} {format_numbers(indices)}" for split, indices in by_split.items())
-
-
-def main_grids(cells: Sequence[SuccessCell]) -> list[Table]:
-    """Return the paper's main table of each simulator: a row per system, a column per condition.
-
-    The best of a condition (see `SuccessCell.best`) are bold, between `**`. If all rates have the
-    same n, only the note states it.
-    """
-    whole = [cell for cell in cells if not cell.part]
-    grids: list[Table] = []
-    for simulator, group in groupby(whole, lambda cell: cell.simulator):
-        own = list(group)
-        conditions = [condition.name for condition in in_order({cell.condition for cell in own})]
-        at = {(cell.system, cell.condition): cell for cell in own}
-        counts = {cell.n for cell in own if cell.n}
-        rows = []
-        for system in dict.fromkeys(cell.system for cell in own):
-            texts = [_shown(at.get((system, name)), with_n=len(counts) > 1) for name in conditions]
-            rows.append([display_name(system), *texts])
-        notes = []
-        if len(counts) == 1:
-            notes.append(f"n = {counts.pop()} in each cell.")
-        if not grids:  # once for all grids
-            notes.append(_NOTE)
-            if any(cell.best for cell in whole):
-                notes.append(_BEST)
-        if any(NOT_EXPECTED in row for row in rows):
-            notes.append(
-                f"{NOT_EXPECTED}: the condition does not apply to the system, or is not expected."
-            )
-        references = dict.fromkeys(display_name(cell.system) for cell in own if cell.reference)
-        if references:
-            notes.append(f"References, not ranked: {', '.join(references)}.")
-        chances = [cell.chance for cell in own if not math.isnan(cell.chance)]
-        if chances:
-            levels = dict.fromkeys([percent(min(chances)), percent(max(chances))])
-            notes.append(f"Guessing succeeds in {' to '.join(levels)}: see the table chance.")
-        errors = sum(cell.errors for cell in own)
-        notes.append(f"Errors: {errors}." if errors else "No errors.")
-        title = f"Success by system and condition, {simulator}"
-        columns: Columns = dict.fromkeys(["system", *conditions], "text")
-        grids.append(Table(simulator, title, columns, rows, " ".join(notes)))
-    return grids
-
-
-def _shown(cell: SuccessCell | None, *, with_n: bool) -> str:
-    if cell is None:
-        return NOT_EXPECTED
-    errors = f", errors: {cell.errors}" if cell.errors else ""
-    if not cell.n:
-        return f"no result†{errors}" if any(cell.counts) else "missing†"
-    low, high = cell.interval
-    rate = f"**{percent(cell.rate)}**" if cell.best else percent(cell.rate)
-    n = f" n={cell.n}" if with_n else ""
-    return f"{rate}{cell.mark} [{100 * low:.1f}, {100 * high:.1f}]{n}{errors}"
