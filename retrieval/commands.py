@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -33,51 +32,25 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError, counted, named
 from robomme_interference_data.runtime.executor import Serial, WorkersConfig, make_executor
-from robomme_interference_data.schema.settings import setting
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
+
+from .config import ENCODER_HELP, RETRIEVAL, IndexConfig
 
 if TYPE_CHECKING:
     from robomme_interference_data.data.buffer_set import BufferSet
 
     from .select import Similarities
 
-_RETRIEVAL = "Retrieval"
-_EXECUTION = "Execution"
 _CALIBRATION = "Calibration"
 
 _SWEEP = (0.80, 0.99)
 """First and last threshold that a calibration grades."""
 
-_ENCODER_HELP = (
-    "thumbnail (no weights), siglip (the paper's model), or siglip:ID with the id or folder of "
-    "another SigLIP or SigLIP 2 model."
-)
 _CAMERA_HELP = "Camera whose frames are compared; default: the first."
 
-EncoderName = Annotated[str, typer.Option(help=_ENCODER_HELP, rich_help_panel=_RETRIEVAL)]
-Camera = Annotated[str | None, typer.Option(help=_CAMERA_HELP, rich_help_panel=_RETRIEVAL)]
-Shift = Annotated[str, typer.Option(help=SHIFT_HELP, rich_help_panel=_RETRIEVAL)]
-
-
-@dataclass(frozen=True)
-class IndexConfig:
-    """The settings of `index`."""
-
-    encoder: str = setting("thumbnail", help=_ENCODER_HELP, group=_RETRIEVAL)
-    camera: str | None = setting(None, help="Camera to embed.", shown="the first", group=_RETRIEVAL)
-    force: bool = setting(False, help="Build the index again.", group=_RETRIEVAL)
-    device: str | None = setting(
-        None,
-        help="Device of siglip, such as cuda.",
-        shown="a GPU if there is one",
-        group=_EXECUTION,
-    )
-    batch: int | None = setting(
-        None, help="Images per batch.", shown="the encoder's default", group=_EXECUTION
-    )
-    threads: int | None = setting(
-        None, help="Threads that decode.", shown="all processors", group=_EXECUTION
-    )
+EncoderName = Annotated[str, typer.Option(help=ENCODER_HELP, rich_help_panel=RETRIEVAL)]
+Camera = Annotated[str | None, typer.Option(help=_CAMERA_HELP, rich_help_panel=RETRIEVAL)]
+Shift = Annotated[str, typer.Option(help=SHIFT_HELP, rich_help_panel=RETRIEVAL)]
 
 
 @with_settings
@@ -154,7 +127,7 @@ def retrieve(
     condition: ConditionName,
     encoder: EncoderName = "thumbnail",
     rule: Annotated[
-        str, typer.Option(help="RULE, as in retrieval-score.", rich_help_panel=_RETRIEVAL)
+        str, typer.Option(help="RULE, as in retrieval-score.", rich_help_panel=RETRIEVAL)
     ] = "max",
     camera: Camera = None,
     shift: Shift = NO_SHIFT,
@@ -208,7 +181,7 @@ def retrieval_score(
             "joined, mean, last, random, top32 or oracle; THRESHOLD is a cosine or adaptive, by "
             "default the one published for the encoder.",
             metavar="RULE,…",
-            rich_help_panel=_RETRIEVAL,
+            rich_help_panel=RETRIEVAL,
         ),
     ] = ["max"],  # noqa: B006 - typer copies it
     families: Families = [],  # noqa: B006

@@ -11,7 +11,14 @@ from support.package import ROOT, module_files
 
 from robomme_interference_data import errors
 from robomme_interference_data.constants import DOCS_URL
-from robomme_interference_data.errors import InterferenceError, InvalidOptionError, counted, nearest
+from robomme_interference_data.errors import (
+    InterferenceError,
+    InvalidOptionError,
+    counted,
+    named,
+    naming_options,
+    nearest,
+)
 
 CLASSES = [
     value
@@ -86,6 +93,17 @@ def test_nearest_of_very_many_names_is_quick() -> None:
 )
 def test_counted(count: int, nouns: tuple[str, ...], text: str) -> None:
     assert counted(count, *nouns) == text
+
+
+def test_settings_are_named_as_the_reader_writes_them() -> None:
+    assert (named("fps"), named("executor", "ray")) == ("`fps`", 'executor="ray"')
+    assert named("workers", 2) == "workers=2"
+    with naming_options({"fps": "--fps", "buffer_set": "BUFFER_SET"}):
+        assert (named("fps"), named("fps", "1 0")) == ("--fps", "--fps '1 0'")
+        assert (named("buffer_set"), named("workers")) == ("BUFFER_SET", "`workers`")
+        error = InvalidOptionError.expected("fps", 0, "a positive number")
+        assert error.message == "--fps 0; expected a positive number" and error.option == "fps"
+    assert named("fps") == "`fps`"
 
 
 def test_pages_in_hints_are_addresses() -> None:

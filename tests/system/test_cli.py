@@ -335,6 +335,11 @@ def test_show_as_json_and_as_a_picture(run: Run, tiny_buffers: Path, tmp_path: P
 def test_verify(run: Run, own_buffers: Path) -> None:
     code, out, _ = run("verify", own_buffers, "--json", "--no-decode")
     assert (code, json.loads(out)) == (0, {"violations": []})
+    code, out, _ = run("verify", own_buffers, "--json", "--no-decode", "--audit")
+    report = json.loads(out)
+    assert code == 0 and {*report} == {"violations", "audit", "shortcuts"}
+    assert report["audit"]["leaks"] == report["shortcuts"] == []  # the answers are all alike
+    assert sum(row["units"] for row in report["audit"]["families"]) == 17
     (video, *_) = sorted(own_buffers.glob("demonstrations/videos/*front/*/*.mp4"))
     video.unlink()
     code, out, err = run("verify", own_buffers, "--no-decode")

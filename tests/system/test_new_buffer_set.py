@@ -50,7 +50,7 @@ def test_a_buffer_set_for_published_demonstrations(
     given = ("--demonstrations", BASE, "--source", mine, "--workers", 1)
     code, _, err = run("build", out, *given, "--conditions", "k0,k1,k2")
     assert code == 0, err
-    assert "publish" in err
+    assert "--audit" in err
     buffer_set = load_buffer_set(out)
     assert (
         buffer_set.header.datasets["demonstrations"].location
@@ -64,6 +64,8 @@ def test_a_buffer_set_for_published_demonstrations(
     # Again: nothing changes. With other units: a question, as planned buffers would get others.
     made = contents(out)
     assert run("build", out, *given)[0] == 0
+    assert contents(out) == made
+    assert run("build", out, *given[2:])[0] == 0  # its buffers name the demonstrations
     assert contents(out) == made
     code, _, err = run("build", out, *given[:2], "--source", "sample:Cup,Box")
     assert code == 1 and "k1, k2" in err and "--yes" in err
