@@ -19,6 +19,11 @@ class Nothing:
         return self._run.row(
             task,
             Status.FAIL,
-            **{"seed": 0, "difficulty": "easy", "goal": "", "steps": 0},
-            **{"history_frames": 0, "lesson_frames": 0, "lesson_share": None},
+            seed=0,
+            difficulty="easy",
+            goal="",
+            steps=0,
+            history_frames=0,
+            lesson_frames=0,
+            lesson_share=None,
         )

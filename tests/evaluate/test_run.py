@@ -12,6 +12,8 @@ import pandas
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from support.buffer_sets import copy_buffer_set
+from support.retrieval import make_index
 from support.runs import header, run, run_one, untimed
 from support.worlds import World
 
@@ -19,6 +21,10 @@ from robomme_interference_data.errors import HashMismatchError, RunError, Simula
 from robomme_interference_data.evaluate.rollout import worker
 from robomme_interference_data.evaluate.rollout.worker import StartSimulator
 from robomme_interference_data.evaluate.run.log import read_record
+from robomme_interference_data.evaluate.score.config import Expected, Settings
+from robomme_interference_data.evaluate.score.partners import base_of
+from robomme_interference_data.evaluate.score.scoring import score
+from robomme_interference_data.evaluate.systems import FACT_COLUMNS
 from robomme_interference_data.runtime.executor import Outcome, Serial
 
 pytestmark = pytest.mark.usefixtures("trouble")
@@ -45,6 +51,30 @@ def test_a_run_writes_a_row_for_every_rollout(tmp_path: Path) -> None:
     frame, stored = result.to_pandas(), pandas.read_parquet(tmp_path / "run" / "rollouts.parquet")
     pandas.testing.assert_frame_equal(frame, stored)
     assert frame["success"].tolist() == [row.success for row in result.rows]
+
+
+def test_rows_and_run_json_have_the_facts_of_the_system(tmp_path: Path) -> None:
+    buffer_set = copy_buffer_set(tmp_path / "buffer_set")
+    make_index(buffer_set)
+    settings = {"buffer_set": buffer_set, "families": ("MoveCube",), "conditions": ("k1",)}
+
+    def facts(name: str, **changes: Any) -> dict[str, Any]:
+        (row,) = run(tmp_path / name, **settings, system=name, **changes).rows
+        stated: dict[str, Any] = header(tmp_path / name)["identity"]["facts"]
+        assert stated == {column: getattr(row, column) for column in FACT_COLUMNS}
+        return stated
+
+    plain = facts("a", policy="replay:window:8")
+    assert (plain["policy"], plain["memory"], plain["retrieval"]) == ("replay", "window:8", None)
+    step = facts("b", policy="replay:window:8", retrieval="thumbnail")
+    assert step == plain | {"retrieval": "thumbnail/max/adaptive"}  # whatever their labels
+    other = facts("c", policy="replay:window:8", policy_options=("extrapolate=true",))
+    assert other["policy_id"] != plain["policy_id"] and not plain["reference"]
+    cheat = facts("d")
+    assert (cheat["policy"], cheat["memory"], cheat["reads_history"]) == ("python", None, True)
+    rows = [tmp_path / name for name in "abcd"]
+    (outcomes,) = score(Settings(rows=rows, expected=Expected.OBSERVED)).outcomes.values()
+    assert [base_of(outcomes, name) for name in "abcd"] == [None, "a", None, None]
 
 
 # --- resume ------------------------------------------------------------------------------------

@@ -80,7 +80,7 @@ def test_siglip_makes_an_index(own_buffers: Path, model: str) -> None:
     assert open_index(datasets["distractors"], model).center is None
     buffer = load_buffer(QUERIES[0], "k1", buffer_set=own_buffers)
     selector = Selector(model, device="cpu")
-    assert selector.label(buffer) == "siglip-tiny/max/adaptive"
+    assert selector.label(buffer.query.dataset) == "siglip-tiny/max/adaptive"
     live = encoder.features(encoder.prepare(buffer.query.frame()[None]))
     given = measure(buffer, model, query=normalized(live)[0])
     assert given.alike == pytest.approx(measure(buffer, model).alike, abs=2e-3)
