@@ -205,15 +205,16 @@ class _Live:
             }
             policy.observe(frames, np.stack([observation.state for observation in watched]))
             size = getattr(self.simulator, "action_size", ACTION_SIZE)
-            return _checked(policy.act(seen[-1], goal), size)
+            return _checked(policy.act(seen[-1], goal), size, len(seen[-1].state))
 
 
-def _checked(actions: Any, size: int) -> NDArray[np.float32]:
+def _checked(actions: Any, size: int, state_size: int) -> NDArray[np.float32]:
     """Return the actions of a chunk that are executed, `(n, size) float32`, n from 1 to 16."""
     try:
-        return action_array(actions, chunk=True, size=size)[:ACTION_CHUNK]
+        checked = action_array(actions, chunk=True, size=size, state_size=state_size)
     except InvalidOptionError as error:
         raise PolicyError(f"the policy's answer: {error.message}", error.hint) from None
+    return checked[:ACTION_CHUNK]
 
 
 def _model_columns(writer: SubgoalWriter | None) -> dict[str, Any]:

@@ -43,6 +43,11 @@ class Config:
     pictures: bool = True  # False: the control, with its memory's positions and lengths only
     seed: int = 0
 
+    @property
+    def targets_are_states(self) -> bool:
+        """Whether an action is a state to reach, but for its last value, the gripper's."""
+        return self.action == self.state
+
 
 class FrameEncoder(nn.Module):
     """A patch encoder: patches of 4 × 4 pixels, then a convolution over neighbors."""
@@ -97,16 +102,25 @@ class MemoryModel(nn.Module):
             self.register_buffer("state_mean", torch.zeros(config.state))
             self.register_buffer("state_std", torch.ones(config.state))
             self.register_buffer("action_std", torch.ones(config.action))
+            if not config.targets_are_states:
+                self.register_buffer("action_mean", torch.zeros(config.action))
 
     def fit_scales(self, batch: dict[str, Any]) -> None:
-        """Set the scales of states and of changes of the joints, from a batch of the data."""
-        state = batch["observation.state"]
-        change = (batch["action"] - self._still(batch))[~batch["action_is_pad"]]
+        """Set the scales of states and of what is added to the first guess, from a batch."""
+        state, valid = batch["observation.state"], ~batch["action_is_pad"]
+        if not self.config.targets_are_states:
+            self.action_mean = batch["action"][valid].mean(0)
+        change = (batch["action"] - self._first_guess(batch))[valid]
         self.state_mean = state.mean(0)
         self.state_std, self.action_std = _std(state), _std(change)
 
-    def _still(self, batch: dict[str, Any]) -> Tensor:
-        """Return the action that keeps the joints where they are, `(B, 1, D)`."""
+    def _first_guess(self, batch: dict[str, Any]) -> Tensor:
+        """Return the action that keeps the joints where they are, `(B, 1, D)`.
+
+        Of a robot whose actions are no states, it is the mean action, `(D,)`.
+        """
+        if not self.config.targets_are_states:
+            return self.action_mean  # type: ignore[return-value]
         return functional.pad(batch["observation.state"][:, None, :-1], (0, 1))
 
     def forward(self, batch: dict[str, Any]) -> Tensor:
@@ -118,7 +132,7 @@ class MemoryModel(nn.Module):
         if self.config.task == "act":
             read = self._read(self.mixed(self.mix(tokens)) + time, is_pad)
             change = self.head(read).unflatten(1, (self.config.chunk, -1)) * self.action_std
-            return self._still(batch) + change
+            return self._first_guess(batch) + change
         is_option = ~batch["question.option_is_pad"]
         # A batch has O lists of B texts.
         words = [text for texts in zip(*batch["question.options"], strict=True) for text in texts]
@@ -184,7 +198,7 @@ class MemoryModel(nn.Module):
         """Return the mean of the embeddings of hashed words, `(N, width)`."""
         hashed = [[1 + zlib.crc32(w.encode()) % (WORDS - 1) for w in t.split()] for t in texts]
         longest = max(1, *map(len, hashed))
-        padded = [one + [0] * (longest - len(one)) for one in hashed]
+        padded = [numbers + [0] * (longest - len(numbers)) for numbers in hashed]
         text: Tensor = self.words(torch.tensor(padded, device=self.words.weight.device))
         return text
 

@@ -76,11 +76,12 @@ class MemoryPolicy(Policy):
         return batch
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
-        """Return the next chunk of actions, `(chunk, 8) float32`."""
+        """Return the next chunk of actions, `(chunk, A) float32`."""
         batch = on_device(self.batch(goal), self._device)
         with torch.inference_mode():
             actions: NDArray[np.float32] = self._model(batch)[0].cpu().numpy()
-        actions[:, -1] = np.sign(actions[:, -1])
+        if self.config.targets_are_states:
+            actions[:, -1] = np.sign(actions[:, -1])  # the gripper closes or opens
         return actions
 
     def metadata(self) -> dict[str, Any]:

@@ -103,23 +103,46 @@ def choose_cameras(
 
 
 def action_array(
-    action: ArrayLike, *, chunk: bool = False, size: int = ACTION_SIZE
+    action: ArrayLike,
+    *,
+    chunk: bool = False,
+    size: int = ACTION_SIZE,
+    state_size: int | None = None,
 ) -> NDArray[np.float32]:
-    """Check an action, and return it as `(size,) float32`; a chunk of n ≥ 1 as `(n, size)`."""
+    """Check an action, and return it as `(size,) float32`; a chunk of n ≥ 1 as `(n, size)`.
+
+    The error about another size says so if it is that of a state.
+    """
+    expected = f"({size},) action"
+    if chunk:
+        expected = f"(n, {size}) actions, n at least 1"
     try:
         array = np.asarray(action)
-    except ValueError:  # rows of several lengths
-        array = np.empty(0)
+    except ValueError:
+        raise _wrong_action("rows of several lengths", expected, size) from None
     shape = array.shape[1:] if chunk else array.shape
-    if shape == (size,) and array.dtype.kind in "fiu":
-        with np.errstate(over="ignore"):
-            converted = array.astype(np.float32)
-        if len(converted) and np.isfinite(converted).all():
-            return converted
-    expected = f"(n, {size}) actions, n at least 1" if chunk else f"({size},) action"
-    raise InvalidOptionError(
-        f"got {array.dtype} {array.shape} {np.array2string(array, threshold=2 * size)}; "
-        f"expected {expected}, of finite numbers",
+    if shape != (size,) or not len(array):
+        fault = f"shape {array.shape}"
+        if array.shape[-1:] == (state_size,) and state_size != size:
+            fault += f", {state_size} values as in a state"
+        raise _wrong_action(fault, expected, size)
+    if array.dtype.kind not in "fiu":
+        raise _wrong_action(f"dtype {array.dtype}", f"{expected}, of numbers", size)
+    with np.errstate(over="ignore"):
+        converted = array.astype(np.float32)
+    wrong = np.argwhere(~np.isfinite(converted)).tolist()
+    if wrong:
+        where = f"{wrong[0]}".replace("[", "(").replace("]", ")")
+        fault = f"{array[tuple(wrong[0])]} at {where}"
+        if len(wrong) > 1:
+            fault += f", the first of {len(wrong)} such values"
+        raise _wrong_action(fault, f"{expected}, of finite float32 numbers", size)
+    return converted
+
+
+def _wrong_action(fault: str, expected: str, size: int) -> InvalidOptionError:
+    return InvalidOptionError(
+        f"got {fault}; expected {expected}",
         "An action is 7 absolute joint targets in rad, then the gripper, −1 closed to 1 open."
         if size == ACTION_SIZE
         else "The simulator, or the recordings, have actions of this size.",

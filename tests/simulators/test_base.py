@@ -69,6 +69,24 @@ def test_invalid_actions(given: Any, chunk: bool) -> None:
         action_array(given, chunk=chunk)
 
 
+@pytest.mark.parametrize(
+    ("given", "size", "fault"),
+    [
+        (np.zeros((3, 11)), 10, "shape (3, 11), 11 values as in a state"),
+        (np.zeros((3, 9)), 10, "shape (3, 9)"),
+        (np.zeros((3, 10), bool), 10, "dtype bool"),
+        (np.where(np.arange(20).reshape(2, 10) > 16, np.nan, 0), 10, "nan at (1, 7), the first of"),
+        ([[1.0], [1.0, 2.0]], 10, "rows of several lengths"),
+    ],
+)
+def test_an_error_about_actions_says_what_is_wrong(given: Any, size: int, fault: str) -> None:
+    """It shows no array."""
+    with pytest.raises(InvalidOptionError) as raised:
+        action_array(given, chunk=True, size=size, state_size=11)
+    assert raised.value.message.startswith(f"got {fault}")
+    assert "[" not in raised.value.message
+
+
 def test_an_episode_runs_until_it_ends() -> None:
     with Double() as simulator:
         simulator.reset("MoveCube/test/9")

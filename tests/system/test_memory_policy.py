@@ -51,6 +51,31 @@ def weights(run: Path) -> dict[str, torch.Tensor]:
     return load_file(run / "model.safetensors")
 
 
+def test_actions_need_not_have_the_size_of_states() -> None:
+    """A robot with 11 state and 10 action values: the first guess is the mean action."""
+    from memory_model import Config, MemoryModel
+
+    def batch(items: int) -> dict[str, Any]:
+        return {
+            "observation.state": torch.randn(items, 11),
+            "action": 5 + torch.randn(items, 4, 10),
+            "action_is_pad": torch.zeros(items, 4, dtype=torch.bool),
+            "memory.state": torch.randn(items, 3, 11),
+            "memory.position": torch.arange(3).expand(items, -1),
+            "memory.is_pad": torch.zeros(items, 3, dtype=torch.bool),
+            "position": torch.full((items,), 3),
+            "task": ["place the cup"] * items,
+        }
+
+    torch.manual_seed(0)
+    sizes = {"state": 11, "action": 10, "chunk": 4, "image_size": 16}
+    model = MemoryModel(Config(task="act", data="", memory="full", cameras=(), **sizes))
+    model.fit_scales(batch(64))
+    actions = model(batch(2))
+    assert actions.shape == (2, 4, 10)
+    assert abs(actions.mean().item() - 5) < 0.5
+
+
 @pytest.mark.slow
 def test_it_learns_to_answer_and_writes_rows(program: Any, tmp_path: Path) -> None:
     """Of six golden lessons: their frames are of one color each, so not all can be told apart."""
