@@ -14,6 +14,7 @@ from support import runs, worlds
 from support.buffer_sets import CONDITIONS, GOLDEN, contents, copy_buffer_set, stored_frames
 from support.hub_server import HubServer
 from support.machine import full_disk
+from support.messages import raises
 from support.publishing import LESSONS, UNITS, files, plain_cards, plan, plan_again, publish, tags
 from support.tabletop import TABLETOP, copy_tabletop
 
@@ -135,7 +136,7 @@ def test_private_repositories(hub: HubServer, login: Login) -> None:
     assert all(one.private for one in hub.repositories.values())
     assert len(load_buffer_set(UNITS)) == 15
     login("stranger")
-    with pytest.raises(HubError, match="dataset repository .* does not exist"):
+    with raises(HubError):
         load_buffer_set(UNITS)
 
 
@@ -267,13 +268,13 @@ def test_a_buffer_set_of_published_demonstrations(hub: HubServer, tmp_path: Path
 
 def test_published_demonstrations_that_cannot_be_used(hub: HubServer, tmp_path: Path) -> None:
     commit = hub.push("datasets/others/lessons", GOLDEN / "distractors")
-    with pytest.raises(PublishError, match="other demonstrations"):
+    with raises(PublishError):
         publish(placed(hub, tmp_path / "other", commit))
-    with pytest.raises(HubError, match="no revision"):
+    with raises(HubError):
         publish(placed(hub, tmp_path / "missing", commit="a" * 40))
     root = placed(hub, tmp_path / "gated")
     hub.gated.add("datasets/others/lessons")
-    with pytest.raises(HubError, match="gated"):
+    with raises(HubError):
         publish(root)
     assert UNITS not in str(hub.repositories)
 
@@ -291,7 +292,7 @@ def test_a_token_without_rights(
         hub.push(f"datasets/{LESSONS}", {"README.md": b"to come"})
         hub.push(f"datasets/{UNITS}", {"README.md": b"to come"})
     login(**who)
-    with pytest.raises(HubError, match="lacks the permission for .*someone/") as caught:
+    with raises(HubError) as caught:
         publish(GOLDEN)
     assert "hf auth login" in str(caught.value.hint)
     assert hub.uploads() == [] and tags(hub, LESSONS) == {}
@@ -312,7 +313,7 @@ def test_invalid_login(
 def test_what_a_repository_may_hold(hub: HubServer) -> None:
     other = {"data/train.csv": b"1,2", "README.md": b"mine"}
     hub.push("datasets/someone/other", other)
-    with pytest.raises(PublishError, match=r"something else, such as data/train\.csv"):
+    with raises(PublishError):
         publish(GOLDEN, "someone/other")
     assert writes(hub) == []
     hub.push(f"datasets/{UNITS}", {"README.md": b"to come", "LICENSE": b"free"})
@@ -322,7 +323,7 @@ def test_what_a_repository_may_hold(hub: HubServer) -> None:
     hub.renamed[f"datasets/{UNITS}"] = "datasets/someone/new"
     hub.repositories["datasets/someone/new"] = hub.repositories.pop(f"datasets/{UNITS}")
     hub.repositories["datasets/someone/new"].name = "datasets/someone/new"
-    with pytest.raises(HubError, match="is now called someone/new"):
+    with raises(HubError):
         publish(GOLDEN)
 
 
@@ -394,7 +395,7 @@ def test_a_buffer_set_that_fails_a_check_is_not_published(
     assert "build_report.json" in err and f"robomme-interference verify {root}" in err
     audit = Audit({}, leaks=[Leak("same scene", "unit MoveCube/train/0"), Leak("other", "b")])
     monkeypatch.setattr(checks, "audit_buffer_set", lambda _: audit)
-    with pytest.raises(PublishError, match="2 leaks, such as same scene: unit MoveCube") as caught:
+    with raises(PublishError) as caught:
         check_buffer_set(load_buffer_set(GOLDEN))
     assert caught.value.command == f"audit {GOLDEN}"
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from support.buffer_sets import GOLDEN, contents, copy_buffer_set
 from support.hub_server import Blob
 from support.machine import full_disk
+from support.messages import raises
 from support.publishing import content_of, plain_cards
 
 from robomme_interference_data import load_buffer, load_buffer_set
@@ -147,7 +148,7 @@ def test_a_folder_of_something_else_is_kept(tmp_path: Path, other: str) -> None:
 def test_a_full_disk_leaves_what_was_there(tmp_path: Path) -> None:
     out, files = tmp_path / "out", folder(GOLDEN)
     for left in (0, 12_000):  # the first file does not fit, a later one
-        with full_disk(left), pytest.raises(OSError, match="File too large") as caught:
+        with full_disk(left), raises(OSError) as caught:
             write_folder(files, out)
         assert str(tmp_path) in f"{caught.value.filename} {caught.value.filename2}"
         assert [*tmp_path.iterdir()] == []
@@ -168,20 +169,16 @@ def test_a_full_disk_leaves_what_was_there(tmp_path: Path) -> None:
     ],
 )
 def test_invalid_publications(wrong: dict[str, Any]) -> None:
-    with pytest.raises(InvalidOptionError, match="expected") as caught:
+    with raises(InvalidOptionError) as caught:
         Publication(**{"repo_id": "people/tiny", **wrong})
     assert repr(next(iter(wrong.values())))[:6] in caught.value.message
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"demonstrations_id": "people/tiny"}, "are both"),
-        ({"repo_id": "people/" + "a" * 90}, "demonstrations_id 'people/a*-demonstrations'"),
-    ],
+    "options", [{"demonstrations_id": "people/tiny"}, {"repo_id": "people/" + "a" * 90}]
 )
-def test_invalid_settings(options: dict[str, str], words: str) -> None:
-    with pytest.raises(InvalidOptionError, match=words):
+def test_invalid_settings(options: dict[str, str]) -> None:
+    with raises(InvalidOptionError):
         PublishConfig(**{"repo_id": "people/tiny", **options})
 
 

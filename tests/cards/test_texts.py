@@ -11,6 +11,7 @@ from support import scoring
 from support.buffer_sets import plan_again
 from support.cards import OF_BUFFER_SET, OF_DEMONSTRATIONS, OF_RESULTS, RUN
 from support.made_up import record, write_metadata
+from support.messages import raises
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.cards.dataset_facts import (
@@ -195,7 +196,7 @@ def test_the_base_comes_from_the_manifests(tmp_path: Path) -> None:
 def test_a_buffer_set_without_buffers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     buffer_set = made_up(tmp_path)
     monkeypatch.setattr(buffer_set, "manifests", list)
-    with pytest.raises(FormatError, match="no buffers"):
+    with raises(FormatError):
         buffer_set_facts(buffer_set)
 
 
@@ -208,7 +209,7 @@ def test_results_of_several_runs_are_an_error(tmp_path: Path) -> None:
     copy = tmp_path / "rollouts.jsonl"
     copy.write_bytes((RUN / "rollouts.jsonl").read_bytes().replace(b"replay-full", b"my-memory"))
     found = score(Settings(rows=(RUN, copy)))
-    with pytest.raises(InvalidOptionError, match="2 files"):
+    with raises(InvalidOptionError):
         results_text(found, OF_RESULTS)
 
 

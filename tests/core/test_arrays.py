@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
+from support.messages import raises
 
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.storage.arrays import (
@@ -32,7 +33,7 @@ def test_arrays_are_as_numpy_writes_them(tmp_path: Path, order: Any, shape: Any)
 
 
 def test_a_full_disk_raises_the_systems_error() -> None:
-    with pytest.raises(OSError, match="No space left") as caught:
+    with raises(OSError) as caught:
         write_array(Path("/dev/full"), np.zeros(10**6, np.uint8))
     assert caught.value.errno == errno.ENOSPC
 
@@ -61,7 +62,7 @@ def test_what_is_written_is_read(tmp_path_factory: Any, dtype: Any, data: st.Dat
 )
 def test_other_arrays_raise(tmp_path: Path, array: Any) -> None:
     np.save(tmp_path / "a.npy", array)
-    with pytest.raises(FormatError, match=r"a\.npy: .* expected float16 of shape \(-1, 8\)"):
+    with raises(FormatError):
         read_array(tmp_path / "a.npy", np.float16, (-1, 8))
 
 
@@ -71,7 +72,7 @@ def test_a_file_is_as_long_as_its_header_says(tmp_path: Path) -> None:
     data = path.read_bytes()
     for wrong in (data[:-1], data + b"\0", data[:128], data[:100], data[:9], b""):
         path.write_bytes(wrong)
-        with pytest.raises(FormatError, match="a.npy"):
+        with raises(FormatError):
             read_array(path, np.float16, (-1, 8))
 
 

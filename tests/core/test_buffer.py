@@ -1,6 +1,5 @@
 """Buffers: the very frames of their sessions in order, however they are requested."""
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from support.buffer_sets import (
     stored_states,
     with_sessions,
 )
+from support.messages import raises
 
 from robomme_interference_data import Buffer, DecodedCache, SessionEntry, load_buffer_set
 from robomme_interference_data.errors import HashMismatchError, InvalidOptionError, UnknownNameError
@@ -135,38 +135,32 @@ def test_arrays_are_the_callers() -> None:
 
 @pytest.mark.parametrize("indices", [[-1, 3], range(100_000), [144]])
 def test_frames_are_inside(indices: Sequence[int]) -> None:
-    with pytest.raises(UnknownNameError, match="144 history frames"):
+    with raises(UnknownNameError):
         next(buffer().stream(8, None, indices))
     for index in (-1, 144):
-        message = f"frame {index} is not in the buffer of MoveCube/test/0 under k3"
-        with pytest.raises(UnknownNameError, match=message):
+        with raises(UnknownNameError):
             buffer().frame(index)
 
 
 @pytest.mark.parametrize(
-    ("use", "message"),
+    "use",
     [
-        (lambda made, wrong: made.frame(wrong), "index {}; expected an integer"),
-        (lambda made, wrong: next(made.stream(wrong)), "chunk {}; expected an integer"),
-        (
-            lambda made, wrong: next(made.stream(8, None, [wrong])),
-            "indices [{}]; expected strictly",
-        ),
+        lambda made, wrong: made.frame(wrong),
+        lambda made, wrong: next(made.stream(wrong)),
+        lambda made, wrong: next(made.stream(8, None, [wrong])),
     ],
 )
 @pytest.mark.parametrize("wrong", [1.5, True, "1", [1]])
-def test_numbers_are_whole(
-    use: Callable[[Buffer, Any], object], message: str, wrong: object
-) -> None:
-    with pytest.raises(InvalidOptionError, match=re.escape(message.format(repr(wrong)))):
+def test_numbers_are_whole(use: Callable[[Buffer, Any], object], wrong: object) -> None:
+    with raises(InvalidOptionError):
         use(buffer(), wrong)
 
 
 @pytest.mark.parametrize("indices", [[3, 3], [4, 3], 3, "front"])
 def test_indices_ascend_and_chunks_are_positive(indices: Any) -> None:
-    with pytest.raises(InvalidOptionError, match="strictly ascending"):
+    with raises(InvalidOptionError):
         next(buffer().stream(8, None, indices))
-    with pytest.raises(InvalidOptionError, match="chunk 0; expected an integer from 1"):
+    with raises(InvalidOptionError):
         next(buffer().stream(0))
 
 
@@ -182,7 +176,7 @@ def test_indices_ascend_and_chunks_are_positive(indices: Any) -> None:
     ],
 )
 def test_cameras_and_encoders_are_names(use: Callable[[Any], object]) -> None:
-    with pytest.raises(InvalidOptionError, match="^(camera|cameras|encoder) .*; expected"):
+    with raises(InvalidOptionError):
         use(buffer())
 
 
@@ -219,7 +213,7 @@ def test_cameras_by_full_or_unknown_name(camera: str) -> None:
         lambda: next(made.stream(8, (camera,))),
     ]
     for use in uses:
-        with pytest.raises(UnknownNameError, match=r"camera '\w+' is not in") as caught:
+        with raises(UnknownNameError) as caught:
             use()
         assert "front, wrist" in (caught.value.hint or "")
 
@@ -241,7 +235,7 @@ def test_verify_names_what_differs() -> None:
     lesson, unit = made.manifest.sessions
     changed = with_sessions(made.manifest, lesson, replace(unit, sha256="0" * 64))
     other = Buffer(changed, made.query, BUFFER_SET.datasets)
-    with pytest.raises(HashMismatchError, match=f"distractor {unit.source} .*recorded SHA-256"):
+    with raises(HashMismatchError):
         other.verify()
 
 

@@ -17,6 +17,7 @@ import pytest
 from support.buffer_sets import CONDITIONS, GOLDEN, QUERIES, UNITS
 from support.damage import HEADER, ROWS, edit, renew_header
 from support.lerobot_layouts import edit_columns, edit_info
+from support.messages import raises
 
 from robomme_interference_data import (
     DecodedCache,
@@ -177,16 +178,16 @@ def test_episodes_that_cannot_be_loaded(
 
 
 @pytest.mark.parametrize(
-    ("option", "values", "message"),
+    ("option", "values"),
     [
-        ("cache", (3, ["x"], b"x", "", "a\0b"), "expected True, False, a folder"),
-        ("threads", (0, -3, True, "2", 1.5), "expected an integer from 1"),
-        ("buffer_set", (None, 3, b"g", "", "a\0b"), "expected a folder"),
+        ("cache", (3, ["x"], b"x", "", "a\0b")),
+        ("threads", (0, -3, True, "2", 1.5)),
+        ("buffer_set", (None, 3, b"g", "", "a\0b")),
     ],
 )
-def test_no_such_option(option: str, values: tuple[Any, ...], message: str) -> None:
+def test_no_such_option(option: str, values: tuple[Any, ...]) -> None:
     for value in values:
-        with pytest.raises(InvalidOptionError, match=message):
+        with raises(InvalidOptionError):
             load_buffer_set(**{"buffer_set": GOLDEN, option: value})
 
 
@@ -255,18 +256,18 @@ def test_unknown_cameras_are_an_error_in_a_folder_too(tiny_buffers: Path) -> Non
 
 def test_what_is_no_buffer_set(tmp_path: Path) -> None:
     for folder in (tmp_path, GOLDEN / "demonstrations"):
-        with pytest.raises(MissingFileError, match="is not a buffer set") as caught:
+        with raises(MissingFileError) as caught:
             load_buffer_set(folder)
         assert "build BUFFER_SET" in str(caught.value.command)
     (tmp_path / "begun" / ".demonstrations.building").mkdir(parents=True)
     with pytest.raises(MissingFileError) as caught:
         load_buffer_set(tmp_path / "begun")
     assert caught.value.command is None and "to resume it" in str(caught.value.hint)
-    with pytest.raises(MissingFileError, match="no folder .*nowhere"):
+    with raises(MissingFileError):
         load_buffer_set(tmp_path / "nowhere")
-    with pytest.raises(InvalidOptionError, match="neither a folder nor"):
+    with raises(InvalidOptionError):
         load_buffer_set(str(tmp_path / "nowhere"))
-    with pytest.raises(InvalidOptionError, match="only a repository has revisions"):
+    with raises(InvalidOptionError):
         load_buffer_set(GOLDEN, revision="data-1.0.0")
 
 
@@ -282,7 +283,7 @@ def test_another_dataset_than_the_manifests_name(own_buffers: Path) -> None:
     identity = own_buffers / "distractors" / "meta" / "interference.json"
     revision = load_buffer_set(own_buffers).header.datasets["distractors"].revision
     identity.write_text(identity.read_text().replace(revision, "0" * 64))
-    with pytest.raises(HashMismatchError, match="the manifests were made for") as caught:
+    with raises(HashMismatchError) as caught:
         load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
     assert caught.value.command == f"build {own_buffers} --only manifests"
 
@@ -305,7 +306,7 @@ def test_damaged_headers(own_buffers: Path, before: str, after: str) -> None:
     text = header.read_text()
     assert before in text
     header.write_text(text.replace(before, after))
-    with pytest.raises(FormatError, match=r"manifest\.json"):
+    with raises(FormatError):
         load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
 
 
@@ -320,13 +321,13 @@ def test_damaged_headers(own_buffers: Path, before: str, after: str) -> None:
 )
 def test_damaged_rows(own_buffers: Path, columns: dict[str, Any]) -> None:
     edit_columns(own_buffers / ROWS, **columns)
-    with pytest.raises(FormatError, match=r"buffers\.parquet"):
+    with raises(FormatError):
         load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
 
 
 def test_a_key_that_occurs_twice(own_buffers: Path) -> None:
     edit(own_buffers / ROWS, lambda table: pa.concat_tables([table, table.slice(8, 1)]))
-    with pytest.raises(FormatError, match="2 rows of MoveCube/test/0 under k3"):
+    with raises(FormatError):
         load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
 
 
@@ -356,23 +357,14 @@ def other_first_view(root: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (other_goals, "does not have the SHA-256 in manifest.json"),
-        (
-            other_goals_with_their_sum,
-            "goals of MoveCube/test/0 under k3 is not what the rules give",
-        ),
-        (shorter_lesson, "episode records of .* are not those of its revision"),
-        (other_first_view, "first live view .*frames 48 to 48.* recorded SHA-256"),
-    ],
+    "change", [other_goals, other_goals_with_their_sum, shorter_lesson, other_first_view]
 )
 def test_a_verified_load_checks_the_query(
-    own_buffers: Path, change: Callable[[Path], object], message: str
+    own_buffers: Path, change: Callable[[Path], object]
 ) -> None:
     change(own_buffers)
     load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
-    with pytest.raises(HashMismatchError, match=message):
+    with raises(HashMismatchError):
         load_buffer_set(own_buffers).load("MoveCube/test/0", "k3", verify=True)
 
 
@@ -386,7 +378,7 @@ def test_datasets_have_their_names(own_buffers: Path, name: str, other: str | No
         renamed = name.replace("a", "\N{CYRILLIC SMALL LETTER A}") if " " in other else other
         edited["datasets"][renamed] = dataset
     header.write_text(json.dumps(edited))
-    with pytest.raises(FormatError, match=r"manifest\.json: datasets .*expected demonstrations"):
+    with raises(FormatError):
         load_buffer_set(own_buffers)
 
 
@@ -406,12 +398,12 @@ def test_rows_that_the_rules_do_not_give(own_buffers: Path, change: Callable[[An
     made = load_buffer_set(own_buffers)
     for episode in ("VideoRepick/test/0", "PatternLock/test/0"):
         assert len(made.load(episode, "k3").sessions) == 4
-        with pytest.raises(HashMismatchError, match="is not what the rules give"):
+        with raises(HashMismatchError):
             made.load(episode, "k3", verify=True)
-        with pytest.raises(HashMismatchError, match="is not what the rules give"):
+        with raises(HashMismatchError):
             next(made.buffers(condition="k3")).verify()
         made.load(episode, "k0", verify=True)
-    with pytest.raises(HashMismatchError, match="is not what the rules give"):
+    with raises(HashMismatchError):
         made.check_tables(["k0", "k3"])
     made.check_tables(["k0", "no-history"])
     made.check_tables(["k3"], planned=False)
@@ -421,7 +413,7 @@ def test_rows_of_other_rules(own_buffers: Path) -> None:
     renew_header(own_buffers, rule_version=2)
     made = load_buffer_set(own_buffers)
     assert made.load("MoveCube/test/0", "k3")
-    with pytest.raises(FormatError, match="follows version 2 of the rules"):
+    with raises(FormatError):
         made.load("MoveCube/test/0", "k3", verify=True)
 
 
@@ -433,11 +425,11 @@ def test_parts_of_an_id_are_those_of_the_id(own_buffers: Path, part: str, value:
     edit_columns(own_buffers / ROWS, **{part: [value] * 15})
     made = load_buffer_set(own_buffers)
     assert made.families == ("VideoRepick", "MoveCube", "PatternLock")
-    with pytest.raises(FormatError, match=rf"buffers\.parquet: {part} of .*/test/0 is {value!r}"):
+    with raises(FormatError):
         list(made.buffers(family="PatternLock"))
     for path in ("interference.parquet", "episodes/chunk-000/file-000.parquet"):
         edit_columns(own_buffers / "demonstrations/meta" / path, **{part: [value] * 3})
-    with pytest.raises(FormatError, match=f"{part} of .*/test/0 is {value!r}"):
+    with raises(FormatError):
         load_buffer_set(own_buffers).query("PatternLock/test/0")
 
 
@@ -460,7 +452,7 @@ def test_features_that_are_not_as_they_must_be(
         lambda buffer: buffer.states,
         lambda buffer: buffer.query.frame(),
     ):
-        with pytest.raises(FormatError, match=feature):
+        with raises(FormatError):
             use(load_buffer_set(own_buffers).load("MoveCube/test/0", condition))
 
 
@@ -468,7 +460,7 @@ def test_a_row_that_is_missing(own_buffers: Path) -> None:
     edit(own_buffers / ROWS, lambda table: table.slice(0, 3))
     with pytest.raises(UnknownNameError):
         load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
-    with pytest.raises(FormatError, match="no row of VideoRepick/test/0 under k7"):
+    with raises(FormatError):
         load_buffer_set(own_buffers).load("VideoRepick/test/0", "k7")
 
 

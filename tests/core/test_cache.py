@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.messages import raises
 
 from robomme_interference_data import DecodedCache
 from robomme_interference_data.errors import InvalidOptionError
@@ -39,7 +40,7 @@ def test_put_and_get(tmp_path: Path) -> None:
     assert found is not None
     np.testing.assert_array_equal(found, frames(1))
     assert isinstance(found, np.memmap)
-    with pytest.raises(ValueError, match="read-only"):
+    with raises(ValueError):
         found[0] = 0
     assert [path.name for path in cache.folder.iterdir()] == [f"{name(1)}.npy"]
 
@@ -86,7 +87,7 @@ def test_the_bound_holds_after_every_put(tmp_path: Path, bound: int) -> None:
         assert sizes == [FILE_BYTES] * min(seed + 1, bound // FILE_BYTES)
     DecodedCache(tmp_path / "smaller", FILE_BYTES - 1).put(name(1), frames(1))
     assert not (tmp_path / "smaller").exists()
-    with pytest.raises(InvalidOptionError, match="max_bytes is 0"):
+    with raises(InvalidOptionError):
         DecodedCache(tmp_path, max_bytes=0)
 
 

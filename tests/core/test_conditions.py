@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.messages import raises
 
 from robomme_interference_data import EpisodeId
 from robomme_interference_data.constants import DATASETS, DISTRACTORS
@@ -114,7 +115,7 @@ def test_order() -> None:
     names = [one.name for one in in_order(given)]
     assert names == ["no-history", "k0", "k7", "k10", "before-k1", "stale-k0"]
     for names in ([], ["k1", "k1"]):
-        with pytest.raises(InvalidOptionError, match="expected at least one, each once"):
+        with raises(InvalidOptionError):
             in_order(names)
 
 
@@ -147,7 +148,7 @@ def test_shifts_are_written_as_they_are_read() -> None:
     "text", ["", "light", "light:0", "light:4", "Light:2", "fog:1", "light:2 ", None]
 )
 def test_invalid_shifts(text: Any) -> None:
-    with pytest.raises(InvalidOptionError, match="strength from 1 to 3, such as light:2"):
+    with raises(InvalidOptionError):
         parse_shift(text)
 
 
@@ -172,5 +173,5 @@ def test_what_is_written_is_read_again(parts: list[tuple[str, tuple[int, int]]])
     ("text", "points"), [("", ()), ("<point>", ((1, 2),)), ("at <point>", ()), ("go", ((1, 2),))]
 )
 def test_words_and_points_must_go_together(text: str, points: tuple[tuple[int, int], ...]) -> None:
-    with pytest.raises(InvalidOptionError, match="points"):
+    with raises(InvalidOptionError):
         Subgoal(text, points)

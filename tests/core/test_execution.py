@@ -1,11 +1,11 @@
 """What every executor does, shown by the one in this process."""
 
 import os
-import re
 import sys
 from typing import Any
 
 import pytest
+from support.messages import raises
 
 from robomme_interference_data.errors import (
     InvalidIdError,
@@ -82,7 +82,7 @@ def test_a_task_is_started_again_after_some_errors(
 
 def test_the_last_worker_may_not_retire() -> None:
     function = Noted(WorkerRetiredError("gone"), 1)
-    with pytest.raises(WorkerRetiredError, match="gone"):
+    with raises(WorkerRetiredError):
         list(Serial().run(function, [1]))
     assert function.calls[-1] == "closed"
 
@@ -130,20 +130,20 @@ def test_executors_by_name() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    "settings",
     [
-        ({"executor": "rey"}, "'rey' is none of processes, ray"),
-        ({"workers": 0}, "workers 0"),
-        ({"resources": ("gpus=0.5",)}, '`resources` has no effect with executor="processes"'),
-        ({"executor": "ray", "resources": ("cpus=NaN",)}, "`resources`: cpus nan"),
-        ({"executor": "ray", "resources": ("gpus=1.5",)}, "`resources`: gpus 1.5"),
-        ({"executor": "ray", "resources": ("tpus=1",)}, "Its options: cpus, gpus."),
-        ({"executor": "ray://a:1x"}, "executor 'ray://a:1x'; expected"),
-        ({"executor": "ray:"}, "executor 'ray:'; expected"),
+        {"executor": "rey"},
+        {"workers": 0},
+        {"resources": ("gpus=0.5",)},
+        {"executor": "ray", "resources": ("cpus=NaN",)},
+        {"executor": "ray", "resources": ("gpus=1.5",)},
+        {"executor": "ray", "resources": ("tpus=1",)},
+        {"executor": "ray://a:1x"},
+        {"executor": "ray:"},
     ],
 )
-def test_settings_of_workers_are_checked(settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(InvalidOptionError, match=re.escape(message)):
+def test_settings_of_workers_are_checked(settings: dict[str, Any]) -> None:
+    with raises(InvalidOptionError):
         make_executor(WorkersConfig(**settings))
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.messages import raises
 
 from robomme_interference_data.errors import FormatError, MissingFileError
 from robomme_interference_data.storage.files import (
@@ -52,7 +53,7 @@ def test_path_and_list(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["info.json", "meta"])
 def test_missing_file_or_folder_in_its_place(tmp_path: Path, name: str) -> None:
     (tmp_path / "meta").mkdir()
-    with pytest.raises(MissingFileError, match=rf"{name} is missing in {tmp_path}") as caught:
+    with raises(MissingFileError) as caught:
         LocalFiles(tmp_path).path(name)
     assert isinstance(caught.value, FileNotFoundError)
     assert "build it again" in str(caught.value.hint)
@@ -85,7 +86,7 @@ def test_written_json_is_indented_and_sorted(tmp_path: Path) -> None:
 def test_invalid_json_objects(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "info.json"
     path.write_bytes(data)
-    with pytest.raises(FormatError, match=r"info\.json: not (valid JSON|a JSON object)") as caught:
+    with raises(FormatError) as caught:
         read_json(path)
     assert caught.value.hint
 
@@ -94,13 +95,13 @@ def test_invalid_json_objects(tmp_path: Path, data: bytes) -> None:
 def test_a_path_never_leads_out(tmp_path: Path, relative: str) -> None:
     (tmp_path / "x").write_text("secret")
     (tmp_path / "data").mkdir()
-    with pytest.raises(FormatError, match="leads out of it"):
+    with raises(FormatError):
         LocalFiles(tmp_path / "data").path(relative)
 
 
 @pytest.mark.parametrize("relative", ["a/\ud800.mp4", "x" * 5000, "x/" * 3000])
 def test_names_that_no_file_can_have(tmp_path: Path, relative: str) -> None:
-    with pytest.raises(FormatError, match="not a valid path|is too long"):
+    with raises(FormatError):
         LocalFiles(tmp_path).path(relative)
 
 
@@ -114,10 +115,10 @@ def test_links_are_followed_inside_only(tmp_path: Path) -> None:
     (root / "folder").symlink_to(tmp_path)
     assert LocalFiles(root).path("meta/inside").read_text() == "here"
     for relative in ("meta/out", "folder/secret"):
-        with pytest.raises(FormatError, match="link that leads out"):
+        with raises(FormatError):
             LocalFiles(root).path(relative)
     (root / "round").symlink_to("round")
-    with pytest.raises(MissingFileError, match="is missing"):
+    with raises(MissingFileError):
         LocalFiles(root).path("round")
     (tmp_path / "link").symlink_to(root)  # the folder itself may be one
     assert LocalFiles(tmp_path / "link").path("real").read_text() == "here"
@@ -133,7 +134,7 @@ def test_snapshots_of_the_hubs_cache_link_to_its_blobs(tmp_path: Path) -> None:
     (root / "info.json").symlink_to("../../blobs/abc")
     (root / "other").symlink_to("../../refs/main")
     assert LocalFiles(root).path("info.json").read_text() == "data"
-    with pytest.raises(FormatError, match="link that leads out"):
+    with raises(FormatError):
         LocalFiles(root).path("other")
 
 
@@ -150,13 +151,13 @@ def test_sums_equal_those_of_sha256sum(tmp_path: Path) -> None:
     assert list(read_sums(path)) == ["a", "b"]
     for damaged in ("abc  a\n", "no sums\n", text.replace("  a", " a")):
         path.write_text(damaged)
-        with pytest.raises(FormatError, match="is not a SHA-256"):
+        with raises(FormatError):
             read_sums(path)
     path.write_text(text.replace("  a", "  ../../a"))
-    with pytest.raises(FormatError, match="leads out"):
+    with raises(FormatError):
         read_sums(path)
     path.write_bytes(b"\xff")
-    with pytest.raises(FormatError, match="decode"):
+    with raises(FormatError):
         read_sums(path)
 
 
@@ -171,7 +172,7 @@ def test_sums_equal_those_of_sha256sum(tmp_path: Path) -> None:
     ],
 )
 def test_json_holds_finite_numbers_and_each_key_once(text: str) -> None:
-    with pytest.raises(FormatError, match="here: not valid JSON"):
+    with raises(FormatError):
         parse_json(text.encode("latin-1"), "here")
 
 
@@ -181,7 +182,7 @@ def test_json_has_a_bounded_depth() -> None:
 
     assert parse_json(nested(64), "here")
     for depth in (66, 5_000, 500_000):
-        with pytest.raises(FormatError, match="here: not valid JSON"):
+        with raises(FormatError):
             parse_json(nested(depth), "here")
     many = b'{"a":[' + b"{}," * 1000 + b"{}]}"
     assert len(parse_json(many, "here")["a"]) == 1001
@@ -205,7 +206,7 @@ def test_nothing_is_left_and_the_old_file_stays_when_writing_fails(tmp_path: Pat
     with pytest.raises(KeyboardInterrupt), atomic_path(path) as partial:
         partial.write_text("half")
         raise KeyboardInterrupt
-    with pytest.raises(ValueError, match="not JSON compliant"):
+    with raises(ValueError):
         write_json(path, {"a": math.nan})
     assert read_json(path) == {"a": 1}
     assert list(tmp_path.iterdir()) == [path]

@@ -22,6 +22,7 @@ from support.buffer_sets import (
     with_sessions,
 )
 from support.hostile import TARGETS, mutated, places
+from support.messages import raises
 
 from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.data.buffer import Buffer
@@ -93,7 +94,7 @@ def test_a_bomb_raises_before_it_is_decoded(outcomes: dict[str, str], name: str)
 def test_a_session_has_a_bounded_number_of_frames(change: dict[str, int]) -> None:
     session = to_dict(load_buffer(QUERIES[0], "k1", buffer_set=GOLDEN).manifest.sessions[0])
     assert from_dict(SessionEntry, session, "here")
-    with pytest.raises(FormatError, match="here: .*session span"):
+    with raises(FormatError):
         from_dict(SessionEntry, session | change, "here")
 
 
@@ -101,7 +102,7 @@ def test_a_session_has_a_bounded_number_of_frames(change: dict[str, int]) -> Non
 def test_a_buffer_has_a_bounded_number_of_frames_and_sessions(change: dict[str, int]) -> None:
     manifest = to_dict(load_buffer(QUERIES[0], "k1", buffer_set=GOLDEN).manifest)
     many = [manifest["sessions"][1] | change] * (2**13 // change["repeat"])
-    with pytest.raises(FormatError, match="in .* sessions; expected at most"):
+    with raises(FormatError):
         from_dict(BufferManifest, manifest | {"sessions": many * 2}, "here")
 
 
@@ -135,12 +136,12 @@ def test_frames_that_need_too_much_memory_raise(tmp_path: Path) -> None:
     buffer = load_buffer(QUERIES[0], "k7", buffer_set=root)
     short = load_buffer(QUERIES[0], "no-history", buffer_set=root)
     assert len(buffer) * 4096 * 4096 * 3 <= 16 * 2**30  # so its videos are looked at
-    with pytest.raises(FormatError, match="pixels; expected 4096×4096"):
+    with raises(FormatError):
         buffer.frames()
     assert short.frames().shape == (0, 4096, 4096, 3)
     many = with_sessions(buffer.manifest, *buffer.manifest.sessions * 8)
     held = Buffer(many, buffer.query, load_buffer_set(root).datasets)
-    with pytest.raises(FormatError, match="are allocated at once") as caught:
+    with raises(FormatError) as caught:
         held.frames()
     assert "stream" in str(caught.value.hint)
 

@@ -13,6 +13,7 @@ import pytest
 from huggingface_hub import constants
 from support.hub_server import HubServer
 from support.lerobot_layouts import write_lerobot
+from support.messages import raises
 
 from robomme_interference_data.build_dataset.sources import open_source
 from robomme_interference_data.errors import (
@@ -53,7 +54,7 @@ FILES |= {"README.md": b"read me", "meta/deep/a.parquet": b"a"}
     ],
 )
 def test_invalid_locations_are_never_requested(hub: HubServer, text: str) -> None:
-    with pytest.raises(InvalidOptionError, match="neither a folder nor a model repository"):
+    with raises(InvalidOptionError):
         locate(text, "model")
     assert hub.requests == []
 
@@ -118,7 +119,7 @@ def test_a_revision_is_pinned_once(hub: HubServer) -> None:
 @pytest.mark.parametrize("path", ["../../etc/passwd", "/etc/passwd"])
 def test_no_path_leads_out(hub: HubServer, path: str) -> None:
     hub.push(DATASET, FILES)
-    with pytest.raises(FormatError, match="leads out of it"):
+    with raises(FormatError):
         HubFiles(REPO).path(path)
     assert hub.requests == []
 
@@ -135,22 +136,20 @@ def test_missing_file(hub: HubServer) -> None:
 
 
 @pytest.mark.parametrize(
-    ("repo", "revision", "message", "hint"),
+    ("repo", "revision", "hint"),
     [
-        ("someone/smal", None, "repository 'someone/smal' .* does not exist", "hf auth login"),
-        (REPO, "v9", "has no revision 'v9'", "/tree/main"),
-        (REPO, "0" * 40, "has no revision '0000", "/tree/main"),
-        ("someone/gated", None, "is gated", "/datasets/someone/gated, then log in: hf auth login"),
+        ("someone/smal", None, "hf auth login"),
+        (REPO, "v9", "/tree/main"),
+        (REPO, "0" * 40, "/tree/main"),
+        ("someone/gated", None, "/datasets/someone/gated, then log in: hf auth login"),
     ],
 )
-def test_errors_of_the_hub(
-    hub: HubServer, repo: str, revision: str, message: str, hint: str
-) -> None:
+def test_errors_of_the_hub(hub: HubServer, repo: str, revision: str, hint: str) -> None:
     hub.push(DATASET, FILES)
     hub.push(REPO, FILES)  # a model of the same name is another repository
     hub.push("datasets/someone/gated", FILES)
     hub.gated.add("datasets/someone/gated")
-    with pytest.raises(HubError, match=message) as caught:
+    with raises(HubError) as caught:
         HubFiles(repo, revision).path("README.md")
     assert hint in str(caught.value.hint)
 
@@ -160,7 +159,7 @@ def test_an_unreachable_hub(hub: HubServer, monkeypatch: pytest.MonkeyPatch) -> 
         free.bind(("127.0.0.1", 0))
         endpoint = f"http://127.0.0.1:{free.getsockname()[1]}"
         monkeypatch.setattr(constants, "ENDPOINT", endpoint)
-    with pytest.raises(HubError, match=f"'my/splt' on {endpoint} .* cannot be reached") as caught:
+    with raises(HubError) as caught:
         HubFiles("my/splt").path("README.md")
     assert "same command again" in str(caught.value.hint)
 
@@ -170,7 +169,7 @@ def test_a_revoked_token(hub: HubServer, login: Callable[..., None], revision: s
     hub.push(DATASET, FILES)
     login("someone")
     hub.tokens.clear()
-    with pytest.raises(HubError, match="rejects your login") as caught:
+    with raises(HubError) as caught:
         HubFiles(REPO, revision).path("README.md")
     assert "hf auth login (HF_TOKEN" in str(caught.value.hint)
 
@@ -182,7 +181,7 @@ def test_a_hub_that_is_down(hub: HubServer) -> None:
     files = HubFiles(REPO)
     assert files.commit == commit
     assert files.path("README.md").read_bytes() == b"read me"
-    with pytest.raises(HubError, match=r"not in the cache, .* busy \(503\)") as caught:
+    with raises(HubError) as caught:
         HubFiles("someone/else").path("README.md")
     assert "same command again" in str(caught.value.hint)
 
@@ -197,11 +196,11 @@ def test_offline(hub: HubServer, offline: Callable[[], None]) -> None:
     assert files.commit == commit
     assert files.path("meta/part-1.json").read_bytes() == b"1"
     assert files.list("meta/deep") == ["meta/deep/a.parquet"]
-    with pytest.raises(HubError, match="HF_HUB_OFFLINE is set") as caught:
+    with raises(HubError) as caught:
         files.path("meta/part-2.json")
     assert "unset HF_HUB_OFFLINE" in str(caught.value.hint)
     for ask in (lambda: HubFiles("a/b").commit, lambda: HubFiles("a/b", "0" * 40).list("meta")):
-        with pytest.raises(HubError, match="not in the cache, .* HF_HUB_OFFLINE is set"):
+        with raises(HubError):
             ask()
     assert len(hub.requests) == before
 
@@ -209,7 +208,7 @@ def test_offline(hub: HubServer, offline: Callable[[], None]) -> None:
 def test_a_folder_that_comes_damaged(hub: HubServer) -> None:
     hub.push(DATASET, FILES)
     fault = hub.fault("GET", "/meta/part-1.*", wrong=True)
-    with pytest.raises(HashMismatchError, match="meta/part-1.* came damaged"):
+    with raises(HashMismatchError):
         HubFiles(REPO).list("meta")
     fault.times = 0
     before = len(hub.downloads())
@@ -266,7 +265,7 @@ def test_a_source_fetches_what_it_needs_and_opens_offline_again(
     source = open_source(f"lerobot:{REPO}")
     assert source.provenance["revision"] == commit
     assert len(list(source.read(source.episodes()[1], ("front",)).frames)) == 7
-    with pytest.raises(HubError, match="of the dataset repository .* is not in the cache"):
+    with raises(HubError):
         list(source.read(source.episodes()[1], ("wrist",)).frames)
 
 

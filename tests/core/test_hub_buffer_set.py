@@ -12,6 +12,7 @@ from support import worlds
 from support.buffer_sets import GOLDEN, copy_buffer_set
 from support.hub import BASE, BUFFER_SET, push_buffer_set, running_hub
 from support.hub_server import HubServer
+from support.messages import raises
 from support.retrieval import make_index
 
 from robomme_interference_data import load_buffer, load_buffer_set
@@ -69,7 +70,7 @@ def test_no_more_is_downloaded_than_the_buffer_needs(hub: HubServer) -> None:
 
 
 def test_what_is_published_is_not_planned_again(hub: HubServer) -> None:
-    with pytest.raises(UnknownNameError, match="condition 'k2' is not in") as caught:
+    with raises(UnknownNameError) as caught:
         load_buffer(QUERY, "k2", buffer_set=BUFFER_SET)
     command = str(caught.value.command)
     assert f"build BUFFER_SET --demonstrations {BASE}@" in command and command.endswith("k7,k2")
@@ -114,7 +115,7 @@ def test_a_location_that_leads_elsewhere(own_buffers: Path) -> None:
     for location in ("..", "/etc", "a/b", "a/b@main", "https://somewhere/a/b"):
         value["datasets"]["distractors"]["location"] = location
         header.write_text(json.dumps(value), encoding="utf-8")
-        with pytest.raises(FormatError, match="location"):
+        with raises(FormatError):
             load_buffer_set(own_buffers)
 
 
@@ -202,11 +203,11 @@ def test_fetch_is_for_repositories_and_mixes_no_buffer_sets(
 
 
 def test_only_text_can_name_a_repository(hub: HubServer, run: Any) -> None:
-    with pytest.raises(MissingFileError, match="there is no folder"):
+    with raises(MissingFileError):
         load_buffer_set(Path(BUFFER_SET))
     files = locate(BUFFER_SET, revision=VERSION)
     assert load_buffer_set(files.location).location == files.location
-    with pytest.raises(MissingFileError, match="is not a buffer set"):
+    with raises(MissingFileError):
         load_buffer_set(BASE)
     code, _, error = run("verify", BASE)
     assert code == 1 and f"{BASE}@" in error  # the command reads it as a repository

@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.messages import raises
 
 from robomme_interference_data import EpisodeId
 from robomme_interference_data.constants import FAMILIES, SPLITS
@@ -43,9 +44,9 @@ def test_what_is_no_id(given: Any) -> None:
 
 @pytest.mark.parametrize("number", [-1, 10**18, True, "3", 1.0])
 def test_indices_and_answers_are_numbers(number: Any) -> None:
-    with pytest.raises(InvalidIdError, match="is not an episode index"):
+    with raises(InvalidIdError):
         EpisodeId("MoveCube", "test", number)
-    with pytest.raises(InvalidIdError, match="is not an answer"):
+    with raises(InvalidIdError):
         EpisodeId("MoveCube", "test", 1, number)
 
 
@@ -98,5 +99,5 @@ def test_what_is_no_list_of_numbers(text: str) -> None:
 @pytest.mark.parametrize("text", ["0-99999999", "0-1000000"])
 def test_too_many_numbers_are_called_that(text: str) -> None:
     for parse in (parse_numbers, count_numbers):
-        with pytest.raises(InvalidOptionError, match=f"{text}' asks for over 1,000,000 episodes"):
+        with raises(InvalidOptionError):
             parse(text)

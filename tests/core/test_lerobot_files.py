@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.lerobot_layouts import DATA, NAMES, TABLE, edit_columns, edit_info, write_lerobot
+from support.messages import raises
 from support.recordings import EPISODES
 
 from robomme_interference_data.errors import FormatError, MissingFileError, UnknownNameError
@@ -67,9 +68,9 @@ def test_values_frames_and_locations(root: Path) -> None:
     location = lerobot.locate(2)
     expected = LOCATIONS[str(lerobot.version)]
     assert (location.length, location.data, location.videos[front]) == expected
-    with pytest.raises(UnknownNameError, match="episode 3 is not in .* 3 episodes"):
+    with raises(UnknownNameError):
         lerobot.row(3)
-    with pytest.raises(FormatError, match="7 stored frames; frames 4 to 7"):
+    with raises(FormatError):
         lerobot.iter_frames(1, front, 4, 8)
 
 
@@ -91,7 +92,7 @@ def test_episodes_out_of_order(v30: Path) -> None:
     whole = pq.read_table(v30 / TABLE)
     pq.write_table(whole.slice(1), v30 / TABLE)
     pq.write_table(whole.slice(0, 1), (v30 / TABLE).with_name("file-001.parquet"))
-    with pytest.raises(FormatError, match="each once and in order"):
+    with raises(FormatError):
         _ = opened(v30).table
 
 
@@ -116,24 +117,24 @@ def test_any_template_is_filled_or_one_clear_error(template: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "message"),
+    "path",
     [
-        ("{video_key.__class__}/{file_index}", "cannot be filled in"),
-        ("{file_index:999999999d}", "cannot be filled in"),
-        ("data/{chunk_index:03d/file.parquet", "cannot be filled in"),
-        ("{nothing}", "cannot be filled in"),
-        ("videos/../../outside.mkv", "leads out of it"),
-        ("{file_index}" * 500, "_path is '"),
-        ("linked.mkv", "is a link that leads out of the folder"),
+        "{video_key.__class__}/{file_index}",
+        "{file_index:999999999d}",
+        "data/{chunk_index:03d/file.parquet",
+        "{nothing}",
+        "videos/../../outside.mkv",
+        "{file_index}" * 500,
+        "linked.mkv",
     ],
 )
 @pytest.mark.parametrize("which", ["data_path", "video_path"])
-def test_invalid_paths(root: Path, which: str, path: str, message: str) -> None:
+def test_invalid_paths(root: Path, which: str, path: str) -> None:
     outside = root.parent / "outside.mkv"
     outside.write_bytes(b"secret")
     (root / "linked.mkv").symlink_to(outside)
     edit_info(root, **{which: path})
-    with pytest.raises(FormatError, match=message):
+    with raises(FormatError):
         read_all(root)
 
 
@@ -187,21 +188,21 @@ GOOD = json.dumps(LINE) + "\n"
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    "text",
     [
-        ("[0, 1]\n", "line 1: not a JSON object"),
-        (GOOD + "[" * 100_000, "line 2: "),
-        (GOOD * 3, "the episodes 0 to 2, each once"),
-        ("", "no whole numbers 'episode_index'"),
-        (GOOD + '{"episode_index": 1}\n', "no whole numbers 'length'"),
-        (json.dumps(LINE | {"length": 10**30}), "cannot be read"),
-        (GOOD + json.dumps(LINE | {"tasks": 7}), "cannot be read"),
+        "[0, 1]\n",
+        GOOD + "[" * 100_000,
+        GOOD * 3,
+        "",
+        GOOD + '{"episode_index": 1}\n',
+        json.dumps(LINE | {"length": 10**30}),
+        GOOD + json.dumps(LINE | {"tasks": 7}),
     ],
 )
-def test_lines_that_are_wrong(tmp_path: Path, text: str, message: str) -> None:
+def test_lines_that_are_wrong(tmp_path: Path, text: str) -> None:
     root = write_lerobot(tmp_path, version="v2.1", stored=None)
     (root / "meta/episodes.jsonl").write_text(text)
-    with pytest.raises(FormatError, match=message):
+    with raises(FormatError):
         _ = opened(root).table
 
 
@@ -228,25 +229,25 @@ def test_episode_tables_that_are_wrong(v30: Path, columns: dict[str, Any]) -> No
 
 
 @pytest.mark.parametrize(
-    ("columns", "message"),
+    "columns",
     [
-        ({"episode_index": [0] * 13 + [1] * 6 + [2] * 9}, "13 rows of episode 0; expected 12"),
-        ({"frame_index": [0, 2, 1, *range(3, 12), *range(7), *range(9)]}, "not in the order of"),
-        ({"episode_index": None}, "no column 'episode_index'"),
-        ({"observation.state": pa.array([[0.0]] * 28)}, "1 values a frame; info.json"),
-        ({"observation.state": pa.array([["x"]] * 28)}, "expected lists of floats"),
+        {"episode_index": [0] * 13 + [1] * 6 + [2] * 9},
+        {"frame_index": [0, 2, 1, *range(3, 12), *range(7), *range(9)]},
+        {"episode_index": None},
+        {"observation.state": pa.array([[0.0]] * 28)},
+        {"observation.state": pa.array([["x"]] * 28)},
     ],
 )
-def test_rows_that_are_wrong(v30: Path, columns: dict[str, Any], message: str) -> None:
+def test_rows_that_are_wrong(v30: Path, columns: dict[str, Any]) -> None:
     edit_columns(v30 / DATA, **columns)
-    with pytest.raises((FormatError), match=message):
+    with raises(FormatError):
         read_all(v30)
 
 
 def test_files_that_are_missing(v30: Path) -> None:
     (v30 / TABLE).unlink()
-    with pytest.raises(MissingFileError, match="meta/episodes holds no parquet file"):
+    with raises(MissingFileError):
         read_all(v30)
     (v30 / "meta/info.json").unlink()
-    with pytest.raises(MissingFileError, match=r"is no LeRobot dataset: meta/info\.json"):
+    with raises(MissingFileError):
         opened(v30)

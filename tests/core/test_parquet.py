@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.messages import raises
 
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.storage.parquet import RowSpan
@@ -49,36 +50,36 @@ def test_groups_without_such_rows_are_not_read(tmp_path: Path) -> None:
     data[start : start + column.total_compressed_size] = bytes(column.total_compressed_size)
     path.write_bytes(data)
     assert RowSpan(path, 40, 50).scalars("number").tolist() == list(range(40, 50))
-    with pytest.raises(FormatError, match=r"table\.parquet: cannot be read"):
+    with raises(FormatError):
         RowSpan(path).scalars("number")
 
 
 @pytest.mark.parametrize(
-    ("values", "method", "message"),
+    ("values", "method"),
     [
-        ([1, 2], "no", "no column 'no'; its columns are v"),
-        (["a", "b"], "scalars", "of type string with 0 empty"),
-        ([1, None], "scalars", "with 1 empty values"),
-        ([[1], [1, 2]], "scalars", "lists of several values"),
-        (pa.array([2**63, 1], pa.uint64()), "scalars", "cannot be read"),
-        ([1.0, 2.0], "vectors", "expected lists of floats"),
-        ([[1.0], [1.0, 2.0]], "vectors", r"several lengths: \[1, 2\]"),
-        ([[1.0], [None]], "vectors", "empty values"),
-        ([{"bytes": "a"}], "images", "expected images as struct"),
-        (pa.array([{"path": "a.png"}], IMAGE), "images", "in row 0 of column 'v' is not stored"),
-        (pa.array([None], IMAGE), "images", "is not stored in the file"),
+        ([1, 2], "no"),
+        (["a", "b"], "scalars"),
+        ([1, None], "scalars"),
+        ([[1], [1, 2]], "scalars"),
+        (pa.array([2**63, 1], pa.uint64()), "scalars"),
+        ([1.0, 2.0], "vectors"),
+        ([[1.0], [1.0, 2.0]], "vectors"),
+        ([[1.0], [None]], "vectors"),
+        ([{"bytes": "a"}], "images"),
+        (pa.array([{"path": "a.png"}], IMAGE), "images"),
+        (pa.array([None], IMAGE), "images"),
     ],
 )
-def test_columns_of_another_kind(tmp_path: Path, values: Any, method: str, message: str) -> None:
+def test_columns_of_another_kind(tmp_path: Path, values: Any, method: str) -> None:
     span = RowSpan(write(tmp_path / "t", v=values))
-    with pytest.raises(FormatError, match=message):
+    with raises(FormatError):
         list(span.scalars("no") if method == "no" else getattr(span, method)("v"))
 
 
 def test_no_parquet_file(tmp_path: Path) -> None:
     for data in (b"", b"episode_id,frame_index\n", b"PAR1" * 100):
         (tmp_path / "t").write_bytes(data)
-        with pytest.raises(FormatError, match=r"t: cannot be read: .*\nThe file is damaged"):
+        with raises(FormatError):
             RowSpan(tmp_path / "t")
 
 
@@ -87,7 +88,7 @@ def test_fewer_rows_than_the_file_says(tmp_path: Path) -> None:
     path = tmp_path / "rows.parquet"
     pq.write_table(pa.table({"n": range(5)}), path)
     assert RowSpan(path).part(3, 5).scalars("n").tolist() == [3, 4]
-    with pytest.raises(FormatError, match="2 rows of n; expected 4"):
+    with raises(FormatError):
         RowSpan(path).part(3, 7).scalars("n")
 
 
@@ -151,18 +152,16 @@ def test_many_short_texts_are_not_taken_for_long_ones(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("column", "message"),
+    "column",
     [
-        (pa.array([1], pa.timestamp("us", "Mars/Olympus")), "is of type timestamp"),
-        (pa.array([[(1, 2)]], pa.map_(pa.int64(), pa.int64())), "is of type map"),
-        (pa.array([b"ab"], pa.binary(2)), "is of type fixed_size_binary"),
+        pa.array([1], pa.timestamp("us", "Mars/Olympus")),
+        pa.array([[(1, 2)]], pa.map_(pa.int64(), pa.int64())),
+        pa.array([b"ab"], pa.binary(2)),
     ],
 )
-def test_kinds_of_columns_that_no_table_of_ours_has(
-    tmp_path: Path, column: pa.Array, message: str
-) -> None:
+def test_kinds_of_columns_that_no_table_of_ours_has(tmp_path: Path, column: pa.Array) -> None:
     pq.write_table(pa.table({"v": column, "w": [1]}), tmp_path / "t")
-    with pytest.raises(FormatError, match=message):
+    with raises(FormatError):
         RowSpan(tmp_path / "t").table()
     assert RowSpan(tmp_path / "t").table(["w"]).num_rows == 1
 
@@ -172,7 +171,7 @@ def test_text_that_is_none(tmp_path: Path) -> None:
         pa.string(), 1, [None, pa.array([0, 1], pa.int32()).buffers()[1], pa.py_buffer(b"\xff")]
     )
     pq.write_table(pa.table({"v": column}), tmp_path / "t")
-    with pytest.raises(FormatError, match="UTF8"):
+    with raises(FormatError):
         RowSpan(tmp_path / "t").table()
 
 
@@ -191,20 +190,13 @@ def test_a_struct_of_thrift(data: bytes, expected: dict[tuple[int, int], Any]) -
     assert _read_struct(file) == expected
     assert file.tell() == len(data)
     for length in range(len(data)):
-        with pytest.raises(ValueError, match="truncated"):
+        with raises(ValueError):
             _read_struct(io.BytesIO(data[:length]))
 
 
-@pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        (b"\x05\x02\x02\x00", "not in order"),
-        (b"\x15" + b"\xff" * 11, "over ten bytes"),
-        (b"\x19\x15\x02\x00", "of kind 9"),
-    ],
-)
-def test_a_struct_that_pyarrow_might_read_otherwise(data: bytes, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+@pytest.mark.parametrize("data", [b"\x05\x02\x02\x00", b"\x15" + b"\xff" * 11, b"\x19\x15\x02\x00"])
+def test_a_struct_that_pyarrow_might_read_otherwise(data: bytes) -> None:
+    with raises(ValueError):
         _read_struct(io.BytesIO(data))
 
 

@@ -11,6 +11,7 @@ import pytest
 from support import damage
 from support.buffer_sets import copy_buffer_set
 from support.lerobot_layouts import edit_columns
+from support.messages import raises
 from support.tabletop import QUERIES, TABLETOP, copy_tabletop
 
 from robomme_interference_data import load_buffer_set
@@ -119,22 +120,17 @@ def test_damage_is_one_error(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    "change",
     [
-        (put("revision", "0" * 64), "other demonstrations"),
-        (
-            lambda table: put("index", 49)(put("episode_id", "VideoRepick/test/49")(table)),
-            "lacks the question of VideoRepick/test/0",
-        ),
+        put("revision", "0" * 64),
+        lambda table: put("index", 49)(put("episode_id", "VideoRepick/test/49")(table)),
     ],
 )
-def test_questions_of_other_demonstrations_are_stale(
-    tmp_path: Path, change: Any, words: str
-) -> None:
+def test_questions_of_other_demonstrations_are_stale(tmp_path: Path, change: Any) -> None:
     root = copy_tabletop(tmp_path / "buffer_set")
     damage.edit(root / QUESTIONS_PATH, change)
     damage.renew_header(root)
-    with pytest.raises(FormatError, match=words) as raised:
+    with raises(FormatError) as raised:
         read_questions(load_buffer_set(root))
     assert raised.value.command == f"build {root} --only questions"
 
@@ -148,7 +144,7 @@ def test_further_columns_are_left_aside(tmp_path: Path) -> None:
 
 def test_a_buffer_set_without_questions_says_how_to_make_them(tmp_path: Path) -> None:
     root = copy_buffer_set(tmp_path / "buffer_set")
-    with pytest.raises(MissingFileError, match="has no questions") as raised:
+    with raises(MissingFileError) as raised:
         read_questions(load_buffer_set(root))
     assert raised.value.command == f"build {root} --only questions"
     (root / QUESTIONS_PATH).mkdir()

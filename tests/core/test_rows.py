@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.messages import raises
 
 from robomme_interference_data import EpisodeId
 from robomme_interference_data.errors import FormatError
@@ -88,36 +89,36 @@ def test_round_trips(found: list[Row]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    "change",
     [
-        ({"count": True}, "count: True; expected a whole number"),
-        ({"count": 2**63}, "count: a number of 64 bits"),
-        ({"share": "0.5"}, "share: '0.5'; expected a number"),
-        ({"share": 10**400}, "share: a number of 1329 bits"),
-        ({"fine": 1}, "fine: 1; expected true or false"),
-        ({"note": 3}, "note: 3; expected text"),
-        ({"episode_id": "MoveCube"}, "'MoveCube' is not an episode id"),
-        ({"goals": "g"}, "goals: 'g'; expected a list"),
-        ({"goals": [None]}, "goals: None; expected text"),
-        ({"digests": []}, "digests: .*; expected a map"),
-        ({"parts": [{"name": "a", "size": 3}]}, "parts: source is missing"),
+        {"count": True},
+        {"count": 2**63},
+        {"share": "0.5"},
+        {"share": 10**400},
+        {"fine": 1},
+        {"note": 3},
+        {"episode_id": "MoveCube"},
+        {"goals": "g"},
+        {"goals": [None]},
+        {"digests": []},
+        {"parts": [{"name": "a", "size": 3}]},
     ],
 )
-def test_wrong_values_raise_one_error(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(FormatError, match=message):
+def test_wrong_values_raise_one_error(change: dict[str, Any]) -> None:
+    with raises(FormatError):
         from_dict(Row, {**PLAIN, **change}, "here")
 
 
 def test_missing_and_unknown_names() -> None:
     short = {name: value for name, value in PLAIN.items() if name not in ("note", "goals")}
-    with pytest.raises(FormatError, match="here: goals is missing"):
+    with raises(FormatError):
         from_dict(Row, short, "here")
     assert from_dict(Row, {**short, "goals": ["g"]}, "here") == ROW  # None may be left out
     assert from_dict(Row, {**PLAIN, "more": 1}, "here") == ROW
-    with pytest.raises(FormatError, match="unknown more"):
+    with raises(FormatError):
         from_dict(Row, {**PLAIN, "more": 1}, "here", strict=True)
     table = to_table([ROW], arrow_schema(Row, ["x", "y"])).drop_columns(["share"])
-    with pytest.raises(FormatError, match="column share is missing"):
+    with raises(FormatError):
         list(from_table(Row, table, "here"))
 
 
@@ -128,17 +129,17 @@ class Header:
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    "text",
     [
-        ('{"format_version": 2, "name": "a"}', "has format version 2; this package reads 1"),
-        ('{"name": "a"}', "has format version None"),
-        ('{"format_version": 1}', "name is missing"),
-        ('{"format_version": 1, "name": "a", "nmae": 1}', "unknown nmae"),
-        ("[]", "not a JSON object"),
+        '{"format_version": 2, "name": "a"}',
+        '{"name": "a"}',
+        '{"format_version": 1}',
+        '{"format_version": 1, "name": "a", "nmae": 1}',
+        "[]",
     ],
 )
-def test_headers(tmp_path: Path, text: str, message: str) -> None:
+def test_headers(tmp_path: Path, text: str) -> None:
     path = tmp_path / "header.json"
     path.write_text(text)
-    with pytest.raises(FormatError, match=message):
+    with raises(FormatError):
         read_header(path, Header)

@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.buffer_sets import QUERIES
+from support.messages import raises
 from support.retrieval import remade
 
 from robomme_interference_data import Buffer, load_buffer, load_buffer_set
@@ -186,18 +187,18 @@ def test_the_users_settings_have_no_effect(buffer: Buffer, strip: Path, tmp_path
 
 def test_files_that_cannot_be_written(buffer: Buffer, tmp_path: Path) -> None:
     for name in ("strip.gif", "strip", "strip.png.txt"):
-        with pytest.raises(InvalidOptionError, match=r"ends in \.png or \.svg") as caught:
+        with raises(InvalidOptionError) as caught:
             draw_strip(buffer, tmp_path / name)
         assert str(caught.value.hint).startswith("For example: ")
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "strip.png").mkdir()
     (tmp_path / "file").touch()
     for folder in (tmp_path, tmp_path / "file"):
-        with pytest.raises(InvalidOptionError, match=r"cannot be written: (.|\n)*free disk space"):
+        with raises(InvalidOptionError):
             draw_strip(buffer, folder / "strip.png")
     out = tmp_path / "strip.svg"
     out.write_bytes(b"old")
-    with pytest.raises(UnknownNameError, match="camera 'fornt'"):
+    with raises(UnknownNameError):
         draw_strip(buffer, out, camera="fornt")
     assert out.read_bytes() == b"old"  # a failure keeps the earlier picture
     assert len(list(tmp_path.iterdir())) == 3

@@ -9,6 +9,7 @@ import av
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.messages import raises
 
 from robomme_interference_data.errors import FormatError, InterferenceError, MissingFileError
 from robomme_interference_data.storage.encode import CODECS
@@ -114,7 +115,7 @@ def test_frames_are_the_callers(videos: dict[str, Video]) -> None:
 @pytest.mark.parametrize("start", [0, COUNT - 1, COUNT, 5000])
 def test_frames_after_the_end(videos: dict[str, Video], start: int) -> None:
     for video in videos.values():
-        with pytest.raises(FormatError, match=f"expected frames {start} to"):
+        with raises(FormatError):
             list(iter_frames(video.path, start, max(start, COUNT) + 1, FPS))
 
 
@@ -122,15 +123,15 @@ def test_frames_after_the_end(videos: dict[str, Video], start: int) -> None:
 def test_not_a_video(tmp_path: Path, data: bytes) -> None:
     (tmp_path / "file.mp4").write_bytes(data)
     for name in ("file.mp4", "."):  # a folder is none either
-        with pytest.raises(FormatError, match="is not a readable video"):
+        with raises(FormatError):
             next(iter_frames(tmp_path / name, 0, 1, FPS))
-    with pytest.raises(MissingFileError, match=r"nowhere\.mp4 does not exist"):
+    with raises(MissingFileError):
         next(iter_frames(tmp_path / "nowhere.mp4", 0, 1, FPS))
 
 
 @pytest.mark.parametrize("fps", [5, 9.5, 24, 20, 30])  # a multiple of the rate leaves gaps
 def test_another_rate(videos: dict[str, Video], fps: float) -> None:
-    with pytest.raises(FormatError, match="frames per second|frame 1 is missing"):
+    with raises(FormatError):
         list(iter_frames(videos["lossless.mp4"].path, 0, 20, fps))
 
 
@@ -138,13 +139,13 @@ def test_times_with_a_gap_or_off_the_grid(tmp_path: Path) -> None:
     """Time bases in milliseconds cannot hold every frame time exactly."""
     path = write(tmp_path / "gap.mkv", times=[0, 1, 2, 3, 6, 7, 8])
     assert len(list(iter_frames(path, 6, 9, FPS))) == 3
-    with pytest.raises(FormatError, match=r"frame 4 is missing; the next frame is 6"):
+    with raises(FormatError):
         list(iter_frames(path, 2, 8, FPS))
     base = Fraction(1, 1000)
     path = write(tmp_path / "rounded.mkv", times=[0, 101, 199, 300, 408], time_base=base)
     assert len(list(iter_frames(path, 0, 5, FPS))) == 5
     path = write(tmp_path / "uneven.mkv", times=[0, 100, 200, 340, 400], time_base=base)
-    with pytest.raises(FormatError, match=r"at 0\.3400 s lies between frames 3 and 4"):
+    with raises(FormatError):
         list(iter_frames(path, 0, 5, FPS))
 
 
@@ -190,7 +191,7 @@ def test_a_header_that_is_not_text_and_frames_of_another_size(
     data = videos["lossless.mp4"].path.read_bytes()
     path = tmp_path / "damaged.mp4"
     path.write_bytes(data.replace(b"VideoHandler", b"Video\xff\xfedler"))
-    with pytest.raises(FormatError, match="is not a readable video"):
+    with raises(FormatError):
         next(iter_frames(path, 0, 1, FPS))
-    with pytest.raises(FormatError, match="80×64 pixels; expected 32×64"):
+    with raises(FormatError):
         next(iter_frames(videos["ffv1.mkv"].path, 0, 1, FPS, (64, 32, 3)))

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support import scoring as made
+from support.messages import raises
 from support.scoring import BASE, RETRIEVAL, cells, record, records, run
 
 from robomme_interference_data.errors import InvalidOptionError
@@ -102,7 +103,7 @@ def test_p_of_equivalence_agrees_with_the_verdict(
 
 @pytest.mark.parametrize("margin", [0, -1, 101, math.nan])
 def test_a_margin_is_in_points(margin: float) -> None:
-    with pytest.raises(InvalidOptionError, match="points, more than 0 up to 100"):
+    with raises(InvalidOptionError):
         Settings((), margin=margin)
 
 
@@ -198,5 +199,5 @@ def test_looks_spend_the_level() -> None:
     assert alone.power - 0.06 < often.power < alone.power + 0.02
     done = run("power", "--looks", "5")
     assert "look 5 after 450 episodes: significant if p holm is below  0.042" in done.stdout
-    with pytest.raises(InvalidOptionError, match="looks 21"):
+    with raises(InvalidOptionError):
         plan(0.05, 450, 0.06, looks=21)

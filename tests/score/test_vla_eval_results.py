@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.messages import raises
 from support.scoring import OWN, REVISION
 
 from robomme_interference_data.errors import FormatError
@@ -40,7 +41,7 @@ def test_an_episode_that_failed_is_an_error_of_its_own_number(tmp_path: Path) ->
 
 def test_episodes_beyond_the_last_are_bad_rows(tmp_path: Path) -> None:
     path = write(tmp_path / "a.json", TASK | {"metrics": ROW}, failed(4))
-    with pytest.raises(FormatError, match=r"row 2: MoveCube/k0 has fewer .* episodes_per_task"):
+    with raises(FormatError):
         read_rows([path])
     assert [row.episode for row in read_rows([path], lenient=True)] == [0]
 
@@ -56,5 +57,5 @@ def test_episodes_beyond_the_last_are_bad_rows(tmp_path: Path) -> None:
     ],
 )
 def test_other_files_are_no_results(tmp_path: Path, episode: Any) -> None:
-    with pytest.raises(FormatError, match="holds no results of this benchmark in vla-eval"):
+    with raises(FormatError):
         read_rows([write(tmp_path / "a.json", episode)])

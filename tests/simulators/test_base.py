@@ -9,6 +9,7 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+from support.messages import raises
 from support.simulator_doubles import ENDLESS, UNKNOWN, Double
 
 from robomme_interference_data.errors import (
@@ -26,15 +27,15 @@ ACTION = np.zeros(8, np.float32)
 
 
 @pytest.mark.parametrize(
-    ("name", "error", "message"),
+    ("name", "error"),
     [
-        ("tabeltop", UnknownNameError, "Did you mean 'tabletop'"),
-        ("no_such_module:make", InvalidOptionError, "no_such_module"),
-        ("support.simulator_doubles:nothing", UnknownNameError, "function 'nothing' is not in"),
+        ("tabeltop", UnknownNameError),
+        ("no_such_module:make", InvalidOptionError),
+        ("support.simulator_doubles:nothing", UnknownNameError),
     ],
 )
-def test_an_unknown_simulator_is_named(name: str, error: type[Exception], message: str) -> None:
-    with pytest.raises(error, match=message):
+def test_an_unknown_simulator_is_named(name: str, error: type[Exception]) -> None:
+    with raises(error):
         make_simulator(name)
 
 
@@ -42,7 +43,7 @@ def test_a_missing_extra_names_the_line_to_type(monkeypatch: pytest.MonkeyPatch)
     for name in [name for name in sys.modules if ".tabletop." in name and "episodes" not in name]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "sapien", None)
-    with pytest.raises(MissingExtraError, match=r"data\[sim\]"):
+    with raises(MissingExtraError):
         make_simulator("tabletop")
 
 
@@ -94,7 +95,7 @@ def test_an_episode_runs_until_it_ends() -> None:
             simulator.step(np.zeros(7, np.float32))  # changes nothing
         statuses = [simulator.step(simulator.act("oracle"))[1] for _ in range(3)]
         assert statuses == [Status.ONGOING, Status.ONGOING, Status.SUCCESS]
-        with pytest.raises(SimulatorCrashError, match="no episode is running"):
+        with raises(SimulatorCrashError):
             simulator.step(ACTION)
 
 
@@ -111,7 +112,7 @@ def test_no_episode_runs_after_a_failed_reset() -> None:
         simulator.reset("MoveCube/test/0")
         with pytest.raises((InvalidIdError, UnknownNameError)):
             simulator.reset(refused)
-        with pytest.raises(SimulatorCrashError, match="no episode is running"):
+        with raises(SimulatorCrashError):
             simulator.step(ACTION)
 
 
@@ -121,7 +122,7 @@ def test_closed_simulator() -> None:
     simulator.close()
     simulator.close()
     for call in (lambda: simulator.reset("MoveCube/test/0"), lambda: simulator.step(ACTION)):
-        with pytest.raises(SimulatorCrashError, match="closed"):
+        with raises(SimulatorCrashError):
             call()
 
 

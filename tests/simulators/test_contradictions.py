@@ -5,6 +5,7 @@ from collections import Counter
 import numpy as np
 import pytest
 from support.families import families
+from support.messages import raises
 
 from robomme_interference_data.build_dataset.sources.base import SourceEpisode
 from robomme_interference_data.build_dataset.sources.simulator import SimulatorSource
@@ -64,5 +65,5 @@ def test_other_answers_occur_equally_often() -> None:
 
 
 def test_official_episodes_have_no_other_answer() -> None:
-    with pytest.raises(SourceError, match="another answer"):
+    with raises(SourceError):
         SimulatorSource("robomme").contradict(SourceEpisode(EpisodeId("MoveCube", "test", 0)))

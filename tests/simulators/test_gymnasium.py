@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.lazy import lazy
+from support.messages import raises
 
 import robomme_interference_data.simulators.tabletop  # noqa: F401, registers the ids
 from robomme_interference_data.constants import FAMILIES
@@ -70,18 +71,17 @@ def test_an_episode_is_the_simulators(tabletop: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "possible"),
+    "options",
     [
-        ({"obs_mode": "rgbd"}, "'rgb' or 'state' or 'state_dict' or 'none'"),
-        ({"render_mode": "human"}, "None or 'rgb_array' or 'sensors'"),
-        ({"control_mode": "pd_ee_delta_pose"}, "'pd_joint_pos'"),
-        ({"num_envs": 2}, "expected 1"),
-        ({"obs_mode": "rgb", "render": False}, "'none' or 'state'"),
+        {"obs_mode": "rgbd"},
+        {"render_mode": "human"},
+        {"control_mode": "pd_ee_delta_pose"},
+        {"num_envs": 2},
+        {"obs_mode": "rgb", "render": False},
     ],
 )
-def test_unsupported_options(options: dict[str, Any], possible: str) -> None:
-    name, value = next(iter(options.items()))
-    with pytest.raises(InvalidOptionError, match=f"^{name} {value!r}; .*{possible}"):
+def test_unsupported_options(options: dict[str, Any]) -> None:
+    with raises(InvalidOptionError):
         tabletop_env.TabletopEnv(**options)
 
 
@@ -95,13 +95,13 @@ def test_seeds_and_options_of_a_reset() -> None:
         assert seen.shape == (1, 18)  # positions and velocities of nine joints
     assert env.reset(seed=0, options={"difficulty": "hard"})[1]["difficulty"] == "hard"
     for seed in (-1, 2**32, "a", 0.5):
-        with pytest.raises(InvalidOptionError, match="whole number, 0 to 4294967295"):
+        with raises(InvalidOptionError):
             env.unwrapped.reset(seed=seed)
     for answer in (3, -4, "push", 1.0):
-        with pytest.raises(InvalidOptionError, match="a whole number, -3 to 2"):
+        with raises(InvalidOptionError):
             env.reset(seed=0, options={"answer": answer})
     for difficulty in ("eesy", 7):
-        with pytest.raises(InvalidOptionError, match="easy, medium, hard"):
+        with raises(InvalidOptionError):
             env.reset(seed=0, options={"difficulty": difficulty})
     env.close()
 

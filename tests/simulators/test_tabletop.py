@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.families import families
+from support.messages import raises
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import (
@@ -247,22 +248,22 @@ def test_the_cube_is_in_sight_all_through_a_lesson_in_pushing(tabletop: Tabletop
 
 def test_motion_out_of_reach_is_an_error(scene: TabletopEnv) -> None:
     reset(scene, "VideoUnmask", 0)
-    with pytest.raises(RunError, match="no solution"):
+    with raises(RunError):
         list(scene.arm.move((0.6, 0.0, 0.1)))
     scene.arm.reset()
-    with pytest.raises(RunError, match=r"joint \d at its limit"):
+    with raises(RunError):
         list(scene.arm.move((-0.3, 0.28, 0.02), -math.pi / 2))
 
 
 def test_invalid_input(blind: TabletopSimulator) -> None:
     blind.reset("PatternLock/test/0")
-    with pytest.raises(UnknownNameError, match="Did you mean 'oracle'"):
+    with raises(UnknownNameError):
         blind.act("orakle")
     with pytest.raises(UnknownNameError):
         blind.reset("MoveCube/test/999")
-    with pytest.raises(InvalidOptionError, match="every n-th"):
+    with raises(InvalidOptionError):
         blind.reset(SHORT, demonstration=-1)
-    with pytest.raises(SimulatorCrashError, match="no episode is running"):
+    with raises(SimulatorCrashError):
         blind.act("oracle")
-    with pytest.raises(InvalidOptionError, match="Did you mean 'front'"):
+    with raises(InvalidOptionError):
         TabletopSimulator(cameras=("fornt",))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.buffer_sets import copy_buffer_set, dataset, stored_frames, stored_states
+from support.messages import raises
 from support.retrieval import QUIET
 
 from robomme_interference_data.errors import HashMismatchError
@@ -90,7 +91,7 @@ def test_damaged_frames_are_not_stored(tmp_path: Path) -> None:
     units = dataset(root, "distractors")
     one, other = (root / "distractors" / units.files_of(n, ["front"])[1] for n in (0, 1))
     one.write_bytes(other.read_bytes())
-    with pytest.raises(HashMismatchError, match="observation.images.front"):
+    with raises(HashMismatchError):
         stored_values(units, FRONT, tmp_path / "store", 16, QUIET)
     assert not [*(tmp_path / "store").glob("distractors-*/*/values.npy")]
 
@@ -102,7 +103,7 @@ def test_a_full_disk_is_an_error_before_anything_is_decoded(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("os.posix_fallocate", full)
-    with pytest.raises(OSError, match="No space left"):
+    with raises(OSError):
         stored_values(dataset(tiny_buffers, "distractors"), FRONT, tmp_path, 16, QUIET)
     monkeypatch.undo()
     assert len(stored_values(dataset(tiny_buffers, "distractors"), FRONT, tmp_path, 16, QUIET))

@@ -13,6 +13,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from support.buffer_sets import GOLDEN, QUERIES, copy_buffer_set, plan_again
+from support.messages import raises
 from support.retrieval import make_index
 from support.shifted import add_shifted
 from support.tabletop import TABLETOP
@@ -185,7 +186,7 @@ def test_a_batch_is_the_collated_items(memory: str, make: Make) -> None:
     loader = torch.utils.data.DataLoader(data, None, sampler=sampler, num_workers=2)
     for batch, chosen in zip(loader, sampler, strict=True):
         same(batch, data[chosen])
-    with pytest.raises(IndexError, match="636"):
+    with raises(IndexError):
         data[[0, 3 * LIVE]]
 
 
@@ -267,40 +268,40 @@ def test_sessions_drawn_anew_keep_the_rules(make: Make, buffers: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "options, error, match",
+    ("options", "error"),
     [
-        ({"conditions": {"k0": 0}}, InvalidOptionError, "conditions"),
-        ({"conditions": {"k0": -1}}, InvalidOptionError, "conditions"),
-        ({"conditions": {"k0": float("nan")}}, InvalidOptionError, "conditions"),
-        ({"conditions": []}, InvalidOptionError, "conditions"),
-        ({"conditions": ["k5"]}, UnknownNameError, "k5"),
-        ({"memory": "framesamp:1"}, InvalidOptionError, "framesamp:1"),
-        ({"memory": "full:9"}, InvalidOptionError, "full:9"),
-        ({"memory": "sometimes"}, UnknownNameError, "sometimes"),
-        ({"cameras": ["side"]}, UnknownNameError, r"'side'(.|\n)*`cameras` to one of"),
-        ({"cameras": "front"}, InvalidOptionError, "'front'"),
-        ({"families": "MoveCube"}, InvalidOptionError, "'MoveCube'"),
-        ({"image_size": 33}, InvalidOptionError, "32"),
-        ({"image_size": 0}, InvalidOptionError, "0"),
-        ({"chunk": -1}, InvalidOptionError, "chunk"),
-        ({"families": ["RouteStick"]}, UnknownNameError, "RouteStick"),
-        ({"episodes": "7"}, InvalidOptionError, "episodes"),
-        ({"unit_episodes": "0"}, InvalidOptionError, "redraw"),
-        ({"retrieval_rule": "mean"}, InvalidOptionError, "Set retrieval"),
-        ({"retrieval_camera": "wrist"}, InvalidOptionError, "Set retrieval"),
-        ({"shifts": {"light:1": 1}}, InvalidOptionError, "shifts"),
-        ({"questions": True}, MissingFileError, "questions"),
-        ({"conditions": ["raw-k1"], "redraw": True}, MissingFileError, "distractors-raw"),
-        ({"memory": "full", "redraw": True}, InvalidOptionError, "full"),
+        ({"conditions": {"k0": 0}}, InvalidOptionError),
+        ({"conditions": {"k0": -1}}, InvalidOptionError),
+        ({"conditions": {"k0": float("nan")}}, InvalidOptionError),
+        ({"conditions": []}, InvalidOptionError),
+        ({"conditions": ["k5"]}, UnknownNameError),
+        ({"memory": "framesamp:1"}, InvalidOptionError),
+        ({"memory": "full:9"}, InvalidOptionError),
+        ({"memory": "sometimes"}, UnknownNameError),
+        ({"cameras": ["side"]}, UnknownNameError),
+        ({"cameras": "front"}, InvalidOptionError),
+        ({"families": "MoveCube"}, InvalidOptionError),
+        ({"image_size": 33}, InvalidOptionError),
+        ({"image_size": 0}, InvalidOptionError),
+        ({"chunk": -1}, InvalidOptionError),
+        ({"families": ["RouteStick"]}, UnknownNameError),
+        ({"episodes": "7"}, InvalidOptionError),
+        ({"unit_episodes": "0"}, InvalidOptionError),
+        ({"retrieval_rule": "mean"}, InvalidOptionError),
+        ({"retrieval_camera": "wrist"}, InvalidOptionError),
+        ({"shifts": {"light:1": 1}}, InvalidOptionError),
+        ({"questions": True}, MissingFileError),
+        ({"conditions": ["raw-k1"], "redraw": True}, MissingFileError),
+        ({"memory": "full", "redraw": True}, InvalidOptionError),
     ],
 )
-def test_bad_input(options: dict[str, Any], error: type[Exception], match: str, make: Make) -> None:
-    with pytest.raises(error, match=match):
+def test_bad_input(options: dict[str, Any], error: type[Exception], make: Make) -> None:
+    with raises(error):
         make(**options)
 
 
 def test_a_buffer_set_without_executions(tiny_buffers: Path, tmp_path: Path) -> None:
-    with pytest.raises(MissingFileError, match="executions") as raised:
+    with raises(MissingFileError) as raised:
         HistoryDataset(tiny_buffers, ["k0"], store=tmp_path)
     assert raised.value.command == f"build {tiny_buffers} --only executions --source KIND:PATH"
     assert HistoryDataset(tiny_buffers, ["k0"], chunk=0, store=tmp_path, quiet=True)[0]
