@@ -172,7 +172,8 @@ def _facts(
 
     `shown` is the buffer whose film strip the card shows, drawn once and only when needed.
     """
-    camera = shown.query.dataset.camera()
+    dataset = shown.query.dataset
+    camera = dataset.camera() if dataset.cameras else None
     sessions = ", ".join(f"{session.role} {session.source}" for session in shown.sessions)
     simulators = {record.simulator for dataset in datasets.values() for record in dataset.records()}
     named = sorted(filter(None, simulators))
@@ -180,6 +181,8 @@ def _facts(
 
     @cache
     def pictures() -> dict[str, bytes]:
+        if camera is None:
+            return {}
         shown.fetch([camera])
         return {STRIP: strip_png(shown)}
 
@@ -194,6 +197,7 @@ def _facts(
             f"{sessions or 'no session'}. Goal: {shown.goal}",
             "shown": shown,
             "camera": camera,
+            "difficulties": any(record.difficulty for record in queries),
             "first": queries[0].episode_id,
             "header": None,
             "other_conditions": [],

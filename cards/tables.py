@@ -3,6 +3,7 @@
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, is_dataclass
+from itertools import chain
 from statistics import mean, median
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
@@ -31,17 +32,19 @@ _DIFFICULTIES: Columns = {"easy": "count", "medium": "count", "hard": "count", "
 
 def count_table(records: Iterable[EpisodeRecord]) -> Table:
     """Return the number of episodes by family and difficulty, and of their frames."""
+    groups = _by_family(records)
+    difficulties = _difficulty_columns(chain.from_iterable(groups.values()))
     rows = [
         (
             escape(name),
             len(of_family),
-            *_difficulties(of_family),
+            *_count_difficulties(of_family, difficulties),
             sum(record.length for record in of_family),
         )
-        for name, of_family in _by_family(records).items()
+        for name, of_family in groups.items()
     ]
     columns: Columns = {"family": "text", "episodes": "count"}
-    columns |= _DIFFICULTIES
+    columns |= difficulties
     columns["frames"] = "count"
     return Table("counts", "Episodes", columns, [*rows, _total(rows)])
 
@@ -49,12 +52,14 @@ def count_table(records: Iterable[EpisodeRecord]) -> Table:
 def unit_table(queries: Iterable[EpisodeRecord], units: Iterable[EpisodeRecord]) -> Table:
     """Return the number of queries by family and difficulty, and of units by family."""
     groups, pool = _by_family(queries), Counter(unit.episode_id.family for unit in units)
+    difficulties = _difficulty_columns(chain.from_iterable(groups.values()))
     rows = []
     for name in sorted({*groups, *pool}, key=family_order):
         of_family = groups.get(name, [])
-        rows.append((escape(name), len(of_family), *_difficulties(of_family), pool[name]))
+        counts = _count_difficulties(of_family, difficulties)
+        rows.append((escape(name), len(of_family), *counts, pool[name]))
     columns: Columns = {"family": "text", "queries": "count"}
-    columns |= _DIFFICULTIES
+    columns |= difficulties
     columns["units"] = "count"
     return Table("counts", "Queries and units", columns, [*rows, _total(rows)])
 
@@ -66,7 +71,8 @@ def goal_table(records: Iterable[EpisodeRecord]) -> Table:
         (escape(record.episode_id), escape(record.difficulty or ""), escape(record.goal))
         for record in first
     ]
-    return Table("goals", "Goals", {"episode": "text", "difficulty": "text", "goal": "text"}, rows)
+    columns: Columns = {"episode": "text", "difficulty": "text", "goal": "text"}
+    return Table("goals", "Goals", columns, rows).without_empty("difficulty")
 
 
 def condition_table(conditions: Iterable[str], manifests: Iterable[BufferManifest]) -> Table:
@@ -110,7 +116,14 @@ def _by_family(records: Iterable[EpisodeRecord]) -> dict[str, list[EpisodeRecord
     return {name: groups[name] for name in sorted(groups, key=family_order)}
 
 
-def _difficulties(records: Sequence[EpisodeRecord]) -> tuple[int, ...]:
+def _difficulty_columns(records: Iterable[EpisodeRecord]) -> Columns:
+    """Return the columns of the difficulties; none if no episode has one."""
+    return _DIFFICULTIES if any(record.difficulty for record in records) else {}
+
+
+def _count_difficulties(records: Sequence[EpisodeRecord], columns: Columns) -> tuple[int, ...]:
+    if not columns:
+        return ()
     counts = Counter(record.difficulty for record in records)
     known = [counts[name] for name in DIFFICULTIES]
     return (*known, len(records) - sum(known))

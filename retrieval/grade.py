@@ -180,9 +180,10 @@ _NOTE = (
     "hit: share of queries with a chosen lesson frame, with the 95% Wilson interval. Means over "
     "queries with 95% BCa bootstrap intervals (none for a single query): purity, the share of "
     "chosen frames that belong to the lesson; coverage, the share of the lesson that was chosen; "
-    "evidence kept, the share of evidence spans with a chosen frame; false sessions, the number of "
-    "other sessions with a chosen frame. Sums over queries: cuts found, of all cuts between true "
-    "sessions; false cuts, inside a true session. pass: mean purity and mean coverage are both at "
+    "evidence kept, where evidence is known, the share of its spans with a chosen frame; false "
+    "sessions, the number of other sessions with a chosen frame. Sums over queries: cuts found, of "
+    "all cuts between true sessions; false cuts, inside a true session. pass: mean purity and mean "
+    "coverage are both at "
     f"least {PASS_MARK:.0%}."
 )
 
@@ -226,7 +227,8 @@ def cell_table(cells: Sequence[Cell], title: str) -> Table:
         for cell in cells
         if not several or cell.family == ALL
     ]
-    return Table("retrieval", title, columns, rows, _NOTE)
+    table = Table("retrieval", title, columns, rows, _NOTE)
+    return table.without_empty("evidence_kept")
 
 
 def _share(cell: Cell, name: str) -> str | None:

@@ -78,8 +78,9 @@ def verify_buffer_set(
         if not folder.is_relative_to(root):  # in a repository of its own
             for path in further_files(folder, ()):
                 yield Violation(f"{name}/{path}", "is not part of the dataset")
-    if decode:
-        progress.start("Verifying", sum(_frames(dataset, copy) for dataset in datasets.values()))
+    frames = sum(_frames(dataset, copy) for dataset in datasets.values())
+    if decode and frames:
+        progress.start("Verifying", frames)
     for name, dataset in datasets.items():
         units, shown = datasets.get(DISTRACTORS), progress if decode else None
         yield from caught(name, dataset_violations(name, dataset, header, units, shown, copy))
@@ -94,6 +95,23 @@ def verify_buffer_set(
         yield from caught(QUESTIONS_PATH, _questions(buffer_set, decode=decode))
     elif (root / QUESTIONS_PATH).exists():
         yield Violation(QUESTIONS_PATH, f"is not listed in {HEADER}")
+
+
+def undecoded_frames(buffer_set: BufferSet) -> int:
+    """Return the number of frames that a copy holds and `verify_buffer_set` cannot decode.
+
+    They are of episodes of which only some cameras were fetched: hashes need all of them.
+    """
+    copy = buffer_set.copy
+    if copy is None:
+        return 0
+    return sum(
+        record.length
+        for dataset in buffer_set.datasets.values()
+        for record in dataset.records()
+        if copy.holds(dataset, record.episode_index)
+        and not copy.holds_all(dataset, record.episode_index)
+    )
 
 
 def _files(buffer_set: BufferSet, root: Path) -> Iterator[Violation]:

@@ -70,6 +70,14 @@ class Rollouts(Runner[RunConfig]):
         policy, subgoals = POLICIES.pin(config.policy), pin_subgoals(config.subgoals)
         super().__init__(dataclasses.replace(config, policy=policy, subgoals=subgoals), buffer_set)
 
+    @property
+    def retried_errors(self) -> tuple[type[Exception], ...]:
+        """Errors after which a rollout is started again."""
+        if self.config.policies is None:
+            return super().retried_errors
+        # A shared policy that hangs delays all its rollouts: which of them it hung at is unknown.
+        return (*super().retried_errors, TimeoutError)
+
     def lock(self, folder: Path) -> AbstractContextManager[None]:
         """Keep other runs from the policy's servers."""
         return lock_servers(self.config.policy, folder)

@@ -60,7 +60,10 @@ class WorkConfig(WorkersConfig, RetrievalConfig):
     )
     model_seed: int = setting(0, group=_EXECUTION, help="Seed for all random draws.")
     rollout_timeout_s: float = setting(
-        3600.0, group=_EXECUTION, help="Maximum seconds of a rollout or question.", rare=True
+        3600.0,
+        group=_EXECUTION,
+        help="Maximum seconds of a rollout or question; then it is an error.",
+        rare=True,
     )
     cache: bool = setting(
         False, group=_EXECUTION, help="Keep decoded frames on disk for later runs.", rare=True

@@ -13,9 +13,6 @@ from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import (
     InterferenceError,
     InvalidOptionError,
-    ServerDiedError,
-    ServerKeepaliveError,
-    SimulatorCrashError,
     first_line,
     named,
 )
@@ -220,7 +217,7 @@ def _run_items(
             outcomes = pool.run(
                 [Job(item, runner.metadata) for item in shuffle_work(set(items) - done.keys())],
                 time_limit=run.config.rollout_timeout_s,
-                again=(SimulatorCrashError, ServerKeepaliveError, ServerDiedError),
+                again=runner.retried_errors,
             )
             stack.callback(outcomes.close)
         try:

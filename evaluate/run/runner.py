@@ -14,6 +14,11 @@ from robomme_interference_data.constants import DEMONSTRATIONS, PROTOCOL_VERSION
 from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import load_buffer_set
+from robomme_interference_data.errors import (
+    ServerDiedError,
+    ServerKeepaliveError,
+    SimulatorCrashError,
+)
 from robomme_interference_data.evaluate.policies.registry import policy_kind
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.retrieval.columns import retrieval_columns
@@ -225,6 +230,11 @@ class Runner[C: RunConfig | AskConfig](ABC):
         self.config, self.buffer_set = config, buffer_set
         self.metadata: dict[str, Any] = {}
         self.versions: Mapping[str, str] = {}
+
+    @property
+    def retried_errors(self) -> tuple[type[Exception], ...]:
+        """Errors after which a rollout or question is started again."""
+        return (SimulatorCrashError, ServerKeepaliveError, ServerDiedError)
 
     def lock(self, folder: Path) -> AbstractContextManager[None]:
         """Keep other runs from policy servers in the block; `folder` is this run's."""

@@ -55,7 +55,7 @@ def list_buffers(
         },
         list(map(values, manifests)),
         "lesson share: of an even 32-frame sample of the history",
-    )
+    ).without_empty("difficulty")
     episodes = len({manifest.episode_id for manifest in manifests})
     total = f"{counted(len(manifests), 'buffer')} of {counted(episodes, 'episode')}"
     echo(f"{table.text()}\n\n{total}")

@@ -188,6 +188,7 @@ def main() -> None:
     except typer.Abort as error:
         _fail(ShownError(type(error).__name__, "aborted"), as_json)
     except KeyboardInterrupt:  # outside `graceful_interrupt`
+        print_status("\nInterrupted.")
         sys.exit(128 + signal.SIGINT)
     except BrokenPipeError:  # head or less closed stdout
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

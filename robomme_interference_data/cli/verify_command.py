@@ -40,7 +40,10 @@ def verify(
     robomme-interference verify my-buffers --audit --no-decode
     ```
     """
-    from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
+    from robomme_interference_data.build_dataset.verify.buffer_set import (
+        undecoded_frames,
+        verify_buffer_set,
+    )
     from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.runtime.progress import WorkProgress
 
@@ -49,6 +52,10 @@ def verify(
     with progress:
         violations = list(checks)
     report: dict[str, Any] = {"violations": [vars(violation) for violation in violations]}
+    # A damaged buffer set may have no rows to count or to audit.
+    skipped = undecoded_frames(opened) if decode and not violations else 0
+    if skipped:
+        report["frames_not_decoded"] = skipped
     if not as_json:
         for violation in violations:
             echo(f"{violation.where}: {violation.what}")
@@ -58,8 +65,10 @@ def verify(
             if violations
             else f"All {what} of {buffer_set} hold."
         )
+        if skipped:
+            frames = counted(skipped, "frame")
+            print_status(f"Not decoded: {frames}, of which only some cameras were fetched.")
     leaks = False
-    # A damaged buffer set may have no rows to audit.
     if audit and not violations:
         leaks = _audit(opened, report, as_json=as_json)
     if as_json:

@@ -154,9 +154,10 @@ class Executor(ABC):
     def run(self, function: Task, tasks: Iterable[Any], **limits: Any) -> Generator[Outcome]:
         """Call a function on every task; yield outcomes as they arrive.
 
-        A worker that dies or exceeds a limit is replaced, and its task is retried. A worker whose
-        function raises `WorkerRetiredError` returns its task to the others and ends; any other
-        exception, except those in `again`, is final. If the generator is closed early, workers that
+        A worker that dies or exceeds a limit is replaced. Its task is retried, unless the task
+        exceeded `time_limit`: a retry would likely take as long again. A worker whose function
+        raises `WorkerRetiredError` returns its task to the others and ends; any other exception,
+        except those in `again`, is final. If the generator is closed early, workers that
         have a task are stopped.
 
         Args:
@@ -164,7 +165,8 @@ class Executor(ABC):
             tasks: Picklable tasks.
             limits: `time_limit`: seconds that one task may take; None, the default, for no limit.
                 `attempts`: how often a task is started before its error is reported; 2 by default.
-                `again`: errors of this package after which a task is retried; none by default.
+                `again`: errors after which a task is retried, such as `TimeoutError`; none by
+                default.
         """
         end_if_starting()
         todo = list(tasks)

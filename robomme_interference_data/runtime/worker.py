@@ -115,12 +115,16 @@ class ProcessWorker(Worker):
 
     def work(self, function: "Task", task: Any, time_limit: float | None) -> bytes:
         """Run a task; return its outcome, without the task and its files, pickled."""
-        with self.limit(time_limit, "the task"):
+        with self.limit(time_limit, _WHOLE_TASK):
             outcome = replace(attempt(function, task, self), task=None)
             try:
                 return pickle.dumps(outcome)
             except Exception as problem:
                 return pickle.dumps(_unreadable(outcome.error or problem, outcome.trace))
+
+
+_WHOLE_TASK = "the task"
+"""What the error about an exceeded limit names, if it was that of a whole task."""
 
 
 class Task(Protocol):
@@ -150,7 +154,8 @@ class Outcome:
         attempts: How often the task was started.
         files: Files that the task sent (see `Worker.send_file`), by path.
         node: The node of a cluster that ran it; None on this machine.
-        worker: `alive` after the task; `dead` because of it; or `lost` with its node.
+        worker: `alive` after the task; `dead` because of it; `late` if the task exceeded its own
+            limit, which ends the worker too; or `lost` with its node.
     """
 
     task: Any = None
@@ -161,7 +166,7 @@ class Outcome:
     attempts: int = 1
     files: dict[str, bytes] = field(default_factory=dict)
     node: str | None = None
-    worker: Literal["alive", "dead", "lost"] = "alive"
+    worker: Literal["alive", "dead", "late", "lost"] = "alive"
 
 
 def attempt(function: Task, task: Any, worker: Worker) -> Outcome:
@@ -200,8 +205,13 @@ def read_remains(home: Path) -> Outcome:
     if not has_begun(home):
         return Outcome(worker="dead")
     message, _, trace = (home / _LIMIT).read_bytes().decode(errors="replace").partition("\n")
-    error = TimeoutError(message) if trace else None
-    return Outcome(error=error, trace=trace or None, files=take_files(home), worker="dead")
+    files = take_files(home)
+    if not trace:
+        return Outcome(files=files, worker="dead")
+    late = message.startswith(_WHOLE_TASK)
+    return Outcome(
+        error=TimeoutError(message), trace=trace, files=files, worker="late" if late else "dead"
+    )
 
 
 def take_files(home: Path) -> dict[str, bytes]:

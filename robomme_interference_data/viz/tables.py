@@ -43,6 +43,15 @@ class Table:
     rows: Sequence[Sequence[Any]]
     note: str = ""
 
+    def without_empty(self, name: str) -> "Table":
+        """Return the table without a column that has no value, nor text, in any row."""
+        place = [*self.columns].index(name)
+        if any(row[place] not in (None, "") for row in self.rows):
+            return self
+        kept = {column: form for column, form in self.columns.items() if column != name}
+        rows = [(*row[:place], *row[place + 1 :]) for row in self.rows]
+        return replace(self, columns=kept, rows=rows)
+
     def records(self) -> list[dict[str, Any]]:
         """Return the rows by column name, NaN as None, for JSON."""
         return [dict(zip(self.columns, map(_known, row), strict=True)) for row in self.rows]

@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from robomme_interference_data import load_buffer, load_buffer_set
+from robomme_interference_data.cards.dataset_facts import buffer_set_facts
 from robomme_interference_data.cli.main import app
 from robomme_interference_data.evaluate.ceiling import ceiling
 from robomme_interference_data.evaluate.run.config import CeilingConfig
@@ -62,7 +63,6 @@ def test_lerobot_opens_it(sets: tuple[Path, Path]) -> None:
     [
         ("index", "--encoder", "thumbnail"),
         ("evaluate", "--policy", "replay", "--out", "out"),
-        ("card",),
         ("show", "MoveCube/test/0", "k0", "--out", "out/strip.png"),
     ],
 )
@@ -74,3 +74,11 @@ def test_what_needs_images_says_so(
     assert code != 0 and "Traceback" not in errors
     assert "stored without images" in errors and "Build a buffer set with `cameras`" in errors
     assert not (tmp_path / "out").exists()
+
+
+def test_a_card_needs_no_images(sets: tuple[Path, Path], run: Run) -> None:
+    """It has no film strip, and its example reads no frames."""
+    code, card, errors = run("card", sets[0])
+    assert code == 0, errors
+    assert "![" not in card and "buffer.states" in card
+    assert buffer_set_facts(load_buffer_set(sets[0])).pictures() == {}

@@ -96,6 +96,19 @@ def test_the_default_camera_of_a_part_is_one_that_is_there(
     assert code == 1 and "--cameras" in err
 
 
+def test_verify_says_which_frames_it_cannot_decode(part: Path, run: Run) -> None:
+    """Hashes are of all cameras; the part has one of two."""
+    buffer_set = load_buffer_set(part)
+    copy, units = buffer_set.copy, buffer_set.datasets["distractors"]
+    assert copy is not None
+    held = [buffer_set.query("MoveCube/test/0").record.length]
+    held += [unit.length for unit in units.records() if copy.holds(units, unit.episode_index)]
+    code, out, err = run("verify", part, "--json")
+    assert code == 0 and json.loads(out)["frames_not_decoded"] == sum(held)
+    assert "0/0" not in err
+    assert "Not decoded" in run("verify", part)[2]
+
+
 def test_a_camera_that_was_not_fetched(part: Path) -> None:
     buffer_set = load_buffer_set(part)
     with pytest.raises(MissingFileError) as caught:
@@ -161,7 +174,7 @@ def test_a_run_on_a_part_plays_what_it_holds(
 
 
 def test_a_part_is_verified(part: Path) -> None:
-    counted: dict[str, int] = {"done": 0}
+    counted: dict[str, int] = {"done": 0, "all": 0}
     shown: Any = SimpleNamespace(
         start=lambda text, frames: counted.update(all=frames),
         advance=lambda frames: counted.update(done=counted["done"] + frames),

@@ -37,6 +37,14 @@ def test_a_terminal_gets_aligned_columns() -> None:
     ]
 
 
+def test_a_column_without_values_can_be_left_out() -> None:
+    columns: Columns = {"family": "text", "difficulty": "text", "n": "count"}
+    table = Table("t", "T", columns, [("a", None, 1), ("b", "", 2)]).without_empty("difficulty")
+    assert (list(table.columns), table.rows) == (["family", "n"], [("a", 1), ("b", 2)])
+    table = Table("t", "T", columns, [("a", None, 1), ("b", "hard", 2)]).without_empty("difficulty")
+    assert list(table.columns) == list(columns)
+
+
 def test_markdown_has_a_title_and_a_note() -> None:
     lines = TABLE.markdown().splitlines()
     assert lines[0] == "# Rates of systems"

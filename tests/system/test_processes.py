@@ -103,10 +103,12 @@ def test_failing_tasks_do_not_stop_others(tmp_path: Path, run: Run) -> None:
         assert found[key].attempts == 2
 
 
-def test_a_task_that_hangs_is_tried_again_and_given_up(tmp_path: Path, run: Run) -> None:
+def test_a_task_that_exceeds_its_limit_is_given_up(tmp_path: Path, run: Run) -> None:
     (hung,) = run([("hang", str(tmp_path))], time_limit=0.5)
     assert isinstance(hung.error, TimeoutError)
-    assert (str(hung.error), hung.attempts) == ("the task took more than 0.5 s", 2)
+    assert (str(hung.error), hung.attempts) == ("the task took more than 0.5 s", 1)
+    (hung,) = run([("hang", str(tmp_path))], time_limit=0.5, again=(TimeoutError,))
+    assert hung.attempts == 2
     wait_until_gone(pids_in(tmp_path, 0), seconds=5)
 
 

@@ -50,7 +50,8 @@ def _first(starts: Sequence[ErrorCell], complete: Sequence[ErrorCell]) -> str:
         for cell in complete
         if cell is not first and (cell in starts or cell.condition == NO_HISTORY)
     ]
-    lowest = others and all(first.error.value <= cell.error.value for cell in others)
+    rivals = {cell.system for cell in others} - {first.system}
+    lowest = rivals and all(first.error.value <= cell.error.value for cell in others)
     error = f"{first.error.value:.4f} under {named(first.condition)}"
     has = f"the lowest action error, {error}" if lowest else f"an action error of {error}"
     return f"Offline, {display_name(first.system)} has {has}, over {first.n} recordings."
