@@ -1,4 +1,7 @@
-"""Subgoal writers by their text: `oracle`, or a vision-language model."""
+"""Subgoal writers by their text: `oracle`, or a vision-language model.
+
+Its functions are called, through `evaluate/optional.py`, for runs with subgoals only.
+"""
 
 import inspect
 from collections.abc import Mapping, Sequence
@@ -26,15 +29,15 @@ _WRITER_OPTIONS = [
 ]
 
 
-def pin_subgoals(text: str | None) -> str | None:
+def pin_subgoals(text: str) -> str:
     """Return the full text of a writer, with the commit of a model on the Hub."""
-    return text if text in (None, ORACLE) else MODELS.pin(str(text))
+    return text if text == ORACLE else MODELS.pin(text)
 
 
-def make_writer(config: RunConfig) -> SubgoalWriter | None:
-    """Make the subgoal writer of a run; None if the run has none."""
-    if config.subgoals in (None, ORACLE):
-        return None if config.subgoals is None else OracleWriter()
+def make_writer(config: RunConfig) -> SubgoalWriter:
+    """Make the subgoal writer of a run that has one."""
+    if config.subgoals == ORACLE:
+        return OracleWriter()
     writer_options, model_options = _split(config)
     model = MODELS.make(str(config.subgoals), model_options, _WRITER_OPTIONS)
     prompt = load_published(config.subgoal_prompt or DEFAULT_PROMPT, config.system)
@@ -48,7 +51,7 @@ def with_published(config: RunConfig) -> RunConfig:
         InvalidOptionError: The prompt, or an option that is set, is another one.
     """
     published = PUBLISHED.get(config.system or "")
-    if published is None or config.subgoals in (None, ORACLE):
+    if published is None or config.subgoals == ORACLE:
         return config
     text = str(config.subgoals)
     if MODELS.parse(text).kind != "openai":
@@ -67,32 +70,27 @@ def with_published(config: RunConfig) -> RunConfig:
 
 
 def describe_subgoals(config: RunConfig) -> dict[str, Any]:
-    """Return the metadata of the writer, empty without one."""
-    writer = make_writer(config)
-    if writer is None:
-        return {}
-    with closing(writer):
+    """Return the metadata of the writer."""
+    with closing(make_writer(config)) as writer:
         return {"subgoals": writer.metadata()}
 
 
 def subgoals_identity(config: RunConfig, metadata: Mapping[str, Any]) -> Any:
     """Return what of the subgoals can change a result, given `describe_subgoals`' metadata."""
-    if config.subgoals in (None, ORACLE):
-        return config.subgoals
+    if config.subgoals == ORACLE:
+        return ORACLE
     writer_options, model_options = _split(config)
     writer = metadata["subgoals"]
     model = model_identity(str(config.subgoals), model_options, writer["model"])
     return model | {"prompt_sha256": writer["prompt_sha256"]} | writer_options
 
 
-def subgoals_text(config: RunConfig, metadata: Mapping[str, Any]) -> str | None:
+def subgoals_text(config: RunConfig, metadata: Mapping[str, Any]) -> str:
     """Return what writes subgoals as `SystemFacts` have it; see `subgoals_identity`."""
-    if config.subgoals is None:
-        return None
     if config.subgoals == ORACLE:
         points = policy_options(config.policy, config.policy_options).get("points", True)
         return ORACLE if points else f"{ORACLE} in words"
-    kind = MODELS.parse(config.subgoals).kind
+    kind = MODELS.parse(str(config.subgoals)).kind
     return f"{kind} {short_digest(subgoals_identity(config, metadata))}"
 
 

@@ -14,6 +14,7 @@ from robomme_interference_data.errors import (
     PolicyServerError,
     named,
 )
+from robomme_interference_data.evaluate import optional
 from robomme_interference_data.evaluate.run.identity import plain
 from robomme_interference_data.evaluate.systems import System
 from robomme_interference_data.schema.conditions import NO_HISTORY
@@ -31,7 +32,6 @@ from .registry import (
     server_addresses,
     starts_server,
 )
-from .server_lock import lock_server
 
 logger = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ def lock_servers(text: str, out: Path) -> Iterator[None]:
     """Keep other runs from a policy's servers in the block; `out` is this run's folder."""
     with ExitStack() as stack:
         for host, port in server_addresses(text) if one_client(text) else ():
-            stack.enter_context(lock_server(host, port, f"the run in {out.resolve()}"))
+            stack.enter_context(optional.lock_server(host, port, f"the run in {out.resolve()}"))
         yield
 
 

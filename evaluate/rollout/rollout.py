@@ -15,9 +15,8 @@ from robomme_interference_data.constants import ACTION_CHUNK, MAX_STEPS
 from robomme_interference_data.data.buffer import Buffer, Chunk
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import InvalidOptionError, PolicyError, RunError
+from robomme_interference_data.evaluate import optional
 from robomme_interference_data.evaluate.language.columns import model_columns
-from robomme_interference_data.evaluate.language.images import HistoryFrames
-from robomme_interference_data.evaluate.language.subgoal_writer import SubgoalWriter
 from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.history import HistoryReader
@@ -37,6 +36,7 @@ from robomme_interference_data.simulators.episode import ACTION_SIZE, Observatio
 from .recording_check import check_episode, check_lesson
 
 if TYPE_CHECKING:
+    from robomme_interference_data.evaluate.language.subgoal_writer import SubgoalWriter
     from robomme_interference_data.retrieval.selector import Selector
 
     from .clips import Clip
@@ -65,7 +65,7 @@ def run_rollout(
     policy: Policy,
     buffer_set: BufferSet,
     selector: "Selector | None" = None,
-    writer: SubgoalWriter | None = None,
+    writer: "SubgoalWriter | None" = None,
     history: HistoryReader | None = None,
     clip: "Clip | None" = None,
     worker: Worker | None = None,
@@ -116,7 +116,8 @@ def run_rollout(
                 policy.add_history(chunk.frames, chunk.states, len(received))
         if writer is not None:
             with clock.part("model_s"):
-                writer.start(HistoryFrames(buffer, received, reader), rollout_info, simulator)
+                frames = optional.HistoryFrames(buffer, received, reader)
+                writer.start(frames, rollout_info, simulator)
     live = _Live(run.config, policy, simulator, writer, clock, clip, worker)
     try:
         status = live.run(first, info.goal)
@@ -151,7 +152,7 @@ class _Live:
     config: RunConfig
     policy: Policy
     simulator: Simulator
-    writer: SubgoalWriter | None
+    writer: "SubgoalWriter | None"
     clock: _Clock
     clip: "Clip | None"
     worker: Worker
@@ -217,7 +218,7 @@ def _checked(actions: Any, size: int, state_size: int) -> NDArray[np.float32]:
     return checked[:ACTION_CHUNK]
 
 
-def _model_columns(writer: SubgoalWriter | None) -> dict[str, Any]:
+def _model_columns(writer: "SubgoalWriter | None") -> dict[str, Any]:
     if writer is None:
         return {}
     turns = writer.turns

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from robomme_interference_data.constants import EXECUTIONS, ORACLE, RECORDINGS
 from robomme_interference_data.data.buffer_set import BufferSet
@@ -16,14 +16,7 @@ from robomme_interference_data.errors import (
     SimulatorCrashError,
     named,
 )
-from robomme_interference_data.evaluate.language.subgoal_writers import (
-    describe_subgoals,
-    pin_subgoals,
-    subgoals_identity,
-    subgoals_text,
-    with_published,
-)
-from robomme_interference_data.evaluate.policies.answers import Answers, read_answers
+from robomme_interference_data.evaluate import optional
 from robomme_interference_data.evaluate.policies.capabilities import Role
 from robomme_interference_data.evaluate.policies.identity import (
     check_memory_kind,
@@ -40,7 +33,6 @@ from robomme_interference_data.evaluate.policies.registry import (
     policy_options,
     starts_server,
 )
-from robomme_interference_data.evaluate.policies.shared import Address
 from robomme_interference_data.evaluate.run.config import RunConfig, check_unused
 from robomme_interference_data.evaluate.run.plan import RunPlan, WorkItem
 from robomme_interference_data.evaluate.run.runner import (
@@ -58,6 +50,10 @@ from .checks import check_plan, check_settings, check_system
 from .names import default_system
 from .worker import RolloutTask, StartServer, StartSimulator
 
+if TYPE_CHECKING:
+    from robomme_interference_data.evaluate.policies.answers import Answers
+    from robomme_interference_data.evaluate.policies.shared import Address
+
 
 class Rollouts(Runner[RunConfig]):
     """Rollouts of a policy in a simulator."""
@@ -67,8 +63,10 @@ class Rollouts(Runner[RunConfig]):
         self._answers: Answers | None = None
         self._addresses: Sequence[Address] = ()
         # The commit of a model is the same for all workers.
-        policy, subgoals = POLICIES.pin(config.policy), pin_subgoals(config.subgoals)
-        super().__init__(dataclasses.replace(config, policy=policy, subgoals=subgoals), buffer_set)
+        config = dataclasses.replace(config, policy=POLICIES.pin(config.policy))
+        if config.subgoals is not None:
+            config = dataclasses.replace(config, subgoals=optional.pin_subgoals(config.subgoals))
+        super().__init__(config, buffer_set)
 
     @property
     def retried_errors(self) -> tuple[type[Exception], ...]:
@@ -84,14 +82,18 @@ class Rollouts(Runner[RunConfig]):
 
     def prepare(self) -> None:
         """Check the settings, and identify the policy and the writer of its subgoals."""
-        config = self.config = with_published(self.config)
+        if self.config.subgoals is not None:
+            self.config = optional.with_published(self.config)
+        config = self.config
         check_system(config, self.system)  # before a policy server is waited for
         self._policy, self._policy_metadata = describe_policy(
             config.policy, config.policy_options, workers=config.workers
         )
         check_settings(config, self.buffer_set, self._policy)
         self._system = name_system(self.system)
-        self._subgoal_metadata = describe_subgoals(config)
+        self._subgoal_metadata: dict[str, Any] = {}
+        if config.subgoals is not None:
+            self._subgoal_metadata = optional.describe_subgoals(config)
         self.metadata = self._policy_metadata | self._subgoal_metadata
         self.versions = simulator_versions(config.simulator, config.robomme_python)
 
@@ -99,12 +101,15 @@ class Rollouts(Runner[RunConfig]):
         """Return what the system is."""
         config, spec = self.config, POLICIES.parse(self.config.policy)
         published = self._system.facts if self._system.paper else SystemFacts()
+        subgoals = None
+        if config.subgoals is not None:
+            subgoals = optional.subgoals_text(config, self._subgoal_metadata)
         return SystemFacts(
             policy=spec.kind,
             policy_id=short_digest(self._policy_identity()),
             memory=policy_memory(config.policy) or published.memory,
             retrieval=retrieval_text(config, self.buffer_set),
-            subgoals=subgoals_text(config, self._subgoal_metadata),
+            subgoals=subgoals,
             # A policy without memory may have a subgoal writer that reads the history.
             reads_history=published.reads_history
             and (self._policy.wants_history or config.subgoals is not None),
@@ -117,7 +122,7 @@ class Rollouts(Runner[RunConfig]):
         check_plan(self.config, self._system, self.buffer_set, plan, items)
         if policy_kind(self.config.policy).acts_out_answers:
             path = Path(POLICIES.parse(self.config.policy).target)
-            self._answers = read_answers(self.config, path, self.buffer_set, items)
+            self._answers = optional.read_answers(self.config, path, self.buffer_set, items)
 
     @contextmanager
     def shared(self) -> Iterator[None]:
@@ -125,9 +130,7 @@ class Rollouts(Runner[RunConfig]):
         if self.config.policies is None:
             yield
             return
-        from robomme_interference_data.evaluate.policies.process import policy_processes
-
-        with policy_processes(self.config) as self._addresses:
+        with optional.policy_processes(self.config) as self._addresses:
             yield
 
     def task(self, run: RunContext[RunConfig]) -> RolloutTask:
@@ -158,10 +161,12 @@ class Rollouts(Runner[RunConfig]):
 
     def identity(self, plan: RunPlan) -> dict[str, Any]:
         """Return what of simulator, policy and subgoals can change a result."""
-        config = self.config
+        subgoals = None
+        if self.config.subgoals is not None:
+            subgoals = optional.subgoals_identity(self.config, self._subgoal_metadata)
         return {
             "simulator_version": dict(self.versions),
-            "subgoals": subgoals_identity(config, self._subgoal_metadata),
+            "subgoals": subgoals,
             **self._policy_identity(),
         }
 

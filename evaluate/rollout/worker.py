@@ -4,7 +4,7 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from robomme_interference_data.constants import DEMONSTRATIONS, ORACLE
 from robomme_interference_data.data.dataset import Dataset
@@ -16,12 +16,9 @@ from robomme_interference_data.errors import (
     WorkerRetiredError,
     first_line,
 )
-from robomme_interference_data.evaluate.language.subgoal_writer import SubgoalWriter
-from robomme_interference_data.evaluate.language.subgoal_writers import make_writer
-from robomme_interference_data.evaluate.policies.answers import Answers
+from robomme_interference_data.evaluate import optional
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import make_policy, starts_server
-from robomme_interference_data.evaluate.policies.shared import Address, SharedPolicy
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout
@@ -42,6 +39,11 @@ from robomme_interference_data.simulators.registry import (
 
 from .recording_check import check_episode
 from .rollout import run_rollout
+
+if TYPE_CHECKING:
+    from robomme_interference_data.evaluate.language.subgoal_writer import SubgoalWriter
+    from robomme_interference_data.evaluate.policies.answers import Answers
+    from robomme_interference_data.evaluate.policies.shared import Address
 
 logger = logging.getLogger(__name__)
 
@@ -72,8 +74,8 @@ class RolloutTask(RunTask[RunConfig]):
     def __init__(
         self,
         run: RunContext[RunConfig],
-        answers: Answers | None = None,
-        addresses: Sequence[Address] = (),
+        answers: "Answers | None" = None,
+        addresses: "Sequence[Address]" = (),
         policy: Policy | None = None,
     ):
         super().__init__(run)
@@ -116,9 +118,7 @@ class RolloutTask(RunTask[RunConfig]):
     def _run(self, job: Job, worker: Worker) -> tuple[Rollout, str | None]:
         item, config, clip = job.item, self.run.config, None
         if config.videos:
-            from .clips import Clip
-
-            clip = Clip(item, self.run.system, worker.folder)
+            clip = optional.Clip(item, self.run.system, worker.folder)
         try:
             row = self._roll(job, worker, clip)
         except Exception as error:
@@ -150,7 +150,7 @@ class RolloutTask(RunTask[RunConfig]):
         if not self._addresses:
             return make_policy(config.policy, config.policy_options, worker=worker.number)
         address = self._addresses[worker.number % len(self._addresses)]
-        return SharedPolicy.open(address, worker.number)
+        return optional.SharedPolicy.open(address, worker.number)
 
     def _open_simulator(self, policy: Policy, worker: Worker) -> Simulator:
         config = self.run.config
@@ -175,9 +175,9 @@ class RolloutTask(RunTask[RunConfig]):
         except Exception:
             self.close()  # the rollout of this episode becomes an error row
 
-    def _open_writer(self) -> SubgoalWriter | None:
-        if self._writer is None:
-            self._writer = make_writer(self.run.config)
+    def _open_writer(self) -> "SubgoalWriter | None":
+        if self._writer is None and self.run.config.subgoals is not None:
+            self._writer = optional.make_writer(self.run.config)
         return self._writer
 
     def _roll(self, job: Job, worker: Worker, clip: Any) -> Rollout:

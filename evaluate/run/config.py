@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from robomme_interference_data.constants import DEMONSTRATIONS, SPLITS
 from robomme_interference_data.errors import InvalidOptionError, named
+from robomme_interference_data.evaluate import optional
 from robomme_interference_data.runtime.executor import WorkersConfig
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.sampling import MEMORY_FORM
@@ -230,8 +231,6 @@ class CeilingConfig(RetrievalConfig):
 
 def check_shared(config: WorkConfig) -> None:
     """Check the settings that rollouts and questions share."""
-    from .tracking import check_tracker
-
     positive = ("workers", "max_errors", "rollout_timeout_s")
     for name in (*positive, "history_chunk", "simulator_timeout_s"):
         value = getattr(config, name, 1)
@@ -242,7 +241,8 @@ def check_shared(config: WorkConfig) -> None:
     if config.split not in SPLITS:
         raise InvalidOptionError.one_of("split", config.split, SPLITS)
     check_retrieval(config)
-    check_tracker(config.track)
+    if config.track is not None:
+        optional.check_tracker(config.track)
 
 
 def check_retrieval(config: RetrievalConfig) -> None:

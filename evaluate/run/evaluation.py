@@ -16,6 +16,7 @@ from robomme_interference_data.errors import (
     first_line,
     named,
 )
+from robomme_interference_data.evaluate import optional
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.runtime.executor import (
     Executor,
@@ -35,7 +36,6 @@ from .log import RunLog, count_statuses, is_done, open_log, read_record, row_lin
 from .plan import RunPlan, WorkItem, plan_work, shuffle_work
 from .row import Rollout
 from .runner import Job, RunContext, Runner
-from .tracking import Tracking, open_tracker
 
 if TYPE_CHECKING:
     import pandas
@@ -145,8 +145,8 @@ def run_evaluation(
             run = dataclasses.replace(run, facts=runner.facts(), buffer_set=log.header.buffer_set)
             callbacks = [] if progress is None else [progress]
             if config.track is not None:
-                opened = partial(open_tracker, config.track, folder, plain(identity))
-                callbacks.append(stack.enter_context(Tracking(config.track, opened)))
+                opened = partial(optional.open_tracker, config.track, folder, plain(identity))
+                callbacks.append(stack.enter_context(optional.Tracking(config.track, opened)))
             return _run_items(run, runner, pool, items, log, callbacks)
 
 

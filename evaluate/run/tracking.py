@@ -65,10 +65,8 @@ class CsvTracker:
         self._file.close()
 
 
-def check_tracker(name: str | None) -> None:
+def check_tracker(name: str) -> None:
     """Check that a tracker exists and its library is installed, without importing it."""
-    if name is None:
-        return
     if name not in TRACKERS:
         raise InvalidOptionError.one_of("track", name, TRACKERS)
     if name in LIBRARIES and find_spec(name) is None:
