@@ -10,6 +10,7 @@ import pytest
 from support.buffer_sets import GOLDEN, plan_again
 from support.damage import HEADER, ROWS, edit, put, renew_header
 from support.made_up import record, write_metadata
+from support.messages import raises
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.verify.audit import Audit, Leak, audit_buffer_set
@@ -116,5 +117,5 @@ def test_leaks_in_a_buffer(
 
 def test_a_header_without_a_condition_of_the_rows(own_buffers: Path) -> None:
     renew_header(own_buffers, conditions=["no-history", "k0"])
-    with pytest.raises(FormatError, match="k1 is not among its conditions"):
+    with raises(FormatError):
         audit_buffer_set(load_buffer_set(own_buffers))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.buffer_sets import GOLDEN, contents
 from support.made_up import MadeUpSource, record, write_metadata
+from support.messages import raises
 
 from robomme_interference_data.build_dataset.config import BuffersConfig, BuildConfig
 from robomme_interference_data.build_dataset.dataset.build import BuildResult, build_dataset
@@ -79,7 +80,7 @@ def test_the_golden_demonstrations_hold_what_the_source_gives(tmp_path: Path) ->
 def test_build_resumes_from_staged_episodes(tmp_path: Path) -> None:
     out = tmp_path / "out"
     source = MadeUpSource(TRAIN, {"B/train/0": {9: SourceError("broke off", "record it again")}})
-    with pytest.raises(SourceError, match="B/train/0: broke off"):
+    with raises(SourceError):
         build(out, source)
     assert not out.exists()
     for name in TRAIN:  # nothing but that one is read again
@@ -93,7 +94,7 @@ def test_build_resumes_from_staged_episodes(tmp_path: Path) -> None:
 
 def test_several_failures_are_listed(tmp_path: Path) -> None:
     wrong = {name: {3: SourceError("broke off")} for name in list(TRAIN)[1:]}
-    with pytest.raises(BuildError, match="3 of 4 episodes failed") as caught:
+    with raises(BuildError) as caught:
         build(tmp_path / "out", MadeUpSource(TRAIN, wrong))
     assert "A/train/1: broke off (started 1 times)" in caught.value.message
     assert "the same command again" in str(caught.value.hint)
@@ -138,7 +139,7 @@ def test_a_dataset_is_of_one_robot_and_keeps_what_it_is(tmp_path: Path) -> None:
         "values of state: a, b, c, d, e, f, g, h in A/train/0, unknown in": Robot(15, "aloha"),
     }
     for number, (difference, other) in enumerate(others.items(), 2):
-        with pytest.raises(SourceError, match="cannot be in one dataset") as caught:
+        with raises(SourceError) as caught:
             build(out, MadeUpSource({f"A/train/{number}": (260, None)}, robot=other))
         assert difference in caught.value.message and "{" not in caught.value.message
 
@@ -243,7 +244,7 @@ def test_dataset_with_other_settings_is_unchanged(
 ) -> None:
     before = contents(built)
     other = MadeUpSource({"A/train/1": (260, 5)}, **source)
-    with pytest.raises(InterferenceError, match=message) as caught:
+    with raises(InterferenceError) as caught:
         build(built, other, **options)
     assert "settings" not in message or "Choose another `buffer_set`" in str(caught.value.hint)
     assert contents(built) == before
@@ -252,7 +253,7 @@ def test_dataset_with_other_settings_is_unchanged(
 def test_episodes_of_other_cameras_mix_in_those_that_all_have(tmp_path: Path) -> None:
     one = MadeUpSource({"A/train/0": (260, None)})
     both = MadeUpSource({"B/train/0": (260, None)}, cameras=("front", "wrist"))
-    with pytest.raises(SourceError, match="cannot be in one dataset") as caught:
+    with raises(SourceError) as caught:
         build(tmp_path / "out", one, both)
     assert "`cameras`" in str(caught.value.hint)
     assert build(tmp_path / "out", one, both, cameras=("front",)).episodes == 2
@@ -295,20 +296,17 @@ def test_unknown_files_and_concurrent_builds(tmp_path: Path) -> None:
     source = MadeUpSource(TRAIN)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("keep")
-    with pytest.raises(BuildError, match="is not a dataset of this package"):
+    with raises(BuildError):
         build(tmp_path / "mine", source)
     assert contents(tmp_path / "mine") == {"notes.txt": b"keep"}
     work = staging_path(tmp_path / "out")
     work.mkdir()
-    with (
-        file_lock(work / "lock", BuildError("x")),
-        pytest.raises(BuildError, match="another process is building .*out"),
-    ):
+    with file_lock(work / "lock", BuildError("x")), raises(BuildError):
         build(tmp_path / "out", source)
 
 
 def test_no_dataset_under_a_name_that_is_not_utf_8(tmp_path: Path) -> None:
-    with pytest.raises(InvalidOptionError, match="a path in UTF-8"):
+    with raises(InvalidOptionError):
         build(tmp_path / "caf\udce9" / "out", MadeUpSource(TRAIN))
     assert not any(tmp_path.iterdir())
 
@@ -346,7 +344,7 @@ def test_filters() -> None:
     ):
         with pytest.raises(error):
             listed(source, **filters)
-    with pytest.raises(SourceError, match=r"recorded twice \(in source 1 and source 2\)") as caught:
+    with raises(SourceError) as caught:
         listed(source, source)
     assert "`" not in str(caught.value.hint)  # a filter would leave out both
 
@@ -440,12 +438,12 @@ def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     (root / ".hidden").touch()
     plan_dataset("distractors", config(tmp_path))
     (root / "thesis.txt").write_text("mine")
-    with pytest.raises(BuildError, match=r"out holds thesis.txt, and nothing of a buffer set"):
+    with raises(BuildError):
         plan_dataset("distractors", config(tmp_path))
     staging_path(root / "demonstrations").mkdir()  # a build has begun: the file came later
     plan_dataset("distractors", config(tmp_path))
     file = BuildConfig(source=("sample",), buffer_set=root / "thesis.txt")
-    with pytest.raises(BuildError, match="is a file"):
+    with raises(BuildError):
         plan_dataset("distractors", file)
 
 
@@ -454,5 +452,5 @@ def test_build_all_rejects_folders_with_unknown_files(tmp_path: Path, name: str)
     folder = tmp_path / "out" / name
     folder.mkdir(parents=True)
     (folder / "notes.txt").write_text("mine")
-    with pytest.raises(BuildError, match=f"{name} exists"):
+    with raises(BuildError):
         plan_build(config(tmp_path), BuffersConfig())

@@ -10,6 +10,7 @@ import pytest
 from support.buffer_sets import build, dataset, plan_again, violations
 from support.lerobot_layouts import write_lerobot
 from support.made_up import MadeUpSource, record, write_metadata
+from support.messages import raises
 from support.recordings import EPISODES, write_frames, write_h5
 
 from robomme_interference_data import load_buffer, load_buffer_set
@@ -85,22 +86,20 @@ def frame(shown: bool | None, action: float | None = 1.0) -> Frame:
 
 
 @pytest.mark.parametrize(
-    ("frames", "error", "message"),
+    ("frames", "error"),
     [
-        ([frame(True), frame(False)], NothingToStore, "1 live frame;"),
-        ([frame(None), frame(None)], SourceError, "does not mark"),
-        ([frame(True), frame(False, None)], InvalidOptionError, "no actions"),
+        ([frame(True), frame(False)], NothingToStore),
+        ([frame(None), frame(None)], SourceError),
+        ([frame(True), frame(False, None)], InvalidOptionError),
     ],
 )
-def test_episodes_without_an_execution(
-    frames: list[Frame], error: type[Exception], message: str
-) -> None:
-    with pytest.raises(error, match=message):
+def test_episodes_without_an_execution(frames: list[Frame], error: type[Exception]) -> None:
+    with raises(error):
         list(select_execution(frames))
 
 
 def test_a_source_without_actions_is_one_error(tmp_path: Path) -> None:
-    with pytest.raises(InvalidOptionError, match="MoveCube/test/0: the source has no actions"):
+    with raises(InvalidOptionError):
         build(tmp_path, EXECUTIONS, MadeUpSource(QUERIES, actions=False))
     assert not (tmp_path / EXECUTIONS).exists()
 
@@ -116,7 +115,7 @@ def test_a_buffer_set_with_executions(tmp_path: Path) -> None:
     assert np.array_equal(first, opened.query(QUERY).frame("front")) and len(others) == 3
     assert np.array_equal(others[2], source.frame(QUERY, 8, 5).images["front"])
     assert made.read_vectors(index, "action", 0, 4)[:, 0].tolist() == [-5, -6, -7, -8]
-    with pytest.raises(UnknownNameError, match=r"'actoin' is not in(.|\n)*'action'"):
+    with raises(UnknownNameError):
         made.read_vectors(index, "actoin", 0, 4)
     (root / EXECUTIONS / IDENTITY_PATH).unlink()  # buffers do not need them
     assert len(load_buffer(QUERY, "k1", buffer_set=root, verify=True)) == 5 + 32
@@ -138,20 +137,15 @@ def test_executions_begin_with_the_query_frame(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    "changes",
     [
-        ({"seed": 8}, "seed: 8 in it, 7 in the demonstrations"),
-        ({"goals": ("do it", "again")}, "goals: do it / again in it, do it in the"),
-        ({"difficulty": "hard"}, "difficulty: hard in it, unknown in the"),
-        (
-            {"episode_id": EpisodeId("MoveCube", "test", 1)},
-            "MoveCube/test/1 .*demonstrations lack it",
-        ),
+        {"seed": 8},
+        {"goals": ("do it", "again")},
+        {"difficulty": "hard"},
+        {"episode_id": EpisodeId("MoveCube", "test", 1)},
     ],
 )
-def test_executions_of_other_episodes(
-    tmp_path: Path, changes: dict[str, Any], message: str
-) -> None:
+def test_executions_of_other_episodes(tmp_path: Path, changes: dict[str, Any]) -> None:
     known = {"seed": 7, "goals": ("do it",)}
     write_metadata(tmp_path / DEMONSTRATIONS, DEMONSTRATIONS, [record("", QUERY, **known)])
     write_metadata(
@@ -160,5 +154,5 @@ def test_executions_of_other_episodes(
     live = {"exec_start_idx": None, "span_sha256": None}
     executions = [record("", QUERY, **live | known | changes)]
     write_metadata(tmp_path / EXECUTIONS, EXECUTIONS, executions)
-    with pytest.raises(SourceError, match=message):
+    with raises(SourceError):
         plan_manifests(datasets_in(tmp_path), ("k0",))

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from support.buffer_sets import CONDITIONS, GOLDEN, QUERIES, contents, copy_buffer_set
 from support.made_up import record, write_metadata
+from support.messages import raises
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.manifests import (
@@ -75,21 +76,21 @@ def test_lesson_parts_without_digests_are_an_error(tmp_path: Path) -> None:
     root = made_up(tmp_path, queries=queries)
     assert len(list(planned_buffers(plan_manifests(datasets_in(root), ("k1",))))) == 1
     for name in ("parts-k1", "held-k1"):
-        with pytest.raises(FormatError, match="MoveCube/test/0: no digests of its parts"):
+        with raises(FormatError):
             list(planned_buffers(plan_manifests(datasets_in(root), (name,))))
 
 
 def test_datasets_that_conditions_need(tmp_path: Path) -> None:
     root = made_up(tmp_path)
     for name, needed in (("raw-k1", "distractors-raw"), ("misled-k0", "contradictions")):
-        with pytest.raises(SourceError, match=f"{name} needs the dataset {needed}") as caught:
+        with raises(SourceError) as caught:
             plan_manifests(datasets_in(root), ("k1", name))
         assert f"--only {needed}" in str(caught.value.command)
     records = [record("contradictions", "PatternLock/test/1/2", lesson=40)]
     write_metadata(root / "contradictions", "contradictions", records)
     plan = plan_manifests(datasets_in(root), ("stale-k1",))
     assert list(plan.datasets) == ["demonstrations", "distractors", "contradictions"]
-    with pytest.raises(SourceError, match=r"contradictions lacks \w+/test/0"):
+    with raises(SourceError):
         list(planned_buffers(plan))
     queries = [record("demonstrations", "PatternLock/test/1")]
     one = made_up(tmp_path / "one", queries=queries)
@@ -114,7 +115,7 @@ def test_a_buffer_is_exact_where_all_of_it_is(tmp_path: Path) -> None:
 
 def test_a_pool_too_small(tmp_path: Path) -> None:
     root = made_up(tmp_path)
-    with pytest.raises(BuildError, match="needs 10 distractor units"):
+    with raises(BuildError):
         list(write_manifests(plan_manifests(datasets_in(root), ("k10",)), root))
     assert list((root / "manifests").iterdir()) == []
 
@@ -125,14 +126,14 @@ def test_the_position_limit(tmp_path: Path, limit: int, fits: bool) -> None:
     if fits:
         assert len(list(planned_buffers(plan))) == 8
         return
-    with pytest.raises(InvalidOptionError, match="under k1 needs 1365 positions") as caught:
+    with raises(InvalidOptionError) as caught:
         list(planned_buffers(plan))
     assert 'position_limit="none"' in str(caught.value.hint)
 
 
 def test_units_must_be_of_train_episodes(tmp_path: Path) -> None:
     units = [record("distractors", "InsertPeg/test/0"), record("distractors", "Drawer/val/0")]
-    with pytest.raises(SourceError, match="must come from train episodes.* test, val"):
+    with raises(SourceError):
         plan_manifests(datasets_in(made_up(tmp_path, units=units)))
 
 
@@ -140,7 +141,7 @@ def test_datasets_that_do_not_fit(tmp_path: Path) -> None:
     root = made_up(tmp_path)
     info = root / "distractors" / "meta" / "info.json"
     info.write_text(info.read_text().replace("      4,\n", "      8,\n"))
-    with pytest.raises(SourceError, match="cannot follow one another"):
+    with raises(SourceError):
         plan_manifests(datasets_in(root))
     info.write_text(info.read_text().replace("      8,\n", "      4,\n"))
     plan_manifests(datasets_in(root))
@@ -154,7 +155,7 @@ def test_datasets_that_do_not_fit(tmp_path: Path) -> None:
         plan_manifests(datasets_in(root))
     (root / "demonstrations").rename(root / "distractors")
     (root / "units").rename(root / "demonstrations")
-    with pytest.raises(InvalidOptionError, match="is a dataset of distractors"):
+    with raises(InvalidOptionError):
         plan_manifests(datasets_in(root))
 
 
@@ -195,5 +196,5 @@ def test_unknown_files_are_kept(tmp_path: Path) -> None:
     other = made_up(tmp_path / "other")
     (other / "manifests").mkdir()
     (other / "manifests" / "notes.txt").write_text("mine")
-    with pytest.raises(BuildError, match=r"holds notes\.txt"):
+    with raises(BuildError):
         list(write_manifests(plan_manifests(datasets_in(other)), other))

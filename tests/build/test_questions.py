@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.machine import full_disk
+from support.messages import raises
 from support.tabletop import QUERIES, TABLETOP, copy_tabletop, scene_of
 
 from robomme_interference_data import load_buffer_set
@@ -271,13 +272,13 @@ def test_letters_of_one_thing_stand_side_by_side() -> None:
 
 @pytest.mark.parametrize("changes", [{"simulator": "robomme"}, {"seed": -1}])
 def test_only_tabletops_episodes_have_questions(changes: dict[str, Any]) -> None:
-    with pytest.raises(BuildError, match="MoveCube/test/0 .*does not list the possible answers"):
+    with raises(BuildError):
         list(make_questions(buffer_set_of(EpisodeId("MoveCube", "test", 0), **changes)))
 
 
 def test_views_of_another_size_are_an_error() -> None:
     wide = np.zeros((240, 320, 3), np.uint8)
-    with pytest.raises(BuildError, match="320×240 pixels; expected 256×256"):
+    with raises(BuildError):
         list(make_questions(buffer_set_of(EpisodeId("MoveCube", "test", 0), view=wide)))
 
 

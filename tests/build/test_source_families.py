@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.goal_texts import GOALS, UNMASK
+from support.messages import raises
 
 from robomme_interference_data.build_dataset.sources.families import (
     ids_by_block,
@@ -69,27 +70,27 @@ HEADER = "episode_index,family"
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    "text",
     [
-        ("", "first line is ''(.|\n)*episode_index,family"),
-        ("episode_index,famly\n0,A\n", "first line is 'episode_index,famly'"),
-        (f"{HEADER}\n0,A\n1\n", "line 3 has 1 values; expected 2"),
-        (f"{HEADER}\n0,A\n-1,A\n", "line 3: episode_index is '-1'"),
-        (f"{HEADER}\n0,A\n{'9' * 5000},A\n", "line 3: episode_index is '999"),
-        (f"{HEADER}\n0,A\n2,A\n", "line 3: the dataset has 2 episodes"),
-        (f"{HEADER}\n0,A\n\n0,B\n", "line 4 is a second line of episode 0"),
-        (f"{HEADER}\n0,A\n", "names 1 of 2 episodes; missing: 1"),
-        (f"{HEADER}\n0,A\n1,9lives\n", "episode 1: '9lives' is not a family name"),
-        (f"{HEADER},split\n0,A,train\n1,A,trian\n", "episode 1: 'trian' is not a split"),
-        (f"{HEADER},index\n0,A,0\n1,A,0\n", "0 and 1 are both named A/train/0"),
-        (f"{HEADER},exec_start_idx\n0,A,-1\n", "line 2: exec_start_idx is '-1'"),
-        (f"{HEADER},exec_start_idx\n0,A,\n", "line 2: exec_start_idx is empty.* or 0 if"),
-        (f"{HEADER}\n0,{'A' * 200_000}\n", "field larger than"),
+        "",
+        "episode_index,famly\n0,A\n",
+        f"{HEADER}\n0,A\n1\n",
+        f"{HEADER}\n0,A\n-1,A\n",
+        f"{HEADER}\n0,A\n{'9' * 5000},A\n",
+        f"{HEADER}\n0,A\n2,A\n",
+        f"{HEADER}\n0,A\n\n0,B\n",
+        f"{HEADER}\n0,A\n",
+        f"{HEADER}\n0,A\n1,9lives\n",
+        f"{HEADER},split\n0,A,train\n1,A,trian\n",
+        f"{HEADER},index\n0,A,0\n1,A,0\n",
+        f"{HEADER},exec_start_idx\n0,A,-1\n",
+        f"{HEADER},exec_start_idx\n0,A,\n",
+        f"{HEADER}\n0,{'A' * 200_000}\n",
     ],
 )
-def test_errors_name_the_line_or_episode(tmp_path: Path, text: str, message: str) -> None:
+def test_errors_name_the_line_or_episode(tmp_path: Path, text: str) -> None:
     path = written(tmp_path, text)
-    with pytest.raises(SourceError, match=message) as caught:
+    with raises(SourceError) as caught:
         ids_by_file(path, 2)
     assert str(path) in caught.value.message
 
@@ -97,7 +98,7 @@ def test_errors_name_the_line_or_episode(tmp_path: Path, text: str, message: str
 def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / "latin.csv").write_bytes("episode_index,famílie\n".encode("latin1"))
     for name in ("none.csv", "latin.csv"):
-        with pytest.raises(SourceError, match=r"\.csv(.|\n)*episode_index,family"):
+        with raises(SourceError):
             ids_by_file(tmp_path / name, 1)
 
 
@@ -122,7 +123,7 @@ def test_columns(rows: list[dict[str, Any]], expected: list[str] | str) -> None:
     if isinstance(expected, list):
         assert names(ids_by_columns(rows, "here")) == dict(enumerate(expected))
         return
-    with pytest.raises(SourceError, match=expected):
+    with raises(SourceError):
         ids_by_columns(rows, "here")
 
 

@@ -11,6 +11,7 @@ import av
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from support.messages import raises
 from support.recordings import (
     Rows,
     check_recording,
@@ -81,7 +82,7 @@ def test_rate_and_names_are_those_that_are_stated(tmp_path: Path) -> None:
     write_table(tmp_path / "video", rows_of(DRAWER, FOUR))
     assert read_one(tmp_path / "video").robot == Robot(10)
     write_table(tmp_path / "video", rows_of(DRAWER, FOUR, fps=15))
-    with pytest.raises(SourceError, match="different frame rates: 10, 15"):
+    with raises(SourceError):
         read_one(tmp_path / "video")
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.damage import flipped_bits
+from support.messages import raises
 from support.recordings import EPISODES, check_recording, write_h5
 
 from robomme_interference_data.build_dataset.sources import Recording, Robot, open_source
@@ -114,7 +115,7 @@ def test_subgoals_of_the_demonstration_are_evidence(path: Path) -> None:
 )
 def test_missing_or_invalid_values(path: Path, place: str, value: Any) -> None:
     put(path, place, value)
-    with pytest.raises(SourceError, match=r"is not a complete RoboMME recording") as raised:
+    with raises(SourceError) as raised:
         list(read(path).frames)
     assert raised.value.message.startswith(str(path))
     assert "Record or download the file again" in str(raised.value.hint)
@@ -123,36 +124,32 @@ def test_missing_or_invalid_values(path: Path, place: str, value: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "message"),
-    [
-        ("timestep_4", None, "episode_0 does not hold consecutive timestep_<T> groups"),
-        ("timestep_8/info/is_video_demo", True, "is_video_demo in .*episode_0 is true in 6 frames"),
-    ],
+    ("place", "value"), [("timestep_4", None), ("timestep_8/info/is_video_demo", True)]
 )
-def test_unusable_recordings(path: Path, place: str, value: Any, message: str) -> None:
+def test_unusable_recordings(path: Path, place: str, value: Any) -> None:
     put(path, place, value)
-    with pytest.raises(SourceError, match=message):
+    with raises(SourceError):
         read(path)
 
 
 @pytest.mark.parametrize("keep", [0, -90])
 def test_files_that_are_not_whole(path: Path, keep: int) -> None:
     path.write_bytes(path.read_bytes()[:keep])
-    with pytest.raises(SourceError, match=r"\.h5 is not a complete RoboMME recording"):
+    with raises(SourceError):
         read(path)
 
 
 def test_nothing_to_read(path: Path) -> None:
     for camera in ("front", "wrist"):
         put(path, f"timestep_0/obs/{camera}_rgb", None)
-    with pytest.raises(SourceError, match="episode_0 has no front_rgb or wrist_rgb"):
+    with raises(SourceError):
         read(path)
     with h5py.File(path, "r+") as file:
         del file["episode_0"]
-    with pytest.raises(SourceError, match="holds no episode_<N> group"):
+    with raises(SourceError):
         read(path)
     path.rename(path.with_stem("other"))
-    with pytest.raises(SourceError, match=r"no record_dataset_<Family>\.h5"):
+    with raises(SourceError):
         read(path.parent)
 
 
@@ -166,11 +163,11 @@ def test_any_flipped_bit_is_one_clear_error_or_none(path: Path) -> None:
 
 def test_no_family_and_no_h5py(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path.rename(path.with_stem("record_dataset_Move Cube"))
-    with pytest.raises(InvalidIdError, match="'Move Cube' is not a family name"):
+    with raises(InvalidIdError):
         read(path.parent)
     monkeypatch.delitem(sys.modules, H5Source.__module__)
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(MissingExtraError, match=r"needs h5py(.|\n)*data\[build\]"):
+    with raises(MissingExtraError):
         read(path.parent)
 
 

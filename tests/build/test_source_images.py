@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from support.messages import raises
 from support.recordings import encode_image, make_episode, write_video
 
 from robomme_interference_data.build_dataset.sources.images import info_is_exact, probe_video
@@ -81,11 +82,6 @@ def test_every_single_changed_byte_of_a_png_is_noticed() -> None:
 def test_invalid_images() -> None:
     deep = io.BytesIO()
     Image.fromarray(np.arange(64, dtype=np.uint16).reshape(8, 8)).save(deep, "PNG")
-    for data, message in (
-        (b"", "none"),
-        (b"GIF89a", "47 49 46"),
-        (encode_image(FRAMES[0])[:40], "is damaged"),
-        (deep.getvalue(), "16 bits a channel"),
-    ):
-        with pytest.raises(FormatError, match=message):
+    for data in (b"", b"GIF89a", encode_image(FRAMES[0])[:40], deep.getvalue()):
+        with raises(FormatError):
             decode_image(data)

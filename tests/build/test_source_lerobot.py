@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 from support.goal_texts import GOALS
 from support.lerobot_layouts import DATA, TABLE, edit_columns, edit_info, write_lerobot
+from support.messages import raises
 from support.recordings import EPISODES, MOVE, PEG, Episode, check_recording, make_episode
 
 from robomme_interference_data.build_dataset.config import BuildConfig
@@ -68,7 +69,7 @@ def test_what_per_episode_columns_say(tmp_path: Path, version: str) -> None:
 def test_a_part_of_a_dataset_can_be_used(v21: Path) -> None:
     (v21 / "data/chunk-000/episode_000001.parquet").unlink()
     check_recording(read(v21), EPISODES[NAME])
-    with pytest.raises(MissingFileError, match=r"episode_000001\.parquet is missing"):
+    with raises(MissingFileError):
         read(v21, 1)
 
 
@@ -88,8 +89,7 @@ def test_1600_episodes_are_named_by_block_and_quickly(tmp_path: Path) -> None:
     assert [episode.id for episode in listed] == sorted(episode.id for episode in listed)
 
     edit_columns(root / TABLE, tasks=[[g] for g in [*goals[:950], PEG, *goals[951:]]])
-    message = f"episode 950 would be MoveCube/train/50, but its goal {PEG!r} .*it fits InsertPeg"
-    with pytest.raises(SourceError, match=message) as caught:
+    with raises(SourceError) as caught:
         open_source(f"lerobot:{root}").episodes()
     assert "`families_file`" in str(caught.value.hint)
     families = [name.split("/")[0] for _, (name, _) in sorted(found.items())]
@@ -104,10 +104,10 @@ def test_1600_episodes_are_named_by_block_and_quickly(tmp_path: Path) -> None:
 
 def test_families_that_are_not_told_or_do_not_fit(tmp_path: Path) -> None:
     root = write_lerobot(tmp_path / "nameless", episode_id=None)
-    with pytest.raises(SourceError, match=r"families of the 3 episodes(.|\n)*`families_file`"):
+    with raises(SourceError):
         read(root)
     root = write_lerobot(tmp_path / "towel", one(make_episode(0, 2, "fold the towel")))
-    with pytest.raises(SourceError, match="it fits no family of RoboMME"):
+    with raises(SourceError):
         read(root)
 
 
@@ -118,7 +118,7 @@ def test_columns_by_other_names(v21: Path) -> None:
     expected = replace(known, images=images, action=known.state)
     check_recording(read(v21, columns=given), expected)
     edit_info(v21, lambda info: [info["features"].pop(one) for one in ("image", "wrist_image")])
-    with pytest.raises(SourceError, match=r"has no camera(.|\n)*front=COLUMN") as raised:
+    with raises(SourceError) as raised:
         read(v21)
     assert "actions, exec_start_idx, is_demo, state" in raised.value.message
 
@@ -135,7 +135,7 @@ def test_another_robot_keeps_its_cameras_rate_names_and_type(tmp_path: Path) -> 
     check_recording(recording, episode)
     top = read(root, columns={"top": "observation.images.front"})
     assert set(next(top.frames).images) == {"top", "left", "right"}
-    with pytest.raises(InvalidOptionError, match="is no camera name"):
+    with raises(InvalidOptionError):
         read(root, columns={"../x": "observation.images.front"})
 
 
@@ -147,11 +147,11 @@ def test_a_given_column_takes_precedence_over_the_one_of_its_name(tmp_path: Path
         seen = next(chosen.frames).images
         np.testing.assert_array_equal(seen[name], episode.images["right"][0])
         assert "right" not in seen
-    with pytest.raises(UnknownNameError, match="'nothing' is not in"):
+    with raises(UnknownNameError):
         read(root, columns={"left": "nothing"})
     copy = {"left": {"dtype": "image", "shape": [48, 64, 3]}}
     edit_info(root, lambda info: info["features"].update(copy))
-    with pytest.raises(SourceError, match=r"are both camera 'left'(.|\n)*NAME=left"):
+    with raises(SourceError):
         read(root)
 
 
@@ -163,7 +163,7 @@ def test_a_families_file_can_mark_the_demonstrations(tmp_path: Path, version: st
     file.write_text("episode_index,family\n0,MoveCube\n")
     named = replace(config, families_file=file)
     assert plan_dataset("distractors", named).episodes
-    with pytest.raises(SourceError, match=r"MoveCube/train/0(.|\n)*is_demo(.|\n)*exec_start_idx"):
+    with raises(SourceError):
         plan_dataset("demonstrations", named)  # before anything is read
     file.write_text("episode_index,family,exec_start_idx\n0,MoveCube,3\n")
     assert plan_dataset("demonstrations", named).episodes
@@ -172,18 +172,18 @@ def test_a_families_file_can_mark_the_demonstrations(tmp_path: Path, version: st
 
 
 @pytest.mark.parametrize(
-    ("columns", "error", "message"),
+    ("columns", "error"),
     [
-        ({"is_dem": "is_demo"}, SourceError, "'is_dem' needs images(.|\n)*'is_demo'"),
-        ({"front": "imge"}, UnknownNameError, "'imge' is not in(.|\n)*'image'"),
-        ({"front": "state"}, SourceError, "'state' holds float32 .*'front' needs images"),
-        ({"wrist": "depth"}, SourceError, r"of the shape \(48, 64, 1\).*three channels"),
+        ({"is_dem": "is_demo"}, SourceError),
+        ({"front": "imge"}, UnknownNameError),
+        ({"front": "state"}, SourceError),
+        ({"wrist": "depth"}, SourceError),
     ],
 )
-def test_columns_that_do_not_fit(v21: Path, columns: Any, error: Any, message: str) -> None:
+def test_columns_that_do_not_fit(v21: Path, columns: Any, error: Any) -> None:
     depth = {"dtype": "image", "shape": [48, 64, 1]}
     edit_info(v21, lambda info: info["features"].update(depth=depth))
-    with pytest.raises(error, match=message):
+    with raises(error):
         read(v21, columns=columns)
 
 
@@ -206,7 +206,7 @@ def test_marks(tmp_path: Path, columns: Any, lesson: int | str) -> None:
         shown = [frame.is_demonstration for frame in read(root).frames]
         assert shown == [step < lesson for step in range(4)]
         return
-    with pytest.raises((SourceError, FormatError), match=lesson):
+    with raises((SourceError, FormatError)):
         read(root)
 
 
@@ -224,7 +224,7 @@ def test_subgoals_of_the_demonstration_are_evidence(tmp_path: Path, column: str)
     )
     edit_columns(root / DATA, **{column: None})
     edit_columns(root / DATA, **{column: [1] * 6})
-    with pytest.raises(FormatError, match=r"is of type int64; expected texts"):
+    with raises(FormatError):
         read(root)
 
 
@@ -233,7 +233,7 @@ def test_evidence_of_this_projects_datasets_goes_before_subgoals(tmp_path: Path)
     root = write_lerobot(tmp_path, one(), evidence=[spans])
     assert read(root).evidence == (EvidenceSpan(0, "hooks it", 0, 2),)
     other = write_lerobot(tmp_path / "other", one(), evidence=[[spans[0] | {"stop": 0}]])
-    with pytest.raises(FormatError, match="evidence of part 0"):
+    with raises(FormatError):
         read(other)
 
 
@@ -266,5 +266,5 @@ def test_images_that_are_wrong(tmp_path: Path) -> None:
     edit_columns(root / DATA, **{column: wrong})
     frames = read(root).frames
     assert [next(frames).is_demonstration for _ in range(2)] == [True, True]  # read one by one
-    with pytest.raises(FormatError, match="frame 2 of .* image is damaged"):
+    with raises(FormatError):
         next(frames)

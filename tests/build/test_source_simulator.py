@@ -4,6 +4,7 @@ import pickle
 from typing import Any
 
 import pytest
+from support.messages import raises
 from support.simulator_doubles import Double
 
 from robomme_interference_data.build_dataset.dataset.frame_selection import (
@@ -97,7 +98,7 @@ def test_the_tabletop_under_shifts(made: list[Double]) -> None:
         (False, None, *[10.0] * 8)
     }
     for other in ("robomme", "sample"):
-        with pytest.raises(InvalidOptionError, match=f"{other} cannot show"):
+        with raises(InvalidOptionError):
             open_source(other, shifted=True)
 
 
@@ -115,7 +116,7 @@ def test_one_simulator_is_kept_for_the_same_cameras(made: list[Double]) -> None:
     assert made[1].closed
     list(read(copy, ("front",)).frames)
     assert len(made) == 3
-    with pytest.raises(InvalidOptionError, match="'top' is none of front, wrist"):
+    with raises(InvalidOptionError):
         read(copy, ("top",))
 
 
@@ -146,9 +147,9 @@ def test_a_simulator_of_ones_own_is_a_source(name: str) -> None:
     assert [sorted(frame.images) for frame in frames] == [["top"]] * 8
     copy = pickle.loads(pickle.dumps(source))
     assert [one.images for one in copy.read(source.episodes()[0], ()).frames] == [{}] * 8
-    with pytest.raises(InvalidOptionError, match="'front' is none of top"):
+    with raises(InvalidOptionError):
         source.read(source.episodes()[0], ("front",))
-    with pytest.raises(InvalidOptionError, match="cannot show its episodes under shifts"):
+    with raises(InvalidOptionError):
         open_source(OWN + name, shifted=True)
 
 

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.lerobot_layouts import write_lerobot
+from support.messages import raises
 from support.recordings import (
     EPISODES,
     SEEDS,
@@ -76,7 +77,7 @@ def test_only_the_cameras_asked_for_are_read(source: Source) -> None:
     episode = source.episodes()[0]
     frames = list(source.read(episode, ("wrist",)).frames)
     assert [list(frame.images) for frame in frames] == [["wrist"]] * 12
-    with pytest.raises(InvalidOptionError, match="'wirst' is none of front, wrist.*\n.*'wrist'"):
+    with raises(InvalidOptionError):
         source.read(episode, ("front", "wirst"))
 
 
@@ -102,7 +103,7 @@ def test_files_that_are_gone_since_they_were_listed(source: Source, tmp_path: Pa
     episode = source.episodes()[0]
     for path in recorded(tmp_path):
         path.unlink()
-    with pytest.raises((SourceError, MissingFileError), match=r"made|changed"):
+    with raises((SourceError, MissingFileError)):
         list(source.read(episode, None).frames)
 
 
@@ -142,7 +143,7 @@ def test_a_folder_without_the_kind_of_its_content(source: Source, tmp_path: Path
     with pytest.raises(InvalidOptionError) as caught:
         open_source(text)
     assert caught.value.hint == f"Write {source.provenance['kind']}:{text}"
-    with pytest.raises(UnknownNameError, match="there is no source"):
+    with raises(UnknownNameError):
         open_source(str(tmp_path))
 
 
@@ -162,17 +163,12 @@ def test_a_demonstration_comes_first_and_in_one_piece(lesson: int, rest: int) ->
 
 
 @pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"goals": ()}, "the goal is missing"),
-        ({"goals": ("do it", " ")}, "the goal is 'do it' and ' '"),
-        ({"difficulty": "esy"}, "'esy'; expected one of easy, medium, hard.*\n.*'easy'"),
-    ],
+    "values", [{"goals": ()}, {"goals": ("do it", " ")}, {"difficulty": "esy"}]
 )
-def test_recordings_check_themselves(values: dict[str, Any], message: str) -> None:
+def test_recordings_check_themselves(values: dict[str, Any]) -> None:
     known = {"goals": ("do it",), "seed": None, "difficulty": None, "simulator": None}
     frames = compose({}, np.zeros((0, 1), np.float32), None, None)
-    with pytest.raises(SourceError, match=message):
+    with raises(SourceError):
         Recording(**(known | values), exact=True, frames=frames)
 
 

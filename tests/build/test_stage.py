@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from support.made_up import MadeUpSource, picture
+from support.messages import raises
 
 from robomme_interference_data.build_dataset.dataset import stage
 from robomme_interference_data.build_dataset.dataset.frame_selection import (
@@ -150,20 +151,18 @@ def wrong_frame(**changes: Any) -> Frame:
 
 
 @pytest.mark.parametrize(
-    ("number", "frame", "message"),
+    ("number", "frame"),
     [
-        (3, wrong_frame(state=np.full(8, np.nan, np.float32)), r"state of stored frame 3 is \[nan"),
-        (3, wrong_frame(state=np.zeros(7, np.float32)), "All frames of an episode"),
-        (3, wrong_frame(images={"front": picture("x", 1)[:8]}), "All frames of an episode"),
-        (0, wrong_frame(images={"front": picture("x", 1)[..., 0]}), r"expected \(H, W, 3\) uint8"),
-        (3, SourceError("broke off", "record it again"), "MoveCube/test/0: broke off"),
+        (3, wrong_frame(state=np.full(8, np.nan, np.float32))),
+        (3, wrong_frame(state=np.zeros(7, np.float32))),
+        (3, wrong_frame(images={"front": picture("x", 1)[:8]})),
+        (0, wrong_frame(images={"front": picture("x", 1)[..., 0]})),
+        (3, SourceError("broke off", "record it again")),
     ],
 )
-def test_frames_that_cannot_be_stored(
-    tmp_path: Path, number: int, frame: Any, message: str
-) -> None:
+def test_frames_that_cannot_be_stored(tmp_path: Path, number: int, frame: Any) -> None:
     source = MadeUpSource({NAME: (40, 20)}, {NAME: {number: frame}})
-    with pytest.raises(SourceError, match=message) as caught:
+    with raises(SourceError) as caught:
         staged(tmp_path, source)
     assert caught.value.message.startswith(f"{NAME}: ")
     assert list(tmp_path.iterdir()) == []  # nothing half-made
@@ -177,7 +176,7 @@ def test_a_video_that_decodes_to_something_else(
             yield image if number != 7 else 255 - image
 
     monkeypatch.setattr(stage, "iter_frames", other)
-    with pytest.raises(BuildError, match="does not decode to the frames"):
+    with raises(BuildError):
         staged(tmp_path, MadeUpSource({NAME: (40, 20)}))
     assert list(tmp_path.iterdir()) == []
 
@@ -235,15 +234,11 @@ def test_nothing_is_read_beyond_the_last_frame_that_is_needed(
 
 
 @pytest.mark.parametrize(
-    ("select", "lesson", "length", "reason"),
-    [
-        (SELECT_UNIT, None, 248, "248 raw frames; a unit needs 249"),
-        (select_demonstration, 0, 100, "no demonstration frame"),
-        (select_demonstration, 100, 100, "no live observation after the demonstration"),
-    ],
+    ("select", "lesson", "length"),
+    [(SELECT_UNIT, None, 248), (select_demonstration, 0, 100), (select_demonstration, 100, 100)],
 )
-def test_nothing_to_store(select: Any, lesson: int | None, length: int, reason: str) -> None:
-    with pytest.raises(NothingToStore, match=reason):
+def test_nothing_to_store(select: Any, lesson: int | None, length: int) -> None:
+    with raises(NothingToStore):
         list(select(marks(lesson, length)))
-    with pytest.raises(SourceError, match=r"does not mark(.|\n)*can be built without"):
+    with raises(SourceError):
         list(select_demonstration(marks(None, 10)))

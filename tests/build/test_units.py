@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from support.buffer_sets import violations
 from support.made_up import MadeUpSource
+from support.messages import raises
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.config import BuildConfig
@@ -53,7 +54,7 @@ def test_a_unit_is_of_the_chosen_frames() -> None:
     assert steps(RAW_DISTRACTORS, 50) == [*range(12)]
     assert steps(DISTRACTORS, 3, Unit(1, 8)) == [0]
     for kind in (DISTRACTORS, RAW_DISTRACTORS):
-        with pytest.raises(NothingToStore, match="9 raw frames; a unit needs 10"):
+        with raises(NothingToStore):
             steps(kind, 9)
 
 
@@ -70,9 +71,9 @@ def test_a_buffer_set_of_short_units(tmp_path: Path) -> None:
         build(tmp_path, kind, lengths)
     build(tmp_path, RAW_DISTRACTORS, TRAIN, Unit(4, 2))
     conditions = ("k0", "k1", "held-k1", "raw-k1")
-    with pytest.raises(SourceError, match="8 frames at stride 1, .* 4 frames at stride 3"):
+    with raises(SourceError):
         plan_manifests(datasets_in(tmp_path), conditions)
-    with pytest.raises(BuildError, match="exists with units of 8 frames at stride 1, not of 12 "):
+    with raises(BuildError):
         build(tmp_path, RAW_DISTRACTORS, TRAIN)
     (tmp_path / RAW_DISTRACTORS).rename(tmp_path.with_name("other"))
     build(tmp_path, RAW_DISTRACTORS, TRAIN)
@@ -93,7 +94,7 @@ def test_a_buffer_set_of_short_units(tmp_path: Path) -> None:
 
 
 def test_only_short_episodes_are_an_error_that_names_the_options(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match="11 raw frames; a unit needs 249") as caught:
+    with raises(SourceError) as caught:
         build(tmp_path, DISTRACTORS, TRAIN, Unit(32, 8))
     assert "`unit`" in str(caught.value.hint)
     assert not (tmp_path / DISTRACTORS).exists()

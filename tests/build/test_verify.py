@@ -19,6 +19,7 @@ import pytest
 from numpy.typing import NDArray
 from support.buffer_sets import GOLDEN, QUERIES, UNITS, plan_again, renew_sums, violations
 from support.damage import HEADER, ROWS, edit, flipped_bits, put, renew_header
+from support.messages import raises
 from support.mutations import Place, mutate, renew
 from support.retrieval import QUIET, TwoSums, make_index
 from support.tabletop import TABLETOP, copy_tabletop
@@ -283,7 +284,7 @@ def test_a_dataset_that_is_gone(own_buffers: Path) -> None:
     shutil.rmtree(own_buffers / "distractors")
     expect(own_buffers, "distractors: .*missing")
     shutil.rmtree(own_buffers / "manifests")
-    with pytest.raises(MissingFileError, match="is not a buffer set"):
+    with raises(MissingFileError):
         violations(own_buffers)
 
 
@@ -354,7 +355,7 @@ def test_questions_that_are_not_listed(tmp_path: Path) -> None:
     header = json.loads((root / HEADER).read_text())
     (root / HEADER).write_text(json.dumps(header | {"questions": None}))
     expect(root, r"questions\.parquet: is not listed in manifests/manifest\.json")
-    with pytest.raises(FormatError, match="does not have the SHA-256 in manifests"):
+    with raises(FormatError):
         read_questions(load_buffer_set(root))
     (root / QUESTIONS_PATH).unlink()
     assert violations(root, decode=False) == []
@@ -406,7 +407,7 @@ def test_what_describes_the_content_is_in_the_revision(
     renew(own_buffers, path)
     expect(own_buffers, r"interference\.json: revision is .*; the episodes give")
     name = path.split("/", maxsplit=1)[0]
-    with pytest.raises(HashMismatchError, match="not those of its revision"):
+    with raises(HashMismatchError):
         load_buffer_set(own_buffers).load("MoveCube/test/0", "k1", verify=True)
     assert name in {"demonstrations", "distractors"}
 
@@ -456,7 +457,7 @@ def test_a_dataset_that_is_a_link_out_of_the_buffer_set(own_buffers: Path, name:
     (own_buffers / name).rename(outside)
     (own_buffers / name).symlink_to(outside)
     expect(own_buffers, f"{name}: .* is a link that leads out of the buffer set")
-    with pytest.raises(FormatError, match="is a link that leads out of the buffer set"):
+    with raises(FormatError):
         load_buffer_set(own_buffers).load("MoveCube/test/0", "k1")
     (own_buffers / name).unlink()
     (own_buffers / name).symlink_to(outside.rename(own_buffers / "inside"))

@@ -20,6 +20,7 @@ import msgpack
 import numpy as np
 import pytest
 from support.lazy import lazy
+from support.messages import raises
 from support.policy_calls import client, info, observation, rollout, section
 from support.policy_server import PolicyServer
 from support.worlds import BUFFER_SET
@@ -74,7 +75,7 @@ def test_a_silent_port_is_reported_soon_and_times_out(
     with listening() as port:
         policy = WebsocketPolicy("127.0.0.1", port, connect_s=0.6)
         began = time.monotonic()
-        with pytest.raises(PolicyServerError, match="it does not answer"):
+        with raises(PolicyServerError):
             policy.metadata()
         assert 0.5 < time.monotonic() - began < 60
     assert len(caplog.messages) == 1
@@ -82,18 +83,18 @@ def test_a_silent_port_is_reported_soon_and_times_out(
 
 
 @pytest.mark.parametrize(
-    ("status", "words"),
+    "status",
     [
-        (HTTPStatus.SERVICE_UNAVAILABLE, r"it answers 503 \(for 0\.5 s\)"),  # after retries
-        (HTTPStatus.NOT_FOUND, r"is no policy server.* websocket.* 404"),
+        HTTPStatus.SERVICE_UNAVAILABLE,  # after retries
+        HTTPStatus.NOT_FOUND,
     ],
 )
 def test_a_server_that_is_not_ready_or_no_policy_server(
-    server: PolicyServer, status: HTTPStatus, words: str
+    server: PolicyServer, status: HTTPStatus
 ) -> None:
     server.status = status
     with client(server, connect_s=0.5) as policy:
-        with pytest.raises(PolicyServerError, match=words):
+        with raises(PolicyServerError):
             policy.reset(info(0))
         server.status = None
         rollout(policy, 0, [], [])
@@ -103,7 +104,7 @@ def test_the_key_is_sent(server: PolicyServer, monkeypatch: pytest.MonkeyPatch) 
     server.api_key = "abc"
     monkeypatch.delenv(API_KEY_VARIABLE, raising=False)
     with client(server) as policy:
-        with pytest.raises(PolicyServerError, match="answers 401") as raised:
+        with raises(PolicyServerError) as raised:
             policy.reset(info(0))
         assert API_KEY_VARIABLE in (raised.value.hint or "")
         monkeypatch.setenv(API_KEY_VARIABLE, "abc")
@@ -113,7 +114,7 @@ def test_the_key_is_sent(server: PolicyServer, monkeypatch: pytest.MonkeyPatch) 
 def test_a_server_that_sends_no_metadata() -> None:
     with handling(lambda opened: opened.recv()) as port:
         policy = WebsocketPolicy("127.0.0.1", port, connect_s=0.5)
-        with pytest.raises(PolicyServerError, match="did not answer within"):
+        with raises(PolicyServerError):
             policy.reset(info(0))
 
 
@@ -126,7 +127,7 @@ def test_the_next_reset_connects_to_a_restarted_server() -> None:
         policy = WebsocketPolicy("127.0.0.1", server.port)
         rollout(policy, 2, [2], [16])
         policy.observe(*section(0, 4))
-    with pytest.raises(PolicyServerError, match="closed the connection"):
+    with raises(PolicyServerError):
         policy.act(observation(3), "pick")  # never in the middle of a rollout
     with server.running():
         rollout(policy, 2, [2], [])
@@ -138,7 +139,7 @@ def test_a_server_that_hangs_times_out(server: PolicyServer) -> None:
     resume = threading.Event()
     server.before = lambda message: resume.wait(30) and None if "prompt" in message else None
     with client(server, response_s=0.3) as policy:
-        with pytest.raises(PolicyServerError, match=r"did not answer within 0\.3 s"):
+        with raises(PolicyServerError):
             rollout(policy, 0, [], [])
         resume.set()
 
@@ -158,7 +159,7 @@ def test_a_server_that_does_not_read_times_out() -> None:
         policy.reset(info(2000))
         frames = {"front": np.zeros((2000, 64, 64, 3), np.uint8)}
         policy.add_history(frames, np.zeros((2000, 8), np.float32), 2000)
-        with pytest.raises(PolicyServerError, match=r"did not answer within 0\.5 s"):
+        with raises(PolicyServerError):
             policy.observe({"front": frames["front"][:1]}, np.zeros((1, 8), np.float32))
         stop.set()
         policy.close()
@@ -214,11 +215,11 @@ def test_an_answer_that_is_slow_or_endless_is_an_error(monkeypatch: pytest.Monke
 
     with handling(handle) as port:
         policy = WebsocketPolicy("127.0.0.1", port, response_s=0.4)
-        with pytest.raises(PolicyServerError, match=r"did not answer within 0\.4 s"):
+        with raises(PolicyServerError):
             policy.reset(info(0))
         monkeypatch.setattr(connection, "MAX_BYTES", 5000)
         policy = WebsocketPolicy("127.0.0.1", port, response_s=20)
-        with pytest.raises(PolicyServerError, match="1009"):
+        with raises(PolicyServerError):
             policy.reset(info(0))
         stop.set()
 
@@ -340,10 +341,7 @@ def test_reading_counts_into_the_time_limit(
         return unpack(data, **options)
 
     monkeypatch.setattr(wire.msgpack, "unpackb", slowly)
-    with (
-        client(server, response_s=0.2) as policy,
-        pytest.raises(PolicyServerError, match=r"did not answer within 0\.2 s"),
-    ):
+    with client(server, response_s=0.2) as policy, raises(PolicyServerError):
         rollout(policy, 0, [], [])
 
 

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from support.messages import raises
 
 from robomme_interference_data.errors import PolicyError, UnknownNameError
 from robomme_interference_data.evaluate.policies.builtin import (
@@ -48,7 +49,7 @@ def test_the_frames_that_a_memory_keeps() -> None:
     # numpy truncates linspace(0, 310, 32) to 0, 10, …, 310; the last one is the live frame.
     assert list(Memory("framesamp").earlier(310)) == list(range(0, 310, 10))
     assert Memory("window", 3).kept([5, 6, 8, 9]) == [8, 9]  # two, and the live one
-    with pytest.raises(UnknownNameError, match="Did you mean 'window'"):
+    with raises(UnknownNameError):
         ReplayPolicy("windw")
 
 
@@ -170,7 +171,7 @@ def test_replay_continues_over_calls_then_holds_until_a_reset() -> None:
 def test_noop_holds_and_a_privileged_policy_needs_the_simulator() -> None:
     held = Noop().act(seen(0, 0.2, 0.0), "goal")
     np.testing.assert_array_equal(held, np.tile([*[np.float32(0.2)] * 7, 1], (16, 1)))
-    with pytest.raises(PolicyError, match="needs the simulator"):
+    with raises(PolicyError):
         Privileged("oracle").act(seen(0, 0.0), "goal")
 
 
@@ -208,9 +209,9 @@ def test_recall_knows_the_evidence_that_its_memory_keeps(
 
 
 def test_recall_needs_evidence() -> None:
-    with pytest.raises(PolicyError, match="unknown"):
+    with raises(PolicyError):
         Recall().reset(RolloutInfo("goal", 0, 0, Recorder(), None))  # type: ignore[arg-type]
-    with pytest.raises(UnknownNameError, match="framesamp"):
+    with raises(UnknownNameError):
         Recall("framesmap")
 
 

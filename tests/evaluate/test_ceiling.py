@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from support.buffer_sets import copy_buffer_set
 from support.made_up import record
+from support.messages import raises
 from support.retrieval import make_index
 from support.shifted import add_shifted
 from support.tabletop import TABLETOP
@@ -66,25 +67,25 @@ def test_retrieval_under_a_shift(tmp_path: Path) -> None:
         kept(buffer_set, shift=s, **options) for s in ("none", "light:1", "clutter:3")
     )
     assert plain == same != black  # light:1 looks as always, clutter:3 is black
-    with pytest.raises(InvalidOptionError, match="the shift light:1 has no effect"):
+    with raises(InvalidOptionError):
         ceiling(load_buffer_set(buffer_set), CeilingConfig(shift="light:1"))
 
 
 def test_invalid_settings_are_errors(tiny_buffers: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     buffer_set = load_buffer_set(tiny_buffers)
-    with pytest.raises(UnknownNameError, match=r"'framesmap'(.|\n)*framesamp"):
+    with raises(UnknownNameError):
         ceiling(buffer_set, CeilingConfig("framesmap"))
-    with pytest.raises(InvalidOptionError, match="frames"):
+    with raises(InvalidOptionError):
         ceiling(buffer_set, CeilingConfig(frames=0))
-    with pytest.raises(UnknownNameError, match="k9"):
+    with raises(UnknownNameError):
         ceiling(buffer_set, CeilingConfig(conditions=("k9",)))
-    with pytest.raises(InvalidOptionError, match="`retrieval_rule` has no effect"):
+    with raises(InvalidOptionError):
         ceiling(buffer_set, CeilingConfig(retrieval_rule="last"))
-    with pytest.raises(InvalidOptionError, match="nothing to retrieve from under no-history"):
+    with raises(InvalidOptionError):
         ceiling(buffer_set, CeilingConfig(retrieval="thumbnail", conditions=("no-history", "k0")))
     unknown = SimpleNamespace(record=SimpleNamespace(evidence=None))
     monkeypatch.setattr(BufferSet, "query", lambda *_: unknown)
-    with pytest.raises(InvalidOptionError, match="that show the answer are unknown"):
+    with raises(InvalidOptionError):
         ceiling(buffer_set, CeilingConfig())
 
 

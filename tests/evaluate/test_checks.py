@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from support.buffer_sets import QUERIES, copy_buffer_set
+from support.messages import raises
 from support.retrieval import QUIET, make_index
 from support.runs import CHEAT, config, run, run_one
 from support.worlds import World
@@ -92,7 +93,7 @@ def test_every_condition_needs_its_embeddings(tmp_path: Path) -> None:
     sum(write_manifests(plan_manifests(datasets_in(buffer_set), ("k0", "stale-k0")), buffer_set))
     make_index(buffer_set)
     settings = STEP | {"buffer_set": buffer_set, "families": ("MoveCube",)}
-    with pytest.raises(MissingFileError, match=f"{CONTRADICTIONS} has no embeddings"):
+    with raises(MissingFileError):
         run(tmp_path / "run", **settings, conditions=("k0", "stale-k0"))
     assert not (tmp_path / "run").exists()
     assert run(tmp_path / "run", **settings, conditions=("k0",)).counts["error"] == 0
@@ -100,7 +101,7 @@ def test_every_condition_needs_its_embeddings(tmp_path: Path) -> None:
 
 def test_videos_need_pillow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "PIL", None)
-    with pytest.raises(MissingExtraError, match="`videos` needs pillow"):
+    with raises(MissingExtraError):
         run_one(tmp_path / "run", videos=True)
     assert not (tmp_path / "run").exists()
 
@@ -113,7 +114,7 @@ def test_conditions_beyond_a_systems_positions_are_errors(
     limited = {"system": "perceptual-framesamp-modul"}
     run(tmp_path / "run", conditions=("k0", "k3"), **limited)  # 48 + 3 · 32
     for conditions in (("k3", "k7"), ()):
-        with pytest.raises(InvalidOptionError, match="a history of 272 frames under k7\n"):
+        with raises(InvalidOptionError):
             run(tmp_path / "run", conditions=conditions, **limited)
 
 
@@ -126,7 +127,7 @@ def test_the_default_is_all_conditions_that_apply(tmp_path: Path) -> None:
     assert conditions("baseline", system="pi05_baseline") == ["no-history"]
     still = "python:support.own_policies:Still"  # takes no history
     assert conditions("still", policy=still) == ["no-history"]
-    with pytest.raises(InvalidOptionError, match="takes no history, so k0 has no effect"):
+    with raises(InvalidOptionError):
         run_one(tmp_path / "k0", policy=still, conditions=("k0",))
 
 
@@ -183,7 +184,7 @@ def test_recall_needs_evidence(tiny_buffers: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(buffer_set, "query", lambda _: unknown)
     settings = config(policy="recall:window")
     plan = plan_work(buffer_set.episode_ids, conditions=("k0",))
-    with pytest.raises(InvalidOptionError, match=r"MoveCube/test/0|VideoRepick/test/0") as raised:
+    with raises(InvalidOptionError) as raised:
         check_plan(settings, name_system("recall-window"), buffer_set, plan, plan.items())
     assert "reference/sources" in (raised.value.hint or "")
 
@@ -222,7 +223,7 @@ def test_the_default_name_states_the_policy_and_the_retrieval_step(
     settings: dict[str, Any] = {"policy": "replay:window"} | changes
     assert default_system(config(**settings)) == name
     check_name(tiny_buffers, name, **settings)
-    with pytest.raises(InvalidOptionError, match="is not the control"):
+    with raises(InvalidOptionError):
         check_name(tiny_buffers, other, **settings)
     assert default_system(config(policy="python:my.module:make")) == "my.module-make"
 
@@ -247,7 +248,7 @@ def test_a_name_of_the_table_needs_its_policy(
     if words is None:
         check_name(tiny_buffers, system, policy=policy)
         return
-    with pytest.raises(InvalidOptionError, match=words) as raised:
+    with raises(InvalidOptionError) as raised:
         check_name(tiny_buffers, system, policy=policy)
     assert raised.value.hint is not None and "name of your own" in raised.value.hint
 
@@ -255,7 +256,7 @@ def test_a_name_of_the_table_needs_its_policy(
 def test_the_papers_retrieval_system_chooses_by_max(tiny_buffers: Path) -> None:
     served = {"policy": "websocket://h:1", "retrieval": "siglip"}
     check_name(tiny_buffers, "retrieval-framesamp-modul", **served)
-    with pytest.raises(InvalidOptionError, match="the rule max, not last"):
+    with raises(InvalidOptionError):
         check_name(tiny_buffers, "retrieval-framesamp-modul", retrieval_rule="last/0.9", **served)
-    with pytest.raises(InvalidOptionError, match="no retrieval step, and `retrieval` is siglip"):
+    with raises(InvalidOptionError):
         check_name(tiny_buffers, "perceptual-framesamp-modul", **served)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.lazy import lazy
+from support.messages import raises
 
 from robomme_interference_data.constants import ACTION, FRONT, STATE, WRIST
 from robomme_interference_data.errors import (
@@ -260,15 +261,15 @@ def test_renamed_observations_fit(tmp_path: Path) -> None:
 def test_missing_files_and_devices_are_errors(act: Path, vqbet: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(act, tmp_path / "policy")
     shutil.copy(vqbet / "model.safetensors", folder / "model.safetensors")  # of another model
-    with pytest.raises(PolicyError, match="LeRobot cannot load the policy"):
+    with raises(PolicyError):
         made(folder).reset(RolloutInfo("x", 0, 0))
     for name in ("policy_postprocessor.json", "model.safetensors"):
         (folder / name).unlink()
-        with pytest.raises(MissingFileError, match=f"{name}.* missing in"):
+        with raises(MissingFileError):
             made(folder)
-    with pytest.raises(InvalidOptionError, match="neither a folder nor a model repository"):
+    with raises(InvalidOptionError):
         made(tmp_path / "none")
-    with pytest.raises(HubError, match="not in the cache"):
+    with raises(HubError):
         lerobot.LeRobotPolicy("nobody/nothing")
     for device in ("cuda:99", "tpu", "cuda:x"):
         with pytest.raises(InvalidOptionError):

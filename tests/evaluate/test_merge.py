@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+from support.messages import raises
 from support.runs import header, run, run_one, untimed
 
 from robomme_interference_data.errors import FormatError, RunError
@@ -91,7 +92,7 @@ def test_videos_are_copied(tmp_path: Path) -> None:
     assert here.read_bytes() == there.read_bytes()
     here.unlink()
     here.symlink_to(__file__)
-    with pytest.raises(FormatError, match="link that leads out"):
+    with raises(FormatError):
         merge_runs([tmp_path / "a"], tmp_path / "other")
     assert not (tmp_path / "other").exists()
 
@@ -99,14 +100,14 @@ def test_videos_are_copied(tmp_path: Path) -> None:
 def test_other_runs_and_existing_folders_are_errors(tmp_path: Path) -> None:
     run_one(tmp_path / "a")
     run_one(tmp_path / "b", model_seed=1)
-    with pytest.raises(RunError, match=r"b holds another run: model_seed is 1 there, 0 here"):
+    with raises(RunError):
         merge_runs([tmp_path / "a", tmp_path / "b"], tmp_path / "merged")
-    with pytest.raises(RunError, match="b already exists"):
+    with raises(RunError):
         merge_runs([tmp_path / "a"], tmp_path / "b")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(RunError, match=r"empty holds no run: run\.json is missing"):
+    with raises(RunError):
         merge_runs([tmp_path / "a", tmp_path / "empty"], tmp_path / "merged")
     (tmp_path / "a" / "rollouts.jsonl").write_text("{}\n")
-    with pytest.raises(FormatError, match="line 1 is no row"):
+    with raises(FormatError):
         merge_runs([tmp_path / "a"], tmp_path / "merged")
     assert not (tmp_path / "merged").exists()

@@ -28,6 +28,7 @@ from support.chat_server import (
     UNCOUNTED,
     ChatServer,
 )
+from support.messages import raises
 
 from robomme_interference_data.errors import InvalidOptionError, ModelError
 from robomme_interference_data.evaluate.language import bounded_http
@@ -114,15 +115,10 @@ def test_temporary_failures_are_retried(server: ChatServer, fault: str) -> None:
     assert len(server.seen) == 3
 
 
-@pytest.mark.parametrize(
-    ("fault", "words"),
-    [(BROKEN, "answers 500"), (EMPTY, "without a chat completion"), (CLOSED, "cannot be reached")],
-)
-def test_a_failure_after_all_retries_is_one_error(
-    server: ChatServer, fault: str, words: str
-) -> None:
+@pytest.mark.parametrize("fault", [BROKEN, EMPTY, CLOSED])
+def test_a_failure_after_all_retries_is_one_error(server: ChatServer, fault: str) -> None:
     server.faults = [fault] * 9
-    with pytest.raises(ModelError, match=words):
+    with raises(ModelError):
         model_of(server, "repeats=2").reply(ASKED)
     assert len(server.seen) == 3
 
@@ -131,7 +127,7 @@ def test_a_failure_after_all_retries_is_one_error(
 def test_no_whole_answer_in_time(server: ChatServer, fault: str) -> None:
     server.faults = [fault] * 2
     began = time.monotonic()
-    with pytest.raises(ModelError, match="no answer in time"):
+    with raises(ModelError):
         model_of(server, "repeats=1", "response_s=0.05", "connect_s=0.1").reply(ASKED)
     assert len(server.seen) == 2
     assert time.monotonic() - began < 60
@@ -140,7 +136,7 @@ def test_no_whole_answer_in_time(server: ChatServer, fault: str) -> None:
 def test_an_answer_without_end(server: ChatServer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bounded_http, "MAX_BYTES", 1 << 20)
     server.faults = [ENDLESS] * 2
-    with pytest.raises(ModelError, match="more than 1048576 bytes"):
+    with raises(ModelError):
         model_of(server, "repeats=1").reply(ASKED)
     assert model_of(server).reply(ASKED).text == "1 images"
 
@@ -160,14 +156,11 @@ def test_a_refusal_is_an_empty_answer_and_tokens_may_be_unknown(server: ChatServ
 
 
 @pytest.mark.parametrize(
-    ("fault", "words", "next_step"),
-    [(BUSY_FOR_AN_HOUR, "answers 429", "resume"), (LOCKED, "answers 401", "OPENAI_API_KEY")],
+    ("fault", "next_step"), [(BUSY_FOR_AN_HOUR, "resume"), (LOCKED, "OPENAI_API_KEY")]
 )
-def test_failures_that_no_retry_solves(
-    server: ChatServer, fault: str, words: str, next_step: str
-) -> None:
+def test_failures_that_no_retry_solves(server: ChatServer, fault: str, next_step: str) -> None:
     server.faults = [fault]
-    with pytest.raises(ModelError, match=words) as raised:
+    with raises(ModelError) as raised:
         model_of(server).reply(ASKED)
     assert next_step in str(raised.value.hint)
     assert len(server.seen) == 1
@@ -178,7 +171,7 @@ def test_an_invalid_key_is_an_error_that_does_not_show_it(
     server: ChatServer, key: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("OPENAI_API_KEY", key)
-    with pytest.raises(InvalidOptionError, match="OPENAI_API_KEY") as raised:
+    with raises(InvalidOptionError) as raised:
         model_of(server)
     assert key not in str(raised.value)
 
@@ -186,7 +179,7 @@ def test_an_invalid_key_is_an_error_that_does_not_show_it(
 def test_a_missing_model_is_an_error_that_lists_those_served(server: ChatServer) -> None:
     model = model_of(server, name="small")
     for call in (model.metadata, lambda: model.reply(ASKED)):
-        with pytest.raises(ModelError, match="serves no model 'small'") as raised:
+        with raises(ModelError) as raised:
             call()
         assert "tiny" in str(raised.value.hint)
     assert len(server.seen) == 1
@@ -195,7 +188,7 @@ def test_a_missing_model_is_an_error_that_lists_those_served(server: ChatServer)
 
 def test_a_list_of_models_that_cannot_be_read(server: ChatServer) -> None:
     server.faults = [DEEP]
-    with pytest.raises(ModelError, match="does not list its models"):
+    with raises(ModelError):
         model_of(server).metadata()
 
 
@@ -203,7 +196,7 @@ def test_no_server_listens() -> None:
     with ChatServer() as server:
         model = model_of(server, "repeats=1")
     for call in (model.metadata, lambda: model.reply(ASKED)):
-        with pytest.raises(ModelError, match="cannot be reached"):
+        with raises(ModelError):
             call()
 
 
@@ -219,7 +212,7 @@ def test_no_server_listens() -> None:
     ],
 )
 def test_invalid_names_are_errors(text: str) -> None:
-    with pytest.raises(InvalidOptionError, match="expected"):
+    with raises(InvalidOptionError):
         MODELS.parse(text)
 
 
@@ -231,7 +224,7 @@ def test_invalid_names_are_errors(text: str) -> None:
     ],
 )
 def test_options_out_of_range(server: ChatServer, option: str) -> None:
-    with pytest.raises(InvalidOptionError, match=option.partition("=")[0]):
+    with raises(InvalidOptionError):
         model_of(server, option)
 
 

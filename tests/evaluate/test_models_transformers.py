@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.asking import ask
 from support.lazy import lazy
+from support.messages import raises
 
 from robomme_interference_data.errors import InvalidOptionError, ModelError
 from robomme_interference_data.evaluate.language.models import (
@@ -101,15 +102,15 @@ def test_digests_follow_the_files(tmp_path: Path) -> None:
 
 def test_models_that_cannot_be_loaded(tiny: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ModelError, match="cannot load the model"):
+    with raises(ModelError):
         MODELS.make(f"transformers:{tmp_path / 'empty'}")
     for file in tiny.glob("*.json"):
         shutil.copy(file, tmp_path / "empty")
-    with pytest.raises(ModelError, match="it has no weights"):
+    with raises(ModelError):
         MODELS.make(f"transformers:{tmp_path / 'empty'}")
-    with pytest.raises(InvalidOptionError, match="neither a folder"):
+    with raises(InvalidOptionError):
         MODELS.make("transformers:nowhere at all")
-    with pytest.raises(InvalidOptionError, match="device"):
+    with raises(InvalidOptionError):
         MODELS.make(f"transformers:{tiny}", ["device=cuda:77"])
 
 

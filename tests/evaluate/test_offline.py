@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.buffer_sets import build, plan_again
 from support.made_up import MadeUpSource
+from support.messages import raises
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.sources import Frame
@@ -151,7 +152,7 @@ def test_damaged_recordings_are_an_error(buffers: Path, tmp_path: Path) -> None:
     made = load_buffer_set(root).datasets["executions"]
     index = made.index_of(EpisodeId.parse(DRAWER))
     shutil.copyfile(video, root / "executions" / made.files_of(index, ["front"])[1])
-    with pytest.raises(HashMismatchError, match=DRAWER):
+    with raises(HashMismatchError):
         walk(root, Constant(np.zeros((16, 8))))
 
 
@@ -167,7 +168,7 @@ def test_robots_with_other_actions(tmp_path: Path) -> None:
     row = walk(root, Constant(np.ones((4, 3))))
     assert row.action_l1_values == "13.500000000 28.000000000 1.000000000"
     assert row.action_l1 == round(42.5 / 3, 9)
-    with pytest.raises(PolicyError, match=r"\(4, 8\)(.|\n)*expected \(n, 3\) actions"):
+    with raises(PolicyError):
         walk(root, Constant(np.ones((4, 8))))
 
 
@@ -225,7 +226,7 @@ def test_one_recording_has_no_mean_of_others(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("actions", [np.full((16, 8), np.nan), np.zeros((16, 7)), None])
 def test_actions_that_cannot_be_compared(buffers: Path, actions: Any) -> None:
-    with pytest.raises(PolicyError, match=r"(?s)the policy's answer.*expected \(n, 8\) actions"):
+    with raises(PolicyError):
         walk(buffers, Constant(actions))
 
 
@@ -245,36 +246,34 @@ def test_a_run_resumes(buffers: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    "changes",
     [
-        ({"policy": "oracle"}, "needs a script of the simulator.*\nLeave out `offline`"),
-        ({"policy": "follow-subgoals"}, "needs a script of the simulator"),
-        ({"policy": "hold", "offline": False}, "needs a script of the simulator.*\nSet `offline`"),
-        ({"policy": "mean", "conditions": ("k0",)}, "takes no history"),
-        ({"policy": "hold", "policy_options": ("chunk=17",)}, "chunk 17; expected 1 to 16"),
-        ({"simulator": "robomme"}, "`simulator` has no effect"),
-        ({"shift": "light:1"}, "`shift` has no effect"),
-        ({"videos": True}, "`videos` has no effect"),
-        ({"check_lesson": True}, "`check_lesson` has no effect"),
-        ({"subgoals": "oracle"}, "need a simulator"),
-        ({"offline": False, "simulator": "recordings"}, "no simulator to choose"),
+        {"policy": "oracle"},
+        {"policy": "follow-subgoals"},
+        {"policy": "hold", "offline": False},
+        {"policy": "mean", "conditions": ("k0",)},
+        {"policy": "hold", "policy_options": ("chunk=17",)},
+        {"simulator": "robomme"},
+        {"shift": "light:1"},
+        {"videos": True},
+        {"check_lesson": True},
+        {"subgoals": "oracle"},
+        {"offline": False, "simulator": "recordings"},
     ],
 )
-def test_settings_that_do_not_fit(
-    buffers: Path, tmp_path: Path, changes: dict[str, Any], message: str
-) -> None:
+def test_settings_that_do_not_fit(buffers: Path, tmp_path: Path, changes: dict[str, Any]) -> None:
     usual: dict[str, Any] = {"policy": "noop", "offline": True}
     config = RunConfig(buffer_set=str(buffers), out=tmp_path / "run", **usual | changes)
-    with pytest.raises(InterferenceError, match=message):
+    with raises(InterferenceError):
         run_evaluation(config, executor=Serial())
     assert not (tmp_path / "run").exists()
 
 
 def test_buffer_sets_without_executions(tmp_path: Path, own_buffers: Path) -> None:
-    with pytest.raises(InterferenceError, match="has no executions"):
+    with raises(InterferenceError):
         evaluate(own_buffers, tmp_path / "run")
     root = buffer_set(tmp_path / "some", families=("OpenDrawer",))
-    with pytest.raises(InterferenceError, match="StackCups/test/0"):
+    with raises(InterferenceError):
         evaluate(root, tmp_path / "run")
     assert evaluate(root, tmp_path / "run", families=("OpenDrawer",)).planned == 2
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 from support.buffer_sets import QUERIES
+from support.messages import raises
 from support.own_simulators import Played
 from support.runs import config, run, run_one
 from support.worlds import World
@@ -74,9 +75,9 @@ def test_an_episode_that_breaks_is_an_error_row(tmp_path: Path) -> None:
 def test_another_shape_of_an_undeclared_simulator(tiny_buffers: Path) -> None:
     lesson, first, info = World().reset("MoveCube/test/0")
     query = load_buffer_set(tiny_buffers).query("MoveCube/test/0")
-    with pytest.raises(SimulatorError, match=r"'state': \(1,\)"):  # which would broadcast
+    with raises(SimulatorError):  # which would broadcast
         check_episode(query, lesson, Observation(first.images, first.state[:1]), info)
-    with pytest.raises(RunError, match="is 1.0000 away"):
+    with raises(RunError):
         check_episode(query, lesson, Observation(first.images, first.state + 1), info)
 
 
@@ -128,5 +129,5 @@ def test_a_simulator_without_a_script_cannot_act() -> None:
 
     simulator = Scriptless()
     simulator.reset(QUERIES[0])
-    with pytest.raises(UnknownNameError, match="Scriptless cannot act as oracle"):
+    with raises(UnknownNameError):
         simulator.act("oracle")

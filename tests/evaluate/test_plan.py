@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.messages import raises
 
 from robomme_interference_data.errors import (
     FormatError,
@@ -64,7 +65,7 @@ def test_invalid_plans_are_errors(
 
 @pytest.mark.parametrize("text", ["", "0/8", "2/8/1", "a/b"])
 def test_invalid_shards_are_errors(text: str) -> None:
-    with pytest.raises(InvalidOptionError, match="NUMBER/OF"):
+    with raises(InvalidOptionError):
         RunPlan({"MoveCube/test": "0"}, ("k0",), text)
 
 
@@ -101,5 +102,5 @@ def test_the_size_of_plans_is_limited() -> None:
     plans = tuple(RunPlan({"MoveCube/test": f"0-{16_000 + n}"}, conditions) for n in range(2))
     assert plans[0].most == 64 * 16_001
     assert RunHeader(1, {}, "buffer_set", plans[:1]).plans == plans[:1]
-    with pytest.raises(FormatError, match="rollouts; expected at most"):
+    with raises(FormatError):
         RunHeader(1, {}, "buffer_set", plans)

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from support.chat_server import ChatServer, Seen
 from support.client_prompts import FILES
+from support.messages import raises
 from support.runs import EPISODE, config, header, run_one
 from support.worlds import buffer_set_here, query_of
 
@@ -149,22 +150,22 @@ def test_memer(client: Path, condition: str, video: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("system", "changes", "message"),
+    ("system", "changes"),
     [
-        ("memer", {"subgoal_prompt": None}, "not the prompt of memer"),
-        ("memer", {"subgoal_prompt": "memer"}, "not the prompt of memer"),
-        ("symbolic-groundsg", {"subgoal_prompt": "grounded"}, "not the prompt of symbolic-g"),
-        ("memer", {"subgoal_options": ("max_tokens=256",)}, "max_tokens of subgoals is 256"),
-        ("memer", {"subgoal_options": ("fps=10",)}, "fps of subgoals is 10.0; memer has 30.0"),
-        ("memer", {"subgoal_options": ("stride=1",)}, "stride of subgoals is 1; memer has 2"),
+        ("memer", {"subgoal_prompt": None}),
+        ("memer", {"subgoal_prompt": "memer"}),
+        ("symbolic-groundsg", {"subgoal_prompt": "grounded"}),
+        ("memer", {"subgoal_options": ("max_tokens=256",)}),
+        ("memer", {"subgoal_options": ("fps=10",)}),
+        ("memer", {"subgoal_options": ("stride=1",)}),
     ],
 )
 def test_another_prompt_or_option_may_not_carry_the_name(
-    client: Path, system: str, changes: dict[str, Any], message: str
+    client: Path, system: str, changes: dict[str, Any]
 ) -> None:
     with ChatServer() as server:
         given = settings(system, server.url, client / PUBLISHED[system].file)
-        with pytest.raises(InvalidOptionError, match=message) as raised:
+        with raises(InvalidOptionError) as raised:
             run_one(client / "run", **given | changes)
         assert "/paper-systems.html" in str(raised.value.hint)
         assert not (client / "run").exists()
@@ -172,7 +173,7 @@ def test_another_prompt_or_option_may_not_carry_the_name(
 
 def test_a_model_that_takes_no_video_may_not_carry_the_name(client: Path) -> None:
     given = settings("memer", "http://h/v1", client / "api_memer.py", subgoals="transformers:tiny")
-    with pytest.raises(InvalidOptionError, match="takes images"):
+    with raises(InvalidOptionError):
         with_published(config(**given))
 
 
@@ -191,7 +192,7 @@ def test_the_published_values_may_be_set_and_are_recorded(client: Path) -> None:
 )
 def test_a_file_that_is_not_the_client_is_an_error(client: Path, code: str) -> None:
     (client / "api_memer.py").write_text(code)
-    with ChatServer() as server, pytest.raises(FormatError, match=r"not api_memer\.py of the"):
+    with ChatServer() as server, raises(FormatError):
         run_one(client / "run", **settings("memer", server.url, client / "api_memer.py"))
 
 

@@ -10,6 +10,7 @@ import pytest
 from support.asking import ask, behind, look, questions, right_letter
 from support.buffer_sets import copy_buffer_set
 from support.chat_server import BROKEN, ChatServer
+from support.messages import raises
 from support.retrieval import make_index
 from support.tabletop import LESSON, QUERIES, TABLETOP, copy_tabletop, scene_of, shown
 
@@ -129,7 +130,7 @@ def test_more_frames_than_the_model_takes_are_an_error(tmp_path: Path) -> None:
     with ChatServer(lambda seen: "B") as server:
         for settings in ({"memory": "framesamp:6"}, {"memory": "full"}):
             options = behind(server, model_options=("images=5",), **settings)
-            with pytest.raises(InvalidOptionError, match="the model takes 5 images at most"):
+            with raises(InvalidOptionError):
                 ask(tmp_path / "run", **ONE, **options)
         assert not (tmp_path / "run").exists()
         for changes in ({"memory": "framesamp:5"}, {"memory": "framesamp:9", "control": "text"}):
@@ -249,7 +250,7 @@ def test_a_model_answers_questions_whose_options_recall_does_not_know(tmp_path: 
     revision = buffer_set.datasets[DEMONSTRATIONS].identity.revision
     others = revision, "Which?", ("red", "blue"), (0, 1), 1, ("", ""), questions()[MOVE].picture
     write_questions([Question(episode, *others) for episode in buffer_set.episode_ids], root)
-    with pytest.raises(InvalidOptionError, match="recall does not know"):
+    with raises(InvalidOptionError):
         ask(tmp_path / "recall", buffer_set=root)
     with ChatServer(lambda seen: "B") as server:
         rows = ask(tmp_path / "run", buffer_set=root, **behind(server, memory="framesamp:3")).rows

@@ -10,6 +10,7 @@ from typing import Any
 
 import psutil
 import pytest
+from support.messages import raises
 from support.policy_calls import client, rollout
 from support.policy_server import Memoryless, PolicyServer
 from support.runs import header, run, run_one
@@ -43,15 +44,14 @@ def test_a_server_that_reports_no_checkpoint_needs_the_option(
 ) -> None:
     for metadata in ({}, {"reset_pose": [0.0]}):
         server.metadata = metadata
-        with pytest.raises(InvalidOptionError, match="does not report which checkpoint") as raised:
+        with raises(InvalidOptionError) as raised:
             run_one(tmp_path / "run", policy=server.url)
         assert "checkpoint=TEXT" in (raised.value.hint or "")
     assert server.calls == [] and not (tmp_path / "run").exists()
     run_one(tmp_path / "run", policy=server.url, policy_options=NAMED)
     assert header(tmp_path / "run")["identity"]["policy_options"]["checkpoint"] == "a"
     # The checkpoint's name is text, even if it looks like a number.
-    difference = r"policy_options\.checkpoint is 'a' there, '79999' here"
-    with pytest.raises(RunError, match=difference):
+    with raises(RunError):
         run_one(tmp_path / "run", policy=server.url, policy_options=("checkpoint=79999",))
 
 
@@ -61,9 +61,9 @@ def test_a_server_that_reports_its_checkpoint_needs_no_option(
     server.metadata = {"checkpoint": "a"}
     assert run_one(tmp_path / "run", policy=server.url).counts["fail"] == 1
     run_one(tmp_path / "same", policy=server.url, policy_options=NAMED)
-    with pytest.raises(PolicyServerError, match="serves the checkpoint 'a', not 'b'"):
+    with raises(PolicyServerError):
         run_one(tmp_path / "other", policy=server.url, policy_options=("checkpoint=b",))
-    with pytest.raises(InvalidOptionError, match="checkpoint ' '; expected its name"):
+    with raises(InvalidOptionError):
         run_one(tmp_path / "empty", policy=server.url, policy_options=("checkpoint= ",))
 
 
@@ -71,20 +71,16 @@ def test_a_server_that_reports_its_checkpoint_needs_no_option(
 
 
 @pytest.mark.parametrize(
-    ("memory", "right", "wrong", "message"),
-    [
-        (None, FRAMES, NONE, "refuses to act without frames, and that of pi05_baseline acts"),
-        (Memoryless(), NONE, FRAMES, f"acts without any frame, and that of {FRAMES} refuses to"),
-    ],
+    ("memory", "right", "wrong"), [(None, FRAMES, NONE), (Memoryless(), NONE, FRAMES)]
 )
 def test_a_server_of_the_other_kind_is_an_error(
-    tmp_path: Path, memory: Any, right: str, wrong: str, message: str
+    tmp_path: Path, memory: Any, right: str, wrong: str
 ) -> None:
     settings: dict[str, Any] = {"policy_options": NAMED, "conditions": ("no-history",)}
     with PolicyServer(memory).running() as server:
         result = run(tmp_path / "right", policy=server.url, system=right, **settings)
         assert result.counts["fail"] == 2
-        with pytest.raises(PolicyServerError, match=message):
+        with raises(PolicyServerError):
             run(tmp_path / "wrong", policy=server.url, system=wrong, **settings)
         assert not (tmp_path / "wrong").exists()
         calls = len(server.calls)
@@ -94,7 +90,7 @@ def test_a_server_of_the_other_kind_is_an_error(
 
 def test_another_error_does_not_identify_the_kind(server: PolicyServer) -> None:
     server.before = lambda message: "no key 'x'" if "prompt" in message else None
-    with pytest.raises(PolicyServerError, match="reports: no key 'x'"):
+    with raises(PolicyServerError):
         check_servers_memory(server.url, NAMED, name_system(FRAMES))
 
 
@@ -118,7 +114,7 @@ def compiling(call: str, times: int = 1) -> PolicyServer:
 
 def test_keepalive_ends_a_rollout_with_a_separate_error() -> None:
     with compiling("add_buffer").running() as server, client(server) as policy:
-        with pytest.raises(ServerKeepaliveError, match="received 1011 .* keepalive ping timeout"):
+        with raises(ServerKeepaliveError):
             rollout(policy, 40, [40], [16])
         rollout(policy, 40, [40], [16])
         assert (server.connections, server.memory.count) == (2, 57)
@@ -165,7 +161,7 @@ def test_two_runs_never_drive_one_server(tmp_path: Path, server: PolicyServer) -
         # Also in a list, and under another name of this machine.
         listed = f"websocket://127.0.0.1:1,localhost:{server.port}"
         for policy in (server.url, listed):
-            with pytest.raises(PolicyServerError, match="two runs spoil each other") as raised:
+            with raises(PolicyServerError) as raised:
                 run_one(tmp_path / "second", policy=policy, policy_options=NAMED)
             holder = f"the run in {tmp_path / 'first'} (process {process})"
             assert f":{server.port} is driven by {holder}" in raised.value.message
@@ -220,7 +216,7 @@ def test_a_server_that_dies_is_started_again(tmp_path: Path) -> None:
 
 
 def test_a_server_that_cannot_start_is_an_error_with_the_end_of_its_log(tmp_path: Path) -> None:
-    with pytest.raises(ServerDiedError, match="ended, exit code 1") as raised:
+    with raises(ServerDiedError) as raised:
         serve(tmp_path / "run", "--metadata", "no JSON")
     assert "rror" in str(raised.value.hint)
     assert not (tmp_path / "run").exists()
@@ -229,7 +225,7 @@ def test_a_server_that_cannot_start_is_an_error_with_the_end_of_its_log(tmp_path
 def test_a_server_that_does_not_listen_is_an_error_with_the_end_of_its_log(tmp_path: Path) -> None:
     code = "print('loading {port}'); __import__('time').sleep(99)"
     served = {"policy": f"websocket:{shlex.join([sys.executable, '-uc', code])}"}
-    with pytest.raises(PolicyServerError, match="cannot be reached") as raised:
+    with raises(PolicyServerError) as raised:
         run(tmp_path / "run", policy_options=("connect_s=1.5",), **served)
     hint = str(raised.value.hint)
     assert "listen at {port}" in hint and "connect_s" in hint and "loading 18" in hint
@@ -252,7 +248,7 @@ def test_invalid_commands_are_errors(tmp_path: Path, changes: dict[str, Any], wo
 
 
 def test_a_worker_whose_server_reports_another_model_plays_no_rollout(tmp_path: Path) -> None:
-    with pytest.raises(WorkerRetiredError, match="'other'"):
+    with raises(WorkerRetiredError):
         serve(tmp_path / "run", "--differs", tmp_path / "asked", "--dies", tmp_path / "died")
     assert (tmp_path / "run" / "rollouts.jsonl").read_text() == ""
 
@@ -287,7 +283,7 @@ def test_the_end_of_a_long_log_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(websocket, "_LOG_BYTES", 5)
     policy: Any = make_policy("websocket:echo {port} is the port")
     try:
-        with pytest.raises(InterferenceError, match="ended"):
+        with raises(InterferenceError):
             policy.metadata()
         assert policy.log() == b"port\n"
     finally:

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.messages import raises
 
 from robomme_interference_data.errors import PolicyError, ServerDiedError
 from robomme_interference_data.evaluate.policies.batching import Batcher
@@ -133,7 +134,7 @@ def test_a_policy_that_cannot_be_made_is_made_again_for_the_next_session() -> No
         return one
 
     batches: Batcher[int] = Batcher(make, 2, 0.0)
-    with pytest.raises(OSError, match="busy"):
+    with raises(OSError):
         batches.open(0)
     assert isinstance(batches.open(0), Adding)
 

@@ -1,6 +1,7 @@
 """The table of systems, their conditions, and valid names."""
 
 import pytest
+from support.messages import raises
 
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError
 from robomme_interference_data.evaluate.systems import SYSTEMS, check_history, name_system
@@ -26,7 +27,7 @@ def test_position_limits_name_the_conditions() -> None:
         check_history(system, {"k7": 2796})  # 2796 + 1300 = 4096
         longest = {"k7": 2796, "k31": 2797, "k63": 100_000}
         if name in limited:
-            with pytest.raises(InvalidOptionError, match="under k31, 100000 frames under k63"):
+            with raises(InvalidOptionError):
                 check_history(system, longest)
         else:
             check_history(system, longest)
@@ -41,5 +42,5 @@ def test_names_outside_the_table() -> None:
 
 @pytest.mark.parametrize("name", ["", " ", "-x", "a b", "a/b", "x" * 65, "π"])
 def test_invalid_names_are_errors(name: str) -> None:
-    with pytest.raises(InvalidIdError, match="is not the name of a system"):
+    with raises(InvalidIdError):
         name_system(name)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support import worlds
 from support.lazy import lazy
+from support.messages import raises
 from support.policy_calls import observation, section
 from support.policy_server import PolicyServer
 from support.runs import header, run, run_one
@@ -158,17 +159,17 @@ def test_a_run_resumes_with_the_same_checkpoint_only(tmp_path: Path) -> None:
         assert start["policy"]["server"] == f"127.0.0.1:{port}"
         assert start["versions"]["vla-eval"]
         assert run(tmp_path / "run", policy_options=NAMED, **settings).rows == result.rows
-        with pytest.raises(RunError, match="checkpoint is 'mine/1' there, 'other' here"):
+        with raises(RunError):
             run(tmp_path / "run", policy_options=("checkpoint=other",), **settings)
-        for changes, words in (
-            ({"policy_options": ()}, "'checkpoint'"),
-            ({"policy_options": ("checkpoint= ",)}, "expected its name"),
-            ({"policy_options": NAMED, "system": None}, "need a name"),
-            ({"policy_options": NAMED, "system": "perceptual-framesamp-modul"}, "paper's system"),
-            ({"policy_options": NAMED, "subgoals": "oracle"}, "reads no subgoals"),
-            ({"policy_options": NAMED, "workers": 2, "policies": 1}, "cannot be shared"),
+        for changes in (
+            {"policy_options": ()},
+            {"policy_options": ("checkpoint= ",)},
+            {"policy_options": NAMED, "system": None},
+            {"policy_options": NAMED, "system": "perceptual-framesamp-modul"},
+            {"policy_options": NAMED, "subgoals": "oracle"},
+            {"policy_options": NAMED, "workers": 2, "policies": 1},
         ):
-            with pytest.raises(InvalidOptionError, match=words):
+            with raises(InvalidOptionError):
                 run(tmp_path / "other", **settings, **changes)
 
 
@@ -176,7 +177,7 @@ def test_a_run_resumes_with_the_same_checkpoint_only(tmp_path: Path) -> None:
 def test_a_server_without_memory_runs_without_history_only(tmp_path: Path) -> None:
     with servers.running(servers.Blind()) as port:
         settings = {"policy": f"vla-eval:ws://127.0.0.1:{port}", "policy_options": NAMED}
-        with pytest.raises(InvalidOptionError, match="takes no history, so k0 has no effect"):
+        with raises(InvalidOptionError):
             run(tmp_path / "run", **settings)
         (row,) = run_one(tmp_path / "run", **settings).rows
         assert (row.status, row.steps) == ("fail", worlds.STEPS)
@@ -212,7 +213,7 @@ def test_a_server_with_one_client_has_one_worker(tmp_path: Path) -> None:
         with servers.running(servers.MmeVlaModelServer(use_history=not shared)) as port:
             settings["policy"] = f"vla-eval:ws://127.0.0.1:{port}"
             if not shared:
-                with pytest.raises(InvalidOptionError, match="2 workers need 2 policy servers"):
+                with raises(InvalidOptionError):
                     run(tmp_path / "run", workers=2, **settings)
             assert run(tmp_path / f"{shared}", workers=1 + shared, **settings).counts["fail"] == 2
 
@@ -245,11 +246,7 @@ def dims(size: int, form: str) -> Any:
 def test_a_server_that_does_not_fit_is_an_error(kind: str, parts: Any, words: str) -> None:
     if kind != "params":
         parts = {name: dims(*part) for name, part in parts.items()}
-    match = f"Noting.* does not fit.*{words}"
-    with (
-        servers.running(servers.Noting(**{kind: parts})) as port,
-        pytest.raises(PolicyServerError, match=match),
-    ):
+    with servers.running(servers.Noting(**{kind: parts})) as port, raises(PolicyServerError):
         servers.made(port)
 
 
@@ -277,11 +274,9 @@ def test_an_error_ends_a_rollout_and_the_next_one_connects_again() -> None:
 
     server = servers.Noting(answer=broken)
     with servers.connected(server) as policy:
-        with pytest.raises(
-            PolicyServerError, match="observation_failed: KeyError: 'no such layer'"
-        ):
+        with raises(PolicyServerError):
             servers.play(policy)
-        with pytest.raises(PolicyServerError, match="was lost"):
+        with raises(PolicyServerError):
             policy.act(observation(1), "pick")
         servers.play(policy)
     assert len({session for session, _, _ in server.events}) == 2
@@ -292,8 +287,7 @@ def test_an_error_at_the_start_of_an_episode() -> None:
         async def on_episode_start(self, config: Any, ctx: Any) -> None:
             raise MemoryError("full")
 
-    match = "episode_start_failed: MemoryError: full"
-    with servers.connected(Full()) as policy, pytest.raises(PolicyServerError, match=match):
+    with servers.connected(Full()) as policy, raises(PolicyServerError):
         servers.play(policy)
 
 
@@ -304,7 +298,7 @@ def test_a_server_that_is_started_again_must_be_the_same() -> None:
     with servers.running(servers.Noting(servers.ALL), port):
         servers.play(policy)
     with servers.running(servers.Noting(), port):
-        with pytest.raises(PolicyServerError, match="it began with"):
+        with raises(PolicyServerError):
             servers.play(policy)
         policy.close()
 
@@ -331,32 +325,21 @@ class Empty:
         return {"joints": np.zeros(8)}
 
 
-@pytest.mark.parametrize(
-    ("fault", "words"),
-    [
-        (Twice, r"sends action 3; expected action 4"),
-        (Silent, r"did not answer within 0\.3 s"),
-        (Empty, "answers without actions: joints"),
-    ],
-)
-def test_answers_that_do_not_fit(fault: type, words: str) -> None:
+@pytest.mark.parametrize("fault", [Twice, Silent, Empty])
+def test_answers_that_do_not_fit(fault: type) -> None:
     server = type("Odd", (fault, servers.Noting), {})()
-    with (
-        servers.connected(server, "response_s=0.3") as policy,
-        pytest.raises(PolicyServerError, match=words),
-    ):
+    with servers.connected(server, "response_s=0.3") as policy, raises(PolicyServerError):
         servers.play(policy, live=2)
 
 
 def test_another_version_of_the_protocol(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vla_eval.protocol.messages.PROTOCOL_VERSION", 2)
-    match = "version 2 of vla-eval.*expected version 1"
-    with servers.running(servers.Noting()) as port, pytest.raises(PolicyServerError, match=match):
+    with servers.running(servers.Noting()) as port, raises(PolicyServerError):
         servers.made(port)
 
 
 def test_a_server_of_another_kind(server: PolicyServer) -> None:
-    with pytest.raises(PolicyServerError, match="is no server of vla-eval: .*missing"):
+    with raises(PolicyServerError):
         servers.made(server.port)
 
 
@@ -365,6 +348,6 @@ def test_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in [one for one in sys.modules if one.startswith((package, "vla_eval"))]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "vla_eval", None)
-    with pytest.raises(MissingExtraError, match="needs vla_eval") as raised:
+    with raises(MissingExtraError) as raised:
         make_policy("vla-eval:ws://127.0.0.1:1", ["checkpoint=mine/1"])
     assert "robomme-interference-data[vla-eval]" in str(raised.value.hint)

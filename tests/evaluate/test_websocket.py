@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from support.messages import raises
 from support.policy_calls import INFER, RESET, added, client, info, observation, rollout, section
 from support.policy_server import PolicyServer
 
@@ -122,7 +123,7 @@ def test_a_message_that_is_cut_or_has_a_tail_is_an_error(data: bytes, draw: st.D
     ],
 )
 def test_unsupported_values_are_not_sent(value: Any) -> None:
-    with pytest.raises(FormatError, match="cannot"):
+    with raises(FormatError):
         pack({"a": [value]})
 
 
@@ -132,19 +133,19 @@ def claimed(kind: str, **fields: Any) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("data", "text"),
+    "data",
     [
-        (claimed("__ndarray__", dtype="|O"), "dtype object"),
-        (claimed("__ndarray__", dtype="float99"), "float99"),
-        (claimed("__ndarray__", dtype="2<f4"), "cannot hold NumPy data"),
-        (claimed("__ndarray__", data="0000"), "without bytes and shape"),
-        (claimed("__ndarray__", data=b"\x00" * 5), "4 bytes with 5 bytes of data"),
-        (claimed("__npgeneric__", data=2**40, dtype="<i4"), "are not a message"),
-        (msgpack.packb({"a": msgpack.ExtType(5, b"")}), "extension type 5"),
+        claimed("__ndarray__", dtype="|O"),
+        claimed("__ndarray__", dtype="float99"),
+        claimed("__ndarray__", dtype="2<f4"),
+        claimed("__ndarray__", data="0000"),
+        claimed("__ndarray__", data=b"\x00" * 5),
+        claimed("__npgeneric__", data=2**40, dtype="<i4"),
+        msgpack.packb({"a": msgpack.ExtType(5, b"")}),
     ],
 )
-def test_invalid_messages_are_not_read(data: bytes, text: str) -> None:
-    with pytest.raises(FormatError, match=text):
+def test_invalid_messages_are_not_read(data: bytes) -> None:
+    with raises(FormatError):
         unpack(data)
 
 
@@ -234,10 +235,10 @@ def test_metadata_and_actions_of_the_server(server: PolicyServer) -> None:
 def test_a_traceback_becomes_one_error_with_its_last_line(server: PolicyServer) -> None:
     with client(server) as policy:
         policy.reset(info(0))
-        with pytest.raises(PolicyServerError, match="reports: AssertionError: history feats"):
+        with raises(PolicyServerError):
             policy.act(observation(0), "pick")  # without a frame in the memory
         # The memory is lost with the connection: this rollout ends.
-        with pytest.raises(PolicyServerError, match="was lost, and its memory with it"):
+        with raises(PolicyServerError):
             policy.observe(*section(0, 1))
         assert policy.metadata()["server_metadata"] == {}
         assert server.connections == 1
@@ -247,17 +248,17 @@ def test_a_traceback_becomes_one_error_with_its_last_line(server: PolicyServer) 
 
 @pytest.mark.parametrize("call", ["reset", "add_buffer", "prompt"])
 @pytest.mark.parametrize(
-    ("answer", "text"),
+    "answer",
     [
-        (PolicyServer.CLOSE, "closed the connection: "),
-        ("", "reports: an empty text"),
-        (b"\xc1", "1 bytes are not a message"),
-        (msgpack.packb([1]), "answers with a list; expected a map"),
-        (msgpack.packb({"a": 1, "b": 2}), "answers without '.*': a, b"),
-        (msgpack.packb({"reset_finished": False}), "answers without"),
+        PolicyServer.CLOSE,
+        "",
+        b"\xc1",
+        msgpack.packb([1]),
+        msgpack.packb({"a": 1, "b": 2}),
+        msgpack.packb({"reset_finished": False}),
     ],
 )
-def test_every_answer_is_checked(server: PolicyServer, call: str, answer: Any, text: str) -> None:
+def test_every_answer_is_checked(server: PolicyServer, call: str, answer: Any) -> None:
     server.before = lambda message: answer if call in message else None
-    with client(server) as policy, pytest.raises(PolicyServerError, match=text):
+    with client(server) as policy, raises(PolicyServerError):
         rollout(policy, 2, [2], [])

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.messages import raises
 from support.retrieval import made
 
 from robomme_interference_data.errors import InvalidOptionError
@@ -91,10 +92,10 @@ def test_a_family_is_left_out_of_other_buffers_too() -> None:
 
 def test_nothing_to_fit() -> None:
     alone = made(condition="k0", cuts={}, high={}, spans=((0, 6),))
-    with pytest.raises(InvalidOptionError, match="without any cut between sessions"):
+    with raises(InvalidOptionError):
         found_in(alone)
     short = made(cuts={}, high={}, spans=((0, 1), (1, 2)))
-    with pytest.raises(InvalidOptionError, match="without any session of two frames"):
+    with raises(InvalidOptionError):
         found_in(short)
     assert found_in(*three()[:2]).held_out == ()  # one family
 

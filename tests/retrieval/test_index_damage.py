@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.buffer_sets import QUERIES
 from support.damage import flipped_bits
+from support.messages import raises
 from support.retrieval import change_header, make_index
 
 from robomme_interference_data import load_buffer, load_buffer_set
@@ -41,31 +42,31 @@ def check(buffer_set: Path) -> None:
 
 
 def test_without_an_index(tiny_buffers: Path) -> None:
-    with pytest.raises(MissingFileError, match="no embeddings of encoder 'thumbnail'") as caught:
+    with raises(MissingFileError) as caught:
         look_up(tiny_buffers)
     expected = f"index {tiny_buffers} --encoder thumbnail"
     assert caught.value.command == expected
-    with pytest.raises(MissingFileError, match="camera 'wrist'") as caught:
+    with raises(MissingFileError) as caught:
         load_buffer(QUERIES[0], "k0", buffer_set=tiny_buffers).embeddings("thumbnail", "wrist")
     assert caught.value.command == f"{expected} --camera wrist"
 
 
 @pytest.mark.parametrize(
-    ("change", "error", "message"),
+    ("change", "error"),
     [
-        ({"format_version": 2}, FormatError, "format version 2"),
-        ({"size": 7}, MissingFileError, "made differently"),
-        ({"camera": "wrist"}, MissingFileError, "camera 'wrist'"),
-        ({"sums": "0" * 64}, FormatError, "SHA256SUMS"),
-        ({"qool": 1}, FormatError, "unknown qool"),  # as a flipped bit makes of a key
+        ({"format_version": 2}, FormatError),
+        ({"size": 7}, MissingFileError),
+        ({"camera": "wrist"}, MissingFileError),
+        ({"sums": "0" * 64}, FormatError),
+        ({"qool": 1}, FormatError),  # as a flipped bit makes of a key
     ],
 )
 def test_a_header_that_does_not_fit(
-    whole: Path, change: dict[str, Any], error: type[InterferenceError], message: str
+    whole: Path, change: dict[str, Any], error: type[InterferenceError]
 ) -> None:
     path = whole / FOLDER / "index.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
-    with pytest.raises(error, match=message) as caught:
+    with raises(error) as caught:
         look_up(whole)
     assert str(caught.value.command).startswith("index ")
 
@@ -87,18 +88,13 @@ def test_a_damaged_file_is_named(whole: Path, name: str) -> None:
     content = path.read_bytes()
     for damaged in (content[:-1] + bytes([content[-1] ^ 1]), content[:50], b"", None):
         path.unlink() if damaged is None else path.write_bytes(damaged)
-        message = "is missing" if damaged is None else "does not have the SHA-256"
-        with pytest.raises(FormatError, match=f"{name} {message}") as caught:
+        with raises(FormatError) as caught:
             check(whole)
         assert caught.value.command == f"index {whole} --encoder thumbnail"
 
 
-@pytest.mark.parametrize(
-    ("factor", "columns", "message"), [(np.nan, 528, "finite"), (1, 3, "of shape")]
-)
-def test_invalid_embeddings_with_valid_hashes(
-    whole: Path, factor: float, columns: int, message: str
-) -> None:
+@pytest.mark.parametrize(("factor", "columns"), [(np.nan, 528), (1, 3)])
+def test_invalid_embeddings_with_valid_hashes(whole: Path, factor: float, columns: int) -> None:
     # The hashes are right, the content is not.
     folder = whole / FOLDER
     path, sums, header = folder / episode_file(0), folder / "SHA256SUMS", folder / "index.json"
@@ -106,7 +102,7 @@ def test_invalid_embeddings_with_valid_hashes(
     names, before = read_sums(sums), sha256_file(sums)
     sums.write_text(format_sums(folder, names))
     header.write_text(header.read_text().replace(before, sha256_file(sums)))
-    with pytest.raises(FormatError, match=message):
+    with raises(FormatError):
         look_up(whole)
 
 
@@ -115,22 +111,19 @@ def test_two_models_of_one_name_are_told_apart(own_buffers: Path) -> None:
     encoder.name = "siglip:one/tiny"
     make_index(own_buffers, encoder)
     look_up(own_buffers, "siglip:one/tiny@v2")
-    with pytest.raises(MissingFileError, match="of encoder 'siglip:one/tiny'") as caught:
+    with raises(MissingFileError) as caught:
         look_up(own_buffers, "siglip:two/tiny")
     assert str(caught.value.command).startswith("index ")
 
 
 def test_an_index_of_another_version_of_the_encoder(whole: Path) -> None:
-    for folder, message in (
-        (FOLDER, "made differently in"),
-        (OF_UNITS, "another version of the enco"),
-    ):
+    for folder in (FOLDER, OF_UNITS):
         path = whole / folder / "index.json"
         header = json.loads(path.read_text())
         header["encoder"]["sha256"] = "0" * 64
         path.write_text(json.dumps(header))
         buffer = load_buffer(QUERIES[0], "k0", buffer_set=whole)
-        with pytest.raises(MissingFileError, match=message) as caught:
+        with raises(MissingFileError) as caught:
             Selector("thumbnail").select(buffer, buffer.query.frame())
         assert caught.value.command == f"index {whole} --encoder thumbnail"
 
@@ -139,25 +132,25 @@ def test_pool_statistics_are_only_in_the_index_of_units(whole: Path) -> None:
     """Hashes are valid; pool statistics are missing, wrong, or in the wrong index."""
     change_header(whole / OF_UNITS / "index.json", typical_cosine=None)
     buffer = load_buffer(QUERIES[0], "k0", buffer_set=whole)
-    with pytest.raises(FormatError, match="typical cosine"):
+    with raises(FormatError):
         measure(buffer, "thumbnail")
-    with pytest.raises(FormatError, match="typical cosine"):
+    with raises(FormatError):
         check(whole)
     change_header(whole / OF_UNITS / "index.json", typical_cosine=0.5)
     check(whole)
     change_header(whole / FOLDER / "index.json", typical_cosine=0.5)
-    with pytest.raises(FormatError, match="typical cosine"):
+    with raises(FormatError):
         check(whole)
     change_header(whole / FOLDER / "index.json", typical_cosine=None)
     center = np.load(whole / OF_UNITS / "center.npy")
-    for folder, message in ((OF_UNITS, "not the mean"), (FOLDER, "too many")):
+    for folder in (OF_UNITS, FOLDER):
         before = read_sums(whole / folder / "SHA256SUMS")
         np.save(whole / folder / "center.npy", center + (folder == OF_UNITS))
         sums = format_sums(whole / folder, sorted({*before, "center.npy"}))
         (whole / folder / "SHA256SUMS").write_text(sums)
         digest = sha256_file(whole / folder / "SHA256SUMS")
         change_header(whole / folder / "index.json", sums=digest)
-        with pytest.raises(FormatError, match=f"center.npy is .*{message}"):
+        with raises(FormatError):
             check(whole)
         make_index(whole)
         check(whole)
@@ -166,5 +159,5 @@ def test_pool_statistics_are_only_in_the_index_of_units(whole: Path) -> None:
 def test_embeddings_without_units(whole: Path) -> None:
     """A buffer set lists its units; these are datasets that somebody chose."""
     datasets = {"demonstrations": load_buffer_set(whole).datasets["demonstrations"]}
-    with pytest.raises(MissingFileError, match="distractors"):
+    with raises(MissingFileError):
         BufferSetIndex(datasets, "thumbnail", "front")

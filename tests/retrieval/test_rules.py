@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.messages import raises
 from support.retrieval import embedded, made
 
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
@@ -86,15 +87,15 @@ def test_all_rules() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "error", "message"),
+    ("text", "error"),
     [
-        ("maximum", UnknownNameError, "'maximum'"),
-        ("max/high", InvalidOptionError, "'high'"),
-        ("max/1.5", InvalidOptionError, r"1\.5"),
+        ("maximum", UnknownNameError),
+        ("max/high", InvalidOptionError),
+        ("max/1.5", InvalidOptionError),
     ],
 )
-def test_rules_that_are_none(text: str, error: type[Exception], message: str) -> None:
-    with pytest.raises(error, match=message):
+def test_rules_that_are_none(text: str, error: type[Exception]) -> None:
+    with raises(error):
         Rule.parse(text)
 
 
@@ -184,9 +185,9 @@ def test_lots_are_those_of_the_rule() -> None:
 
 
 def test_refusals() -> None:
-    with pytest.raises(InvalidOptionError, match="the history is empty"):
+    with raises(InvalidOptionError):
         choose(embedded(HISTORY[:0], X), Rule())
     absent = made(cuts={}, high={1: 1}, lessons=())
-    with pytest.raises(InvalidOptionError, match="needs a lesson"):
+    with raises(InvalidOptionError):
         choose(absent, Rule("oracle"))
     assert choose(absent, Rule("max")).spans == ((0, 15),)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.buffer_sets import QUERIES
+from support.messages import raises
 
 from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
@@ -47,7 +48,7 @@ def test_what_it_cannot_choose_from(indexed: Path, tiny_buffers: Path) -> None:
     selector = Selector("thumbnail")
     buffer = load_buffer(QUERIES[0], "k0", buffer_set=indexed)
     for image in (np.zeros((3, 32, 32), np.uint8), np.zeros((32, 32, 3), np.float32)):
-        with pytest.raises(InvalidOptionError, match=r"\(H, W, 3\) uint8"):
+        with raises(InvalidOptionError):
             selector.select(buffer, image)  # type: ignore[arg-type]
     bare = load_buffer(QUERIES[0], "k0", buffer_set=tiny_buffers)
     with pytest.raises(MissingFileError):

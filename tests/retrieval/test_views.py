@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.buffer_sets import GOLDEN, QUERIES, dataset
+from support.messages import raises
 from support.retrieval import make_index
 from support.shifted import add_shifted
 
@@ -67,14 +68,11 @@ def test_missing_views_and_unknown_shifts(run: Run, seen: Path, own_buffers: Pat
     assert "such as light:2" in run("retrieval-score", seen, "--shift", "dark")[2]
 
 
-@pytest.mark.parametrize(
-    ("families", "kind", "message"),
-    [(("MoveCube",), "sample", "lacks VideoRepick/test/0"), ((), "other", "kind: other in it, ")],
-)
+@pytest.mark.parametrize(("families", "kind"), [(("MoveCube",), "sample"), ((), "other")])
 def test_views_of_other_scenes_are_an_error(
-    own_buffers: Path, families: tuple[str, ...], kind: str, message: str
+    own_buffers: Path, families: tuple[str, ...], kind: str
 ) -> None:
-    with pytest.raises(SourceError, match=message):
+    with raises(SourceError):
         add_shifted(own_buffers, *families, kind=kind)
 
 

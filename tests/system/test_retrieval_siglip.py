@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.buffer_sets import QUERIES
+from support.messages import raises
 from support.retrieval import make_index
 
 from robomme_interference_data import load_buffer, load_buffer_set
@@ -153,28 +154,28 @@ def test_incomplete_model_is_an_error(model: str, tmp_path: Path) -> None:
     assert len(part) == 16
     kept = {name: value for name, value in tensors.items() if name not in part}
     save_file(kept, path, metadata={"format": "pt"})
-    with pytest.raises(FormatError, match=r"lacks 16 of the .* such as .*layers\.1") as caught:
+    with raises(FormatError) as caught:
         embed(folder)
     assert "download or save it again" in str(caught.value.hint)
     path.write_bytes(path.read_bytes()[:1000])
-    with pytest.raises(FormatError, match="cannot be loaded"):
+    with raises(FormatError):
         embed(folder)
 
 
 def test_missing_weights(tmp_path: Path) -> None:
     pytest.importorskip("transformers")
-    with pytest.raises(HubError, match="google/siglip-so400m-patch14-384") as caught:
+    with raises(HubError) as caught:
         make_encoder("siglip")
     assert "HF_HUB_OFFLINE" in str(caught.value.hint)
-    with pytest.raises(InvalidOptionError, match="'nothing' is neither a folder nor a model"):
+    with raises(InvalidOptionError):
         make_encoder("siglip:nothing")
-    with pytest.raises(FormatError, match="cannot be loaded"):
+    with raises(FormatError):
         make_encoder(f"siglip:{tmp_path}")
     (tmp_path / "config.json").write_text('{"model_type": "bert"}')
-    with pytest.raises(FormatError, match="type 'bert'"):
+    with raises(FormatError):
         make_encoder(f"siglip:{tmp_path}")
 
 
 def test_unknown_device(model: str) -> None:
-    with pytest.raises(InvalidOptionError, match="device 'nowhere'"):
+    with raises(InvalidOptionError):
         make_encoder(model, device="nowhere")

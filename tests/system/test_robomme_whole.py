@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from support.messages import raises
 
 from robomme_interference_data.build_dataset.config import BuildConfig
 from robomme_interference_data.build_dataset.dataset.build import build_dataset
@@ -43,7 +44,7 @@ def test_an_evaluation_on_it(tmp_path: Path, robomme_python: Path) -> None:
     assert build(DEMONSTRATIONS, replace(queries, cameras=("front",))) == 3
     assert build(DEMONSTRATIONS, replace(queries, cameras=("front",))) == 0
     # The stand-in hides the answers of this family, so its oracle cannot complete an episode.
-    with pytest.raises(BuildError, match="hides its answers"):
+    with raises(BuildError):
         build(DISTRACTORS, replace(queries, buffer_set=tmp_path / "units"))
     units = BuildConfig(
         source=("sample:VideoRepick",), buffer_set=tmp_path, split="train", cameras=("front",)

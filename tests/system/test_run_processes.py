@@ -15,6 +15,7 @@ import psutil
 import pytest
 from support import runs, worlds
 from support.lazy import lazy
+from support.messages import raises
 from support.policy_server import Memory, PolicyServer
 from support.serve_policy import command
 from support.worker_calls import wait_until_gone
@@ -166,7 +167,7 @@ def test_servers_that_go_away_cost_no_rollout(tmp_path: Path, monkeypatch: Any) 
         monkeypatch.setenv("SERVERS", urls)
         result = runs.run(tmp_path / "one", Processes(2), progress=Stopper(stops[1:]), **served)
         assert [(row.status, row.attempt) for row in result.rows] == [("fail", 1)] * ROLLOUTS
-        with pytest.raises(WorkerRetiredError, match="cannot be reached"):
+        with raises(WorkerRetiredError):
             runs.run(tmp_path / "two", Processes(1), progress=Stopper(stops[:1]), **served)
     rows = read_record(tmp_path / "two")
     assert 1 <= len(rows) < ROLLOUTS and {row.status for row in rows.values()} == {"fail"}
@@ -253,46 +254,34 @@ def test_one_bad_rollout_fails_alone(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("policy", "kind", "words"),
-    [
-        ("Unloadable", PolicyError, r"its session\(\) raised OSError: no weights here"),
-        ("Dying", ServerDiedError, "the policy's process ended"),
-    ],
+    ("policy", "kind"), [("Unloadable", PolicyError), ("Dying", ServerDiedError)]
 )
 def test_a_policy_that_cannot_be_loaded_is_one_error(
-    tmp_path: Path, policy: str, kind: type[Exception], words: str
+    tmp_path: Path, policy: str, kind: type[Exception]
 ) -> None:
-    with pytest.raises(kind, match=words):
+    with raises(kind):
         run(tmp_path / "run", policy)
     assert not (tmp_path / "run" / "rollouts.jsonl").exists()
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    "changes",
     [
-        (
-            {"policy": f"{SHARED}Bare"},
-            r"Bare cannot be shared by workers .*it has no session\(\)\n",
-        ),
-        ({"policy": "replay"}, r"it has no session\(\) and no act_batch\(\)"),
-        ({"policy": f"{SHARED}Seeing"}, "it needs the simulator"),
-        ({"policies": 3}, "policies 3; expected 1 to `workers`, 2"),
-        ({"policies": 0}, "policies 0; expected 1 to"),
-        ({"max_batch_size": 0}, "max_batch_size 0; expected 1 or more"),
-        ({"batch_wait_timeout_s": -1.0}, "batch_wait_timeout_s -1.0; expected 0 or more"),
-        ({"policies": None, "max_batch_size": 2}, "`max_batch_size` has no effect"),
-        (
-            {"policy_resources": ("gpus=0.5",)},
-            "`policy_resources` has no effect on policies on this",
-        ),
-        ({"executor": "ray", "policy_resources": ("gpus=1.5",)}, "`policy_resources`: gpus 1.5"),
+        {"policy": f"{SHARED}Bare"},
+        {"policy": "replay"},
+        {"policy": f"{SHARED}Seeing"},
+        {"policies": 3},
+        {"policies": 0},
+        {"max_batch_size": 0},
+        {"batch_wait_timeout_s": -1.0},
+        {"policies": None, "max_batch_size": 2},
+        {"policy_resources": ("gpus=0.5",)},
+        {"executor": "ray", "policy_resources": ("gpus=1.5",)},
     ],
 )
-def test_what_cannot_be_shared_is_an_error(
-    tmp_path: Path, changes: dict[str, Any], words: str
-) -> None:
+def test_what_cannot_be_shared_is_an_error(tmp_path: Path, changes: dict[str, Any]) -> None:
     usual = {"policy": f"{SHARED}Remembering", "workers": 2, "policies": 1}
-    with pytest.raises(InvalidOptionError, match=words):
+    with raises(InvalidOptionError):
         run_evaluation(runs.config(out=tmp_path / "run", **{**usual, "system": None, **changes}))
 
 

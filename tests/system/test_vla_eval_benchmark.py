@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from support import runs, worlds
 from support.lazy import lazy
+from support.messages import raises
 from typer.testing import CliRunner
 
 from robomme_interference_data.cli.main import app
@@ -130,18 +131,18 @@ def make(**settings: Any) -> Any:
 
 
 def test_bad_settings_are_refused() -> None:
-    with pytest.raises(InvalidOptionError, match="k0 would be no-history"):
+    with raises(InvalidOptionError):
         make(conditions=["k0"])
-    with pytest.raises(InvalidOptionError, match="not the paper's system"):
+    with raises(InvalidOptionError):
         make(system="perceptual-framesamp-modul")
-    with pytest.raises(UnknownNameError, match="'condition'"):
+    with raises(UnknownNameError):
         make(condition=["k0"])
-    with pytest.raises(UnknownNameError, match="'k5'"):
+    with raises(UnknownNameError):
         make(conditions=["k5"], send_video_history=True)
     # YAML has other types than a command line.
     others = {"conditions": "k0", "families": None, "episodes": 0, "system": 5, "send_state": "yes"}
     for name, value in others.items():
-        with pytest.raises(InvalidOptionError, match=f"{name} {value!r}; expected"):
+        with raises(InvalidOptionError):
             make(**{name: value})
 
 
@@ -149,13 +150,13 @@ def test_an_episode_beyond_the_last_and_one_that_is_cut_short() -> None:
     played = make(conditions=["no-history"], families=["MoveCube"], episodes="0")
     (task,) = played.get_tasks()
     assert task["name"] == "MoveCube/no-history" and task["episode"] == "0"
-    with pytest.raises(InvalidOptionError, match="has 1 episode"):
+    with raises(InvalidOptionError):
         played.reset({**task, "episode_idx": 1})
     first = played.make_obs(played.reset({**task, "episode_idx": 0}), task)
     assert sorted(first["images"]) == ["agentview"] and "video_history" not in first
     result = played.step({"actions": first["states"]})
     assert not result.done
-    with pytest.raises(RunError, match="max_steps"):
+    with raises(RunError):
         played.get_step_result(result)
     played.cleanup()  # while the rollout waits for an action
 
@@ -166,7 +167,7 @@ def test_a_simulator_that_exits_breaks_one_episode(monkeypatch: pytest.MonkeyPat
     with monkeypatch.context() as patch:
         patch.setattr(worlds.World, "step", lambda *_, **__: sys.exit("gone"))
         first = played.make_obs(played.reset({**task, "episode_idx": 0}), task)
-        with pytest.raises(RunError, match="gone"):
+        with raises(RunError):
             played.step({"actions": first["states"]})
     again = played.make_obs(played.reset({**task, "episode_idx": 0}), task)
     assert again["episode_restart"]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support import runs
 from support.lazy import lazy
+from support.messages import raises
 
 from robomme_interference_data.errors import InvalidOptionError, WorkerRetiredError
 from robomme_interference_data.evaluate.policies.registry import make_policy
@@ -41,7 +42,7 @@ def test_a_run_resumes_after_its_server_died_in_a_rollout(tmp_path: Path) -> Non
     settings: dict[str, Any] = {"conditions": CONDITIONS}
     with servers.serving("Dying") as url:
         settings["policy"] = f"vla-eval:{url}"
-        with pytest.raises(WorkerRetiredError, match="cannot be reached"):
+        with raises(WorkerRetiredError):
             runs.run(tmp_path / "run", policy_options=(*NAMED, "connect_s=1"), **settings)
     assert len(runs.finished_rows(tmp_path / "run")) < 6
     with servers.serving("Dying", int(url.rpartition(":")[2])):
@@ -68,5 +69,5 @@ def test_its_lerobot_server_acts_as_the_policy_here(tmp_path: Path, cameras: Any
             actions = np.concatenate(small.play(policy, 0, [1] * 17))
     np.testing.assert_array_equal(actions[:16], expected[0])
     assert not np.array_equal(actions[16], expected[0][0])
-    with pytest.raises(InvalidOptionError, match="'checkpoint'"):
+    with raises(InvalidOptionError):
         make_policy(f"vla-eval:ws://127.0.0.1:{port}")
