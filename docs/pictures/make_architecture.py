@@ -9,35 +9,44 @@ matplotlib.rcParams["svg.hashsalt"] = "architecture"
 from matplotlib import pyplot  # noqa: E402
 
 BOXES = {
-    "cli": (4.0, 7, "the command line"),
-    "cards": (4.0, 6, "publish data and results, with cards"),
-    "build_dataset": (0.9, 5, "recordings to datasets and manifests"),
-    "training": (8.1, 5, "buffers into training items"),
-    "evaluate": (4.6, 5, "buffers into rollouts, rows into scores"),
-    "retrieval": (5.2, 4, "select the relevant session"),
-    "simulators": (4.0, 3, "tabletop and RoboMME"),
+    "cli": (4.0, 8, "the command line"),
+    "cards": (4.0, 7, "publish data and results, with cards"),
+    "build_dataset": (0.9, 6, "recordings to datasets and manifests"),
+    "training": (8.1, 6, "buffers into training items"),
+    "evaluate": (4.6, 6, "buffers into rollouts, rows into scores"),
+    "retrieval": (5.2, 5, "select the relevant session"),
+    "simulators": (4.0, 4, "tabletop and RoboMME"),
+    "viz": (4.0, 3, "tables, figures, film strips, videos"),
     "data": (4.0, 2, "datasets, queries, buffers"),
-    "stats": (8.2, 1, "intervals, tests"),
-    "viz": (2.2, 1, "tables, figures"),
-    "runtime": (5.0, 1, "tasks in processes or on Ray"),
+    "stats": (6.2, 1, "intervals, tests"),
+    "runtime": (2.6, 1, "tasks in processes or on Ray"),
     "storage": (4.0, 0, "files, Hub, Parquet, video, cache"),
     "schema": (4.0, -1, "records and rules, without IO"),
 }
 """Folder to the center of its box, and what is in it."""
 
 ARROWS = (
-    *(("cli", "cards"), ("cards", "build_dataset"), ("cards", "evaluate")),
-    *(("build_dataset", "simulators"), ("evaluate", "retrieval"), ("retrieval", "simulators")),
+    ("cli", "cards"),
+    ("cards", "build_dataset"),
+    ("cards", "evaluate"),
+    ("build_dataset", "simulators"),
+    ("evaluate", "retrieval"),
     ("training", "retrieval"),
-    *(("evaluate", "stats"), ("simulators", "data"), ("data", "viz"), ("data", "runtime")),
-    *(("viz", "storage"), ("runtime", "storage"), ("storage", "schema")),
+    ("retrieval", "simulators"),
+    ("simulators", "viz"),
+    ("viz", "data"),
+    ("data", "runtime"),
+    ("data", "stats"),
+    ("runtime", "storage"),
+    ("stats", "storage"),
+    ("storage", "schema"),
 )
 
 
 def main() -> None:
     """Write the picture beside this script."""
-    figure, axes = pyplot.subplots(figsize=(9, 6.6))
-    width, height = {"stats": 1.7, "viz": 2.0, "training": 2.8}, 0.56
+    figure, axes = pyplot.subplots(figsize=(9, 7.3))
+    width, height = {"stats": 1.9, "training": 2.8}, 0.56
     for source, target in ARROWS:
         (x0, y0, _), (x1, y1, _) = BOXES[source], BOXES[target]
         arrow = {"arrowstyle": "-|>", "color": "#777777", "lw": 1.2, "shrinkA": 0, "shrinkB": 0}
@@ -57,7 +66,7 @@ def main() -> None:
         axes.add_patch(box)
         axes.text(x, y + 0.1, name, ha="center", va="center", weight="bold", size=10, zorder=3)
         axes.text(x, y - 0.13, text, ha="center", va="center", size=7.5, color="#333", zorder=3)
-    axes.set(xlim=(-1.0, 9.7), ylim=(-1.45, 7.45))
+    axes.set(xlim=(-1.0, 9.7), ylim=(-1.45, 8.45))
     axes.axis("off")
     path = Path(__file__).parent / "architecture.svg"
     figure.savefig(path, bbox_inches="tight", metadata={"Date": None})
