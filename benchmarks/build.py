@@ -25,7 +25,7 @@ from robomme_interference_data.build_dataset.dataset.lerobot_writer import (
     load_lerobot,
     require_lerobot,
 )
-from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan
+from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan, PlannedEpisode
 from robomme_interference_data.build_dataset.dataset.stage import StageTask
 from robomme_interference_data.build_dataset.plan.episodes import choose_episodes
 from robomme_interference_data.build_dataset.sources import (
@@ -125,13 +125,13 @@ def measure(source: Source, folder: Path, options: argparse.Namespace) -> None:
         return made
 
     def plan(source: Source) -> DatasetPlan:
-        tasks = tuple((0, episode) for episode in episodes)
+        tasks = tuple(PlannedEpisode(0, episode) for episode in episodes)
         return DatasetPlan(DEMONSTRATIONS, (source,), tasks, cameras, codec.name)
 
     def stage(source: Source) -> None:
         task = StageTask(plan(source))
         for episode in episodes:
-            task((0, episode), Worker(0))
+            task(PlannedEpisode(0, episode), Worker(0))
 
     def build(executor: Executor) -> None:
         build_dataset(plan(source), place() / "out", executor, WorkProgress(quiet=True))

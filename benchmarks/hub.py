@@ -27,13 +27,12 @@ from made_buffer_set import write_buffer_set
 
 from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.build_dataset.dataset.lerobot_writer import require_lerobot
-from robomme_interference_data.cards.publication import PublishConfig
-from robomme_interference_data.cards.publish import (
+from robomme_interference_data.cards.buffer_set_content import (
     BufferSetContent,
     plan_buffer_set,
     publish_buffer_set,
 )
-from robomme_interference_data.cards.publisher import Publisher
+from robomme_interference_data.cards.publication import PublishConfig
 from robomme_interference_data.data.fetch import fetch
 from robomme_interference_data.data.fetch_plan import FetchConfig, plan_fetch
 
@@ -200,8 +199,8 @@ def time_publishing(hub: Hub, made: Path, options: argparse.Namespace) -> None:
 def publish(root: Path, repo: str) -> None:
     """Publish a buffer set as the command does, without its checks."""
     config = PublishConfig(repo)
-    content, publisher = BufferSetContent(load_buffer_set(root), config), Publisher(config)
-    publish_buffer_set(content, publisher, plan_buffer_set(content, publisher))
+    content = BufferSetContent(load_buffer_set(root), config)
+    publish_buffer_set(content, plan_buffer_set(content))
 
 
 def upload_plainly(root: Path, repo: str) -> None:

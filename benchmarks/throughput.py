@@ -42,7 +42,7 @@ from robomme_interference_data.evaluate import BatchPolicy, Observation, Rollout
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.process import policy_processes
 from robomme_interference_data.evaluate.policies.registry import make_policy
-from robomme_interference_data.evaluate.policies.shared import SharedPolicy
+from robomme_interference_data.evaluate.policies.shared import Address, SharedPolicy
 from robomme_interference_data.runtime.executor import Processes, Worker
 
 FIRST_S, FURTHER_S = 0.050, 0.005
@@ -126,7 +126,7 @@ def served() -> Iterator[str]:
 class Rollouts:
     """A worker: acts until a time; returns when each of its answers came."""
 
-    def __init__(self, config: RunConfig, addresses: Sequence[str], chunk_s: float, folder: Path):
+    def __init__(self, config: RunConfig, addresses: Sequence[Address], chunk_s: float, folder: Path):
         self._config, self._addresses, self._folder = config, addresses, folder
         self._chunk_s = chunk_s
 
@@ -168,7 +168,7 @@ def ask(policy: Policy, frames: dict[str, Any], observation: Observation) -> Non
     assert policy.act(observation, GOAL).shape == (16, 8)
 
 
-def processes(config: RunConfig, addresses: Sequence[str], chunk_s: float, seconds: float) -> float:
+def processes(config: RunConfig, addresses: Sequence[Address], chunk_s: float, seconds: float) -> float:
     """Return the observations a second of workers with their own policies, or a shared one."""
     with tempfile.TemporaryDirectory() as folder:
         task = Rollouts(config, addresses, chunk_s, Path(folder))
