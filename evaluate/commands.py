@@ -65,14 +65,15 @@ def evaluate(config: RunConfig, as_json: AsJson = False) -> None:
     interrupted run, re-run the same command: it skips finished rollouts and repeats errors.
 
     With --offline there is no simulator: the policy acts along recorded executions, and rows have
-    the difference of its actions to the recorded ones.
+    the difference of its actions to the recorded ones. The policies hold and mean fit any robot,
+    as your own may.
 
     Examples:
     ```
     robomme-interference evaluate my-buffers --policy replay:window \
       --out runs/window
 
-    robomme-interference evaluate my-buffers --policy replay --offline \
+    robomme-interference evaluate my-buffers --policy hold --offline \
       --out runs/offline
 
     robomme-interference evaluate my-buffers \

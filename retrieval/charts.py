@@ -86,6 +86,14 @@ def draw_calibration(found: Calibration, title: str, out: Path) -> None:
             )
 
 
+_STYLES: Sequence[dict[str, Any]] = (
+    {"linewidth": 2.6},
+    {"linewidth": 1.8, "linestyle": "--"},
+    {"linewidth": 1.2, "linestyle": ":"},
+)
+"""Of lines in their order: each leaves those below it visible where both are equal."""
+
+
 @contextmanager
 def _two_panels(title: str, out: Path) -> Iterator[Any]:
     """Give two axes side by side, of a figure that is then written."""
@@ -102,12 +110,14 @@ def _draw_line(
 ) -> None:
     """Draw a share by condition with intervals; conditions of different kinds are not joined."""
     color = _COLORS[number % len(_COLORS)]
+    # Later lines are thinner and dashed, so that equal ones below them still show.
+    style = _STYLES[number % len(_STYLES)]
     for _, group in groupby(cells, key=lambda cell: parse_condition(cell.condition).kind):
         joined = list(group)
         x = [at[cell.condition] for cell in joined]
         values = [100 * getattr(cell, share) for cell in joined]
         marker = _MARKERS[number % len(_MARKERS)]
-        axes.plot(x, values, color=color, marker=marker, markersize=4, linewidth=1.2, label=label)
+        axes.plot(x, values, color=color, marker=marker, markersize=4, label=label, **style)
         for position, cell in zip(x, joined, strict=True):
             low, high = getattr(cell, f"{share}_low"), getattr(cell, f"{share}_high")
             if low is not None:

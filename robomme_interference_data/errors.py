@@ -37,7 +37,7 @@ class InterferenceError(Exception):
         message: What was given and what was expected.
         hint: What to do next, or None.
         command: Command of this package that helps, without the program's name, such as
-            `verify my-buffers`; only the command line shows it.
+            `verify my-buffers`.
         option: Python name of the setting that is wrong, such as `workers`; None if it is none.
     """
 
@@ -58,7 +58,12 @@ class InterferenceError(Exception):
         self.option = option
 
     def __str__(self) -> str:
-        return self.message if self.hint is None else f"{self.message}\n{self.hint}"
+        lines = [self.message]
+        if self.hint:
+            lines.append(self.hint)
+        if self.command is not None:
+            lines.append(f"Run: robomme-interference {visible(self.command)}")
+        return "\n".join(lines)
 
     def about(self, what: object) -> Self:
         """Return the same error with its subject in front of the message, such as an episode."""

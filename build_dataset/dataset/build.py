@@ -7,9 +7,11 @@ dataset is extended by the episodes that it lacks; the others are not encoded ag
 
 import os
 import shutil
+from collections import defaultdict
 from collections.abc import Collection, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 
 from robomme_interference_data.build_dataset.alike import (
@@ -116,7 +118,7 @@ def _stage(
             stored.append(episode)
             _check_alike(stored[0], episode)
 
-    missing = []
+    missing, before = [], len(stored) + len(skipped)
     progress.start("Reading and encoding", len(todo))
     for planned in todo:
         done = read_staged(folder(planned))
@@ -138,7 +140,7 @@ def _stage(
             if isinstance(outcome.error, InvalidOptionError | MissingExtraError | SimulatorError):
                 break  # the others would fail alike
     if failures:
-        raise _failure(failures, len(todo))
+        raise _failure(failures, len(todo), some_kept=len(stored) + len(skipped) > before)
 
 
 def _check_alike(first: StoredEpisode, second: StoredEpisode) -> None:
@@ -181,20 +183,35 @@ def _check_like(episode: StoredEpisode, plan: DatasetPlan) -> None:
         )
 
 
-def _failure(failures: Sequence[Outcome], total: int) -> InterferenceError:
+def _failure(failures: Sequence[Outcome], total: int, *, some_kept: bool) -> InterferenceError:
+    """Return the error for failed episodes: each reason once, with its episodes and its hint."""
     error = failures[0].error
     if len(failures) == 1 and isinstance(error, InterferenceError):
         return error
-    lines = []
-    for outcome in failures[:10]:
+    episodes = defaultdict[tuple[str, str], list[str]](list)
+    for outcome in failures:
         _, episode = outcome.task
-        why = first_line(outcome.error).removeprefix(f"{episode.id}: ")  # type: ignore[arg-type]
-        lines.append(f"  {episode.id}: {why} (started {outcome.attempts} times)")
-    more = f"\n  … and {len(failures) - 10} more" if len(failures) > 10 else ""
-    return BuildError(
-        f"{len(failures)} of {total} episodes failed:\n" + "\n".join(lines) + more,
-        "The others are kept. Correct these, and run the same command again, or leave them out.",
-    )
+        reason = first_line(outcome.error).removeprefix(f"{episode.id}: ")  # type: ignore[arg-type]
+        if outcome.attempts > 1:
+            reason += f" (started {outcome.attempts} times)"
+        episodes[reason, getattr(outcome.error, "hint", None) or ""].append(str(episode.id))
+    lines = [
+        f"  {_some_of(names)}: {reason}" for (reason, _), names in islice(episodes.items(), 10)
+    ]
+    if len(episodes) > 10:
+        lines.append(f"  … and {len(episodes) - 10} more reasons")
+    hints = [*dict.fromkeys(hint for _, hint in episodes if hint)][:3]
+    if some_kept:
+        hints.append("The others are kept.")
+    hints.append("Correct these, and run the same command again, or leave them out.")
+    failed = "\n".join([f"{len(failures)} of {total} episodes failed:", *lines])
+    return BuildError(failed, "\n".join(hints))
+
+
+def _some_of(names: Sequence[str]) -> str:
+    """Return the first three names, and how many more there are."""
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return ", ".join(names[:3]) + more
 
 
 def _write(

@@ -25,9 +25,9 @@ def unmarked_error() -> SourceError:
     """Return the error for an episode whose demonstration has no known end."""
     return SourceError(
         "the source does not mark which frames are the demonstration",
-        "Demonstrations and executions need a column is_demo or exec_start_idx in the source, or "
-        f"exec_start_idx in {named('families_file')}; {named('columns', 'is_demo=NAME')} names "
-        "another column. Distractor units can be built without.",
+        "Demonstrations and executions need it. Source frames: the column is_demo. Source lerobot: "
+        f"a column is_demo, or another one with {named('columns', 'is_demo=NAME')}, or "
+        f"exec_start_idx in {named('families_file')}. Distractor units can be built without.",
     )
 
 

@@ -235,7 +235,8 @@ class _Writer:
                 raise SourceError(
                     f"{name} of stored frame {self.length} is {value.tolist()}; expected finite "
                     "float32 numbers",
-                    f"Correct the recording, or leave the episode out with {named('episodes')}.",
+                    "Correct the recording, or leave it out of the source. "
+                    f"{named('episodes')} chooses indices in all families alike.",
                 )
             self._vectors[name].append(value)
             self.digests.update(name, value)

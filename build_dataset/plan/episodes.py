@@ -1,13 +1,17 @@
 """Which episodes of the sources a dataset stores. Pure rules."""
 
+from collections import defaultdict
 from collections.abc import Container, Iterable, Sequence
-from itertools import pairwise
+from itertools import islice, pairwise
 
 from robomme_interference_data.build_dataset.dataset.plan import PlannedEpisode
 from robomme_interference_data.build_dataset.sources import Source, SourceEpisode
 from robomme_interference_data.constants import SPLITS
 from robomme_interference_data.errors import InvalidOptionError, SourceError, counted
 from robomme_interference_data.ids import EpisodeId, format_numbers
+
+_DESCRIBED = 12
+"""Families that an error lists."""
 
 
 def choose_episodes(
@@ -72,6 +76,20 @@ def choose_episodes(
         wanted = ", ".join(filters) or "a query episode"
         raise SourceError(
             f"no episode of {counted(len(listed), 'recorded episode')} is: {wanted}",
-            "Choose others.",
+            f"There are: {_described(planned.episode.id for planned in listed)}. Choose others.",
         )
     return tuple(chosen)
+
+
+def _described(episodes: Iterable[EpisodeId]) -> str:
+    """Return the splits and families of episodes, each with its indices."""
+    indices = defaultdict[tuple[str, str], list[int]](list)
+    for episode in sorted(episodes, key=lambda episode: episode.sort_key):
+        indices[episode.split, episode.family].append(episode.index)
+    parts = [
+        f"{split} {family} {format_numbers(sorted(numbers))}"
+        for (split, family), numbers in islice(indices.items(), _DESCRIBED)
+    ]
+    if len(indices) > _DESCRIBED:
+        parts.append(f"{len(indices) - _DESCRIBED} more families")
+    return ", ".join(parts) or "none"

@@ -52,8 +52,8 @@ def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> 
         )
     if kind.acts_out_answers:
         check_unused(config, ["retrieval"], config.policy, "Set it for the questions instead.")
-    _check_cameras(config, buffer_set.datasets[DEMONSTRATIONS], policy)
     _check_robot(config, buffer_set, kind)
+    _check_cameras(config, buffer_set.datasets[DEMONSTRATIONS], policy)
     if config.videos:
         from robomme_interference_data.viz.episode_video import check_pillow
 
@@ -73,7 +73,8 @@ def _check_cameras(config: RunConfig, demonstrations: Dataset, policy: Policy) -
                 demonstrations.camera(camera)  # raises: stored without images
             raise UnknownNameError(
                 f"the policy {config.policy} reads the camera {camera!r}, which is not in {where}",
-                f"Its cameras: {', '.join(demonstrations.cameras) or 'none'}. Set another policy.",
+                f"Its cameras: {', '.join(demonstrations.cameras)}. "
+                f"{_policies_for_any_robot(config)}",
             )
     for camera in sorted(used - {*live.cameras}):
         raise UnknownNameError(
@@ -93,6 +94,13 @@ def _script_hint(config: RunConfig, kind: PolicyKind) -> str:
     return "Set another simulator, such as tabletop, or another policy."
 
 
+def _policies_for_any_robot(config: RunConfig) -> str:
+    """Return the advice to set a policy that needs neither this robot nor its cameras."""
+    if config.offline:
+        return "Set hold, mean or a policy for this robot, python:module:factory."
+    return "Set a policy for this robot, such as python:module:factory."
+
+
 def _check_robot(config: RunConfig, buffer_set: BufferSet, kind: PolicyKind) -> None:
     """Reject a policy for RoboMME's robot on a robot of another size."""
     (state,) = buffer_set.datasets[DEMONSTRATIONS].features[STATE]
@@ -104,7 +112,7 @@ def _check_robot(config: RunConfig, buffer_set: BufferSet, kind: PolicyKind) -> 
             f"the policy {config.policy} reads {kind.action_size} state values and returns "
             f"{kind.action_size} action values, 7 joints and a gripper; this robot has {state} and "
             f"{action}",
-            'Set a policy for this robot, such as "python:module:factory".',
+            _policies_for_any_robot(config),
         )
 
 

@@ -67,10 +67,13 @@ def compare(
     Systems of both runs are compared with themselves. If the runs share no system and hold one
     each, these two are compared. Runs under different shifts can be compared, because their scenes
     are the same. Differences are the second's rate − the first's. Without a second run, two
-    `conditions` of the first are compared. `look` is the number of this look at the data and of all
-    planned ones; with several, intervals and levels spend 5% over all looks.
+    `conditions` of the first are compared; with one, also a single condition of both. `look` is the
+    number of this look at the data and of all planned ones; with several, intervals and levels
+    spend 5% over all looks.
     """
     _check_arguments(first, second, conditions, systems[0], lenient=lenient)
+    if len(conditions) == 1:
+        conditions = (conditions[0], conditions[0])  # the same in both runs
     alpha = look_levels(look[1])[look[0] - 1] if look[1] > 1 else ALPHA
     a_rows = read_rows([first], systems[0], lenient)
     b_rows = a_rows if second is None else read_rows([second], systems[1], lenient)
@@ -200,11 +203,11 @@ def _check_arguments(
 ) -> None:
     for name in conditions:
         parse_condition(name)
-    if len(conditions) not in (0, 2) or (second is None and len({*conditions}) < 2):
+    if len(conditions) > 2 or (second is None and len({*conditions}) < 2):
         hint, command = _two_conditions(first, read_rows([first], system, lenient))
         raise InvalidOptionError(
             f"conditions to compare: {' '.join(conditions) or 'none'}; expected two different "
-            "ones, or two runs",
+            "ones, or two runs and at most two conditions",
             hint,
             command,
         )

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-from robomme_interference_data.errors import FormatError, RunError, counted
+from robomme_interference_data.errors import FormatError, RunError, counted, named
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.stats.bootstrap import DRAWS
 from robomme_interference_data.stats.intervals import wilson
@@ -135,7 +135,12 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         tables.append(action_error_effects.error_effects_table(errors))
         contrasts += errors
         notes += _not_compared_offline(recordings)
-    if settings.against is Against.PAPER:
+    if settings.against is Against.PAPER and not simulated:
+        notes.append(
+            f"{named('against', settings.against)} has no effect on recordings: the paper has no "
+            "action errors."
+        )
+    elif settings.against is Against.PAPER:
         from .tables import paper
 
         published = paper.published()

@@ -72,9 +72,13 @@ class _Command(TyperCommand):
             raise
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command."""
-        with naming_options(dict(map(_name_and_option, self.params))):
-            return super().invoke(ctx)
+        """Run the command; say so if it is interrupted, which Typer does not."""
+        try:
+            with naming_options(dict(map(_name_and_option, self.params))):
+                return super().invoke(ctx)
+        except KeyboardInterrupt:  # outside `graceful_interrupt`
+            print_status("\nInterrupted.")
+            raise typer.Exit(128 + signal.SIGINT) from None
 
 
 def _name_and_option(parameter: Any) -> tuple[str, str]:
@@ -188,7 +192,6 @@ def main() -> None:
     except typer.Abort as error:
         _fail(ShownError(type(error).__name__, "aborted"), as_json)
     except KeyboardInterrupt:  # outside `graceful_interrupt`
-        print_status("\nInterrupted.")
         sys.exit(128 + signal.SIGINT)
     except BrokenPipeError:  # head or less closed stdout
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

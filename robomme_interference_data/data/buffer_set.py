@@ -278,7 +278,7 @@ class BufferSet:
             raise FormatError.damaged(self._table.path, f"no row of {episode} under {name}")
         if self.copy is not None and not self._is_present[row]:
             options = f"--families {episode.family} --episodes {episode.index} --conditions {name}"
-            raise self.copy.not_fetched(f"{episode} under {name}", options)
+            raise self.copy.not_fetched(f"the sessions of {episode} under {name}", options)
         return self._table.record(row)
 
     def manifests(

@@ -12,7 +12,7 @@ from robomme_interference_data.constants import (
     IDENTITY_PATH,
     MANIFEST_PATH,
 )
-from robomme_interference_data.errors import InvalidOptionError, MissingFileError
+from robomme_interference_data.errors import InvalidOptionError, MissingFileError, named
 from robomme_interference_data.ids import EpisodeId, whole_number
 from robomme_interference_data.schema.conditions import Condition
 from robomme_interference_data.storage.files import LocalFiles
@@ -159,7 +159,10 @@ def open_dataset(buffer_set: BufferSet, name: str, more: str = "") -> Dataset:
         hint = "It is built; plan the buffers again to include it."
         command = f"build {buffer_set.location} --only manifests"
     elif buffer_set.is_own:
-        hint = "Build them from the source of its demonstrations, then plan the buffers again."
+        hint = (
+            "Build them from the source of its demonstrations, with the same options as then, such "
+            f"as {named('families_file')}; then plan the buffers again."
+        )
         command = f"build {buffer_set.location} --only {name} --source KIND:PATH"
     raise MissingFileError(
         f"{buffer_set.location} has no {name}", f"{hint} {more}".strip(), command

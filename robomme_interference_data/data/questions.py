@@ -94,7 +94,10 @@ def digest_questions(questions: Iterable[Question]) -> str:
 def read_questions(buffer_set: BufferSet) -> dict[EpisodeId, Question]:
     """Read the questions of a buffer set, by query episode."""
     hint, command = "Only its publisher can make them again.", None
-    if buffer_set.is_own:
+    recorded = buffer_set.datasets[DEMONSTRATIONS].records()
+    if all(record.simulator is None for record in recorded):
+        hint = "Questions need demonstrations of a simulator that lists the possible answers."
+    elif buffer_set.is_own:
         hint, command = "", f"build {buffer_set.location} --only questions"
     try:
         path = buffer_set.files.path(QUESTIONS_PATH)

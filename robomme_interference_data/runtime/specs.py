@@ -11,6 +11,7 @@ import types
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
@@ -71,6 +72,18 @@ class Spec:
         return f"{self.kind}:{self.target}" if self.target else self.kind
 
 
+def _module_hint(target: str) -> str | None:
+    """Return how to name the module of `folder/file.py:factory`; None for another target."""
+    path, _, factory = target.rpartition(":")
+    if not path.endswith(".py"):
+        return None
+    file = Path(path)
+    return (
+        f"Name the module, not its file: python:{file.stem}:{factory}, with PYTHONPATH set to the "
+        f"folder {file.parent}."
+    )
+
+
 class Registry[K: Kind]:
     """Kinds by name; messages call them `what`, such as `policy`.
 
@@ -94,7 +107,8 @@ class Registry[K: Kind]:
         target = target if colon else kind.default
         match = re.fullmatch(kind.target, target, re.DOTALL)
         if match is None or bool(colon) > bool(target) or not kind.valid(target):
-            raise InvalidOptionError.expected(self._what, text, kind.form)
+            module_hint = _module_hint(target) if name == "python" else None
+            raise InvalidOptionError.expected(self._what, text, kind.form, module_hint)
         # All that is recorded has the one spelling, so that equal runs look equal.
         if kind.spelled(target) != target:
             return self.parse(f"{name}:{kind.spelled(target)}")

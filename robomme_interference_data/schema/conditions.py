@@ -216,9 +216,20 @@ def parse_condition(text: str | Condition) -> Condition:
             return Condition(text, kind, int(match["k"]))
     raise InvalidIdError(
         f"{text!r} is not a condition",
-        f"Expected {NO_HISTORY}, k0, k1, … k{MAX_K}, before-k3, …",
+        f"{_similar(text)}Expected {NO_HISTORY}, k0, k1, … k{MAX_K}, before-k3, …",
         "conditions",
     )
+
+
+def _similar(text: object) -> str:
+    """Return a question about the condition that was likely meant, in small letters, or nothing."""
+    small = str(text).strip().lower()
+    if small == text:
+        return ""
+    try:
+        return f"Did you mean {parse_condition(small).name!r}? "
+    except InvalidIdError:
+        return ""
 
 
 def in_order(conditions: Iterable[str | Condition]) -> tuple[Condition, ...]:

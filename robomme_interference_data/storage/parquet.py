@@ -27,6 +27,9 @@ _IMAGES_AT_ONCE = 8
 _MAX_METADATA_BYTES = 16 << 20
 """Files of LeRobot of 100 MB, with a row group for each episode, have half of it."""
 
+_MAGIC = b"PAR1"
+"""First and last bytes of a Parquet file."""
+
 _MAX_LIST = 1 << 14
 """Length of a list in the metadata, such as row groups: pyarrow allocates memory for it first."""
 
@@ -61,9 +64,12 @@ def open_parquet(path: Path) -> pq.ParquetFile:
 def _check_metadata_size(path: Path) -> None:
     """Raise if a file has more metadata than it needs: parsed, it takes up to 240 times as much."""
     with path.open("rb") as file:
+        begin = file.read(len(_MAGIC))
         end = file.seek(0, os.SEEK_END)
         file.seek(max(0, end - 8))
         size = int.from_bytes(file.read(4), "little")
+        if _MAGIC not in (begin, file.read(4)):
+            raise ValueError("not a Parquet file")
     if size > _MAX_METADATA_BYTES:
         raise ValueError(f"{size:,} bytes of metadata; expected at most {_MAX_METADATA_BYTES:,}")
 
@@ -227,7 +233,8 @@ class RowSpan:
                 "Every row needs a vector of the same length.",
             )
         values = flat.to_numpy().reshape(len(column), lengths[0].as_py())
-        return np.ascontiguousarray(values, dtype=np.float32)
+        with np.errstate(over="ignore"):  # what is too large becomes infinite; callers refuse it
+            return np.ascontiguousarray(values, dtype=np.float32)
 
     def images(self, name: str) -> Iterator[bytes]:
         """Yield the encoded images of a column of structs with the field `bytes`, in order.

@@ -96,8 +96,20 @@ def test_several_failures_are_listed(tmp_path: Path) -> None:
     wrong = {name: {3: SourceError("broke off")} for name in list(TRAIN)[1:]}
     with raises(BuildError) as caught:
         build(tmp_path / "out", MadeUpSource(TRAIN, wrong))
-    assert "A/train/1: broke off (started 1 times)" in caught.value.message
-    assert "the same command again" in str(caught.value.hint)
+    listed = caught.value.message.splitlines()[1:]
+    assert listed == ["  A/train/1, B/train/0, B/train/1: broke off"]
+    assert "The others are kept" in str(caught.value.hint)
+
+
+def test_failures_of_all_episodes_keep_their_hints(tmp_path: Path) -> None:
+    wrong = {name: {3: SourceError("broke off", "Record it again.")} for name in TRAIN}
+    wrong["A/train/0"] = {3: SourceError("is dark", "Lift the cap.")}
+    with pytest.raises(BuildError) as caught:
+        build(tmp_path / "out", MadeUpSource(TRAIN, wrong))
+    assert len(caught.value.message.splitlines()) == 3
+    hints = str(caught.value.hint).splitlines()
+    assert hints[:2] == ["Lift the cap.", "Record it again."]
+    assert "The others are kept." not in hints
 
 
 def test_what_a_killed_build_had_moved_away_is_put_back(tmp_path: Path) -> None:
@@ -454,3 +466,10 @@ def test_build_all_rejects_folders_with_unknown_files(tmp_path: Path, name: str)
     (folder / "notes.txt").write_text("mine")
     with raises(BuildError):
         plan_build(config(tmp_path), BuffersConfig())
+
+
+def test_an_error_about_filters_shows_what_there_is() -> None:
+    names = ("A/train/0", "A/train/1", "A/train/4", "B/test/2")
+    with pytest.raises(SourceError) as caught:
+        choose_episodes([made_up(*names)], numbers=range(50, 61))
+    assert "train A 0-1,4, test B 2" in str(caught.value.hint)

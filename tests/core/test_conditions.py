@@ -175,3 +175,11 @@ def test_what_is_written_is_read_again(parts: list[tuple[str, tuple[int, int]]])
 def test_words_and_points_must_go_together(text: str, points: tuple[tuple[int, int], ...]) -> None:
     with raises(InvalidOptionError):
         Subgoal(text, points)
+
+
+def test_a_condition_in_large_letters_is_recognized() -> None:
+    for text, meant in (("K3", "k3"), ("No-History", "no-history"), (" k0", "k0")):
+        with pytest.raises(InvalidIdError) as raised:
+            parse_condition(text)
+        assert raised.value.hint is not None
+        assert raised.value.hint.startswith(f"Did you mean {meant!r}? ")

@@ -38,7 +38,8 @@ def test_each_is_a_builtin_too_and_travels_between_processes(
     raised = error("what was found", "what to do", "verify my-buffers")
     for one in (raised, pickle.loads(pickle.dumps(raised))):
         assert type(one) is error
-        assert str(one) == "what was found\nwhat to do"
+        lines = ["what was found", "what to do", "Run: robomme-interference verify my-buffers"]
+        assert str(one).splitlines() == lines
         assert (one.hint, one.command) == ("what to do", "verify my-buffers")
     assert str(error("only this")) == "only this"
 

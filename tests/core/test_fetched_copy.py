@@ -135,9 +135,9 @@ def test_commands_work_on_a_part(part: Path, run: Run, tmp_path: Path) -> None:
     [
         ("publish {} --repo-id someone/other --dry-run", "fetch"),
         ("index {}", "fetch"),
-        ("build {} --only manifests --conditions before-k1", "--demonstrations"),
-        ("list {} --conditions before-k1", "--demonstrations"),
-        ("build {} --only questions", "--demonstrations"),
+        ("build {} --only manifests --conditions before-k1", "build BUFFER_SET --demonstrations"),
+        ("list {} --conditions before-k1", "build BUFFER_SET --demonstrations"),
+        ("build {} --only questions", "build BUFFER_SET --demonstrations"),
     ],
 )
 def test_a_part_is_neither_changed_nor_published(

@@ -205,3 +205,18 @@ def test_a_page_header_is_found_however_long_it_is(tmp_path: Path) -> None:
     pq.write_table(table, written, use_dictionary=False, compression="none")
     (tmp_path / "t").write_bytes(written.getvalue())
     assert RowSpan(tmp_path / "t").table() == table
+
+
+def test_a_text_file_is_no_parquet_file(tmp_path: Path) -> None:
+    """Its last bytes are not taken for the size of its metadata."""
+    (tmp_path / "frames.parquet").write_text("episode_id,frame_index\n" * 9)
+    with pytest.raises(FormatError) as raised:
+        RowSpan(tmp_path / "frames.parquet").table()
+    assert "not a Parquet file" in raised.value.message
+    assert "bytes of metadata" not in raised.value.message
+
+
+@pytest.mark.filterwarnings("error")
+def test_numbers_beyond_float32_become_infinite_without_a_warning(tmp_path: Path) -> None:
+    path = write(tmp_path / "t.parquet", state=pa.array([[1.0, 1e300]]))
+    assert np.isinf(RowSpan(path).vectors("state")[0, 1])

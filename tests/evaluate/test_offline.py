@@ -13,7 +13,12 @@ from support.messages import raises
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.sources import Frame
-from robomme_interference_data.errors import HashMismatchError, InterferenceError, PolicyError
+from robomme_interference_data.errors import (
+    HashMismatchError,
+    InterferenceError,
+    InvalidOptionError,
+    PolicyError,
+)
 from robomme_interference_data.evaluate import Policy, RolloutInfo, RunConfig, run_evaluation
 from robomme_interference_data.evaluate.rollout.rollout import run_rollout
 from robomme_interference_data.evaluate.run.plan import WorkItem
@@ -267,6 +272,16 @@ def test_settings_that_do_not_fit(buffers: Path, tmp_path: Path, changes: dict[s
     with raises(InterferenceError):
         run_evaluation(config, executor=Serial())
     assert not (tmp_path / "run").exists()
+
+
+def test_a_policy_of_another_robot_is_refused_with_those_that_fit(
+    arms: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(InterferenceError) as raised:
+        evaluate(arms, tmp_path / "run", policy="replay", conditions=("k0",))
+    assert isinstance(raised.value, InvalidOptionError)
+    assert raised.value.hint is not None
+    assert all(policy in raised.value.hint for policy in ("hold", "mean", "python:"))
 
 
 def test_buffer_sets_without_executions(tmp_path: Path, own_buffers: Path) -> None:

@@ -269,3 +269,10 @@ def test_members_of_another_type_are_errors(name: str, value: str, words: str) -
         make_policy(f"{OWN}changed", [f"name={name}", f"value={value}"])
     assert words in str(raised.value)
     make_policy(f"{OWN}changed", ["name=cameras", 'value=["wrist"]'])  # a list is accepted
+
+
+def test_a_file_in_place_of_a_module_is_explained() -> None:
+    with pytest.raises(InvalidOptionError) as raised:
+        POLICIES.parse("python:pol/file.py:make")
+    assert raised.value.hint is not None
+    assert "python:file:make" in raised.value.hint and "folder pol" in raised.value.hint

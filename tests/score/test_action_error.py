@@ -354,3 +354,16 @@ def test_bad_rows(tmp_path: Path, changes: dict[str, object]) -> None:
     bad = [replace(rows()[0], **changes)]  # type: ignore[arg-type]
     with raises(FormatError):
         read_rows([made.write_parquet(tmp_path / "bad.parquet", bad)])
+
+
+def test_recordings_are_not_compared_with_the_paper(tmp_path: Path) -> None:
+    path = made.write_csv(tmp_path / "a.csv", rows())
+    without = made.score(path).notes
+    found = made.score(path, paper=True)
+    assert "paper" not in found.tables
+    assert len(found.notes) == len(without) + 1
+
+
+def test_one_system_is_not_called_the_lowest(tmp_path: Path) -> None:
+    [headline] = headlines(made.score(made.write_csv(tmp_path / "a.csv", rows())))
+    assert "lowest" not in str(headline)

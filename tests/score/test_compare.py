@@ -142,3 +142,13 @@ def test_a_planned_look_has_a_level_and_intervals_of_its_own(tmp_path: Path) -> 
     assert "Look 2 of 5" in text and f"p holm is below {level:.2g}" in text
     wrong = run("compare", path, "--conditions", "k0,k7", "--looks", "6/5")
     assert isinstance(wrong.exception, InvalidOptionError) and "6/5" in str(wrong.exception)
+
+
+def test_one_condition_of_two_runs(tmp_path: Path) -> None:
+    a = made.write_csv(tmp_path / "a.csv", own(k0="ssff", k7="ssss"))
+    b = made.write_csv(tmp_path / "b.csv", own(k0="sfsf", k7="ssff"))
+    found = compare(a, b, conditions=["k7"]).table.records()
+    assert {(row["condition"], row["against_condition"]) for row in found} == {("k7", "k7")}
+    assert (found[0]["n"], found[0]["lost"]) == (4, 2)
+    with pytest.raises(InvalidOptionError):
+        compare(a, conditions=["k7"])

@@ -21,7 +21,7 @@ from support.buffer_sets import QUERIES, contents
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.cli import doctor
 from robomme_interference_data.cli.console import echo, log_to_stderr, print_json
-from robomme_interference_data.cli.main import app
+from robomme_interference_data.cli.main import app, main
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.schema.codec import to_dict
 
@@ -430,3 +430,18 @@ def test_examples_parse(line: str) -> None:
     from support.command_lines import parse
 
     parse(shlex.split(line)[1:])
+
+
+@pytest.mark.parametrize("options", [(), ("--json",)])
+def test_an_interrupt_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], options: tuple[str, ...]
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("robomme_interference_data.data.loading.load_buffer_set", interrupted)
+    monkeypatch.setattr(sys, "argv", ["robomme-interference", "list", "my-buffers", *options])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 130
+    assert capsys.readouterr().err.split() == ["Interrupted."]
