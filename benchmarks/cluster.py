@@ -35,7 +35,7 @@ from robomme_interference_data.evaluate.run.progress import RunProgress
 from robomme_interference_data.evaluate.run.runner import RunContext
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.runtime.executor import Processes
+from robomme_interference_data.runtime.process import Processes
 from robomme_interference_data.runtime.ray_cluster import RayWorkers
 
 CONDITIONS = ("no-history", "k0", "k1", "k3", "k7")

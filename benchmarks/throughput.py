@@ -43,7 +43,8 @@ from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.process import policy_processes
 from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.policies.shared import Address, SharedPolicy
-from robomme_interference_data.runtime.executor import Processes, Worker
+from robomme_interference_data.runtime.executor import Worker
+from robomme_interference_data.runtime.process import Processes
 
 FIRST_S, FURTHER_S = 0.050, 0.005
 TIMEOUTS_S = (0.01, 0.03)

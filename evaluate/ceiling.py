@@ -13,7 +13,7 @@ from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.retrieval.grade import ALL
-from robomme_interference_data.retrieval.selector import StoredSelector
+from robomme_interference_data.retrieval.stored_selector import StoredSelector
 from robomme_interference_data.schema.conditions import NO_HISTORY, in_order
 from robomme_interference_data.schema.evidence import known_parts
 from robomme_interference_data.schema.sampling import Memory, evidence_kept

@@ -7,13 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.data.buffer import Buffer
-from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.embeddings import BufferSetIndex
 from robomme_interference_data.data.index_layout import index_folder
-from robomme_interference_data.data.views import live_embedding
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.schema.shifts import Shift
 
 from .encoders import check_encoder, encoder_name, make_encoder, published_threshold
 from .select import Rule, choose, measure
@@ -38,32 +35,9 @@ class RetrievalStep:
         camera = dataset.camera(self.camera)
         return f"{PurePath(index_folder(self.encoder, camera)).name}/{self.rule}"
 
-    def _chosen(self, buffer: Buffer, query: NDArray[np.floating]) -> NDArray[np.int64]:
+    def matching_frames(self, buffer: Buffer, query: NDArray[np.floating]) -> NDArray[np.int64]:
         """Choose the frames of a buffer that match the embedding of a live image, `(D,)`."""
         return choose(measure(buffer, self.encoder, self.camera, query), self.rule).frames
-
-
-class StoredSelector(RetrievalStep):
-    """Chooses the frames of a history that match its stored first live view.
-
-    No image is embedded: that view has an embedding in the index, too.
-    """
-
-    def select(
-        self, buffer_set: BufferSet, buffer: Buffer, shift: Shift | None = None
-    ) -> NDArray[np.int64]:
-        """Choose the frames of a buffer that match its stored first live view.
-
-        Args:
-            buffer_set: The buffer set of the buffer.
-            buffer: The history, with at least one frame.
-            shift: Shift of the first live view.
-
-        Returns:
-            Indices in the buffer, ascending, `(n,) int64`, n at least 1.
-        """
-        live = live_embedding(buffer_set, buffer, shift, self.encoder, self.camera)
-        return self._chosen(buffer, live)
 
 
 class Selector(RetrievalStep):
@@ -120,7 +94,7 @@ class Selector(RetrievalStep):
             raise InvalidOptionError.expected("image", actual, "(H, W, 3) uint8")
         features = self._encoder.features(self._encoder.prepare(image[None]))
         query = index.embed(features)[0]
-        return self._chosen(buffer, query)
+        return self.matching_frames(buffer, query)
 
     def _index(self, buffer: Buffer) -> BufferSetIndex:
         """Return the index of the buffer set, which this encoder has to have made."""

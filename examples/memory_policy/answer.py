@@ -20,7 +20,7 @@ from robomme_interference_data.constants import DEMONSTRATIONS, PROTOCOL_VERSION
 from robomme_interference_data.data.questions import LETTERS
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.run.runner import history_columns
-from robomme_interference_data.retrieval.selector import StoredSelector
+from robomme_interference_data.retrieval.stored_selector import StoredSelector
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.storage.files import atomic_path, sha256_file

@@ -6,28 +6,25 @@ reports where it hung.
 """
 
 import math
-import os
 import platform
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, replace
-from importlib import metadata
+from importlib import import_module, metadata
 from typing import Any, Self
 
-from robomme_interference_data.errors import InvalidOptionError, WorkerError, named
+from robomme_interference_data.errors import InvalidOptionError, named
 from robomme_interference_data.lazy import load_extra
 from robomme_interference_data.schema.settings import setting
 
-from .process import ProcessScheduler, end_if_starting
 from .scheduler import Scheduler
 from .specs import bind_options
-from .worker import Outcome, Task, Worker, attempt
+from .worker import Outcome, Task, Worker, attempt, end_if_starting
 
 __all__ = [
     "Executor",
     "Outcome",
-    "Processes",
     "Resources",
     "Serial",
     "WorkerPool",
@@ -101,7 +98,10 @@ def make_executor(config: WorkersConfig) -> "Executor":
                 f"{named('resources')} has no effect with {named('executor', 'processes')}",
                 f"Set {named('executor', 'ray')}, or leave it out.",
             )
-        return Processes(config.workers)
+        # By name: a run in this process starts no others, and imports nothing to start them.
+        processes: Any = import_module(f"{__package__}.process").Processes
+        local: Executor = processes(config.workers)
+        return local
     address, resources = ray_address(config), Resources.parse("resources", config.resources)
     make = load_extra(
         f"{__package__}.ray_cluster", "RayWorkers", named("executor", "ray"), "cluster"
@@ -218,32 +218,3 @@ class _SerialScheduler(Scheduler[_Inline]):
 
     def close(self) -> None:
         getattr(self.function, "close", lambda: None)()
-
-
-@dataclass(frozen=True)
-class Processes(Executor):
-    """Runs tasks in worker processes, whose crashes and hangs do not stop the others.
-
-    Workers print to stderr. Processes that they start end with them.
-
-    Attributes:
-        workers: Number of worker processes.
-    """
-
-    workers: int
-
-    def __post_init__(self) -> None:
-        if self.workers < 1:
-            raise InvalidOptionError.expected("workers", self.workers, "1 or more")
-        if not hasattr(os, "setpgid"):  # a worker ends with its process group
-            raise WorkerError(
-                "worker processes need Linux or macOS",
-                "Use one of them, such as the Windows Subsystem for Linux.",
-            )
-
-    @contextmanager
-    def pool(self, function: Task) -> Iterator[WorkerPool]:
-        """Keep worker processes in the block; see `Executor.pool`."""
-        end_if_starting()
-        with closing(ProcessScheduler(function, self.workers)) as scheduler:
-            yield scheduler

@@ -7,26 +7,20 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.errors import WorkerError
+from robomme_interference_data.errors import InvalidOptionError, WorkerError
 
+from .executor import Executor, WorkerPool
+from .process_worker import ProcessWorker, has_begun, read_remains, take_files
 from .safe_path import safe_path
 from .scheduler import Scheduler
-from .worker import (
-    Outcome,
-    ProcessWorker,
-    Task,
-    has_begun,
-    read_remains,
-    take_files,
-    unpickle_outcome,
-)
+from .worker import STARTED_AGAIN, Outcome, Task, end_if_starting, unpickle_outcome
 
 CLOSE_S = 10.0
 """Seconds that idle workers have to release their resources."""
@@ -36,18 +30,6 @@ START_S = 300.0
 
 _LOOK_S = 5.0
 """Seconds between checks of workers that have not started yet."""
-
-_STARTED_AGAIN = 97
-"""Exit code of a worker whose imports reach the call that starts workers."""
-
-
-def end_if_starting() -> None:
-    """End this process silently if it is a worker that is still importing the caller's script.
-
-    Then a script that starts work at module level gets one error, from its own process.
-    """
-    if getattr(multiprocessing.current_process(), "_inheriting", False):
-        sys.exit(_STARTED_AGAIN)
 
 
 class WorkerProcess:
@@ -114,7 +96,7 @@ class WorkerProcess:
             died = RuntimeError(f"the worker process died (exit code {code})")
             return replace(outcome, error=outcome.error or died)
         problem = f"ended before its first task (exit code {code}); its output is above"
-        if code == _STARTED_AGAIN:
+        if code == STARTED_AGAIN:
             problem = "would start worker processes while it imports the script"
         raise WorkerError(
             f"a worker process {problem}",
@@ -160,3 +142,32 @@ def _serve(function: Task, pipe: Connection, number: int, home: Path) -> None:
             task, time_limit = pipe.recv()
             pipe.send_bytes(worker.work(function, task, time_limit))
     getattr(function, "close", lambda: None)()
+
+
+@dataclass(frozen=True)
+class Processes(Executor):
+    """Runs tasks in worker processes, whose crashes and hangs do not stop the others.
+
+    Workers print to stderr. Processes that they start end with them.
+
+    Attributes:
+        workers: Number of worker processes.
+    """
+
+    workers: int
+
+    def __post_init__(self) -> None:
+        if self.workers < 1:
+            raise InvalidOptionError.expected("workers", self.workers, "1 or more")
+        if not hasattr(os, "setpgid"):  # a worker ends with its process group
+            raise WorkerError(
+                "worker processes need Linux or macOS",
+                "Use one of them, such as the Windows Subsystem for Linux.",
+            )
+
+    @contextmanager
+    def pool(self, function: Task) -> Iterator[WorkerPool]:
+        """Keep worker processes in the block; see `Executor.pool`."""
+        end_if_starting()
+        with closing(ProcessScheduler(function, self.workers)) as scheduler:
+            yield scheduler

@@ -29,10 +29,11 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 from robomme_interference_data.errors import InvalidOptionError, WorkerError, first_line
 
 from .executor import Executor, Resources, WorkerPool, describe
-from .process import CLOSE_S, START_S, end_if_starting
+from .process import CLOSE_S, START_S
+from .process_worker import ProcessWorker, read_remains
 from .safe_path import SAFE_PATH, safe_path
 from .scheduler import Scheduler
-from .worker import Outcome, ProcessWorker, Task, read_remains, unpickle_outcome
+from .worker import Outcome, Task, end_if_starting, unpickle_outcome
 
 logger = logging.getLogger(__name__)
 

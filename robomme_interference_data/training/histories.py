@@ -14,7 +14,7 @@ from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.query_sessions import QuerySessions, SessionSource
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.retrieval.selector import StoredSelector
+from robomme_interference_data.retrieval.stored_selector import StoredSelector
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.schema.shifts import Shift
 

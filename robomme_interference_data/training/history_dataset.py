@@ -15,7 +15,7 @@ from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.data.views import shifted_view
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.ids import EpisodeId, parse_numbers, whole_number
-from robomme_interference_data.retrieval.selector import StoredSelector
+from robomme_interference_data.retrieval.stored_selector import StoredSelector
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.schema.shifts import NO_SHIFT, parse_shift

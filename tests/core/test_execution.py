@@ -17,7 +17,6 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import (
-    Processes,
     Resources,
     Serial,
     Worker,
@@ -25,6 +24,7 @@ from robomme_interference_data.runtime.executor import (
     describe,
     make_executor,
 )
+from robomme_interference_data.runtime.process import Processes
 
 
 class Noted:

@@ -40,7 +40,8 @@ from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.rollout.checks import check_settings, check_system
 from robomme_interference_data.evaluate.rollout.names import default_system
 from robomme_interference_data.evaluate.run.history import HistoryReader
-from robomme_interference_data.runtime.executor import Executor, Processes, Serial
+from robomme_interference_data.runtime.executor import Executor, Serial
+from robomme_interference_data.runtime.process import Processes
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.episode import Observation
 

@@ -10,7 +10,8 @@ from support.messages import raises
 from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.retrieval.select import choose, measure
-from robomme_interference_data.retrieval.selector import Selector, StoredSelector
+from robomme_interference_data.retrieval.selector import Selector
+from robomme_interference_data.retrieval.stored_selector import StoredSelector
 
 
 def test_it_chooses_what_stored_embeddings_choose(indexed: Path) -> None:

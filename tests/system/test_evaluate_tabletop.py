@@ -29,12 +29,13 @@ def buffer_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("tabletop")
     played = "--source tabletop --episodes 0 --cameras front --workers 2"
     for words in (
-        f"demonstrations {out} {played} --split test --families MoveCube,RouteStick",
-        f"executions {out} {played} --split test --families RouteStick",
-        f"distractors {out} {played} --families PatternLock",
-        f"manifests {out} --conditions no-history,k0,k1",
+        f"build {out} --only demonstrations {played} --split test --families MoveCube,RouteStick",
+        f"build {out} --only executions {played} --split test --families RouteStick",
+        f"build {out} --only distractors {played} --families PatternLock",
+        f"build {out} --only manifests --conditions no-history,k0,k1",
+        f"index {out}",
     ):
-        command = [COMMAND, "build", *words.split()]
+        command = [COMMAND, *words.split()]
         done = subprocess.run(command, capture_output=True, text=True, timeout=400, check=False)
         assert done.returncode == 0, done.stderr
     return out
@@ -59,6 +60,39 @@ def test_replay_retraces_the_lesson_with_one_worker_as_with_two(
     one, two = (untimed(run.rows) for run in runs)
     assert one == two
     assert [row["status"] for row in one] == ["success"] * 4
+
+
+_LIST_MODULES = """
+import sys
+from pathlib import Path
+
+from robomme_interference_data.evaluate import RunConfig, run_evaluation
+from robomme_interference_data.runtime.executor import Serial
+
+config = RunConfig(
+    policy="replay:framesamp:32",
+    buffer_set=sys.argv[1],
+    out=Path(sys.argv[2]),
+    conditions=("k1",),
+    families=("MoveCube",),
+    retrieval="thumbnail",
+)
+[row] = run_evaluation(config, executor=Serial()).rows
+assert row.retrieval_start is not None
+package = "robomme_interference_data"
+for name, module in sys.modules.items():
+    # An empty file makes a folder a package.
+    if name.startswith(package) and Path(module.__file__).stat().st_size > 0:
+        print(name.removeprefix(f"{package}."))
+"""
+
+
+def test_a_rollout_with_retrieval_imports_what_it_uses(buffer_set: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", _LIST_MODULES, buffer_set, tmp_path / "run"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=400, check=True)
+    modules = done.stdout.split()
+    assert {"retrieval.selector", "simulators.tabletop.families.move_cube"} <= {*modules}
+    assert len(modules) <= 95, sorted(modules)
 
 
 def test_the_oracle_always_succeeds_and_nothing_is_drawn(buffer_set: Path, tmp_path: Path) -> None:

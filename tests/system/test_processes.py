@@ -17,7 +17,8 @@ from support.worker_calls import behave, is_alive, pids_in, wait_until_gone
 
 from robomme_interference_data.errors import SimulatorCrashError, WorkerError, WorkerRetiredError
 from robomme_interference_data.runtime import process
-from robomme_interference_data.runtime.executor import Outcome, Processes
+from robomme_interference_data.runtime.executor import Outcome
+from robomme_interference_data.runtime.process import Processes
 
 ray_cluster = lazy("support.ray_cluster")
 ray_workers = lazy("robomme_interference_data.runtime.ray_cluster")
@@ -55,7 +56,7 @@ def run(request: pytest.FixtureRequest) -> Run:
 def script(folder: Path, text: str) -> tuple[list[str], dict[str, str]]:
     """Return the command that runs a script, and its environment."""
     path = folder / "script.py"
-    path.write_text("from robomme_interference_data.runtime.executor import Processes\n" + text)
+    path.write_text("from robomme_interference_data.runtime.process import Processes\n" + text)
     return [sys.executable, str(path)], {**os.environ, "PYTHONPATH": str(TESTS)}
 
 

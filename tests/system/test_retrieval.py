@@ -14,7 +14,8 @@ from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.segment import typical_cosine
 from robomme_interference_data.retrieval.select import Rule, choose
-from robomme_interference_data.runtime.executor import Processes, Serial
+from robomme_interference_data.runtime.executor import Serial
+from robomme_interference_data.runtime.process import Processes
 
 pytestmark = pytest.mark.slow
 

@@ -89,7 +89,7 @@ def test_no_module_of_the_current_folder_is_imported(planted: Path, words: str) 
 def test_nor_by_the_workers_of_a_script(planted: Path) -> None:
     script = planted.parent / "script.py"
     script.write_text(
-        "from robomme_interference_data.runtime.executor import Processes\n"
+        "from robomme_interference_data.runtime.process import Processes\n"
         "from support.worker_calls import behave\n"
         'if __name__ == "__main__":\n'
         '    [outcome] = Processes(1).run(behave, [("value", 7)])\n'

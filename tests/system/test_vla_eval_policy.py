@@ -12,7 +12,7 @@ from support.messages import raises
 
 from robomme_interference_data.errors import InvalidOptionError, WorkerRetiredError
 from robomme_interference_data.evaluate.policies.registry import make_policy
-from robomme_interference_data.runtime.executor import Processes
+from robomme_interference_data.runtime.process import Processes
 
 pytestmark = pytest.mark.usefixtures("world")
 

@@ -1,6 +1,7 @@
 """The nine task families; those that share a scene share a file."""
 
 from functools import lru_cache
+from importlib import import_module
 
 from numpy.random import RandomState
 
@@ -10,32 +11,27 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, seed_of, turn_of
 from robomme_interference_data.simulators.tabletop.family import Family
 
-from .insert_peg import InsertPeg
-from .move_cube import MoveCube
-from .stick import PatternLock, RouteStick
-from .video_place import VideoPlaceButton, VideoPlaceOrder
-from .video_repick import VideoRepick
-from .video_unmask import VideoUnmask, VideoUnmaskSwap
-
-_CLASSES: tuple[type[Family], ...] = (
-    VideoRepick,
-    VideoPlaceOrder,
-    VideoPlaceButton,
-    VideoUnmask,
-    VideoUnmaskSwap,
-    MoveCube,
-    InsertPeg,
-    PatternLock,
-    RouteStick,
-)
-_FAMILIES = {each.__name__: each for each in _CLASSES}
+_MODULES = {
+    "VideoRepick": "video_repick",
+    "VideoPlaceOrder": "video_place",
+    "VideoPlaceButton": "video_place",
+    "VideoUnmask": "video_unmask",
+    "VideoUnmaskSwap": "video_unmask",
+    "MoveCube": "move_cube",
+    "InsertPeg": "insert_peg",
+    "PatternLock": "stick",
+    "RouteStick": "stick",
+}
+"""Family, which is the name of its class, to its module, which is imported when it is drawn."""
 
 
 def draw_episode(family: str, seed: int, difficulty: str) -> Family:
     """Return the scene of a seed; nothing is simulated."""
-    if family not in _FAMILIES:
-        raise UnknownNameError.among("family", family, "tabletop", _FAMILIES)
-    return _FAMILIES[family](difficulty, RandomState(seed))
+    if family not in _MODULES:
+        raise UnknownNameError.among("family", family, "tabletop", _MODULES)
+    module = import_module(f"{__package__}.{_MODULES[family]}")
+    drawn: Family = getattr(module, family)(difficulty, RandomState(seed))
+    return drawn
 
 
 _cached_episode = lru_cache(256)(draw_episode)
@@ -43,7 +39,7 @@ _cached_episode = lru_cache(256)(draw_episode)
 
 def known_scene(family: str, seed: int, difficulty: str) -> Family | None:
     """Return a shared scene that must not be played; None for an unknown family or difficulty."""
-    known = family in _FAMILIES and difficulty in DIFFICULTIES
+    known = family in _MODULES and difficulty in DIFFICULTIES
     return _cached_episode(family, seed, difficulty) if known else None
 
 
