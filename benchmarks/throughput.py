@@ -127,7 +127,9 @@ def served() -> Iterator[str]:
 class Rollouts:
     """A worker: acts until a time; returns when each of its answers came."""
 
-    def __init__(self, config: RunConfig, addresses: Sequence[Address], chunk_s: float, folder: Path):
+    def __init__(
+        self, config: RunConfig, addresses: Sequence[Address], chunk_s: float, folder: Path
+    ):
         self._config, self._addresses, self._folder = config, addresses, folder
         self._chunk_s = chunk_s
 
@@ -169,7 +171,9 @@ def ask(policy: Policy, frames: dict[str, Any], observation: Observation) -> Non
     assert policy.act(observation, GOAL).shape == (16, 8)
 
 
-def processes(config: RunConfig, addresses: Sequence[Address], chunk_s: float, seconds: float) -> float:
+def processes(
+    config: RunConfig, addresses: Sequence[Address], chunk_s: float, seconds: float
+) -> float:
     """Return the observations a second of workers with their own policies, or a shared one."""
     with tempfile.TemporaryDirectory() as folder:
         task = Rollouts(config, addresses, chunk_s, Path(folder))

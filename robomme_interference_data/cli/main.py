@@ -15,6 +15,7 @@ from typer.core import TyperCommand
 
 from robomme_interference_data.build_dataset import commands as building
 from robomme_interference_data.cards import commands as publishing
+from robomme_interference_data.constants import DOCS_URL
 from robomme_interference_data.errors import (
     InterferenceError,
     NoRendererError,
@@ -94,8 +95,9 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
     help="History buffers for RoboMME-Interference: build, load, stream and score.",
-    epilog="""A buffer set is a folder with demonstrations, distractor units and manifests.
+    epilog=f"""A buffer set is a folder with demonstrations, distractor units and manifests.
 Options shown with NAME,… accept several values: separate them by commas or repeat the option.
+Pages that help names, such as docs/reference/policies.md, are at {DOCS_URL}.
 
 ```
 robomme-interference doctor

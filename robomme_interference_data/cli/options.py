@@ -14,7 +14,7 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
 
-from robomme_interference_data.errors import naming_options, option_names, with_addresses
+from robomme_interference_data.errors import naming_options, option_names
 from robomme_interference_data.runtime.specs import bind_options
 from robomme_interference_data.schema.settings import SETTING
 
@@ -119,8 +119,7 @@ def _rare_settings(config: Any) -> type | None:
 
 def _set_option(rare: Any) -> inspect.Parameter:
     settings = [
-        f"{field.name}: {with_addresses(field.metadata[SETTING]['help'])}"
-        for field in dataclasses.fields(rare)
+        f"{field.name}: {field.metadata[SETTING]['help']}" for field in dataclasses.fields(rare)
     ]
     option: Any = typer.Option(
         f"--{_SET}",
@@ -153,7 +152,7 @@ def _options(config: Any) -> list[inspect.Parameter]:
 def _option(field: dataclasses.Field[Any], kind: Any) -> inspect.Parameter:
     declared, default = field.metadata[SETTING], field.default
     attributes = {
-        "help": with_addresses(declared["help"]),
+        "help": declared["help"],
         "metavar": declared["metavar"],
         "envvar": declared["env"],
         "rich_help_panel": declared["group"],
