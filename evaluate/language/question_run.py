@@ -16,8 +16,8 @@ from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.run.runner import (
     Job,
     RunContext,
+    RunFunction,
     Runner,
-    RunTask,
     history_columns,
     retrieval_text,
     short_digest,
@@ -89,9 +89,9 @@ class Questions(Runner[AskConfig]):
                     f"{named('memory')}.",
                 )
 
-    def task(self, run: RunContext[AskConfig]) -> "AskTask":
+    def function(self, run: RunContext[AskConfig]) -> "AskFunction":
         """Return the function that asks questions."""
-        return AskTask(run)
+        return AskFunction(run)
 
     def identity(self, plan: RunPlan) -> dict[str, Any]:
         """Return what of questions and model can change an answer."""
@@ -153,7 +153,7 @@ def _name(config: AskConfig) -> str:
     return name
 
 
-class AskTask(RunTask[AskConfig]):
+class AskFunction(RunFunction[AskConfig]):
     """Asks questions; makes the model at the first one, and again after an error."""
 
     def __init__(self, run: RunContext[AskConfig]):

@@ -48,7 +48,7 @@ from robomme_interference_data.simulators.registry import simulator_class, simul
 
 from .checks import check_plan, check_settings, check_system
 from .names import default_system
-from .worker import RolloutTask, StartServer, StartSimulator
+from .worker import RolloutFunction, StartServer, StartSimulator
 
 if TYPE_CHECKING:
     from robomme_interference_data.evaluate.policies.answers import Answers
@@ -133,9 +133,9 @@ class Rollouts(Runner[RunConfig]):
         with optional.policy_processes(self.config) as self._addresses:
             yield
 
-    def task(self, run: RunContext[RunConfig]) -> RolloutTask:
+    def function(self, run: RunContext[RunConfig]) -> RolloutFunction:
         """Return the function that runs rollouts."""
-        return RolloutTask(run, self._answers, self._addresses)
+        return RolloutFunction(run, self._answers, self._addresses)
 
     def needs_workers(self, todo: Sequence[WorkItem]) -> bool:
         """Whether there is work, or a server that only workers start must be identified."""

@@ -22,7 +22,7 @@ from robomme_interference_data.evaluate.policies.registry import make_policy, st
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout
-from robomme_interference_data.evaluate.run.runner import Job, RunContext, RunTask
+from robomme_interference_data.evaluate.run.runner import Job, RunContext, RunFunction
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
@@ -63,7 +63,7 @@ class StartSimulator:
     episode: EpisodeId | None
 
 
-class RolloutTask(RunTask[RunConfig]):
+class RolloutFunction(RunFunction[RunConfig]):
     """Runs rollouts; makes policy and simulator at the first one, and again after an error.
 
     `answers` are those that the policy `answers` carries out; None for all other policies.

@@ -135,7 +135,7 @@ def run_evaluation(
         pool: WorkerPool | None = None
         if runner.needs_workers(todo):
             stack.enter_context(runner.shared())
-            pool = stack.enter_context(executor.pool(runner.task(run)))
+            pool = stack.enter_context(executor.pool(runner.function(run)))
             runner.open(pool, todo)
         identity = run_identity(runner, plan)
         with open_log(folder, identity, buffer_set.name, resume=not config.no_resume) as log:

@@ -35,7 +35,7 @@ from .tables.comparison import (
     comparison_table,
     detectable,
 )
-from .tables.contrast import START, Contrast, Measure, Role
+from .tables.contrast import START, Contrast, Effect, Measure
 from .tables.pairs import Pairs, pair, pair_errors
 
 
@@ -156,7 +156,7 @@ def _contrasts(
                     b.system,
                     after,
                     (a.system, before),
-                    Role.RUNS,
+                    Effect.RUNS,
                     pairs,
                     a.complete(before) and b.complete(after),
                     measure=measure,

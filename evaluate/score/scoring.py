@@ -195,10 +195,10 @@ def _compared(all_outcomes: Sequence[Outcomes], draws: int) -> tuple[list[Contra
         for system in outcomes.systems:
             ceiling = next(iter(ceilings_of(outcomes, system)), None)
             partners = {"base": base_of(outcomes, system), "ceiling": ceiling}
-            for role, partner in partners.items():
+            for relation, partner in partners.items():
                 why = "" if partner is None else _unpaired(outcomes, system, partner)
                 if why:
-                    partners[role] = None
+                    partners[relation] = None
                     simulator = outcomes.simulator
                     notes.append(f"{system} and {partner} in {simulator} are not paired: {why}.")
             contrasts += effects.effects_of(outcomes, system, **partners)

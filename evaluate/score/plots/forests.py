@@ -10,7 +10,7 @@ from robomme_interference_data.evaluate.score.tables.contrast import (
     COMPARISONS,
     START,
     Contrast,
-    Role,
+    Effect,
 )
 from robomme_interference_data.schema.conditions import KINDS, parse_condition
 from robomme_interference_data.stats.bootstrap import Interval
@@ -109,11 +109,11 @@ def effects(figure: Any, data: Data) -> bool:
     groups: _Groups = {}
     for contrast in counted:
         name = ""
-        if contrast.role is Role.HISTORY and contrast.condition == START:
+        if contrast.effect is Effect.HISTORY and contrast.condition == START:
             name = f"{START} − {short(contrast.against[1])}"
-        elif contrast.role is Role.SESSIONS:
+        elif contrast.effect is Effect.SESSIONS:
             name = f"{contrast.condition} − {START}"
-        elif contrast.role is Role.RETRIEVAL and parse_condition(contrast.condition).k == last:
+        elif contrast.effect is Effect.RETRIEVAL and parse_condition(contrast.condition).k == last:
             name = f"{contrast.condition}, with − without retrieval"
         if name:
             groups.setdefault(name, {})[contrast.system] = contrast
@@ -136,7 +136,7 @@ def ceiling(figure: Any, data: Data) -> bool:
     """Draw how far systems are below the ideal observer with their memory."""
     groups: _Groups = {}
     for contrast in data.contrasts:
-        if contrast.role is Role.CEILING and contrast.pairs.n:
+        if contrast.effect is Effect.CEILING and contrast.pairs.n:
             groups.setdefault(contrast.condition, {})[contrast.system] = contrast
     if not groups:
         return False
@@ -150,7 +150,7 @@ def retention(figure: Any, data: Data) -> bool:
     lifts = [
         contrast
         for contrast in data.contrasts
-        if contrast.role is Role.HISTORY and not math.isnan(contrast.retention.value)
+        if contrast.effect is Effect.HISTORY and not math.isnan(contrast.retention.value)
     ]
     if not lifts:
         return False
@@ -214,7 +214,7 @@ def _most_common(contrasts: Sequence[Contrast]) -> _Groups:
     by_question: dict[str, dict[int, list[Contrast]]] = {}
     for contrast in contrasts:
         condition = parse_condition(contrast.condition)
-        asks = condition.kind.asks if contrast.role is Role.SESSIONS else contrast.asks
+        asks = condition.kind.asks if contrast.effect is Effect.SESSIONS else contrast.asks
         if asks and contrast.pairs.n:
             by_question.setdefault(asks, {}).setdefault(condition.k, []).append(contrast)
     counts = Counter(k for by_k in by_question.values() for k in by_k)

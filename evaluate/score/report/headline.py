@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.cells import SuccessCell
-from robomme_interference_data.evaluate.score.tables.contrast import START, Contrast, Role
+from robomme_interference_data.evaluate.score.tables.contrast import START, Contrast, Effect
 from robomme_interference_data.evaluate.systems import display_name, published_base
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.stats.intervals import wilson
@@ -51,7 +51,7 @@ def _leading(
     falls = [
         contrast
         for contrast in score.contrasts
-        if contrast.role is Role.SESSIONS
+        if contrast.effect is Effect.SESSIONS
         and (contrast.simulator, contrast.system) == (leader.simulator, leader.system)
         and contrast.pairs.n
     ]
@@ -138,7 +138,7 @@ def _from_start(score: Score, fall: Contrast) -> str:
     falls = [
         contrast
         for contrast in score.contrasts
-        if contrast.role is Role.SESSIONS
+        if contrast.effect is Effect.SESSIONS
         and (contrast.simulator, contrast.condition) == (fall.simulator, fall.condition)
         and (contrast is fall or contrast.complete)
         and (contrast is fall or not score.is_reference(contrast.simulator, contrast.system))
@@ -158,7 +158,7 @@ def _hurting(score: Score, leader: SuccessCell) -> list[str]:
     effects = [
         contrast
         for contrast in score.contrasts
-        if contrast.role is Role.INTERFERENCE
+        if contrast.effect is Effect.INTERFERENCE
         and (contrast.simulator, contrast.system) == (leader.simulator, leader.system)
         and contrast.complete
     ]

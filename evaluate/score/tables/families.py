@@ -20,12 +20,12 @@ from robomme_interference_data.stats.significance import holm
 from robomme_interference_data.viz.tables import Table
 
 from .comparison import COMPLETE, SIDES, ComparisonTable, comparison_table
-from .contrast import Contrast, Role
+from .contrast import Contrast, Effect
 
 DRAWS = 2000
 """Random signs, and draws of families and episodes."""
 
-_ROLES = (Role.HISTORY, Role.SESSIONS, Role.RETRIEVAL, Role.INTERFERENCE)
+_EFFECTS = (Effect.HISTORY, Effect.SESSIONS, Effect.RETRIEVAL, Effect.INTERFERENCE)
 
 FAMILIES = ComparisonTable(
     name="families",
@@ -71,7 +71,7 @@ def families_table(all_outcomes: Iterable[Outcomes], contrasts: Sequence[Contras
         labels = outcomes.family
         effects, differences, counts = list[Contrast](), list[Floats](), list[int]()
         for contrast in contrasts:
-            if contrast.simulator != outcomes.simulator or contrast.role not in _ROLES:
+            if contrast.simulator != outcomes.simulator or contrast.effect not in _EFFECTS:
                 continue
             before = success(outcomes.status[outcomes.cell(*contrast.against)])
             after = success(outcomes.status[outcomes.cell(contrast.system, contrast.condition)])

@@ -23,7 +23,7 @@ from .comparison import (
     comparison_table,
     detectable,
 )
-from .contrast import Contrast, Measure, Role
+from .contrast import Contrast, Effect, Measure
 from .pairs import Pairs, compare_unpaired, pair
 
 _Compared = Mapping[tuple[str, str], Pairs]
@@ -133,7 +133,7 @@ def matrix_table(contrasts: Iterable[Contrast]) -> Table:
     pairs = [
         contrast
         for contrast in contrasts
-        if contrast.role is Role.SYSTEMS and contrast.measure is Measure.SUCCESS
+        if contrast.effect is Effect.SYSTEMS and contrast.measure is Measure.SUCCESS
     ]
     table = comparison_table(MATRIX, pairs)
     return replace(table, note=f"{table.note} {detectable(pairs, MATRIX.group)}".strip())
@@ -157,7 +157,7 @@ def system_pairs(outcomes: Outcomes) -> Iterator[Contrast]:
                 system,
                 condition,
                 (other, condition),
-                Role.SYSTEMS,
+                Effect.SYSTEMS,
                 pairs,
                 complete=True,
             )

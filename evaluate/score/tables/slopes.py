@@ -22,7 +22,7 @@ from robomme_interference_data.stats.signs import sign_flips, vector_sign_flips
 from robomme_interference_data.viz.tables import Columns, Table
 
 from .comparison import ComparisonTable, comparison_table, tested_table
-from .contrast import Contrast, Role
+from .contrast import Contrast, Effect
 from .pairs import Pairs
 
 
@@ -171,7 +171,7 @@ INTERACTION = ComparisonTable(
 
 def interaction_table(contrasts: Iterable[Contrast]) -> Table:
     """Return the falls of two systems compared, among some comparisons."""
-    return comparison_table(INTERACTION, [c for c in contrasts if c.role is Role.SLOPES])
+    return comparison_table(INTERACTION, [c for c in contrasts if c.effect is Effect.SLOPES])
 
 
 def interactions_of(outcomes: Outcomes, draws: int = DRAWS) -> list[Contrast]:
@@ -219,7 +219,7 @@ def interactions_of(outcomes: Outcomes, draws: int = DRAWS) -> list[Contrast]:
                 system,
                 conditions[-1],
                 (other, conditions[-1]),
-                Role.SLOPES,
+                Effect.SLOPES,
                 compared,
                 _all_complete(outcomes, [system, other], conditions),
                 columns={
