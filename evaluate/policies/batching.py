@@ -67,8 +67,8 @@ class Batcher[K: Hashable]:
             return None
         return attempt(getattr(self._sessions[key], method), *arguments)
 
-    def due_s(self, now: float) -> float | None:
-        """Return the seconds until a batch is due, 0 if one is; None if no request waits."""
+    def until_batch_s(self, now: float) -> float | None:
+        """Return the seconds until `act` is to be called, 0 for now; None if no request waits."""
         if not self._waiting:
             self._since = None
             return None

@@ -157,13 +157,13 @@ class PolicyHost:
         """Make the calls until the run has ended."""
         with closing(self._batcher):
             while not ended():
-                due_s = self._batcher.due_s(time.monotonic())
-                wait_s = _LOOK_S if due_s is None else min(due_s, _LOOK_S)
+                until_batch_s = self._batcher.until_batch_s(time.monotonic())
+                wait_s = _LOOK_S if until_batch_s is None else min(until_batch_s, _LOOK_S)
                 with suppress(Empty):
                     self._make(*self._calls.get(timeout=wait_s))
                     while True:  # all that wait, so that a batch is as large as it can be
                         self._make(*self._calls.get(block=False))
-                if self._batcher.due_s(time.monotonic()) == 0:
+                if self._batcher.until_batch_s(time.monotonic()) == 0:
                     with _time_limit(self._config.rollout_timeout_s):
                         answers = self._batcher.act()
                     for worker, answer in answers.items():

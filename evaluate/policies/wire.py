@@ -47,14 +47,14 @@ def pack(message: Any) -> bytes:
         raise FormatError(f"a message cannot be sent: {error}", _NOTHING_ELSE) from error
 
 
-def check_items(data: bytes, refused: Callable[[Any], bool] = lambda items: False) -> None:
+def check_items(data: bytes, forbidden: Callable[[Any], bool] = lambda items: False) -> None:
     """Check that a message is small once it is read, without keeping what it holds.
 
     The library bounds the length of each map and list; their number multiplies if they are nested.
 
     Args:
         data: The message.
-        refused: Whether a message may not hold this map or list.
+        forbidden: Whether a message may not hold this map or list.
     """
     count = 0
 
@@ -67,7 +67,7 @@ def check_items(data: bytes, refused: Callable[[Any], bool] = lambda items: Fals
             dtype = items.get("dtype", items.get(b"dtype"))
             if dtype is not None and not (isinstance(dtype, str) and len(dtype) <= _DTYPE_LETTERS):
                 raise ValueError(f"a dtype {dtype!r:.80}")
-        if refused(items):
+        if forbidden(items):
             raise ValueError(f"it may not hold {items!r:.80}")
 
     limits = {"max_map_len": MOST_ITEMS, "max_array_len": MOST_ITEMS}

@@ -79,7 +79,7 @@ class RolloutFunction(RunFunction[RunConfig]):
         policy: Policy | None = None,
     ):
         super().__init__(run)
-        self._answers, self._addresses, self._given = answers, addresses, policy
+        self._answers, self._addresses, self._made_policy = answers, addresses, policy
         self._simulator: Simulator | None = None
         self._policy: Policy | None = None
         self._checked = False  # whether the policy's server is the one that the run began with
@@ -145,8 +145,8 @@ class RolloutFunction(RunFunction[RunConfig]):
 
     def _make_policy(self, worker: Worker) -> Policy:
         config = self.run.config
-        if self._given is not None:
-            return self._given
+        if self._made_policy is not None:
+            return self._made_policy
         if not self._addresses:
             return make_policy(config.policy, config.policy_options, worker=worker.number)
         address = self._addresses[worker.number % len(self._addresses)]

@@ -173,9 +173,9 @@ def _rows(settings: Settings) -> CheckedRows:
     rows = read_rows(settings.rows, settings.system, settings.lenient)
     sources = ", ".join(map(str, settings.rows))
     if not len(rows):
-        if rows.refused:
-            message = f"all {rows.refused:,} rows in {sources} are bad; the first is "
-            message += rows.refusals[0]
+        if rows.bad_count:
+            message = f"all {rows.bad_count:,} rows in {sources} are bad; the first is "
+            message += rows.bad_reasons[0]
         else:
             message = f"there are no rows in {sources}"
         raise FormatError(message, "Give at least one valid row.")

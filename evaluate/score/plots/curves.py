@@ -209,6 +209,6 @@ def spread(
             before, count = stacks.pop()
             mean, size = (mean * size + before * count) / (size + count), size + count
         stacks.append((mean, size))
-    found = [mean + gap * (i - (size - 1) / 2) for mean, size in stacks for i in range(size)]
-    last = len(found) - 1
-    return [min(max(v, low + gap * i), high - gap * (last - i)) for i, v in enumerate(found)]
+    placed = [mean + gap * (i - (size - 1) / 2) for mean, size in stacks for i in range(size)]
+    last = len(placed) - 1
+    return [min(max(v, low + gap * i), high - gap * (last - i)) for i, v in enumerate(placed)]

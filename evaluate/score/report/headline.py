@@ -124,12 +124,14 @@ def _nothing_complete(cells: Sequence[SuccessCell]) -> str:
     counting = [cell for cell in cells if cell.n]
     if not counting:
         return f"In {cells[0].simulator}, no rollout counts yet."
-    nearest = min(counting, key=lambda cell: (len(cell.missing) + len(cell.other), -cell.n))
-    other = f", and {len(nearest.other)} are outside the grid" if nearest.other else ""
+    nearest = min(counting, key=lambda cell: (len(cell.missing) + len(cell.unexpected), -cell.n))
+    outside = ""
+    if nearest.unexpected:
+        outside = f", and {len(nearest.unexpected)} are outside the grid"
     return (
         f"In {nearest.simulator}, no cell is complete, so no system leads. The most complete is "
         f"{display_name(nearest.system)} under {named(nearest.condition)}: {len(nearest.missing)} "
-        f"of {nearest.expected} episodes are missing{other}."
+        f"of {nearest.expected} episodes are missing{outside}."
     )
 
 

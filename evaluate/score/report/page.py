@@ -227,7 +227,7 @@ def _source(path: Path, run: RunHeader | None) -> dict[str, list[str]]:
     """Return the facts about a file: its checksum, commands, and `run.json`."""
     facts = {"SHA-256": [sha256_file(path)]}
     if run is not None:
-        lines = [line for start in run.invocations for line in start.command]
+        lines = [line for invocation in run.invocations for line in invocation.command]
         facts |= {"command": [*dict.fromkeys(lines)]} if lines else {}
         facts["run.json"] = [json.dumps(to_dict(run), indent=2, sort_keys=True, ensure_ascii=False)]
     return facts
@@ -255,6 +255,6 @@ def _facts(score: Score, command: str | None) -> dict[str, list[str]]:
         facts[f"revision of the buffer set, {name}"] = revision
     if score.notes:
         facts["note"] = " ".join(score.notes)
-    if rows.refused:
-        facts["bad rows left out"] = f"{rows.refused:,}: {'; '.join(rows.refusals)}"
+    if rows.bad_count:
+        facts["bad rows left out"] = f"{rows.bad_count:,}: {'; '.join(rows.bad_reasons)}"
     return {name: [text] for name, text in facts.items()}

@@ -112,9 +112,8 @@ def over_families(
     """Return, for each comparison, how its difference varies over families.
 
     Intervals are NaN if fewer than ten episodes differ. `values` are second − first of each
-    episode, NaN where not both count, `(E,
-    K)`; `labels` are the families, `(E,)`; `key` seeds the draws. Unknown families and episodes
-    take no part in any draw.
+    episode, NaN where not both count, `(E, K)`; `labels` are the families, `(E,)`; `key` seeds the
+    draws. Unknown families and episodes take no part in any draw.
 
     With the mean mᶠ and the variance sᶠ² of a family's nᶠ differences, the standard deviation
     between families is that of the means less their noise: √max(0, var(mᶠ) − mean(sᶠ² / nᶠ)).
@@ -129,13 +128,13 @@ def over_families(
     residuals); the deviation between groups: Searle (1971), Linear Models, chapter 9.
     """
     masks, place = np.unique(~np.isnan(values), axis=1, return_inverse=True)
-    found: dict[int, OverFamilies] = {}
+    by_column: dict[int, OverFamilies] = {}
     # Most comparisons lack the same episodes, or none: each distinct set is drawn from once.
     for at, known in enumerate(masks.T):
         columns = np.flatnonzero(place == at)
         estimates = _over(values[np.ix_(known, columns)], labels[known], key, draws)
-        found |= zip(columns.tolist(), estimates, strict=True)
-    return [found[column] for column in range(values.shape[1])]
+        by_column |= zip(columns.tolist(), estimates, strict=True)
+    return [by_column[column] for column in range(values.shape[1])]
 
 
 def _over(

@@ -94,9 +94,9 @@ def standings(rates: Mapping[str, float], compared: _Compared) -> dict[str, Stan
     best = max(rates, key=lambda name: rates[name])
     ps = holm([pairs.p for pairs in compared.values()])
     p_holm = {frozenset(both): p for both, p in zip(compared, ps, strict=True)}
-    found = {}
+    standing_of = {}
     for name, rate in rates.items():
-        found[name] = Standing(
+        standing_of[name] = Standing(
             rank=1 + sum(other > rate for other in rates.values()),
             rank_low=bounds[name][0],
             rank_high=bounds[name][1],
@@ -104,7 +104,7 @@ def standings(rates: Mapping[str, float], compared: _Compared) -> dict[str, Stan
             behind=_behind(name, best, compared),
             p_holm=p_holm.get(frozenset((name, best)), math.nan),
         )
-    return found
+    return standing_of
 
 
 def _behind(name: str, best: str, compared: _Compared) -> Interval:
