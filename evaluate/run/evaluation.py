@@ -117,15 +117,17 @@ def run_evaluation(
         FormatError: Files of a run in `out`, or the questions, are damaged.
         MissingExtraError: A library is not installed.
     """
-    end_if_starting()
+    end_if_starting()  # a worker that imports a script without the guard
     check_shared(config)  # before anything is loaded
     buffer_set, folder = load_buffer_set(config.buffer_set), Path(config.out)
     config = with_camera(config, buffer_set)
-    runner = _runner(dataclasses.replace(config, buffer_set=buffer_set.location), buffer_set)
+    runner = _make_runner(dataclasses.replace(config, buffer_set=buffer_set.location), buffer_set)
     with runner.lock(folder), ExitStack() as stack:
         runner.prepare()
         config = runner.config
         plan, items = plan_run(runner)
+        # Read without the lock, which `open_log` takes only once servers have identified the run:
+        # these rows decide what to start, and those that are read again below what to run.
         existing = read_record(folder)
         todo = [item for item in items if item not in existing or not is_done(existing[item])]
         executor = executor or make_executor(config)
@@ -187,7 +189,7 @@ def _check_condition(facts: SystemFacts, condition: str) -> None:
     )
 
 
-def _runner(config: RunConfig | AskConfig, buffer_set: BufferSet) -> Runner[Any]:
+def _make_runner(config: RunConfig | AskConfig, buffer_set: BufferSet) -> Runner[Any]:
     if isinstance(config, AskConfig):
         from robomme_interference_data.evaluate.language.question_run import Questions
 
@@ -209,7 +211,7 @@ def _run_items(
     done = {item: row for item, row in log.rows.items() if is_done(row)}
     for callback in callbacks:
         callback.start(items, [done[item] for item in items if item in done])
-    stopped: str | None = "interrupted"
+    stopped: str | None = "interrupted"  # unless the loop ends in another way than by Ctrl-C
     errors, full = 0, False
     with ExitStack() as stack:
         outcomes: Any = ()
@@ -222,7 +224,7 @@ def _run_items(
             stack.callback(outcomes.close)
         try:
             for outcome in outcomes:
-                row, trace = _row(run, outcome, runner.buffer_set, log)
+                row, trace = _save_files(run, outcome, runner.buffer_set, log)
                 log.append(row, trace)
                 for callback in callbacks:
                     callback.row(row, outcome.node)
@@ -239,7 +241,7 @@ def _run_items(
             full = True
             raise
         finally:
-            stack.close()
+            stack.close()  # ends workers that have a task, before the tables are exported
             *earlier, last = log.header.invocations
             last = dataclasses.replace(last, ended=now(), stopped=stopped)
             if not full:
@@ -248,17 +250,19 @@ def _run_items(
     return RunResult(log.folder, rows, len(items), count_statuses(rows), stopped)
 
 
-def _row(
+def _save_files(
     run: RunContext[Any], outcome: Outcome, buffer_set: BufferSet, log: RunLog
 ) -> tuple[Rollout, str | None]:
     """Write the files of an outcome; return its row, and the traceback of an error or None.
 
-    A row that could not be read again, such as one with a number of 100 bits, becomes an error.
+    A row that could not be read again, such as one with a number of 100 bits, becomes an error:
+    no run could resume from such a line.
     """
     item: WorkItem = outcome.task.item
     error, trace = outcome.error, outcome.trace
     if error is None:
         row, trace = outcome.value
+        # Workers began before the label in the log, and what servers report, were known.
         row = dataclasses.replace(row, buffer_set=run.buffer_set, policy_id=run.facts.policy_id)
         try:
             row_of(row_line(row))
@@ -266,6 +270,7 @@ def _row(
             error = RuntimeError(f"its row cannot be stored: {first_line(unstorable)}")
     if error is not None:
         query = buffer_set.query(item.episode)
+        # A rollout that broke reports how far it came; a worker that died cannot.
         columns: dict[str, Any] = {"steps": 0} | dict(outcome.progress)
         row = run.row(
             item,
