@@ -1,4 +1,4 @@
-"""Rollouts as kinds of runs, simulated and offline: the checks before one, and its identity."""
+"""Runs of rollouts, simulated and offline: the checks before one, and what identifies it."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from robomme_interference_data.evaluate.policies.shared import Address
 
 
-class Rollouts(Runner[RunConfig]):
+class RolloutRunner(Runner[RunConfig]):
     """Rollouts of a policy in a simulator."""
 
     def __init__(self, config: RunConfig, buffer_set: BufferSet):
@@ -179,7 +179,7 @@ _UNUSED = ("simulator", "shift", "check_lesson", "videos")
 """Settings of simulators."""
 
 
-class Offline(Rollouts):
+class OfflineRunner(RolloutRunner):
     """Rollouts along recorded executions: the policy acts, and the recording goes on."""
 
     def __init__(self, config: RunConfig, buffer_set: BufferSet):

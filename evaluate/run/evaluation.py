@@ -191,12 +191,12 @@ def _check_condition(facts: SystemFacts, condition: str) -> None:
 
 def _make_runner(config: RunConfig | AskConfig, buffer_set: BufferSet) -> Runner[Any]:
     if isinstance(config, AskConfig):
-        from robomme_interference_data.evaluate.language.question_run import Questions
+        from robomme_interference_data.evaluate.language.question_run import QuestionRunner
 
-        return Questions(config, buffer_set)
-    from robomme_interference_data.evaluate.rollout.runner import Offline, Rollouts
+        return QuestionRunner(config, buffer_set)
+    from robomme_interference_data.evaluate.rollout.runner import OfflineRunner, RolloutRunner
 
-    return (Offline if config.offline else Rollouts)(config, buffer_set)
+    return (OfflineRunner if config.offline else RolloutRunner)(config, buffer_set)
 
 
 def _run_items(

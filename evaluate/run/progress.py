@@ -66,8 +66,8 @@ class RunProgress:
         self._bar.advance(1, node=node)
         if row.wall_s is not None and len(self._timed) < 2 * self._workers:
             self._timed.append(row)
-            timed = len(self._timed) == 2 * self._workers and self._left > len(self._timed)
-            if timed and (text := estimate(self._timed, self._left, self._workers)):
+            enough = len(self._timed) == 2 * self._workers and self._left > len(self._timed)
+            if enough and (text := estimate(self._timed, self._left, self._workers)):
                 self._console.print(text)
         if not is_done(row):
             error = visible(f"{WorkItem.of(row)} broke: {row.error}")

@@ -250,6 +250,8 @@ def _outcomes(
         }
     episodes = sorted((EpisodeId(*key) for key in ids | expected), key=lambda each: each.sort_key)
 
+    # The values along each axis, their places, and the places of all rows (`at`): at most one row
+    # is at each, because reading keeps one row of a rollout.
     axes = (systems, conditions, [(e.family, e.split, e.index) for e in episodes], model_seeds)
     places = [{name: place for place, name in enumerate(axis)} for axis in axes]
     keys = [(r.system, r.condition, (r.family, r.split, r.episode), r.model_seed) for r in rows]

@@ -49,12 +49,14 @@ def control_of(outcomes: Outcomes, system: str) -> str | None:
 
 
 def _controls(outcomes: Outcomes, system: str) -> Iterator[str]:
-    told = {_told(facts) for facts in outcomes.facts_of(system) if facts.policy_id is not None}
+    with_oracle = {
+        _with_oracle(facts) for facts in outcomes.facts_of(system) if facts.policy_id is not None
+    }
     others = [name for name in outcomes.systems if name != system]
     for name in others:
         facts_of_other = outcomes.facts_of(name)
-        if any(facts.subgoals == ORACLE for facts in facts_of_other) and told & {
-            _told(facts) for facts in facts_of_other
+        if any(facts.subgoals == ORACLE for facts in facts_of_other) and with_oracle & {
+            _with_oracle(facts) for facts in facts_of_other
         }:
             yield name
     for policy, subgoals in (("follow-subgoals", ORACLE), ("oracle", None)):
@@ -66,6 +68,6 @@ def _controls(outcomes: Outcomes, system: str) -> Iterator[str]:
                 yield name
 
 
-def _told(facts: SystemFacts) -> SystemFacts:
+def _with_oracle(facts: SystemFacts) -> SystemFacts:
     """Return the facts of the same policy with the simulator's subgoals."""
     return replace(facts, subgoals=ORACLE, reads_history=True, reference=True)

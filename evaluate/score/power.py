@@ -28,7 +28,7 @@ MOST = 5_000
 
 
 @dataclass(frozen=True)
-class Plan:
+class PowerPlan:
     """What paired rollouts can detect; all but `episodes` and `needed` are fractions.
 
     Attributes:
@@ -58,7 +58,7 @@ class Plan:
     looks: tuple[float, ...] = ()
 
 
-def plan(margin: float, episodes: int, flips: float, tests: int = 1, looks: int = 1) -> Plan:
+def plan(margin: float, episodes: int, flips: float, tests: int = 1, looks: int = 1) -> PowerPlan:
     """Return what episodes can detect; the margin is a fraction."""
     from robomme_interference_data.stats.sequential import MOST_LOOKS, look_levels  # not in scores
 
@@ -83,7 +83,7 @@ def plan(margin: float, episodes: int, flips: float, tests: int = 1, looks: int 
     if levels:
         chance = _sequential(margin, episodes, flips, [level / tests for level in levels])
     noise = min(1.0, z_of(0.95) * math.sqrt(flips / episodes))
-    return Plan(
+    return PowerPlan(
         episodes,
         flips,
         margin,

@@ -16,7 +16,7 @@ from vla_eval.types import Observation as ServerObservation
 from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import InvalidOptionError, RunError, UnknownNameError, counted
-from robomme_interference_data.evaluate.rollout.runner import Rollouts
+from robomme_interference_data.evaluate.rollout.runner import RolloutRunner
 from robomme_interference_data.evaluate.rollout.worker import RolloutFunction
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.evaluation import plan_run
@@ -137,7 +137,7 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
             system=system,
             **chosen,
         )
-        runner = Rollouts(config, opened)
+        runner = RolloutRunner(config, opened)
         runner.prepare()
         with_history = [name for name in config.conditions if name != NO_HISTORY]
         if with_history and not send_video_history:
