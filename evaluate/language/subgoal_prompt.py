@@ -154,6 +154,7 @@ class SubgoalPrompt(Prompt):
     def _pixel(self, numbers: Mapping[str, int], size: tuple[int, int]) -> Pixel:
         pixel = []
         for axis, side in zip("yx", size, strict=True):
+            # Groups of the pattern are `p_y`, `b_y0`, `b_y1`, …: a box has two numbers on an axis.
             values = [value for name, value in numbers.items() if name[2:].startswith(axis)]
             top = self.grid or side - 1
             if max(values) > top:

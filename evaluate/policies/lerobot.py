@@ -223,6 +223,7 @@ class LeRobotPolicy(BatchPolicy):
         """Seed PyTorch for one call, and restore its generators afterwards."""
         devices = [torch.device(self._device)] if self._device.startswith("cuda") else []
         with torch.random.fork_rng(devices):
+            # A seed for each call: a rollout has fewer than 1 << 16 of them.
             torch.manual_seed((self._seed << 16) + self._asked)
             self._asked += 1
             yield

@@ -126,6 +126,9 @@ class RolloutFunction(RunFunction[RunConfig]):
             self._send_files(item, worker, clip, Status.ERROR, what)
             if isinstance(error, ServerKeepaliveError):
                 logger.warning("%s: %s. It is started again, once.", item, error.message)
+            # If the server is gone, this worker must not break one rollout after the other: it
+            # retires, and workers with other servers do the rest. A server that workers start is
+            # started again instead.
             if isinstance(error, PolicyServerError) and not starts_server(config.policy):
                 self.close()
                 self._check_reachable(worker)
@@ -246,7 +249,7 @@ class RolloutFunction(RunFunction[RunConfig]):
 
     def _check_served(self, policy: Policy, metadata: Mapping[str, Any]) -> None:
         """Retire the worker if its server reports other metadata than at the start of the run."""
-        if "server_metadata" not in metadata:
+        if "server_metadata" not in metadata:  # the policy has no server
             return
         from robomme_interference_data.evaluate.run.identity import plain
 

@@ -159,8 +159,9 @@ def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
             rates = success(outcomes.status[place]).T.tolist()
             measured = errors[place].T.tolist()
             for number in np.flatnonzero(outcomes.has_episode[place]).tolist():
-                episode, hard = outcomes.episodes[number], int(outcomes.difficulty[number])
-                came = {
+                episode = outcomes.episodes[number]
+                difficulty = int(outcomes.difficulty[number])
+                outcome_under = {
                     c: _outcome(statuses, error)
                     for c, statuses, error in zip(
                         outcomes.conditions, counts[number], measured[number], strict=True
@@ -174,8 +175,8 @@ def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
                     system,
                     episode.family,
                     f"{episode.split}/{episode.index}",
-                    DIFFICULTIES[hard] if hard >= 0 else "",
-                    [came.get(c, "") for c in conditions],
+                    DIFFICULTIES[difficulty] if difficulty >= 0 else "",
+                    [outcome_under.get(c, "") for c in conditions],
                     flips(outcomes.conditions, rates[number]),
                     [_address(video, folder) if video else "" for video in shown],
                 )
