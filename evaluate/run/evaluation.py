@@ -1,7 +1,7 @@
 """Run an evaluation: check the settings, run what is not finished, and write each row to disk."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -212,42 +212,46 @@ def _run_items(
     for callback in callbacks:
         callback.start(items, [done[item] for item in items if item in done])
     stopped: str | None = "interrupted"  # unless the loop ends in another way than by Ctrl-C
-    errors, full = 0, False
-    with ExitStack() as stack:
-        outcomes: Any = ()
-        if pool is not None:
-            outcomes = pool.run(
-                [Job(item, runner.metadata) for item in shuffle_work(set(items) - done.keys())],
-                time_limit=run.config.rollout_timeout_s,
-                again=runner.retried_errors,
-            )
-            stack.callback(outcomes.close)
-        try:
-            for outcome in outcomes:
-                row, trace = _save_files(run, outcome, runner.buffer_set, log)
-                log.append(row, trace)
-                for callback in callbacks:
-                    callback.row(row, outcome.node)
-                errors = 0 if is_done(row) else errors + 1
-                if errors >= run.config.max_errors:
-                    stopped = f"{errors} in a row broke; the last: {row.error}"
-                    break
-            else:
-                stopped = None
-        except InterferenceError as error:  # no worker is left
-            stopped = error.message
-            raise
-        except OSError:  # a disk without space for a row has none for tables
-            full = True
-            raise
-        finally:
-            stack.close()  # ends workers that have a task, before the tables are exported
-            *earlier, last = log.header.invocations
-            last = dataclasses.replace(last, ended=now(), stopped=stopped)
-            if not full:
-                log.end(dataclasses.replace(log.header, invocations=(*earlier, last)))
+    outcomes = _outcomes(run, runner, pool, shuffle_work(set(items) - done.keys()))
+    errors, disk_full = 0, False
+    try:
+        for outcome in outcomes:
+            row, trace = _save_files(run, outcome, runner.buffer_set, log)
+            log.append(row, trace)
+            for callback in callbacks:
+                callback.row(row, outcome.node)
+            errors = 0 if is_done(row) else errors + 1
+            if errors >= run.config.max_errors:
+                stopped = f"{errors} in a row broke; the last: {row.error}"
+                break
+        else:
+            stopped = None
+    except InterferenceError as error:  # no worker is left
+        stopped = error.message
+        raise
+    except OSError:  # a disk without space for a row has none for tables
+        disk_full = True
+        raise
+    finally:
+        outcomes.close()  # ends workers that have a task, before the tables are exported
+        *earlier, last = log.header.invocations
+        last = dataclasses.replace(last, ended=now(), stopped=stopped)
+        if not disk_full:
+            log.end(dataclasses.replace(log.header, invocations=(*earlier, last)))
     rows = tuple(log.rows[item] for item in items if item in log.rows)
     return RunResult(log.folder, rows, len(items), count_statuses(rows), stopped)
+
+
+def _outcomes(
+    run: RunContext[Any], runner: Runner[Any], pool: WorkerPool | None, items: Iterable[WorkItem]
+) -> Generator[Outcome]:
+    """Yield the outcomes of work items as they arrive; none without workers."""
+    if pool is not None:
+        yield from pool.run(
+            [Job(item, runner.metadata) for item in items],
+            time_limit=run.config.rollout_timeout_s,
+            again=runner.retried_errors,
+        )
 
 
 def _save_files(
@@ -269,21 +273,7 @@ def _save_files(
         except (ValueError, OverflowError, RecursionError) as unstorable:
             error = RuntimeError(f"its row cannot be stored: {first_line(unstorable)}")
     if error is not None:
-        query = buffer_set.query(item.episode)
-        # A rollout that broke reports how far it came; a worker that died cannot.
-        columns: dict[str, Any] = {"steps": 0} | dict(outcome.progress)
-        row = run.row(
-            item,
-            Status.ERROR,
-            seed=query.seed,
-            difficulty=query.difficulty,
-            goal=None,
-            history_frames=0,
-            lesson_frames=0,
-            lesson_share=None,
-            error=_error_text(error),
-            **columns,
-        )
+        row = _error_row(run, outcome, error, buffer_set)
     (log.folder / item.clip).unlink(missing_ok=True)  # of an earlier attempt
     # Rows matter more than clips: a full disk costs a clip only.
     problems = [_write(log.folder, path, data) for path, data in outcome.files.items()]
@@ -295,6 +285,27 @@ def _save_files(
         finished_at=now(),
     )
     return row, "\n".join(filter(None, (trace, *lost))) or None
+
+
+def _error_row(
+    run: RunContext[Any], outcome: Outcome, error: BaseException, buffer_set: BufferSet
+) -> Rollout:
+    item: WorkItem = outcome.task.item
+    query = buffer_set.query(item.episode)
+    # A rollout that broke reports how far it came; a worker that died cannot.
+    columns: dict[str, Any] = {"steps": 0} | dict(outcome.progress)
+    return run.row(
+        item,
+        Status.ERROR,
+        seed=query.seed,
+        difficulty=query.difficulty,
+        goal=None,
+        history_frames=0,
+        lesson_frames=0,
+        lesson_share=None,
+        error=_error_text(error),
+        **columns,
+    )
 
 
 def _write(folder: Path, path: str, data: bytes) -> str | None:
