@@ -141,6 +141,7 @@ def _over(
     values: Floats, labels: NDArray[np.int64], key: str, draws: int
 ) -> Iterator[OverFamilies]:
     """Yield what `over_families` returns, for values without NaN."""
+    # The rows of a family lie together, so that sums over families are sums over ranges of rows.
     order = np.argsort(labels, kind="stable")
     labels, values = labels[order], values[order]
     starts = np.flatnonzero(np.diff(labels, prepend=-1))
@@ -168,6 +169,7 @@ def _over(
     without = (means.sum(axis=0) - means) / (count - 1)
     taken = generator.multinomial(len(starts), np.full(len(starts), 1 / len(starts)), draws)
     parts, intervals = np.split(values, starts[1:]), []
+    # Each family once, for just these families; then as often as drawn, for a sample of families.
     for often in (np.ones_like(taken), taken):
         drawn = sum(_resampled(part, often[:, n], generator) for n, part in enumerate(parts))
         intervals.append(np.quantile(drawn / len(starts), (0.025, 0.975), axis=0))

@@ -115,7 +115,7 @@ def _behind(name: str, best: str, compared: _Compared) -> Interval:
     if (name, best) in compared:
         return compared[name, best].at(level)
     value, low, high = compared[best, name].at(level)
-    return Interval(0.0 - value, -high, -low)
+    return Interval(0.0 - value, -high, -low)  # -value of a tie would be -0.0
 
 
 MATRIX = ComparisonTable(
