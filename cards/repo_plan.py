@@ -170,6 +170,7 @@ def publish_version(plan: RepoPlan, *, private: bool = False) -> RepoPlan:
     logger.info("%s: sending %d files", repository.repo_id, len(plan.difference.sent))
     head = plan.head or repository.create(private)
     commit = repository.commit(plan.files, head, f"Version {version}")
+    # LeRobot's tag moves to each new version. The version's own is last: see the module.
     if plan.content.lerobot is not None:
         repository.tag(plan.content.lerobot, commit, move=True)
     repository.tag(version.tag, commit)
