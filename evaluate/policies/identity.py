@@ -108,12 +108,12 @@ def policy_metadata(text: str, policy: Policy) -> dict[str, Any]:
 def check_metadata(reports: Sequence[Mapping[str, Any]], checkpoint: str | None) -> None:
     """Check that servers report the same model, and the checkpoint that the user names, if any."""
     first = reports[0]
-    for other in reports:
-        if other["server_metadata"] != first["server_metadata"]:
+    for report in reports:
+        if report["server_metadata"] != first["server_metadata"]:
             raise PolicyServerError(
-                f"the policy servers {first['server']} and {other['server']} serve different "
+                f"the policy servers {first['server']} and {report['server']} serve different "
                 f"models: one reports {first['server_metadata']}, the other "
-                f"{other['server_metadata']}",
+                f"{report['server_metadata']}",
                 "Start all of them with the same checkpoint and seed.",
             )
     reported = first["server_metadata"].get("checkpoint")

@@ -165,8 +165,8 @@ def retained(values: Floats, lift: Interval, fall: Interval) -> Interval:
     if not len(values) or whole.mean() <= 0:
         return Interval(math.nan)
     ratio = float(share.mean() / whole.mean())
-    for exact, other, change in ((0.0, none, lift), (1.0, start, fall)):
-        if (end == other).all():
+    for exact, reference, change in ((0.0, none, lift), (1.0, start, fall)):
+        if (end == reference).all():
             return Interval(exact, *(exact + bound / float(whole.mean()) for bound in change[1:]))
     if len(values) < 2:
         return Interval(ratio)
