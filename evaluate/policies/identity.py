@@ -35,7 +35,7 @@ from .registry import (
 
 logger = logging.getLogger(__name__)
 
-MOST_METADATA = 1 << 16
+MAX_METADATA = 1 << 16
 """Most letters of a policy's metadata in JSON: `run.json` holds it once for each start of a run."""
 
 
@@ -92,9 +92,9 @@ def policy_metadata(text: str, policy: Policy) -> dict[str, Any]:
         if isinstance(metadata, Mapping):
             recorded = dict(plain(metadata))
             length = len(indented_json(recorded))
-            if length <= MOST_METADATA:
+            if length <= MAX_METADATA:
                 return recorded
-            fault = f"holds {length:,} letters of JSON; expected at most {MOST_METADATA:,}"
+            fault = f"holds {length:,} letters of JSON; expected at most {MAX_METADATA:,}"
         else:
             fault = f"returned a {type(metadata).__name__}"
     except ValueError as error:
