@@ -34,7 +34,7 @@ from robomme_interference_data.simulators.episode import Observation
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
 
 CAMERAS = ("front", "wrist")
-BARE, WITHOUT, K0, CACHED = "bare loop", NO_HISTORY, "k0", "k0 --cache"
+BARE, WITHOUT, K0, CACHED = "bare loop", NO_HISTORY, "k0", "k0 cached"
 
 
 class Recorded(Policy):
@@ -91,7 +91,7 @@ def main() -> None:
     print_table(
         "A rollout of the oracle's actions, front and wrist drawn at every step, one process; "
         f"medians of {options.rounds} rounds; ratios are against the bare loop, aim at k0 ≤ 1.05.",
-        ("<episode", ">steps", ">bare s", ">no-history", ">k0", ">k0 --cache", ">frames"),
+        ("<episode", ">steps", ">bare s", ">no-history", ">k0", ">k0 cached", ">frames"),
         rows,
     )
     print_table(

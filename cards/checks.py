@@ -42,7 +42,7 @@ def check_buffer_set(buffer_set: BufferSet, progress: WorkProgress | None = None
             f"{buffer_set.location} has {counted(len(leaks), 'leak')}, such as {leaks[0].kind}: "
             f"{leaks[0].where}",
             "List all leaks.",
-            f"audit {buffer_set.location}",
+            f"verify {buffer_set.location} --audit",
         )
     for name in buffer_set.header.datasets if "build" not in missing_extras() else ():
         files = buffer_set.dataset_files(name)

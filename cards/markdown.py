@@ -6,7 +6,7 @@ from typing import Any
 
 from robomme_interference_data.viz.tables import Table
 
-_MOST, _MOST_IN_BLOCK = 400, 20_000
+_MAX, _MAX_IN_BLOCK = 400, 20_000
 """Maximum length of a text, in characters."""
 
 _ENTITIES = {"&": "&amp;", "<": "&lt;", ">": "&gt;", "|": "&#124;", "$": "&#36;"}
@@ -57,7 +57,7 @@ def quoted(value: Any) -> Raw:
 def block(value: Any, language: str = "") -> Raw:
     """Return a text as a block of code."""
     kept = (letter if letter == "\n" or _shown(letter) else " " for letter in str(value))
-    text = _shortened("".join(kept), _MOST_IN_BLOCK)
+    text = _shortened("".join(kept), _MAX_IN_BLOCK)
     fence = "`" * max(3, 1 + max(map(len, re.findall("`+", text)), default=0))
     return Raw(f"{fence}{language}\n{text.rstrip()}\n{fence}")
 
@@ -76,5 +76,5 @@ def _shown(letter: str) -> bool:
     return unicodedata.category(letter)[0] != "C"
 
 
-def _shortened(text: str, most: int = _MOST) -> str:
+def _shortened(text: str, most: int = _MAX) -> str:
     return text if len(text) <= most else text[: most - 1] + "…"

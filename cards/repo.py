@@ -213,6 +213,7 @@ class HubRepository:
             return head
         operations: list[Any] = [CommitOperationDelete(path) for path in difference.removed]
         operations += [CommitOperationAdd(path, files[path].source) for path in difference.sent]
+        # With its parent, a commit fails if somebody else's came between the plan and this one.
         options = {"commit_message": message, "parent_commit": head, **self._repo}
         made = self._call(self._api.create_commit, operations=operations, **options)
         if left := compare(files, self.files(made.oid)):

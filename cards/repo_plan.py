@@ -114,26 +114,26 @@ def plan_version(content: RepoContent, requested: Version | None) -> RepoPlan:
         PublishError: The version exists with other content, or is lower than the newest one, or
             the repository holds something else.
     """
-    published = _RepoState(content)
-    newest = max(published.versions, default=None)
+    state = _RepoState(content)
+    newest = max(state.versions, default=None)
     version = requested or newest or content.first
     files = content.files(version)
-    if version in published.versions:
-        commit = published.versions[version]
-        difference = compare(files, published.files_at(commit))
+    if version in state.versions:
+        commit = state.versions[version]
+        difference = compare(files, state.files_at(commit))
         if difference:
             raise PublishError(
                 f"{content.repo_id} already has a version {version} with other content: "
                 f"{difference}",
                 f"Publish it as a version above {newest} (--version).",
             )
-        return published.plan(version, files, commit)
+        return state.plan(version, files, commit)
     if newest is not None and version < newest:
         raise PublishError(
             f"version {version} of {content.repo_id} is too low: the newest one is {newest}",
             f"Publish it as a version above {newest} (--version).",
         )
-    return published.plan(version, files)
+    return state.plan(version, files)
 
 
 def plan_next_version(content: RepoContent, requested: Version | None) -> RepoPlan:
@@ -145,16 +145,16 @@ def plan_next_version(content: RepoContent, requested: Version | None) -> RepoPl
         content: What the repository is to hold.
         requested: The version if the repository has none; None for its first.
     """
-    published = _RepoState(content)
-    newest = max(published.versions, default=None)
+    state = _RepoState(content)
+    newest = max(state.versions, default=None)
     if newest is None:
         version = requested or content.first
-        return published.plan(version, content.files(version))
-    commit, files = published.versions[newest], content.files(newest)
-    if all(map(is_card, compare(files, published.files_at(commit)).paths)):
-        return published.plan(newest, files, commit)
+        return state.plan(version, content.files(version))
+    commit, files = state.versions[newest], content.files(newest)
+    if all(map(is_card, compare(files, state.files_at(commit)).paths)):
+        return state.plan(newest, files, commit)
     version = Version(newest.major + 1, 0, 0)
-    return published.plan(version, content.files(version))
+    return state.plan(version, content.files(version))
 
 
 def publish_version(plan: RepoPlan, *, private: bool = False) -> RepoPlan:
@@ -170,6 +170,7 @@ def publish_version(plan: RepoPlan, *, private: bool = False) -> RepoPlan:
     logger.info("%s: sending %d files", repository.repo_id, len(plan.difference.sent))
     head = plan.head or repository.create(private)
     commit = repository.commit(plan.files, head, f"Version {version}")
+    # LeRobot's tag moves to each new version. The version's own is last: see the module.
     if plan.content.lerobot is not None:
         repository.tag(plan.content.lerobot, commit, move=True)
     repository.tag(version.tag, commit)

@@ -54,51 +54,51 @@ def results_facts(results: Score | Path) -> Facts:
     Args:
         results: The folder of a run, a file of rows, or the score of either.
     """
-    found = results if isinstance(results, Score) else score(Settings(rows=(results,)))
-    if len(found.rows.sources) != 1:
+    scored = results if isinstance(results, Score) else score(Settings(rows=(results,)))
+    if len(scored.rows.sources) != 1:
         raise InvalidOptionError(
-            f"the score is of {len(found.rows.sources)} files of rows; expected one run",
+            f"the score is of {len(scored.rows.sources)} files of rows; expected one run",
             "Merge the shards of a run.",
             "merge RUN RUN --out RUN",
         )
-    [(source, run)] = found.rows.sources.items()
+    [(source, run)] = scored.rows.sources.items()
     exported = source.parent / RUN_TABLES[0]
     file = exported if run is not None and exported.is_file() else source
-    splits = {*found.rows.names("split")}
+    splits = {*scored.rows.names("split")}
     rows = CardTable(
         name="rollouts",
         record=Rollout,
         path=file.name,
         split=splits.pop() if len(splits) == 1 else "mixed",
     )
-    every = found.all_outcomes
-    systems = dict.fromkeys(name for outcomes in every for name in outcomes.systems)
+    all_outcomes = scored.all_outcomes
+    systems = dict.fromkeys(name for outcomes in all_outcomes for name in outcomes.systems)
     names = list(map(display_name, systems))
-    offline = not found.outcomes
+    offline = not scored.outcomes
     figures = {
         f"README-{re.sub('[^A-Za-z0-9._-]', '-', simulator)}.png": simulator
-        for simulator in found.outcomes
-        if Data(found, simulator).cells
+        for simulator in scored.outcomes
+        if Data(scored, simulator).cells
     }
     captions = {file: f"Success by condition, {name}" for file, name in figures.items()}
-    if any(cell.n for cell in found.error_cells):
+    if any(cell.n for cell in scored.error_cells):
         captions[_ERROR_PICTURE] = "Action error by condition, offline"
     differences = [
-        found.tables[name] for name in ("effects", "action_error_effects") if name in found.tables
+        scored.tables[name] for name in ("effects", "action_error_effects") if name in scored.tables
     ]
-    statuses = Counter(row.status for row in found.rows)
+    statuses = Counter(row.status for row in scored.rows)
     what = "Action errors of" if offline else "Rollouts of"
-    starts = run.invocations if run is not None else ()
+    invocations = run.invocations if run is not None else ()
     return Facts(
         kind="results",
         title="RoboMME-Interference results",
-        examples=len(found.rows),
+        examples=len(scored.rows),
         tables=[rows],
-        simulators=tuple(outcomes.simulator for outcomes in every),
+        simulators=tuple(outcomes.simulator for outcomes in all_outcomes),
         simulated=not offline,
-        limits=_limits(found),
-        provenance=_provenance(found, run, file),
-        pictures=lambda: _pictures(found, figures),
+        limits=_limits(scored),
+        provenance=_provenance(scored, run, file),
+        pictures=lambda: _pictures(scored, figures),
         values={
             "systems": names,
             "what": what,
@@ -106,48 +106,48 @@ def results_facts(results: Score | Path) -> Facts:
             "error_counts": "does not count"
             if offline
             else "counts neither as success nor as failure",
-            "headlines": headlines(found),
+            "headlines": headlines(scored),
             "figures": captions,
             "grids": [
                 {"title": table.title, "table": table, "note": Raw(table.note)}
-                for table in found.grids
+                for table in scored.grids
             ],
             "differences": [{"table": table, "note": Raw(table.note)} for table in differences],
-            "standing": _standing(found, run),
+            "standing": _standing(scored, run),
             "grid": "all recordings in the rows and in the plan of the run"
             if offline
-            else _EXPECTED[found.settings.expected],
-            "cells": _cells(found),
-            "rows": len(found.rows),
+            else _EXPECTED[scored.settings.expected],
+            "cells": _cells(scored),
+            "rows": len(scored.rows),
             "rows_file": rows.path,
             "statuses": ", ".join(
                 f"{statuses[status]:,} {status}"
                 for status in STATUSES
                 if statuses[status] or (status is Status.MEASURED) is offline
             ),
-            "refused": found.rows.refused,
+            "bad_rows": scored.rows.bad_count,
         },
         base_kind="buffer set",
-        base=starts[-1].settings.get("buffer_set") if starts else None,
+        base=invocations[-1].settings.get("buffer_set") if invocations else None,
         details=_details(run),
         tags=("evaluation-results",),
     )
 
 
-def _limits(found: Score) -> list[str]:
-    limits = [origin_limit([outcomes.simulator for outcomes in found.all_outcomes]), *found.notes]
-    what = "success rates" if found.outcomes else "action errors"
-    if not all(cell.complete for cell in _whole(found)):
+def _limits(scored: Score) -> list[str]:
+    limits = [origin_limit([outcomes.simulator for outcomes in scored.all_outcomes]), *scored.notes]
+    what = "success rates" if scored.outcomes else "action errors"
+    if not all(cell.complete for cell in _whole(scored)):
         limits.append(
             f"Not every cell is complete: {what} of incomplete and complete cells are not "
             "comparable."
         )
-    if found.outcomes:
+    if scored.outcomes:
         limits.append(
             "Repeating an episode on a GPU may give another outcome: judge small differences by "
             "the paired tests, or repeat the run with other model seeds."
         )
-    if found.error_cells:
+    if scored.error_cells:
         limits.append(
             "A small action error does not imply success: the policy never sees the consequences "
             "of its own actions."
@@ -155,14 +155,14 @@ def _limits(found: Score) -> list[str]:
     return limits
 
 
-def _whole(found: Score) -> list[Coverage]:
+def _whole(scored: Score) -> list[Coverage]:
     """Return the cells over all episodes."""
-    return [cell for cell in (*found.cells, *found.error_cells) if not cell.part]
+    return [cell for cell in (*scored.cells, *scored.error_cells) if not cell.part]
 
 
-def _standing(found: Score, run: RunHeader | None) -> str:
+def _standing(scored: Score, run: RunHeader | None) -> str:
     """Return how complete the run is, in a sentence."""
-    cells = _whole(found)
+    cells = _whole(scored)
     cell_text = f"{sum(cell.complete for cell in cells)} of {len(cells)} cells are complete."
     if run is None:
         return cell_text
@@ -171,36 +171,38 @@ def _standing(found: Score, run: RunHeader | None) -> str:
     return f"{run_text} row. {cell_text}"
 
 
-def _pictures(found: Score, figures: dict[str, str]) -> dict[str, bytes]:
+def _pictures(scored: Score, figures: dict[str, str]) -> dict[str, bytes]:
     """Draw success by condition, one picture per simulator, and the action error offline."""
     with TemporaryDirectory() as folder:
         for file, simulator in figures.items():
             with open_figure() as figure:
-                draw_figure("success", figure, Data(found, simulator))
+                draw_figure("success", figure, Data(scored, simulator))
                 save_figure(figure, Path(folder) / file)
-        if any(cell.n for cell in found.error_cells):
+        if any(cell.n for cell in scored.error_cells):
             with open_figure() as figure:
-                draw_error_figure(figure, found)
+                draw_error_figure(figure, scored)
                 save_figure(figure, Path(folder) / _ERROR_PICTURE)
         return {path.name: path.read_bytes() for path in sorted(Path(folder).iterdir())}
 
 
-def _provenance(found: Score, run: RunHeader | None, table: Path) -> ProvenanceRows:
+def _provenance(scored: Score, run: RunHeader | None, table: Path) -> ProvenanceRows:
     """Return the provenance of results: buffer set, revision, rows and policy."""
     rows: ProvenanceRows = (
         [("buffer set of the run", code(run.buffer_set))] if run is not None else []
     )
-    for simulator, revision in sorted(found.rows.revisions.items()):
+    for simulator, revision in sorted(scored.rows.revisions.items()):
         rows.append((f"revision of the buffer set, {escape(simulator)}", code(revision)))
-    if found.rows.without_revision:
+    if scored.rows.without_revision:
         rows.append(("revision of the buffer set", "not in the rows"))
     rows.append((f"SHA-256 of `{table.name}`", code(sha256_file(table))))
     if run is not None:
         policy = run.identity.get("policy")
         rows.append(("policy", code(policy) if policy else "not recorded"))
-        for start in run.invocations[-1:]:
-            rows += [("git", code(start.git))] if start.git else []
-            versions = (f"{name} {version}" for name, version in sorted(start.versions.items()))
+        for invocation in run.invocations[-1:]:
+            rows += [("git", code(invocation.git))] if invocation.git else []
+            versions = (
+                f"{name} {version}" for name, version in sorted(invocation.versions.items())
+            )
             rows.append(("versions of the last invocation", escape(", ".join(versions))))
     return [*rows, ("version of the protocol", code(PROTOCOL_VERSION))]
 
@@ -209,13 +211,15 @@ def _details(run: RunHeader | None) -> dict[str, Any]:
     """Return the identity of the run and its commands."""
     if run is None:
         return {}
-    found: dict[str, Any] = {"Identity of the run": run.identity}
-    if commands := dict.fromkeys(line for start in run.invocations for line in start.command):
-        found["Commands"] = [*commands]
-    return found
+    details: dict[str, Any] = {"Identity of the run": run.identity}
+    if commands := dict.fromkeys(
+        line for invocation in run.invocations for line in invocation.command
+    ):
+        details["Commands"] = [*commands]
+    return details
 
 
-def _cells(found: Score) -> Table:
+def _cells(scored: Score) -> Table:
     """Return the main table without the columns that the grid shows."""
     rows = [
         (
@@ -228,7 +232,7 @@ def _cells(found: Score) -> Table:
             cell.errors,
             cell.complete,
         )
-        for cell in _whole(found)
+        for cell in _whole(scored)
     ]
     columns: Columns = {
         "simulator": "text",
@@ -257,7 +261,7 @@ def score_run(run: Path, expected: Expected = Expected.BENCHMARK) -> Score:
     return score(Settings(rows=(run,), expected=expected))
 
 
-def results_content(found: Score, run: Path, config: Publication) -> RepoContent:
+def results_content(scored: Score, run: Path, config: Publication) -> RepoContent:
     """Return the repository of a run's results, without videos of rollouts."""
     command = f"robomme-interference publish-results RUN --repo-id {config.repo_id}"
     files: RepoFiles = {
@@ -265,10 +269,10 @@ def results_content(found: Score, run: Path, config: Publication) -> RepoContent
     }
     with TemporaryDirectory() as name:
         folder = Path(name)
-        write_score(found, folder, command=command)
+        write_score(scored, folder, command=command)
         for path in sorted(path for path in folder.rglob("*") if path.is_file()):
             files[f"score/{path.relative_to(folder).as_posix()}"] = LocalFile(path.read_bytes())
-    facts = results_facts(found)
+    facts = results_facts(scored)
 
     def card(version: Version) -> dict[str, bytes]:
         return card_files(

@@ -76,12 +76,14 @@ def ceiling(buffer_set: BufferSet, config: CeilingConfig) -> list[Ceiling]:
             kept = _kept(buffer, memory, received, config.frames)
             for family in (buffer.episode_id.family, ALL):
                 cells.setdefault((family, buffer.condition), []).append(kept)
-    return [
-        Ceiling(family, name, len(group), *map(_mean, zip(*group, strict=True)))
-        for family in (*buffer_set.families, ALL)
-        for name in names
-        if (group := cells.get((family, name)))
-    ]
+    ceilings = []
+    for family in (*buffer_set.families, ALL):
+        for name in names:
+            queries = cells.get((family, name))
+            if queries:
+                shares, chances = zip(*queries, strict=True)
+                ceilings.append(Ceiling(family, name, len(queries), _mean(shares), _mean(chances)))
+    return ceilings
 
 
 def queries_with_evidence(buffer_set: BufferSet) -> list[Query]:

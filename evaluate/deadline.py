@@ -19,10 +19,10 @@ def shutdown_after(
 
     def expire() -> None:
         expired.set()
-        for one in sockets():
+        for open_socket in sockets():
             with suppress(OSError):  # already closed
                 # Not the method of a TLS socket, which another thread may not call.
-                socket.socket.shutdown(one, socket.SHUT_RDWR)
+                socket.socket.shutdown(open_socket, socket.SHUT_RDWR)
 
     timer = threading.Timer(seconds, expire)
     timer.daemon = True

@@ -10,7 +10,7 @@ from robomme_interference_data.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from .language.images import HistoryFrames
-    from .language.subgoal_writers import (
+    from .language.subgoal_settings import (
         describe_subgoals,
         make_writer,
         pin_subgoals,
@@ -53,7 +53,7 @@ __getattr__ = lazy_exports(
     __name__,
     {
         f"{__package__}.language.images": "HistoryFrames",
-        f"{__package__}.language.subgoal_writers": (
+        f"{__package__}.language.subgoal_settings": (
             "describe_subgoals make_writer pin_subgoals subgoals_identity subgoals_text "
             "with_published"
         ),

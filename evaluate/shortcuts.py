@@ -142,7 +142,7 @@ def by_group(groups: Sequence[Hashable], values: Sequence[Hashable]) -> int:
     return right
 
 
-def shortcut_table(found: Sequence[Shortcut], title: str) -> Table:
+def shortcut_table(measured: Sequence[Shortcut], title: str) -> Table:
     """Return the table for the terminal."""
     return Table(
         "shortcuts",
@@ -166,7 +166,7 @@ def shortcut_table(found: Sequence[Shortcut], title: str) -> Table:
                 shortcut.goal,
                 shortcut.view,
             )
-            for shortcut in found
+            for shortcut in measured
         ],
         "right guesses of each part of the answer (count: of how many there are) without the "
         "lesson's frames: always the most frequent value; the value of the other episode nearest "

@@ -229,7 +229,7 @@ SYSTEMS: dict[str, System] = {system.name: system for system in (*PAPER_SYSTEMS,
 
 
 def name_system(name: str) -> System:
-    """Return a system of the table, or one with a new name, without conditions and limits."""
+    """Return a system of the table, or one with a new name, of which nothing else is known."""
     if not _FREE_NAME.fullmatch(name):
         raise InvalidIdError(
             f"{name!r} is not the name of a system",

@@ -181,7 +181,7 @@ RUN_HEADER = "run.json"
 RUN_RECORD = "rollouts.jsonl"
 RUN_TABLES = ("rollouts.parquet", "rollouts.csv")
 """Exported from the record at the end of a run."""
-MOST_ROW_BYTES = 2 << 30
+MAX_ROW_BYTES = 2 << 30
 """Maximum bytes of a file of rows: two million rollouts have fewer."""
 RUN_METRICS = "metrics.csv"
 """Written while a run proceeds, with `--track csv`."""

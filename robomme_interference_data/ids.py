@@ -12,7 +12,7 @@ from robomme_interference_data.errors import InvalidIdError, InvalidOptionError,
 _FAMILY = re.compile(r"[A-Za-z][A-Za-z0-9_.-]*")
 _INDEX = re.compile(r"0|[1-9][0-9]{0,17}")  # fits the int64 of the tables
 _SPAN = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")
-_MOST_NUMBERS = 1_000_000
+_MAX_NUMBERS = 1_000_000
 _FAMILY_RANK = {family: rank for rank, family in enumerate(FAMILIES)}
 _RESERVED = (*DIFFICULTIES, "all")
 """What tables call other parts of the episodes."""
@@ -157,9 +157,9 @@ def _spans(text: str) -> list[range]:
             )
         spans.append(range(first, last + 1))
         count += len(spans[-1])
-        if count > _MOST_NUMBERS:
+        if count > _MAX_NUMBERS:
             raise InvalidOptionError(
-                f"{text!r} asks for over {_MOST_NUMBERS:,} episodes",
+                f"{text!r} asks for over {_MAX_NUMBERS:,} episodes",
                 "Name those that exist, such as 0-49.",
             )
     return spans

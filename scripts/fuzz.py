@@ -40,7 +40,7 @@ LONGEST_S = 20
 LONGEST_BOMB = 1 << 20
 """Bytes of a bomb that is mutated, too."""
 
-MOST_BYTES = 4 << 30
+MAX_BYTES = 4 << 30
 """Address space that a child gets beside what it has."""
 
 
@@ -149,7 +149,7 @@ def _child(
     (out, name, end), refused, found = about, 0, Counter[str]()
     with suppress(ValueError):
         used = int(Path("/proc/self/statm").read_text().split()[0]) * mmap.PAGESIZE
-        resource.setrlimit(resource.RLIMIT_AS, (used + MOST_BYTES, used + MOST_BYTES))
+        resource.setrlimit(resource.RLIMIT_AS, (used + MAX_BYTES, used + MAX_BYTES))
     for number in numbers:
         progress[:] = number.to_bytes(8, "little")
         data = made(number)

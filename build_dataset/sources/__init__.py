@@ -8,9 +8,9 @@ from robomme_interference_data.constants import INFO_PATH
 from robomme_interference_data.errors import InvalidOptionError, nearest
 from robomme_interference_data.runtime.specs import (
     OWN,
-    Kind,
     Registry,
     Spec,
+    SpecKind,
     import_factory,
     signature_of,
 )
@@ -35,20 +35,22 @@ _LOCATION = "(?P<location>.+)"
 SOURCES = Registry(
     "source",
     {
-        "robomme-h5": Kind(
+        "robomme-h5": SpecKind(
             "robomme-h5:FOLDER", f"{__name__}.h5:H5Source", _LOCATION, extra="build"
         ),
-        "lerobot": Kind(
+        "lerobot": SpecKind(
             "lerobot:FOLDER or lerobot:NAMESPACE/NAME[/FOLDER][@REVISION]",
             f"{__name__}.lerobot:LeRobotSource",
             _LOCATION,
         ),
-        "frames": Kind("frames:FOLDER", f"{__name__}.frames:FramesSource", _LOCATION),
+        "frames": SpecKind("frames:FOLDER", f"{__name__}.frames:FramesSource", _LOCATION),
         **{
-            name: Kind(name, f"{__name__}.simulator:SimulatorSource", arguments={"name": name})
+            name: SpecKind(name, f"{__name__}.simulator:SimulatorSource", arguments={"name": name})
             for name in SIMULATORS
         },
-        "sample": Kind("sample[:FAMILY,…]", f"{__name__}.sample:SampleSource", "(?P<families>.*)"),
+        "sample": SpecKind(
+            "sample[:FAMILY,…]", f"{__name__}.sample:SampleSource", "(?P<families>.*)"
+        ),
     },
     also="MODULE:NAME of a simulator of your own",
 )

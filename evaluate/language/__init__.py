@@ -5,6 +5,7 @@
 | `models`, `openai`, `bounded_http`, `transformers`, `images` | models, and their input |
 | `prompt_files`, `published_prompts` | prompts as files, and those of the paper's systems |
 | `question_run`, `question_prompt`, `responders` | runs of questions |
-| `subgoal_writers`, `subgoal_writer`, `model_writer`, `subgoal_prompt` | writers of subgoals |
+| `subgoal_settings` | the writer of subgoals that the settings of a run name |
+| `subgoal_writer`, `model_writer`, `subgoal_prompt` | writers of subgoals |
 | `columns` | columns of rows about answers and models |
 """

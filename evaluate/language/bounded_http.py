@@ -59,6 +59,8 @@ def _read(response: httpx.Response) -> httpx.Response:
                 raise AnswerTooLongError(f"an answer of more than {MAX_BYTES} bytes")
     finally:
         response.close()
+    # A server may compress all the same; without this header httpx does not decompress the answer,
+    # whose size would then be unlimited.
     headers = [(k, v) for k, v in response.headers.multi_items() if k != "content-encoding"]
     return httpx.Response(
         response.status_code,

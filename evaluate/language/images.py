@@ -56,6 +56,7 @@ def mp4(video: Video) -> bytes:
     height, width = (side // 2 * 2 for side in video.frames.shape[1:3])
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "video.mp4"
+        # The published systems' codec varies from run to run with other sizes, see `CLIP`.
         codec = CLIP if height % 16 or width % 16 else MODEL_VIDEO
         encoder = VideoEncoder(path, codec, max(1, round(video.fps)), height, width)
         for frame in video.frames:
@@ -85,8 +86,8 @@ class HistoryFrames:
 
     def frames(self, places: Sequence[int]) -> NDArray[np.uint8]:
         """Decode frames by their ascending places, `(n, H, W, 3) uint8` RGB."""
-        chosen = [self._indices[place] for place in places]
-        chunks = self._reader.stream(self._buffer, 64, (self.camera,), chosen)
+        indices = [self._indices[place] for place in places]
+        chunks = self._reader.stream(self._buffer, 64, (self.camera,), indices)
         return np.concatenate([chunk.frames[self.camera] for chunk in chunks])
 
     def video(self, places: Sequence[int], fps: float | None = None) -> Video:

@@ -88,6 +88,7 @@ class ModelWriter(SubgoalWriter):
         image = observation.images[self._camera]
         size = (image.shape[0], image.shape[1])
         recent = self._recent_frames()
+        # Live frames have numbers from 0, and the last one that was seen has `_count` - 1.
         images = {number: self._seen[number - self._count] for number in recent}
         views: dict[str, Sequence[Part]] = {
             "<history>": self._history,

@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.runtime.specs import Kind, Registry
+from robomme_interference_data.runtime.specs import Registry, SpecKind
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def _is_endpoint(target: str) -> bool:
 MODELS = Registry(
     "model",
     {
-        "openai": Kind(
+        "openai": SpecKind(
             "openai:URL#MODEL, such as openai:http://localhost:8000/v1#Qwen/Qwen3-VL-4B-Instruct",
             f"{__package__}.openai:OpenAIModel",
             r"(?P<url>https?://[^#\s]+)#(?P<model>\S+)",
@@ -96,7 +96,7 @@ MODELS = Registry(
             not_in_identity=("connect_s", "response_s", "repeats"),
             valid=_is_endpoint,
         ),
-        "transformers": Kind(
+        "transformers": SpecKind(
             "transformers:NAMESPACE/NAME[@REVISION] or transformers:FOLDER",
             f"{__package__}.transformers:TransformersModel",
             r"(?P<path>.+)",

@@ -13,7 +13,7 @@ from robomme_interference_data.storage.files import digest_json
 
 from .models import Part, Video
 
-_MOST_BYTES = 1 << 16
+_MAX_BYTES = 1 << 16
 
 
 def fill(
@@ -103,8 +103,8 @@ class Prompt:
             )
         data = path.read_bytes()
         try:
-            if len(data) > _MOST_BYTES:
-                raise ValueError(f"{len(data)} bytes; expected at most {_MOST_BYTES}")
+            if len(data) > _MAX_BYTES:
+                raise ValueError(f"{len(data)} bytes; expected at most {_MAX_BYTES}")
             return cls._of(tomllib.loads(data.decode()))
         except (ValueError, RecursionError) as error:
             raise FormatError(f"{name} is no prompt: {error}", f"See {page}.") from None

@@ -16,8 +16,8 @@ from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.run.runner import (
     Job,
     RunContext,
+    RunFunction,
     Runner,
-    RunTask,
     history_columns,
     retrieval_text,
     short_digest,
@@ -33,10 +33,10 @@ from robomme_interference_data.simulators.registry import recorded_scene
 from .columns import model_columns
 from .images import HistoryFrames
 from .models import MODELS, model_identity
-from .responders import CONTROLS, OWN, ModelResponder, Prompted
+from .responders import CONTROLS, WITHOUT_MODEL, ModelResponder, Prompted
 
 
-class Questions(Runner[AskConfig]):
+class QuestionRunner(Runner[AskConfig]):
     """Multiple-choice questions about what history buffers show."""
 
     def prepare(self) -> None:
@@ -47,22 +47,22 @@ class Questions(Runner[AskConfig]):
         self.config = config = dataclasses.replace(config, memory=str(self.memory))
         self._questions = read_questions(self.buffer_set)
         self.metadata, self._images = {"model": config.model}, None
-        if config.model not in OWN:
+        if config.model not in WITHOUT_MODEL:
             self.config = config = dataclasses.replace(config, model=MODELS.pin(config.model))
         self.system = _name(config)
-        if config.model not in OWN:
+        if config.model not in WITHOUT_MODEL:
             with closing(ModelResponder(config)) as responder:
                 self.metadata, self._images = responder.metadata(), responder.images
 
     def facts(self) -> SystemFacts:
         """Return what the system is: the model, and what it sees of the past."""
-        config, own = self.config, self.config.model in OWN
+        config, has_model = self.config, self.config.model not in WITHOUT_MODEL
         return SystemFacts(
-            policy=config.model if own else MODELS.parse(config.model).kind,
+            policy=MODELS.parse(config.model).kind if has_model else config.model,
             policy_id=short_digest({"model": self._model_identity(), "control": config.control}),
             memory=None if config.model == "guess" else config.memory,
             retrieval=retrieval_text(config, self.buffer_set),
-            reference=own,
+            reference=not has_model,
         )
 
     def check(self, plan: RunPlan, items: Sequence[WorkItem]) -> None:
@@ -75,7 +75,7 @@ class Questions(Runner[AskConfig]):
                         f"recall does not know the possible answers in {episode}",
                         "Ask a model, or guess.",
                     )
-        # How many frames a retrieval step selects is unknown before.
+        # How many frames a retrieval step selects is unknown before; a memory of N bounds them.
         if self._images is None or (config.retrieval is not None and self.memory.rule == "full"):
             return
         for item in items:
@@ -89,9 +89,9 @@ class Questions(Runner[AskConfig]):
                     f"{named('memory')}.",
                 )
 
-    def task(self, run: RunContext[AskConfig]) -> "AskTask":
+    def function(self, run: RunContext[AskConfig]) -> "AskFunction":
         """Return the function that asks questions."""
-        return AskTask(run)
+        return AskFunction(run)
 
     def identity(self, plan: RunPlan) -> dict[str, Any]:
         """Return what of questions and model can change an answer."""
@@ -105,7 +105,7 @@ class Questions(Runner[AskConfig]):
 
     def _model_identity(self) -> dict[str, Any]:
         config = self.config
-        if config.model in OWN:
+        if config.model in WITHOUT_MODEL:
             return self.metadata
         model = model_identity(config.model, config.model_options, self.metadata["model"])
         return model | {"prompt_sha256": self.metadata["prompt_sha256"]}
@@ -115,7 +115,7 @@ def _check_settings(config: AskConfig) -> None:
     """Check the settings by themselves and against each other."""
     if config.control not in CONTROLS:
         raise InvalidOptionError.one_of("control", config.control, CONTROLS)
-    if config.model in OWN:
+    if config.model in WITHOUT_MODEL:
         unused = ["model_options", "control", "prompt"]
         if config.model == "guess":
             unused += ["memory", "retrieval"]
@@ -124,7 +124,7 @@ def _check_settings(config: AskConfig) -> None:
         raise UnknownNameError(
             f"there is no model {config.model!r}; expected recall, guess, openai:URL#MODEL, "
             "transformers:ID or transformers:FOLDER",
-            nearest(config.model, OWN, more=""),
+            nearest(config.model, WITHOUT_MODEL, more=""),
         )
     else:
         MODELS.parse(config.model)
@@ -133,7 +133,7 @@ def _check_settings(config: AskConfig) -> None:
 def _name(config: AskConfig) -> str:
     """Return the label of the rows: a name of the table only for the responder that it names."""
     default = None
-    if config.model in OWN:
+    if config.model in WITHOUT_MODEL:
         default = f"questions-{config.model}"
         if config.model == "recall":
             default += f"-{Memory.parse(config.memory).label}"
@@ -153,7 +153,7 @@ def _name(config: AskConfig) -> str:
     return name
 
 
-class AskTask(RunTask[AskConfig]):
+class AskFunction(RunFunction[AskConfig]):
     """Asks questions; makes the model at the first one, and again after an error."""
 
     def __init__(self, run: RunContext[AskConfig]):
@@ -180,7 +180,7 @@ class AskTask(RunTask[AskConfig]):
     def work(self, task: Job, worker: Worker) -> tuple[Rollout, None]:
         """Ask a question, and send its transcript; return its row."""
         item, config, began = task.item, self.run.config, time.perf_counter()
-        if self._responder is None and config.model not in OWN:
+        if self._responder is None and config.model not in WITHOUT_MODEL:
             self._responder = ModelResponder(config)
         buffer = self.buffer_set.load(item.episode, item.condition)
         question, query = self.questions[item.episode], buffer.query
@@ -195,7 +195,7 @@ class AskTask(RunTask[AskConfig]):
         right = question.letters[question.right]
         columns: dict[str, Any] = {}
         if self._responder is None:
-            letter: str | None = OWN[config.model](prompted)
+            letter: str | None = WITHOUT_MODEL[config.model](prompted)
         else:
             letter, prompt, reply = self._responder.answer(prompted)
             columns = model_columns(reply.calls, [reply.tokens], letter is None)

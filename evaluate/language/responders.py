@@ -62,7 +62,7 @@ def recall(prompted: Prompted) -> str:
     return prompted.draw("".join(fits) or question.letters)
 
 
-OWN = {"recall": recall, "guess": guess}
+WITHOUT_MODEL = {"recall": recall, "guess": guess}
 """The responders without a model."""
 
 

@@ -19,7 +19,7 @@ VIEWS = ("<history>", "<keyframes>", "<recent>", "<image>")
 """Placeholders of images: the history, the selected key frames, the last live frames (`MemER`), and
 the current view."""
 
-_MOST_LETTERS = 300
+_MAX_LETTERS = 300
 
 _SPECIAL = re.compile(r"<\|\w+\|>")
 """Special tokens of a model, such as `<|box_start|>`: most servers remove them from answers."""
@@ -130,9 +130,9 @@ class SubgoalPrompt(Prompt):
             keyframes = _places(fields.get(self.keyframes_key) or [], shown)
         lines = [line.strip().strip("\"'`*").strip() for line in text.strip().splitlines()]
         words = _SPECIAL.sub("", next(filter(None, lines), ""))
-        if not 0 < len(words) <= _MOST_LETTERS:
+        if not 0 < len(words) <= _MAX_LETTERS:
             raise InvalidOptionError.expected(
-                "the answer", words[:60], f"a subgoal of up to {_MOST_LETTERS} letters in one line"
+                "the answer", words[:60], f"a subgoal of up to {_MAX_LETTERS} letters in one line"
             )
         plain, numbers = read_points(words, self._pattern)
         return NextSubgoal(
@@ -154,6 +154,7 @@ class SubgoalPrompt(Prompt):
     def _pixel(self, numbers: Mapping[str, int], size: tuple[int, int]) -> Pixel:
         pixel = []
         for axis, side in zip("yx", size, strict=True):
+            # Groups of the pattern are `p_y`, `b_y0`, `b_y1`, …: a box has two numbers on an axis.
             values = [value for name, value in numbers.items() if name[2:].startswith(axis)]
             top = self.grid or side - 1
             if max(values) > top:

@@ -149,10 +149,10 @@ def _read_csv(path: Path) -> dict[WorkItem, Rollout]:
     if len({*table.column_names}) < len(table.column_names):
         raise FormatError.damaged(path, "a column occurs twice")
     rows = [*from_table(Rollout, table, path)]
-    found = {WorkItem.of(row): row for row in rows}
-    if len(found) < len(rows):
+    by_item = {WorkItem.of(row): row for row in rows}
+    if len(by_item) < len(rows):
         raise FormatError.damaged(path, "a question has two answers")
-    return found
+    return by_item
 
 
 def _check_kind(path: Path, simulators: set[Any]) -> None:

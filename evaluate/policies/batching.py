@@ -9,7 +9,7 @@ from .policy import BatchPolicy, Policy
 
 logger = logging.getLogger(__name__)
 
-Answer = tuple[Any, Exception | None]
+CallResult = tuple[Any, Exception | None]
 """What a call returned, or the exception that it raised."""
 
 
@@ -59,7 +59,7 @@ class Batcher[K: Hashable]:
         if "_policy" in vars(self):
             self._policy.close()
 
-    def call(self, key: K, request: tuple[str, tuple[Any, ...]]) -> Answer | None:
+    def call(self, key: K, request: tuple[str, tuple[Any, ...]]) -> CallResult | None:
         """Call a session's method, by its name and arguments; None if it is `act`, which waits."""
         method, arguments = request
         if method == "act":
@@ -67,8 +67,8 @@ class Batcher[K: Hashable]:
             return None
         return attempt(getattr(self._sessions[key], method), *arguments)
 
-    def due_s(self, now: float) -> float | None:
-        """Return the seconds until a batch is due, 0 if one is; None if no request waits."""
+    def until_batch_s(self, now: float) -> float | None:
+        """Return the seconds until `act` is to be called, 0 for now; None if no request waits."""
         if not self._waiting:
             self._since = None
             return None
@@ -79,7 +79,7 @@ class Batcher[K: Hashable]:
             return 0.0
         return max(0.0, self._since + self._timeout_s - now)
 
-    def act(self) -> dict[K, Answer]:
+    def act(self) -> dict[K, CallResult]:
         """Answer the oldest requests, as many as fit into a batch.
 
         After an exception in the batch, each request is answered alone: only those at fault fail.
@@ -103,7 +103,7 @@ class Batcher[K: Hashable]:
         return dict(zip(keys, answers, strict=True))
 
 
-def attempt(function: Any, *arguments: Any) -> Answer:
+def attempt(function: Any, *arguments: Any) -> CallResult:
     """Call a function; return its value, or the exception that it raised."""
     try:
         return function(*arguments), None

@@ -118,7 +118,7 @@ def follow(
     where a joint would move over 0.08 rad in a step. The gripper closes when its opening shrinks,
     opens when it grows, and else keeps its command.
     """
-    grip = 1.0 if now[7] > 0.02 else -1.0
+    grip = 1.0 if now[7] > 0.02 else -1.0  # half of a finger's way from closed to open
     targets = [np.append(now[:7], np.float32(grip))]
     at, index = now, None
     for state, seen in zip(states, kept.tolist(), strict=True):
@@ -136,6 +136,7 @@ def follow(
             grip = next_grip
             targets += [np.append(state[:7], grip) for _ in range(GRIP_STEPS)]
         at, index = state, seen
+    # The first target is the current pose, for a memory that keeps no frame.
     return np.array(targets[1:] or targets, np.float32)
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
-from robomme_interference_data.runtime.specs import Kind
+from robomme_interference_data.runtime.specs import SpecKind
 
 
 class Role(Enum):
@@ -42,7 +42,7 @@ class Server:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PolicyKind(Kind):
+class PolicyKind(SpecKind):
     """A kind of policies. Its capabilities have no defaults: a wrong one would go unnoticed.
 
     A group `memory` of `target` is the policy's memory, in the spelling of `Memory`.

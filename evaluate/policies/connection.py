@@ -61,8 +61,8 @@ def check_server_options(checkpoint: str | None, **positive: float) -> None:
     if checkpoint is not None and not checkpoint.strip():
         raise InvalidOptionError.expected("checkpoint", checkpoint, "its name")
     if not min(positive.values()) > 0:
-        given = ", ".join(f"{name} {value}" for name, value in positive.items())
-        raise InvalidOptionError(f"{given}; expected positive numbers")
+        shown = ", ".join(f"{name} {value}" for name, value in positive.items())
+        raise InvalidOptionError(f"{shown}; expected positive numbers")
 
 
 class ServerConnection(ABC):

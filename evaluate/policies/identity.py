@@ -35,7 +35,7 @@ from .registry import (
 
 logger = logging.getLogger(__name__)
 
-MOST_METADATA = 1 << 16
+MAX_METADATA = 1 << 16
 """Most letters of a policy's metadata in JSON: `run.json` holds it once for each start of a run."""
 
 
@@ -92,9 +92,9 @@ def policy_metadata(text: str, policy: Policy) -> dict[str, Any]:
         if isinstance(metadata, Mapping):
             recorded = dict(plain(metadata))
             length = len(indented_json(recorded))
-            if length <= MOST_METADATA:
+            if length <= MAX_METADATA:
                 return recorded
-            fault = f"holds {length:,} letters of JSON; expected at most {MOST_METADATA:,}"
+            fault = f"holds {length:,} letters of JSON; expected at most {MAX_METADATA:,}"
         else:
             fault = f"returned a {type(metadata).__name__}"
     except ValueError as error:
@@ -108,12 +108,12 @@ def policy_metadata(text: str, policy: Policy) -> dict[str, Any]:
 def check_metadata(reports: Sequence[Mapping[str, Any]], checkpoint: str | None) -> None:
     """Check that servers report the same model, and the checkpoint that the user names, if any."""
     first = reports[0]
-    for other in reports:
-        if other["server_metadata"] != first["server_metadata"]:
+    for report in reports:
+        if report["server_metadata"] != first["server_metadata"]:
             raise PolicyServerError(
-                f"the policy servers {first['server']} and {other['server']} serve different "
+                f"the policy servers {first['server']} and {report['server']} serve different "
                 f"models: one reports {first['server_metadata']}, the other "
-                f"{other['server_metadata']}",
+                f"{report['server_metadata']}",
                 "Start all of them with the same checkpoint and seed.",
             )
     reported = first["server_metadata"].get("checkpoint")

@@ -223,6 +223,7 @@ class LeRobotPolicy(BatchPolicy):
         """Seed PyTorch for one call, and restore its generators afterwards."""
         devices = [torch.device(self._device)] if self._device.startswith("cuda") else []
         with torch.random.fork_rng(devices):
+            # A seed for each call: a rollout has fewer than 1 << 16 of them.
             torch.manual_seed((self._seed << 16) + self._asked)
             self._asked += 1
             yield
@@ -306,14 +307,18 @@ def _feature_names(before: Any) -> dict[str, str]:
 
 def _check_features(path: str, config: Any, names: dict[str, str]) -> None:
     """Compare the policy's features with the simulators' observations and actions."""
-    given = {names[FRONT]: _IMAGE_SHAPE, names[WRIST]: _IMAGE_SHAPE, names[STATE]: (ACTION_SIZE,)}
+    provided = {
+        names[FRONT]: _IMAGE_SHAPE,
+        names[WRIST]: _IMAGE_SHAPE,
+        names[STATE]: (ACTION_SIZE,),
+    }
     wrong = []
     for name, feature in (config.input_features or {}).items():
         shape = tuple(feature.shape)
-        if name not in given:
+        if name not in provided:
             wrong.append(f"wants {name} {shape}, which the simulators do not provide")
-        elif shape != given[name]:
-            wrong.append(f"wants {name} of shape {shape}; the simulators provide {given[name]}")
+        elif shape != provided[name]:
+            wrong.append(f"wants {name} of shape {shape}; the simulators provide {provided[name]}")
     actions = {
         name: tuple(feature.shape)
         for name, feature in (config.output_features or {}).items()

@@ -185,6 +185,7 @@ def _local_processes(config: RunConfig) -> Iterator[Sequence[Address]]:
 
         def supervise() -> None:
             try:
+                # However often a process dies, it is started again: rollouts have a limit.
                 for outcome in pool.run(addresses, attempts=sys.maxsize):
                     if outcome.error is not None:
                         failures.append(WorkerError(f"the policy's process ended: {outcome.error}"))

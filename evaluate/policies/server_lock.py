@@ -34,7 +34,7 @@ def lock_server(host: str, port: int, holder: str) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         lock.touch()
         about.touch()
-        other = about.read_text(encoding="utf-8", errors="replace")
+        other_run = about.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
         logger.warning(
             "Nothing keeps other runs from the policy server %s:%s: %s", host, port, error
@@ -42,7 +42,7 @@ def lock_server(host: str, port: int, holder: str) -> Iterator[None]:
         yield
         return
     busy = PolicyServerError(
-        f"the policy server {host}:{port} is driven by {other or 'another run'}; two runs "
+        f"the policy server {host}:{port} is driven by {other_run or 'another run'}; two runs "
         "spoil each other, as a server holds one memory",
         "Wait for that run to end, or start another server, on another port.",
     )

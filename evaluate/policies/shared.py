@@ -23,7 +23,7 @@ from robomme_interference_data.errors import InterferenceError, PolicyError, Ser
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.simulators.episode import Observation
 
-from .batching import Answer, Batcher, attempt
+from .batching import Batcher, CallResult, attempt
 from .policy import Frames, Policy, RolloutInfo
 from .registry import check_members, make_policy
 
@@ -135,8 +135,10 @@ class PolicyHost:
             config.max_batch_size,
             config.batch_wait_timeout_s,
         )
-        self._calls = SimpleQueue[tuple[int, str, tuple[Any, ...], Future[Answer]]]()
-        self._acting: dict[int, Future[Answer]] = {}  # by worker, of requests that wait for a batch
+        self._calls = SimpleQueue[tuple[int, str, tuple[Any, ...], Future[CallResult]]]()
+        self._acting: dict[
+            int, Future[CallResult]
+        ] = {}  # by worker, of requests that wait for a batch
 
     def start(self) -> None:
         """Make the calls in a thread, until this process ends."""
@@ -149,7 +151,7 @@ class PolicyHost:
             CancelledError: The worker opened another session meanwhile.
         """
         method, arguments = pickle.loads(request)
-        future = Future[Answer]()
+        future = Future[CallResult]()
         self._calls.put((worker, method, arguments, future))
         return _packed(future.result())
 
@@ -157,23 +159,23 @@ class PolicyHost:
         """Make the calls until the run has ended."""
         with closing(self._batcher):
             while not ended():
-                due_s = self._batcher.due_s(time.monotonic())
-                wait_s = _LOOK_S if due_s is None else min(due_s, _LOOK_S)
+                until_batch_s = self._batcher.until_batch_s(time.monotonic())
+                wait_s = _LOOK_S if until_batch_s is None else min(until_batch_s, _LOOK_S)
                 with suppress(Empty):
                     self._make(*self._calls.get(timeout=wait_s))
                     while True:  # all that wait, so that a batch is as large as it can be
                         self._make(*self._calls.get(block=False))
-                if self._batcher.due_s(time.monotonic()) == 0:
+                if self._batcher.until_batch_s(time.monotonic()) == 0:
                     with _time_limit(self._config.rollout_timeout_s):
                         answers = self._batcher.act()
                     for worker, answer in answers.items():
                         self._acting.pop(worker).set_result(answer)
 
     def _make(
-        self, worker: int, method: str, arguments: tuple[Any, ...], future: Future[Answer]
+        self, worker: int, method: str, arguments: tuple[Any, ...], future: Future[CallResult]
     ) -> None:
         with _time_limit(self._config.rollout_timeout_s):
-            answer: Answer | None = (None, None)
+            answer: CallResult | None = (None, None)
             if method in (_OPEN, _CLOSE):
                 self._drop(worker)
                 if method == _OPEN:
@@ -225,7 +227,7 @@ def _time_limit(seconds: float) -> Iterator[None]:
         faulthandler.cancel_dump_traceback_later()
 
 
-def _packed(answer: Answer) -> bytes:
+def _packed(answer: CallResult) -> bytes:
     """Pickle an answer; an exception with its traceback, and as text if it cannot be pickled."""
     value, error = answer
     if error is None:

@@ -22,7 +22,7 @@ _NOTHING_ELSE = (
     "Messages hold maps, lists, texts, bytes, numbers and arrays of these, nothing else."
 )
 
-MOST_ITEMS = 1 << 16
+MAX_ITEMS = 1 << 16
 """Most maps and lists in a message together, and most entries in one of them. Actions are an array,
 which is one map; an empty map takes one byte of a message and a hundred in memory."""
 
@@ -47,30 +47,30 @@ def pack(message: Any) -> bytes:
         raise FormatError(f"a message cannot be sent: {error}", _NOTHING_ELSE) from error
 
 
-def check_items(data: bytes, refused: Callable[[Any], bool] = lambda items: False) -> None:
+def check_items(data: bytes, forbidden: Callable[[Any], bool] = lambda items: False) -> None:
     """Check that a message is small once it is read, without keeping what it holds.
 
     The library bounds the length of each map and list; their number multiplies if they are nested.
 
     Args:
         data: The message.
-        refused: Whether a message may not hold this map or list.
+        forbidden: Whether a message may not hold this map or list.
     """
     count = 0
 
     def drop(items: Any) -> None:
         nonlocal count
         count += 1
-        if count > MOST_ITEMS:
-            raise ValueError(f"over {MOST_ITEMS:,} maps and lists")
+        if count > MAX_ITEMS:
+            raise ValueError(f"over {MAX_ITEMS:,} maps and lists")
         if isinstance(items, dict):
             dtype = items.get("dtype", items.get(b"dtype"))
             if dtype is not None and not (isinstance(dtype, str) and len(dtype) <= _DTYPE_LETTERS):
                 raise ValueError(f"a dtype {dtype!r:.80}")
-        if refused(items):
+        if forbidden(items):
             raise ValueError(f"it may not hold {items!r:.80}")
 
-    limits = {"max_map_len": MOST_ITEMS, "max_array_len": MOST_ITEMS}
+    limits = {"max_map_len": MAX_ITEMS, "max_array_len": MAX_ITEMS}
     with _reading(data):
         msgpack.unpackb(data, object_hook=drop, list_hook=drop, ext_hook=_drop_extension, **limits)
 

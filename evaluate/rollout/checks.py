@@ -20,6 +20,7 @@ from robomme_interference_data.evaluate.policies.registry import POLICIES, polic
 from robomme_interference_data.evaluate.run.config import RunConfig, check_unused
 from robomme_interference_data.evaluate.run.plan import RunPlan, WorkItem
 from robomme_interference_data.evaluate.systems import System, check_history, name_system
+from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Resources
 from robomme_interference_data.simulators.registry import SIMULATORS, check_shift, simulator_class
 
@@ -193,26 +194,8 @@ def check_plan(
                 "Build the demonstrations from a source with evidence; see "
                 "docs/reference/sources.md.",
             )
-        recorded = record.simulator
-        if simulator.own_episodes and recorded not in (None, config.simulator):
-            if recorded in SIMULATORS:
-                hint = f"Set {named('simulator', recorded)}, or give a buffer set of "
-                hint += f"{config.simulator}."
-            else:
-                hint = (
-                    "No simulator plays the episodes of this buffer set: give one whose "
-                    f"demonstrations are of {' or '.join(SIMULATORS)}, or your own simulator."
-                )
-            raise InvalidOptionError(
-                f"{episode} was recorded on {recorded!r}, the run is on {config.simulator!r}", hint
-            )
-        if families and episode.family not in families:
-            raise InvalidOptionError(
-                f"{config.simulator} does not play the family {episode.family} of {episode}",
-                f"It plays {', '.join(sorted(families))}. Set {named('families')} to some of "
-                "them, or "
-                f"{named('simulator')} to one that plays these episodes, such as module:class.",
-            )
+        _check_playable(config, families, episode, record.simulator)
+    # What a retrieval step selects is checked in each rollout.
     if system.position_limit is not None and config.retrieval is None:
         planned, longest = set(items), dict.fromkeys(plan.conditions, 0)
         for manifest in buffer_set.manifests():
@@ -220,3 +203,31 @@ def check_plan(
             if WorkItem(name, manifest.episode_id) in planned:
                 longest[name] = max(manifest.history_frames, longest[name])
         check_history(system, longest)
+
+
+def _check_playable(
+    config: RunConfig, families: set[str], episode: EpisodeId, recorded: str | None
+) -> None:
+    """Reject an episode that the simulator does not play.
+
+    `families` are those that it plays, empty if unknown; `recorded` is the episode's simulator.
+    """
+    if simulator_class(config.simulator).own_episodes and recorded not in (None, config.simulator):
+        if recorded in SIMULATORS:
+            hint = f"Set {named('simulator', recorded)}, or give a buffer set of "
+            hint += f"{config.simulator}."
+        else:
+            hint = (
+                "No simulator plays the episodes of this buffer set: give one whose "
+                f"demonstrations are of {' or '.join(SIMULATORS)}, or your own simulator."
+            )
+        raise InvalidOptionError(
+            f"{episode} was recorded on {recorded!r}, the run is on {config.simulator!r}", hint
+        )
+    if families and episode.family not in families:
+        raise InvalidOptionError(
+            f"{config.simulator} does not play the family {episode.family} of {episode}",
+            f"It plays {', '.join(sorted(families))}. Set {named('families')} to some of "
+            "them, or "
+            f"{named('simulator')} to one that plays these episodes, such as module:class.",
+        )

@@ -155,8 +155,8 @@ def history_picture(buffer: Buffer, received: Sequence[int]) -> NDArray[np.uint8
     picture = np.full((VIEW, VIEW, 3), 255, np.uint8)
     colors, sessions = session_colors(buffer.sessions), buffer.session_index
     camera = buffer.query.dataset.camera()
-    for place, chosen in enumerate(spread(0, len(received), _COLUMNS * _COLUMNS)):
-        index = received[chosen]
+    for place, number in enumerate(spread(0, len(received), _COLUMNS * _COLUMNS)):
+        index = received[number]
         y, x = (_THUMB * part for part in divmod(place, _COLUMNS))
         frame = buffer.frame(index, camera)
         step = max(1, frame.shape[0] // _SMALL)

@@ -22,13 +22,13 @@ def check_episode(
     A state or image of another shape fits no episode, and is a `SimulatorError`.
     """
     recorded_shapes = {"state": query.dataset.features[STATE]}
-    given_shapes = {"state": first.state.shape}
+    live_shapes = {"state": first.state.shape}
     for camera in first.images.keys() & {*query.dataset.cameras}:
         recorded_shapes[camera] = query.dataset.shape(camera)
-        given_shapes[camera] = first.images[camera].shape
-    if given_shapes != recorded_shapes:
+        live_shapes[camera] = first.images[camera].shape
+    if live_shapes != recorded_shapes:
         raise SimulatorError(
-            f"the simulator gives {given_shapes}; the buffer set was recorded with "
+            f"the simulator gives {live_shapes}; the buffer set was recorded with "
             f"{recorded_shapes}",
             "Build the buffer set from this simulator, or correct its sizes.",
         )

@@ -78,7 +78,9 @@ def run_rollout(
     config, clock, began = run.config, _Clock(), time.perf_counter()
     worker = worker or Worker(0)  # no time limit
     reader = history or HistoryReader(buffer_set.datasets)
-    cameras = policy.history_cameras if selector is None else ()  # the selection comes later
+    # `load` fetches the videos of these cameras. What retrieval selects is unknown before the
+    # first live view, so its frames are fetched when they are decoded.
+    cameras = policy.history_cameras if selector is None else ()
     buffer = buffer_set.load(item.episode, item.condition, cameras=cameras)
     received: Sequence[int] = range(len(buffer))
     with ExitStack() as stack:
@@ -100,6 +102,7 @@ def run_rollout(
                 camera = buffer.query.dataset.camera(selector.camera)
                 received = selector.select(buffer, first.images[camera]).tolist()
                 check_history(name_system(run.system), {item.condition: len(received)})
+        # Between the two parts of the history: the time of drawing belongs to neither.
         if clip is not None:
             clip.begin(buffer, received, first, info)
         with clock.part("history_s"):
@@ -126,6 +129,7 @@ def run_rollout(
                 f"the {config.simulator} simulator reported an error at step {live.steps}"
             )
     except Exception as error:
+        # `attempt` hands this on as the outcome's progress: columns of the error's row.
         vars(error)["progress"] = {"steps": live.steps, **_model_columns(writer)}
         raise
     memory = None if run.facts.memory is None else Memory.parse(run.facts.memory)
@@ -139,6 +143,7 @@ def run_rollout(
         steps=live.steps,
         **history_columns(buffer, received, memory, retrieved=selector is not None),
         **_model_columns(writer),
+        # A simulator of the user need not be a subclass.
         **(simulator.columns() if isinstance(simulator, Simulator) else {}),
         **times,
         wall_s=round(time.perf_counter() - began, 4),

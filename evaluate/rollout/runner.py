@@ -1,4 +1,4 @@
-"""Rollouts as kinds of runs, simulated and offline: the checks before one, and its identity."""
+"""Runs of rollouts, simulated and offline: the checks before one, and what identifies it."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
@@ -48,14 +48,14 @@ from robomme_interference_data.simulators.registry import simulator_class, simul
 
 from .checks import check_plan, check_settings, check_system
 from .names import default_system
-from .worker import RolloutTask, StartServer, StartSimulator
+from .worker import RolloutFunction, StartServer, StartSimulator
 
 if TYPE_CHECKING:
     from robomme_interference_data.evaluate.policies.answers import Answers
     from robomme_interference_data.evaluate.policies.shared import Address
 
 
-class Rollouts(Runner[RunConfig]):
+class RolloutRunner(Runner[RunConfig]):
     """Rollouts of a policy in a simulator."""
 
     def __init__(self, config: RunConfig, buffer_set: BufferSet):
@@ -133,9 +133,9 @@ class Rollouts(Runner[RunConfig]):
         with optional.policy_processes(self.config) as self._addresses:
             yield
 
-    def task(self, run: RunContext[RunConfig]) -> RolloutTask:
+    def function(self, run: RunContext[RunConfig]) -> RolloutFunction:
         """Return the function that runs rollouts."""
-        return RolloutTask(run, self._answers, self._addresses)
+        return RolloutFunction(run, self._answers, self._addresses)
 
     def needs_workers(self, todo: Sequence[WorkItem]) -> bool:
         """Whether there is work, or a server that only workers start must be identified."""
@@ -179,7 +179,7 @@ _UNUSED = ("simulator", "shift", "check_lesson", "videos")
 """Settings of simulators."""
 
 
-class Offline(Rollouts):
+class OfflineRunner(RolloutRunner):
     """Rollouts along recorded executions: the policy acts, and the recording goes on."""
 
     def __init__(self, config: RunConfig, buffer_set: BufferSet):

@@ -22,7 +22,7 @@ from robomme_interference_data.evaluate.policies.registry import make_policy, st
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout
-from robomme_interference_data.evaluate.run.runner import Job, RunContext, RunTask
+from robomme_interference_data.evaluate.run.runner import Job, RunContext, RunFunction
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
@@ -63,7 +63,7 @@ class StartSimulator:
     episode: EpisodeId | None
 
 
-class RolloutTask(RunTask[RunConfig]):
+class RolloutFunction(RunFunction[RunConfig]):
     """Runs rollouts; makes policy and simulator at the first one, and again after an error.
 
     `answers` are those that the policy `answers` carries out; None for all other policies.
@@ -79,7 +79,7 @@ class RolloutTask(RunTask[RunConfig]):
         policy: Policy | None = None,
     ):
         super().__init__(run)
-        self._answers, self._addresses, self._given = answers, addresses, policy
+        self._answers, self._addresses, self._made_policy = answers, addresses, policy
         self._simulator: Simulator | None = None
         self._policy: Policy | None = None
         self._checked = False  # whether the policy's server is the one that the run began with
@@ -126,6 +126,9 @@ class RolloutTask(RunTask[RunConfig]):
             self._send_files(item, worker, clip, Status.ERROR, what)
             if isinstance(error, ServerKeepaliveError):
                 logger.warning("%s: %s. It is started again, once.", item, error.message)
+            # If the server is gone, this worker must not break one rollout after the other: it
+            # retires, and workers with other servers do the rest. A server that workers start is
+            # started again instead.
             if isinstance(error, PolicyServerError) and not starts_server(config.policy):
                 self.close()
                 self._check_reachable(worker)
@@ -145,8 +148,8 @@ class RolloutTask(RunTask[RunConfig]):
 
     def _make_policy(self, worker: Worker) -> Policy:
         config = self.run.config
-        if self._given is not None:
-            return self._given
+        if self._made_policy is not None:
+            return self._made_policy
         if not self._addresses:
             return make_policy(config.policy, config.policy_options, worker=worker.number)
         address = self._addresses[worker.number % len(self._addresses)]
@@ -246,7 +249,7 @@ class RolloutTask(RunTask[RunConfig]):
 
     def _check_served(self, policy: Policy, metadata: Mapping[str, Any]) -> None:
         """Retire the worker if its server reports other metadata than at the start of the run."""
-        if "server_metadata" not in metadata:
+        if "server_metadata" not in metadata:  # the policy has no server
             return
         from robomme_interference_data.evaluate.run.identity import plain
 

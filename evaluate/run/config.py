@@ -233,7 +233,7 @@ def check_shared(config: WorkConfig) -> None:
     """Check the settings that rollouts and questions share."""
     positive = ("workers", "max_errors", "rollout_timeout_s")
     for name in (*positive, "history_chunk", "simulator_timeout_s"):
-        value = getattr(config, name, 1)
+        value = getattr(config, name, 1)  # questions have no simulator
         if not 0 < value < math.inf:
             raise InvalidOptionError.expected(
                 name, value, "a number above 0", "Leave it out for the default."

@@ -1,7 +1,7 @@
 """Run an evaluation: check the settings, run what is not finished, and write each row to disk."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -117,15 +117,17 @@ def run_evaluation(
         FormatError: Files of a run in `out`, or the questions, are damaged.
         MissingExtraError: A library is not installed.
     """
-    end_if_starting()
+    end_if_starting()  # a worker that imports a script without the guard
     check_shared(config)  # before anything is loaded
     buffer_set, folder = load_buffer_set(config.buffer_set), Path(config.out)
     config = with_camera(config, buffer_set)
-    runner = _runner(dataclasses.replace(config, buffer_set=buffer_set.location), buffer_set)
+    runner = _make_runner(dataclasses.replace(config, buffer_set=buffer_set.location), buffer_set)
     with runner.lock(folder), ExitStack() as stack:
         runner.prepare()
         config = runner.config
         plan, items = plan_run(runner)
+        # Read without the lock, which `open_log` takes only once servers have identified the run:
+        # these rows decide what to start, and those that are read again below what to run.
         existing = read_record(folder)
         todo = [item for item in items if item not in existing or not is_done(existing[item])]
         executor = executor or make_executor(config)
@@ -135,7 +137,7 @@ def run_evaluation(
         pool: WorkerPool | None = None
         if runner.needs_workers(todo):
             stack.enter_context(runner.shared())
-            pool = stack.enter_context(executor.pool(runner.task(run)))
+            pool = stack.enter_context(executor.pool(runner.function(run)))
             runner.open(pool, todo)
         identity = run_identity(runner, plan)
         with open_log(folder, identity, buffer_set.name, resume=not config.no_resume) as log:
@@ -187,14 +189,14 @@ def _check_condition(facts: SystemFacts, condition: str) -> None:
     )
 
 
-def _runner(config: RunConfig | AskConfig, buffer_set: BufferSet) -> Runner[Any]:
+def _make_runner(config: RunConfig | AskConfig, buffer_set: BufferSet) -> Runner[Any]:
     if isinstance(config, AskConfig):
-        from robomme_interference_data.evaluate.language.question_run import Questions
+        from robomme_interference_data.evaluate.language.question_run import QuestionRunner
 
-        return Questions(config, buffer_set)
-    from robomme_interference_data.evaluate.rollout.runner import Offline, Rollouts
+        return QuestionRunner(config, buffer_set)
+    from robomme_interference_data.evaluate.rollout.runner import OfflineRunner, RolloutRunner
 
-    return (Offline if config.offline else Rollouts)(config, buffer_set)
+    return (OfflineRunner if config.offline else RolloutRunner)(config, buffer_set)
 
 
 def _run_items(
@@ -209,76 +211,69 @@ def _run_items(
     done = {item: row for item, row in log.rows.items() if is_done(row)}
     for callback in callbacks:
         callback.start(items, [done[item] for item in items if item in done])
-    stopped: str | None = "interrupted"
-    errors, full = 0, False
-    with ExitStack() as stack:
-        outcomes: Any = ()
-        if pool is not None:
-            outcomes = pool.run(
-                [Job(item, runner.metadata) for item in shuffle_work(set(items) - done.keys())],
-                time_limit=run.config.rollout_timeout_s,
-                again=runner.retried_errors,
-            )
-            stack.callback(outcomes.close)
-        try:
-            for outcome in outcomes:
-                row, trace = _row(run, outcome, runner.buffer_set, log)
-                log.append(row, trace)
-                for callback in callbacks:
-                    callback.row(row, outcome.node)
-                errors = 0 if is_done(row) else errors + 1
-                if errors >= run.config.max_errors:
-                    stopped = f"{errors} in a row broke; the last: {row.error}"
-                    break
-            else:
-                stopped = None
-        except InterferenceError as error:  # no worker is left
-            stopped = error.message
-            raise
-        except OSError:  # a disk without space for a row has none for tables
-            full = True
-            raise
-        finally:
-            stack.close()
-            *earlier, last = log.header.invocations
-            last = dataclasses.replace(last, ended=now(), stopped=stopped)
-            if not full:
-                log.end(dataclasses.replace(log.header, invocations=(*earlier, last)))
+    stopped: str | None = "interrupted"  # unless the loop ends in another way than by Ctrl-C
+    outcomes = _outcomes(run, runner, pool, shuffle_work(set(items) - done.keys()))
+    errors, disk_full = 0, False
+    try:
+        for outcome in outcomes:
+            row, trace = _save_files(run, outcome, runner.buffer_set, log)
+            log.append(row, trace)
+            for callback in callbacks:
+                callback.row(row, outcome.node)
+            errors = 0 if is_done(row) else errors + 1
+            if errors >= run.config.max_errors:
+                stopped = f"{errors} in a row broke; the last: {row.error}"
+                break
+        else:
+            stopped = None
+    except InterferenceError as error:  # no worker is left
+        stopped = error.message
+        raise
+    except OSError:  # a disk without space for a row has none for tables
+        disk_full = True
+        raise
+    finally:
+        outcomes.close()  # ends workers that have a task, before the tables are exported
+        *earlier, last = log.header.invocations
+        last = dataclasses.replace(last, ended=now(), stopped=stopped)
+        if not disk_full:
+            log.end(dataclasses.replace(log.header, invocations=(*earlier, last)))
     rows = tuple(log.rows[item] for item in items if item in log.rows)
     return RunResult(log.folder, rows, len(items), count_statuses(rows), stopped)
 
 
-def _row(
+def _outcomes(
+    run: RunContext[Any], runner: Runner[Any], pool: WorkerPool | None, items: Iterable[WorkItem]
+) -> Generator[Outcome]:
+    """Yield the outcomes of work items as they arrive; none without workers."""
+    if pool is not None:
+        yield from pool.run(
+            [Job(item, runner.metadata) for item in items],
+            time_limit=run.config.rollout_timeout_s,
+            again=runner.retried_errors,
+        )
+
+
+def _save_files(
     run: RunContext[Any], outcome: Outcome, buffer_set: BufferSet, log: RunLog
 ) -> tuple[Rollout, str | None]:
     """Write the files of an outcome; return its row, and the traceback of an error or None.
 
-    A row that could not be read again, such as one with a number of 100 bits, becomes an error.
+    A row that could not be read again, such as one with a number of 100 bits, becomes an error:
+    no run could resume from such a line.
     """
     item: WorkItem = outcome.task.item
     error, trace = outcome.error, outcome.trace
     if error is None:
         row, trace = outcome.value
+        # Workers began before the label in the log, and what servers report, were known.
         row = dataclasses.replace(row, buffer_set=run.buffer_set, policy_id=run.facts.policy_id)
         try:
             row_of(row_line(row))
         except (ValueError, OverflowError, RecursionError) as unstorable:
             error = RuntimeError(f"its row cannot be stored: {first_line(unstorable)}")
     if error is not None:
-        query = buffer_set.query(item.episode)
-        columns: dict[str, Any] = {"steps": 0} | dict(outcome.progress)
-        row = run.row(
-            item,
-            Status.ERROR,
-            seed=query.seed,
-            difficulty=query.difficulty,
-            goal=None,
-            history_frames=0,
-            lesson_frames=0,
-            lesson_share=None,
-            error=_error_text(error),
-            **columns,
-        )
+        row = _error_row(run, outcome, error, buffer_set)
     (log.folder / item.clip).unlink(missing_ok=True)  # of an earlier attempt
     # Rows matter more than clips: a full disk costs a clip only.
     problems = [_write(log.folder, path, data) for path, data in outcome.files.items()]
@@ -290,6 +285,27 @@ def _row(
         finished_at=now(),
     )
     return row, "\n".join(filter(None, (trace, *lost))) or None
+
+
+def _error_row(
+    run: RunContext[Any], outcome: Outcome, error: BaseException, buffer_set: BufferSet
+) -> Rollout:
+    item: WorkItem = outcome.task.item
+    query = buffer_set.query(item.episode)
+    # A rollout that broke reports how far it came; a worker that died cannot.
+    columns: dict[str, Any] = {"steps": 0} | dict(outcome.progress)
+    return run.row(
+        item,
+        Status.ERROR,
+        seed=query.seed,
+        difficulty=query.difficulty,
+        goal=None,
+        history_frames=0,
+        lesson_frames=0,
+        lesson_share=None,
+        error=_error_text(error),
+        **columns,
+    )
 
 
 def _write(folder: Path, path: str, data: bytes) -> str | None:

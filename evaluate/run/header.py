@@ -4,13 +4,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.constants import MOST_ROW_BYTES
+from robomme_interference_data.constants import MAX_ROW_BYTES
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.storage.files import read_bytes
 
 from .plan import RunPlan, WorkItem
 
-_MOST_ROLLOUTS = 1 << 20
+_MAX_ROLLOUTS = 1 << 20
 """Maximum rollouts of all plans of a run: the paper's grid has 25,200."""
 
 
@@ -67,8 +67,8 @@ class RunHeader:
 
     def __post_init__(self) -> None:
         planned = sum(plan.most for plan in self.plans)
-        if planned > _MOST_ROLLOUTS:
-            raise FormatError(f"plans of {planned} rollouts; expected at most {_MOST_ROLLOUTS}")
+        if planned > _MAX_ROLLOUTS:
+            raise FormatError(f"plans of {planned} rollouts; expected at most {_MAX_ROLLOUTS}")
 
     @property
     def items(self) -> tuple[WorkItem, ...]:
@@ -78,5 +78,5 @@ class RunHeader:
 
 def whole_lines(record: Path) -> bytes:
     """Return the bytes of `rollouts.jsonl`, without a last line that a crash cut short."""
-    data = read_bytes(record, MOST_ROW_BYTES)
+    data = read_bytes(record, MAX_ROW_BYTES)
     return data[: data.rfind(b"\n") + 1]

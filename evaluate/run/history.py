@@ -28,30 +28,34 @@ class HistoryReader:
         sessions that were not compared yet are decoded whole, even for a few of their frames.
         """
         frames = np.asarray(indices, np.int64)
-        new = {}
+        unverified = {}  # sessions to compare, with the digests of what was decoded so far
         for session in buffer.sessions:
             key = session.entry, tuple(sorted(cameras))
             read = ((frames >= session.start) & (frames < session.stop)).any()
             if read and key not in self._verified:
-                new[key] = session, FeatureDigests()
-        decoded = [frames, *(np.arange(session.start, session.stop) for session, _ in new.values())]
+                unverified[key] = session, FeatureDigests()
+        decoded = [frames]
+        for session, _ in unverified.values():
+            decoded.append(np.arange(session.start, session.stop))
         for chunk in buffer.stream(size, cameras, np.unique(np.concatenate(decoded)).tolist()):
-            for key in [*new]:
-                session, digests = new[key]
+            for key in [*unverified]:
+                session, digests = unverified[key]
                 inside = (chunk.indices >= session.start) & (chunk.indices < session.stop)
                 if not inside.any():
                     continue
+                # Digests are over stored frames; a held frame stands in the buffer several times.
                 stored = inside & ((chunk.indices - session.start) % session.entry.repeat == 0)
                 digests.update(STATE, chunk.states[stored])
                 for camera in cameras:
                     images = chunk.frames[camera]
-                    images = images if stored.all() else images[stored]
+                    if not stored.all():  # indexing copies all pixels
+                        images = images[stored]
                     digests.update(camera_feature(camera), images)
                 if chunk.indices[-1] >= session.stop - 1:
                     self._compare(session.entry, digests.current())
                     self._verified.add(key)
-                    del new[key]
-            keep = np.isin(chunk.indices, frames)
+                    del unverified[key]
+            keep = np.isin(chunk.indices, frames)  # not those that are only compared
             if keep.all():
                 yield chunk
             elif keep.any():

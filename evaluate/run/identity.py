@@ -81,6 +81,7 @@ def _git() -> str | None:
         )
     except (OSError, subprocess.SubprocessError):
         return None
+    # Of an installed package, git finds whatever repository the environment lies in.
     return done.stdout.strip() if (root / ".git").exists() else None
 
 

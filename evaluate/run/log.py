@@ -127,6 +127,7 @@ def open_log(
             )
         header, rows = read_run(folder)
         check_same_run(folder, header.identity, identity)
+        # Or the next row would continue a line that a crash cut short.
         os.truncate(folder / RUN_RECORD, len(whole_lines(folder / RUN_RECORD)))
         yield RunLog(folder, header, rows)
 
@@ -168,7 +169,8 @@ def read_record(folder: Path) -> dict[WorkItem, Rollout]:
 def row_of(line: bytes) -> Rollout:
     """Read a line of a record."""
     row = from_dict(Rollout, parse_json(line, "its text"), "its fields", strict=True)
-    if b"\\u" in line:  # half of a character
+    # Half of a surrogate pair is valid JSON, but no table or page can hold it: encoding raises.
+    if b"\\u" in line:
         canonical_json(to_dict(row)).encode()
     return row
 

@@ -65,6 +65,7 @@ def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
             elif is_done(row):
                 conflicts[item] = conflicts.get(item, False) or _result(row) != _result(earlier)
     headers = [header for header, _ in runs]
+    # The merged run is not sharded: it lacks, and can run, what was not given to merge.
     plans = [replace(plan, shard="1/1") for header in headers for plan in header.plans]
     joined = replace(
         first,

@@ -66,8 +66,8 @@ class RunProgress:
         self._bar.advance(1, node=node)
         if row.wall_s is not None and len(self._timed) < 2 * self._workers:
             self._timed.append(row)
-            timed = len(self._timed) == 2 * self._workers and self._left > len(self._timed)
-            if timed and (text := estimate(self._timed, self._left, self._workers)):
+            enough = len(self._timed) == 2 * self._workers and self._left > len(self._timed)
+            if enough and (text := estimate(self._timed, self._left, self._workers)):
                 self._console.print(text)
         if not is_done(row):
             error = visible(f"{WorkItem.of(row)} broke: {row.error}")
@@ -93,7 +93,7 @@ _PARTS = {
 
 _OFFLINE_PARTS = _PARTS | {"reset_s": "the recordings", "simulator_s": "the recordings"}
 
-_WORTH_TELLING = 60
+_SHORTEST_ESTIMATE_S = 60
 """Seconds that are left, at least, for an estimate: a shorter run ends before it is read."""
 
 
@@ -109,7 +109,7 @@ def estimate(rows: Sequence[Rollout], left: int, workers: int) -> str:
     """
     total = sum(row.wall_s or 0.0 for row in rows)
     seconds = total / len(rows) * left / workers
-    if seconds < _WORTH_TELLING:
+    if seconds < _SHORTEST_ESTIMATE_S:
         return ""
     names = _OFFLINE_PARTS if rows[0].simulator == RECORDINGS else _PARTS
     parts = dict.fromkeys(names.values(), 0.0)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from robomme_interference_data.evaluate.language.columns import AnswerColumns, ModelColumns
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.retrieval.columns import RetrievalColumns
-from robomme_interference_data.schema.rollouts import Outcome, RolloutKey, Timing
+from robomme_interference_data.schema.rollouts import OutcomeColumns, RolloutKey, Timing
 from robomme_interference_data.schema.sampling import HistoryColumns
 from robomme_interference_data.simulators.measured import ActionErrorColumns
 
@@ -20,7 +20,7 @@ class Rollout(
     AnswerColumns,
     RetrievalColumns,
     HistoryColumns,
-    Outcome,
+    OutcomeColumns,
     SystemFacts,
     RolloutKey,
 ):
@@ -28,4 +28,4 @@ class Rollout(
 
     def __post_init__(self) -> None:
         RolloutKey.__post_init__(self)
-        Outcome.__post_init__(self)
+        OutcomeColumns.__post_init__(self)

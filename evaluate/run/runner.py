@@ -165,7 +165,7 @@ def history_columns(
     return columns
 
 
-class RunTask[C: RunConfig | AskConfig](ABC):
+class RunFunction[C: RunConfig | AskConfig](ABC):
     """The function of a worker; it opens the buffer set and the retrieval step on first use.
 
     After an exception it closes and makes anew everything else that it uses.
@@ -257,7 +257,7 @@ class Runner[C: RunConfig | AskConfig](ABC):
         return nullcontext()
 
     @abstractmethod
-    def task(self, run: RunContext[C]) -> RunTask[C]:
+    def function(self, run: RunContext[C]) -> RunFunction[C]:
         """Return the function of the workers."""
 
     def needs_workers(self, todo: Sequence[WorkItem]) -> bool:

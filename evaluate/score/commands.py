@@ -86,7 +86,7 @@ def score(
             {
                 "headlines": headlines(scored),
                 "rows": len(scored.rows),
-                "bad_rows": scored.rows.refused,
+                "bad_rows": scored.rows.bad_count,
                 "notes": list(scored.notes),
                 "expected": settings.expected,
                 "tables": {name: table.records() for name, table in scored.tables.items()},
@@ -152,7 +152,7 @@ def compare(
     if as_json:
         print_json(
             {
-                "bad_rows": [rows.refused for rows in compared.runs],
+                "bad_rows": [rows.bad_count for rows in compared.runs],
                 "notes": list(compared.notes),
                 "rows": compared.table.records(),
             }
@@ -221,9 +221,9 @@ def _look(text: str) -> tuple[int, int]:
 
 def _print_notes(runs: "Sequence[CheckedRows]", notes: Sequence[str]) -> None:
     for rows in runs:
-        for refusal in rows.refusals:
-            print_status(f"left out: {refusal}")
-        if rows.refused:
-            print_status(f"{rows.refused:,} bad rows left out")
+        for reason in rows.bad_reasons:
+            print_status(f"left out: {reason}")
+        if rows.bad_count:
+            print_status(f"{rows.bad_count:,} bad rows left out")
     for note in notes:
         print_status(note)

@@ -35,7 +35,7 @@ from .tables.comparison import (
     comparison_table,
     detectable,
 )
-from .tables.contrast import START, Contrast, Measure, Role
+from .tables.contrast import START, Contrast, Effect, Measure
 from .tables.pairs import Pairs, pair, pair_errors
 
 
@@ -143,11 +143,11 @@ def _contrasts(
     a: Side, b: Side, conditions: Sequence[str], measure: Measure, alpha: float
 ) -> Iterator[Contrast]:
     """Compare two sides under each condition, over all families and in each."""
-    both = [(conditions[0], conditions[1])] if conditions else [(c, c) for c in a.conditions]
-    both = [(before, after) for before, after in both if before in a.conditions]
-    both = [(before, after) for before, after in both if after in b.conditions]
+    compared = [(conditions[0], conditions[1])] if conditions else [(c, c) for c in a.conditions]
+    compared = [(before, after) for before, after in compared if before in a.conditions]
+    compared = [(before, after) for before, after in compared if after in b.conditions]
     for family in ("", *a.outcomes.families):
-        for before, after in both:
+        for before, after in compared:
             pairs = _pairs(a, b, (before, after), family)
             if pairs.n:
                 bounds = pairs.at(1 - alpha)
@@ -156,7 +156,7 @@ def _contrasts(
                     b.system,
                     after,
                     (a.system, before),
-                    Role.RUNS,
+                    Effect.RUNS,
                     pairs,
                     a.complete(before) and b.complete(after),
                     measure=measure,

@@ -47,7 +47,7 @@ class Outcomes:
     difficulty: NDArray[np.int64]  # index into DIFFICULTIES, −1 if unknown, (E,)
     chance: NDArray[np.float64]  # success of guessing, NaN unless a question, (E,)
     expected: Flags  # the episodes of a complete cell, (E,)
-    due: Flags  # the cells that are expected or have rows, (S, C)
+    in_tables: Flags  # the cells that are expected or have rows, (S, C)
     without_revision: Flags  # systems whose rows name no revision of a buffer set, (S,)
     facts: tuple[frozenset[SystemFacts], ...]  # of each system; only `policy_id` varies, (S,)
 
@@ -131,14 +131,14 @@ class Outcomes:
         return self.expected & (~self.counted | (counting(self.status).sum(-1) < seeds))
 
     @cached_property
-    def other(self) -> Flags:
+    def unexpected(self) -> Flags:
         """Episodes that count without being expected, `(S, C, E) bool`."""
         return self.counted & ~self.expected
 
     @cached_property
     def complete(self) -> Flags:
         """Whether exactly the expected episodes count, with every model seed, `(S, C) bool`."""
-        return np.asarray(self.counted.any(-1) & ~(self.missing | self.other).any(-1))
+        return np.asarray(self.counted.any(-1) & ~(self.missing | self.unexpected).any(-1))
 
     @cached_property
     def repeat_flips(self) -> tuple[int, int]:
@@ -191,6 +191,7 @@ def rate_of(status: Statuses) -> SuccessRate:
     n, counts = len(of), np.unique(of).tolist()
     if not n:
         return SuccessRate(0, math.nan, 0)
+    # Exact, so that systems with equal means of repeats share a rank.
     value = float(sum(Fraction(int(won[of == count].sum()), count) for count in counts) / n)
     rates = won / of
     if n < 2:
@@ -226,7 +227,7 @@ def offline_outcomes(rows: CheckedRows) -> Outcomes | None:
         for item in run.items
     }
     outcomes = _outcomes(measured, RECORDINGS, Expected.OBSERVED, rows.without_revision, planned)
-    return replace(outcomes, due=outcomes.has_rows)
+    return replace(outcomes, in_tables=outcomes.has_rows)
 
 
 def _outcomes(
@@ -238,8 +239,8 @@ def _outcomes(
 ) -> Outcomes:
     systems = tuple(sorted({row.system for row in rows}, key=_table_order))
     observed = {row.condition for row in rows}
-    due = observed if which is Expected.OBSERVED else {*DEFAULT_CONDITIONS}
-    conditions = tuple(condition.name for condition in in_order(observed | due))
+    expected_conditions = observed if which is Expected.OBSERVED else {*DEFAULT_CONDITIONS}
+    conditions = tuple(condition.name for condition in in_order(observed | expected_conditions))
     model_seeds = tuple(sorted({row.model_seed for row in rows}))
     ids = {(row.family, row.split, row.episode) for row in rows}
     expected = ids | {(episode.family, episode.split, episode.index) for episode in planned}
@@ -249,6 +250,8 @@ def _outcomes(
         }
     episodes = sorted((EpisodeId(*key) for key in ids | expected), key=lambda each: each.sort_key)
 
+    # The values along each axis, their places, and the places of all rows (`at`): at most one row
+    # is at each, because reading keeps one row of a rollout.
     axes = (systems, conditions, [(e.family, e.split, e.index) for e in episodes], model_seeds)
     places = [{name: place for place, name in enumerate(axis)} for axis in axes]
     keys = [(r.system, r.condition, (r.family, r.split, r.episode), r.model_seed) for r in rows]
@@ -271,7 +274,11 @@ def _outcomes(
     facts = _facts_of(rows, systems)
     applies = np.array(
         [
-            [c in due and all(each.applies(c) for each in of_system) for c in conditions]
+            [
+                condition in expected_conditions
+                and all(each.applies(condition) for each in of_system)
+                for condition in conditions
+            ]
             for of_system in facts
         ]
     )
@@ -287,7 +294,7 @@ def _outcomes(
         difficulty,
         chance,
         expected=np.array([key in expected for key in axes[2]]),
-        due=applies | (status >= 0).any(axis=(2, 3)),
+        in_tables=applies | (status >= 0).any(axis=(2, 3)),
         without_revision=np.array([(simulator, name) in without_revision for name in systems]),
         facts=facts,
     )

@@ -49,13 +49,14 @@ def control_of(outcomes: Outcomes, system: str) -> str | None:
 
 
 def _controls(outcomes: Outcomes, system: str) -> Iterator[str]:
-    told = {_told(facts) for facts in outcomes.facts_of(system) if facts.policy_id is not None}
+    # Without those of an unknown policy: two unknown policies are not the same one.
+    known = [facts for facts in outcomes.facts_of(system) if facts.policy_id is not None]
+    with_oracle = set(map(_with_oracle, known))
     others = [name for name in outcomes.systems if name != system]
     for name in others:
         facts_of_other = outcomes.facts_of(name)
-        if any(facts.subgoals == ORACLE for facts in facts_of_other) and told & {
-            _told(facts) for facts in facts_of_other
-        }:
+        has_oracle = any(facts.subgoals == ORACLE for facts in facts_of_other)
+        if has_oracle and with_oracle & set(map(_with_oracle, facts_of_other)):
             yield name
     for policy, subgoals in (("follow-subgoals", ORACLE), ("oracle", None)):
         for name in others:
@@ -66,6 +67,6 @@ def _controls(outcomes: Outcomes, system: str) -> Iterator[str]:
                 yield name
 
 
-def _told(facts: SystemFacts) -> SystemFacts:
+def _with_oracle(facts: SystemFacts) -> SystemFacts:
     """Return the facts of the same policy with the simulator's subgoals."""
     return replace(facts, subgoals=ORACLE, reads_history=True, reference=True)

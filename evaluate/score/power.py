@@ -23,12 +23,12 @@ from robomme_interference_data.viz.tables import percent
 POWER = 0.8
 """The power that is planned for."""
 
-MOST = 5_000
+MAX_EPISODES = 5_000
 """The most episodes of a plan: the time to sum over all outcomes grows with them."""
 
 
 @dataclass(frozen=True)
-class Plan:
+class PowerPlan:
     """What paired rollouts can detect; all but `episodes` and `needed` are fractions.
 
     Attributes:
@@ -58,11 +58,11 @@ class Plan:
     looks: tuple[float, ...] = ()
 
 
-def plan(margin: float, episodes: int, flips: float, tests: int = 1, looks: int = 1) -> Plan:
+def plan(margin: float, episodes: int, flips: float, tests: int = 1, looks: int = 1) -> PowerPlan:
     """Return what episodes can detect; the margin is a fraction."""
-    from robomme_interference_data.stats.sequential import MOST_LOOKS, look_levels  # not in scores
+    from robomme_interference_data.stats.sequential import MAX_LOOKS, look_levels  # not in scores
 
-    for name, value, most in (("tests", tests, 10_000), ("looks", looks, MOST_LOOKS)):
+    for name, value, most in (("tests", tests, 10_000), ("looks", looks, MAX_LOOKS)):
         if not 1 <= value <= most:
             raise InvalidOptionError.expected(name, value, f"a number from 1 to {most:,}")
     if not 0 < margin <= 1:
@@ -70,8 +70,10 @@ def plan(margin: float, episodes: int, flips: float, tests: int = 1, looks: int 
         raise InvalidOptionError.expected("margin", float(f"{100 * margin:g}"), expected)
     if not 0 <= flips <= 1:
         raise InvalidOptionError.expected("flips", flips, "a share from 0 to 1, such as 0.06")
-    if not 1 <= episodes <= MOST:
-        raise InvalidOptionError.expected("episodes", episodes, f"a number from 1 to {MOST:,}")
+    if not 1 <= episodes <= MAX_EPISODES:
+        raise InvalidOptionError.expected(
+            "episodes", episodes, f"a number from 1 to {MAX_EPISODES:,}"
+        )
     if margin + flips > 1:
         raise InvalidOptionError(
             f"{100 * margin:g} points and flips {flips} are more than all episodes",
@@ -83,7 +85,7 @@ def plan(margin: float, episodes: int, flips: float, tests: int = 1, looks: int 
     if levels:
         chance = _sequential(margin, episodes, flips, [level / tests for level in levels])
     noise = min(1.0, z_of(0.95) * math.sqrt(flips / episodes))
-    return Plan(
+    return PowerPlan(
         episodes,
         flips,
         margin,
@@ -149,8 +151,9 @@ def power(margin: float, episodes: int, flips: float, alpha: float = ALPHA) -> f
 def needed(margin: float, flips: float, alpha: float = ALPHA) -> int:
     """Return how many episodes find a difference with 80% power; one fewer would not.
 
-    Where they are more than `MOST` it is the normal approximation with a continuity correction,
-    the n of n δ − 1 = (z √(f + δ) + z' √(f + δ − δ²)) √n, whose power is 80% or somewhat more.
+    Where they are more than `MAX_EPISODES` it is the normal approximation with a continuity
+    correction, the n of n δ − 1 = (z √(f + δ) + z' √(f + δ − δ²)) √n, whose power is 80% or
+    somewhat more.
 
     Source: Connor (1987), Sample size for testing differences in proportions for the paired-sample
     design, Biometrics 43, 207–211; the correction: Edwards (1948), Psychometrika 13, 185–187.
@@ -158,7 +161,7 @@ def needed(margin: float, flips: float, alpha: float = ALPHA) -> int:
     both = flips + margin
     wide = z_of(1 - alpha) * math.sqrt(both) + z_of(2 * POWER - 1) * math.sqrt(both - margin**2)
     low, high = 0, math.ceil(((wide + math.sqrt(wide**2 + 4 * margin)) / 2 / margin) ** 2)
-    while high <= MOST and high - low > 1:
+    while high <= MAX_EPISODES and high - low > 1:
         middle = (low + high) // 2
         low, high = (
             (low, middle) if power(margin, middle, flips, alpha) >= POWER else (middle, high)
@@ -205,7 +208,7 @@ def note(counts: Iterable[tuple[int, int, int]], tests: int, effect: str = "") -
     known = [(pairs, gained, lost) for pairs, gained, lost in counts if pairs]
     if not known:
         return ""
-    n = min(MOST, max(pairs for pairs, _, _ in known))
+    n = min(MAX_EPISODES, max(pairs for pairs, _, _ in known))
     differing = round(median((gained + lost) / pairs for pairs, gained, lost in known), 3)
     least = smallest(n, differing, ALPHA / tests, includes_difference=True)
     detected = "no difference" if least is None else f"a difference of {100 * least:.1f} points"

@@ -173,9 +173,9 @@ def _rows(settings: Settings) -> CheckedRows:
     rows = read_rows(settings.rows, settings.system, settings.lenient)
     sources = ", ".join(map(str, settings.rows))
     if not len(rows):
-        if rows.refused:
-            message = f"all {rows.refused:,} rows in {sources} are bad; the first is "
-            message += rows.refusals[0]
+        if rows.bad_count:
+            message = f"all {rows.bad_count:,} rows in {sources} are bad; the first is "
+            message += rows.bad_reasons[0]
         else:
             message = f"there are no rows in {sources}"
         raise FormatError(message, "Give at least one valid row.")
@@ -195,10 +195,10 @@ def _compared(all_outcomes: Sequence[Outcomes], draws: int) -> tuple[list[Contra
         for system in outcomes.systems:
             ceiling = next(iter(ceilings_of(outcomes, system)), None)
             partners = {"base": base_of(outcomes, system), "ceiling": ceiling}
-            for role, partner in partners.items():
+            for relation, partner in partners.items():
                 why = "" if partner is None else _unpaired(outcomes, system, partner)
                 if why:
-                    partners[role] = None
+                    partners[relation] = None
                     simulator = outcomes.simulator
                     notes.append(f"{system} and {partner} in {simulator} are not paired: {why}.")
             contrasts += effects.effects_of(outcomes, system, **partners)

@@ -29,6 +29,7 @@ def write_score(
     stay. Figures are SVG, and also in `formats` (`.png`, `.pdf`). Returns the files of rows that
     were written to `export_to` in the released layout.
     """
+    # Without one of their libraries, this fails before anything is written.
     with open_figure():
         load_jinja2("the report")
     exported = [] if export_to is None else export(score.rows, export_to)

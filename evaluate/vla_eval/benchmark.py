@@ -16,8 +16,8 @@ from vla_eval.types import Observation as ServerObservation
 from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import InvalidOptionError, RunError, UnknownNameError, counted
-from robomme_interference_data.evaluate.rollout.runner import Rollouts
-from robomme_interference_data.evaluate.rollout.worker import RolloutTask
+from robomme_interference_data.evaluate.rollout.runner import RolloutRunner
+from robomme_interference_data.evaluate.rollout.worker import RolloutFunction
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.evaluation import plan_run
 from robomme_interference_data.evaluate.run.log import row_line, row_of
@@ -137,7 +137,7 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
             system=system,
             **chosen,
         )
-        runner = Rollouts(config, opened)
+        runner = RolloutRunner(config, opened)
         runner.prepare()
         with_history = [name for name in config.conditions if name != NO_HISTORY]
         if with_history and not send_video_history:
@@ -151,7 +151,7 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
         facts = replace(runner.facts(), policy="vla-eval", policy_id=None)
         self._run = RunContext(runner.config, runner.system, facts, opened.name, opened.revision)
         self._policy = HarnessPolicy(**options)
-        self._rollouts = RolloutTask(self._run, policy=self._policy)
+        self._rollouts = RolloutFunction(self._run, policy=self._policy)
         # A rollout asks its policy for actions, and vla-eval asks its benchmark for observations:
         # each has its own thread. A simulator that hangs does not keep the process from its end.
         self._jobs = SimpleQueue[Job | None]()

@@ -95,7 +95,7 @@ class VlaEvalConnection(ServerConnection):
             if isinstance(data, str):
                 raise ValueError(f"it sends the text {data!r:.200}")
             # Answers are actions; an image of a few bytes can be huge once it is decoded.
-            check_items(data, refused=is_encoded_image)
+            check_items(data, forbidden=is_encoded_image)
             answer = unpack_message(data)
             if not isinstance(answer.payload, dict):
                 raise ValueError(f"it sends a {type(answer.payload).__name__}")

@@ -132,14 +132,14 @@ def _check_fits(server: str, hello: Mapping[str, Any]) -> None:
     ]
     for what, known in _PARTS.items():
         for name, part in hello.get(f"{what}_spec", {}).items():
-            given = f"declares the {what} {name} ({part['dims']} values, {part['format']})"
+            declaration = f"declares the {what} {name} ({part['dims']} values, {part['format']})"
             if name not in known:
-                faults.append(f"{given}; expected {', '.join(known)}")
+                faults.append(f"{declaration}; expected {', '.join(known)}")
                 continue
             size, formats = known[name].dims, known[name].accepts or {known[name].format}
             if part["dims"] not in (0, size) or part["format"] not in formats:
                 expected = f"{size} values, {' or '.join(sorted(formats))}"
-                faults.append(f"{given}; expected {expected}")
+                faults.append(f"{declaration}; expected {expected}")
     sizes = [part["dims"] for part in hello.get("action_spec", {}).values()]
     if sizes and all(sizes) and sum(sizes) != ACTION_SIZE:
         faults.append(f"declares {sum(sizes)} action values; expected {ACTION_SIZE}")

@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import PAPER_ENCODER
 from robomme_interference_data.data.index_layout import EncoderRecord, encoder_id
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
-from robomme_interference_data.runtime.specs import Kind, Registry
+from robomme_interference_data.runtime.specs import Registry, SpecKind
 from robomme_interference_data.storage.files import digest_json
 
 ENCODERS = Registry(
     "encoder",
     {
-        "thumbnail": Kind("thumbnail", f"{__name__}.thumbnail:Thumbnail"),
-        "siglip": Kind(
+        "thumbnail": SpecKind("thumbnail", f"{__name__}.thumbnail:Thumbnail"),
+        "siglip": SpecKind(
             "siglip, or siglip:ID with the id or folder of a model",
             f"{__name__}.siglip:Siglip",
             r"(?P<model>.+)",

@@ -20,7 +20,7 @@ from robomme_interference_data.schema.settings import setting
 
 from .scheduler import Scheduler
 from .specs import bind_options
-from .worker import Outcome, Task, Worker, attempt, end_if_starting
+from .worker import Outcome, TaskFunction, Worker, attempt, end_if_starting
 
 __all__ = [
     "Executor",
@@ -28,7 +28,7 @@ __all__ = [
     "Resources",
     "Serial",
     "WorkerPool",
-    "Task",
+    "TaskFunction",
     "Worker",
     "end_if_starting",
     "make_executor",
@@ -119,8 +119,8 @@ def ray_address(config: WorkersConfig) -> str:
     return address if colon else "auto"
 
 
-def describe(function: Task) -> dict[str, str]:
-    """Return what must be equal on all machines: versions, and the result of `Task.describe`."""
+def describe(function: TaskFunction) -> dict[str, str]:
+    """Return what must be equal on all machines: versions, and what the function describes."""
     return own_versions() | getattr(function, "describe", dict)()
 
 
@@ -144,14 +144,16 @@ class Executor(ABC):
     workers: int
 
     @abstractmethod
-    def pool(self, function: Task) -> AbstractContextManager[WorkerPool]:
+    def pool(self, function: TaskFunction) -> AbstractContextManager[WorkerPool]:
         """Keep workers for a function in the block, through several runs; then end all workers.
 
         Args:
             function: What to do with each task.
         """
 
-    def run(self, function: Task, tasks: Iterable[Any], **limits: Any) -> Generator[Outcome]:
+    def run(
+        self, function: TaskFunction, tasks: Iterable[Any], **limits: Any
+    ) -> Generator[Outcome]:
         """Call a function on every task; yield outcomes as they arrive.
 
         A worker that dies or exceeds a limit is replaced. Its task is retried, unless the task
@@ -182,7 +184,7 @@ class Serial(Executor):
     workers = 1
 
     @contextmanager
-    def pool(self, function: Task) -> Iterator[WorkerPool]:
+    def pool(self, function: TaskFunction) -> Iterator[WorkerPool]:
         """Release the function's resources when the block ends; see `Executor.pool`."""
         with closing(_SerialScheduler(function, 1)) as scheduler:
             yield scheduler
@@ -193,7 +195,7 @@ class _Inline:
 
     number, ready = 0, True
 
-    def __init__(self, function: Task):
+    def __init__(self, function: TaskFunction):
         self._function, self._worker = function, Worker()
 
     def send(self, task: Any, time_limit: float | None) -> None:

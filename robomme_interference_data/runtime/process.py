@@ -20,7 +20,7 @@ from .executor import Executor, WorkerPool
 from .process_worker import ProcessWorker, has_begun, read_remains, take_files
 from .safe_path import safe_path
 from .scheduler import Scheduler
-from .worker import STARTED_AGAIN, Outcome, Task, end_if_starting, unpickle_outcome
+from .worker import STARTED_AGAIN, Outcome, TaskFunction, end_if_starting, unpickle_outcome
 
 CLOSE_S = 10.0
 """Seconds that idle workers have to release their resources."""
@@ -37,7 +37,7 @@ class WorkerProcess:
 
     ready = True
 
-    def __init__(self, function: Task, number: int):
+    def __init__(self, function: TaskFunction, number: int):
         # "spawn": a fork of a process with threads (encoders, simulators) can hang.
         context = multiprocessing.get_context("spawn")
         self.number = number
@@ -129,7 +129,7 @@ class ProcessScheduler(Scheduler[WorkerProcess]):
             worker.end(max(0.0, deadline - time.monotonic()))
 
 
-def _serve(function: Task, pipe: Connection, number: int, home: Path) -> None:
+def _serve(function: TaskFunction, pipe: Connection, number: int, home: Path) -> None:
     """Work on tasks until the parent closes the pipe."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     multiprocessing.current_process().daemon = False  # a daemon may not start processes
@@ -166,7 +166,7 @@ class Processes(Executor):
             )
 
     @contextmanager
-    def pool(self, function: Task) -> Iterator[WorkerPool]:
+    def pool(self, function: TaskFunction) -> Iterator[WorkerPool]:
         """Keep worker processes in the block; see `Executor.pool`."""
         end_if_starting()
         with closing(ProcessScheduler(function, self.workers)) as scheduler:

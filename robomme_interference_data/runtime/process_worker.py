@@ -14,7 +14,7 @@ from typing import Any
 from urllib.parse import quote, unquote
 
 from . import guard
-from .worker import Outcome, Task, Worker, attempt, unreadable
+from .worker import Outcome, TaskFunction, Worker, attempt, unreadable
 
 _SCRATCH, _FILES, _LIMIT = "scratch", "files", "limit"
 
@@ -80,7 +80,7 @@ class ProcessWorker(Worker):
             left = max(end - time.monotonic(), 0.001)
             faulthandler.dump_traceback_later(left, exit=True, file=self._late)
 
-    def work(self, function: Task, task: Any, time_limit: float | None) -> bytes:
+    def work(self, function: TaskFunction, task: Any, time_limit: float | None) -> bytes:
         """Run a task; return its outcome, without the task and its files, pickled."""
         with self.limit(time_limit, _WHOLE_TASK):
             outcome = replace(attempt(function, task, self), task=None)

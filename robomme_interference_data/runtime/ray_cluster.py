@@ -33,7 +33,7 @@ from .process import CLOSE_S, START_S
 from .process_worker import ProcessWorker, read_remains
 from .safe_path import SAFE_PATH, safe_path
 from .scheduler import Scheduler
-from .worker import Outcome, Task, end_if_starting, unpickle_outcome
+from .worker import Outcome, TaskFunction, end_if_starting, unpickle_outcome
 
 logger = logging.getLogger(__name__)
 
@@ -79,7 +79,7 @@ class RayWorkers(Executor):
             raise InvalidOptionError.expected("executor", f"ray:{self.address}", expected)
 
     @contextmanager
-    def pool(self, function: Task) -> Iterator[WorkerPool]:
+    def pool(self, function: TaskFunction) -> Iterator[WorkerPool]:
         """Keep workers on nodes of a cluster in the block; see `Executor.pool`."""
         end_if_starting()
         with connected(self.address), closing(_RayScheduler(function, self)) as scheduler:
@@ -191,7 +191,7 @@ class _RayWorker:
 class _RayScheduler(Scheduler[_RayWorker]):
     """Runs tasks on the cluster."""
 
-    def __init__(self, function: Task, config: RayWorkers):
+    def __init__(self, function: TaskFunction, config: RayWorkers):
         super().__init__(function, config.workers)
         actor: Any = WorkerActor
         dumps: Any = cloudpickle.dumps

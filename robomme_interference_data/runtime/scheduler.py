@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from robomme_interference_data.errors import WorkerRetiredError
 
-from .worker import Outcome, Task
+from .worker import Outcome, TaskFunction
 
 _LOSSES = 5
 """How often the worker of a task may be lost with its node."""
@@ -62,7 +62,7 @@ class QueuedTask:
 class Scheduler[H: Handle](ABC):
     """Calls a function on tasks, with at most so many workers, started when there is work."""
 
-    def __init__(self, function: Task, workers: int):
+    def __init__(self, function: TaskFunction, workers: int):
         self.function = function
         self._numbers = deque(range(workers))  # of workers that do not run
         self.workers: list[H] = []

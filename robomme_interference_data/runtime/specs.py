@@ -32,7 +32,7 @@ _TYPES = {
 
 
 @dataclass(frozen=True)
-class Kind:
+class SpecKind:
     """One kind of a registry.
 
     Attributes:
@@ -84,7 +84,7 @@ def _module_hint(target: str) -> str | None:
     )
 
 
-class Registry[K: Kind]:
+class Registry[K: SpecKind]:
     """Kinds by name; messages call them `what`, such as `policy`.
 
     `also` is the form of texts that the caller parses itself, for messages.

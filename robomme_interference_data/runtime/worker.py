@@ -58,7 +58,7 @@ class Worker:
         yield
 
 
-class Task(Protocol):
+class TaskFunction(Protocol):
     """What to do with each task: a picklable function, of which each worker gets a copy.
 
     If it has a method `close`, a worker that is no longer needed calls it. If it has a method
@@ -100,7 +100,7 @@ class Outcome:
     worker: Literal["alive", "dead", "late", "lost"] = "alive"
 
 
-def attempt(function: Task, task: Any, worker: Worker) -> Outcome:
+def attempt(function: TaskFunction, task: Any, worker: Worker) -> Outcome:
     """Call the function on a task once."""
     try:
         return Outcome(task, function(task, worker))

@@ -70,7 +70,7 @@ class RolloutKey:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outcome:
+class OutcomeColumns:
     """How a rollout ended, and of which scene."""
 
     seed: Annotated[int | None, "Seed of the scene, or None."]

@@ -9,7 +9,7 @@ from .bootstrap import Floats
 from .intervals import z_of
 from .significance import ALPHA
 
-MOST_LOOKS = 20
+MAX_LOOKS = 20
 """The most planned looks."""
 
 _POINTS = 801  # of the grid that the probability of reaching a look is summed on
@@ -17,7 +17,7 @@ _POINTS = 801  # of the grid that the probability of reaching a look is summed o
 _above = np.vectorize(lambda z: math.erfc(z / math.sqrt(2)) / 2, otypes=[float])
 
 
-@lru_cache(maxsize=MOST_LOOKS)
+@lru_cache(maxsize=MAX_LOOKS)
 def look_levels(looks: int) -> tuple[float, ...]:
     """Return the two-sided level of each of equally spaced looks; together they find 5% by luck.
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import KEY_FRAMES
 from robomme_interference_data.errors import BuildError, FormatError, InvalidOptionError
 
-from .video import MOST_PIXELS
+from .video import MAX_PIXELS
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 
@@ -194,7 +194,7 @@ def decode_image(data: bytes) -> NDArray[np.uint8]:
     codec = av.CodecContext.create("png" if is_png(data) else "mjpeg", "r")
     codec.thread_count = 1
     # By default, FFmpeg accepts a PNG with a wrong checksum.
-    codec.options = {"err_detect": "crccheck+explode", "max_pixels": str(MOST_PIXELS)}
+    codec.options = {"err_detect": "crccheck+explode", "max_pixels": str(MAX_PIXELS)}
     try:
         frames = codec.decode(av.Packet(data)) + codec.decode(None)
     except (av.error.FFmpegError, ValueError) as error:

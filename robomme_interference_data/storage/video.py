@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError, MissingFileError
 
-MOST_PIXELS = 1 << 24
+MAX_PIXELS = 1 << 24
 """Upper bound on the pixels of a frame: twice 3840 × 2160."""
 
 _LATEST = 1 << 62
@@ -122,7 +122,7 @@ def _unreadable(path: Path, why: object) -> FormatError:
 @contextmanager
 def open_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
     """Open a video file and its first video stream, before anything is decoded."""
-    limits = {"max_pixels": str(MOST_PIXELS)}
+    limits = {"max_pixels": str(MAX_PIXELS)}
     allowed = {"protocol_whitelist": "file", "codec_whitelist": ",".join(_DECODERS)}
     try:
         kind = find_container(path)

@@ -397,7 +397,7 @@ def test_a_buffer_set_that_fails_a_check_is_not_published(
     monkeypatch.setattr(checks, "audit_buffer_set", lambda _: audit)
     with raises(PublishError) as caught:
         check_buffer_set(load_buffer_set(GOLDEN))
-    assert caught.value.command == f"audit {GOLDEN}"
+    assert caught.value.command == f"verify {GOLDEN} --audit"
 
 
 # --- results -------------------------------------------------------------------------------------

@@ -32,7 +32,7 @@ from websockets.sync.server import serve
 from robomme_interference_data.errors import FormatError, PolicyError, PolicyServerError
 from robomme_interference_data.evaluate.policies import connection, wire
 from robomme_interference_data.evaluate.policies.connection import API_KEY_VARIABLE
-from robomme_interference_data.evaluate.policies.identity import MOST_METADATA, policy_metadata
+from robomme_interference_data.evaluate.policies.identity import MAX_METADATA, policy_metadata
 from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.policies.websocket import WebsocketPolicy
 
@@ -227,7 +227,7 @@ def test_an_answer_that_is_slow_or_endless_is_an_error(monkeypatch: pytest.Monke
 LIMIT_S = 4.0
 """Time limit of an answer."""
 
-MOST_S = 40.0
+MAX_S = 40.0
 """A row that takes longer was parsed on and on; idle, the slowest takes 3 s."""
 
 MEGABYTES = 1500
@@ -328,7 +328,7 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory, tiny_buffers: Path) -> di
 def test_a_hostile_answer_is_an_error_row(outcomes: dict[str, Any], name: str) -> None:
     status, error, seconds, peak = outcomes[name]
     assert status == "error" and error.startswith("Policy"), error
-    assert seconds < MOST_S and peak < MEGABYTES
+    assert seconds < MAX_S and peak < MEGABYTES
 
 
 def test_reading_counts_into_the_time_limit(
@@ -345,12 +345,12 @@ def test_reading_counts_into_the_time_limit(
         rollout(policy, 0, [], [])
 
 
-@pytest.mark.parametrize("items", [wire.MOST_ITEMS, wire.MOST_ITEMS + 1])
+@pytest.mark.parametrize("items", [wire.MAX_ITEMS, wire.MAX_ITEMS + 1])
 def test_the_items_of_a_message_are_bounded(items: int) -> None:
     maps = msgpack.packb([[{}] * (items - 3 - 1000), [{}] * 1000])
     flat = msgpack.packb([0] * items)
     for data in (maps, flat):
-        if items <= wire.MOST_ITEMS:
+        if items <= wire.MAX_ITEMS:
             assert wire.unpack(data)
         else:
             with pytest.raises(FormatError):
@@ -367,7 +367,7 @@ def test_the_items_of_a_message_are_bounded(items: int) -> None:
         ({"checkpoint": "a", "config": [[{}] * 60_000] * 200}, PolicyServerError),
         ({"checkpoint": "a", "config": "x" * 10_000_000}, PolicyError),
         ({"checkpoint": "a", "config": [*range(60_000)]}, PolicyError),
-        ({"checkpoint": "a", "config": "x" * MOST_METADATA}, PolicyError),
+        ({"checkpoint": "a", "config": "x" * MAX_METADATA}, PolicyError),
     ],
 )
 def test_long_metadata_is_an_error(server: PolicyServer, metadata: Any, error: Any) -> None:
@@ -375,11 +375,11 @@ def test_long_metadata_is_an_error(server: PolicyServer, metadata: Any, error: A
     began = time.monotonic()
     with client(server, connect_s=2.0) as policy, pytest.raises(error):
         policy_metadata("websocket:it", policy)
-    assert time.monotonic() - began < MOST_S
+    assert time.monotonic() - began < MAX_S
 
 
 def test_metadata_that_just_fits(server: PolicyServer) -> None:
-    server.metadata = {"checkpoint": "a", "config": "x" * (MOST_METADATA - 1000)}
+    server.metadata = {"checkpoint": "a", "config": "x" * (MAX_METADATA - 1000)}
     with client(server) as policy:
         assert policy_metadata("websocket:it", policy)["server_metadata"] == server.metadata
 
@@ -436,4 +436,4 @@ def test_a_hostile_answer_of_vla_eval(what: str) -> None:
     began = time.monotonic()
     with serving(handle) as port, pytest.raises(PolicyServerError):
         make_policy(f"vla-eval:ws://127.0.0.1:{port}", ("checkpoint=a", "connect_s=2"))
-    assert time.monotonic() - began < MOST_S
+    assert time.monotonic() - began < MAX_S

@@ -29,7 +29,7 @@ from robomme_interference_data.evaluate.policies.registry import (
     policy_options,
     server_addresses,
 )
-from robomme_interference_data.runtime.specs import Kind, Spec, bind_options
+from robomme_interference_data.runtime.specs import Spec, SpecKind, bind_options
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.recordings import Recordings
 from robomme_interference_data.simulators.registry import SIMULATORS, simulator_class
@@ -171,7 +171,7 @@ def test_the_part_of_a_policy_that_can_change_a_result() -> None:
 
 def test_a_forgotten_capability_is_an_error() -> None:
     capabilities = {one.name for one in dataclasses.fields(PolicyKind)}
-    capabilities -= {one.name for one in dataclasses.fields(Kind)}
+    capabilities -= {one.name for one in dataclasses.fields(SpecKind)}
     declared = vars(POLICIES.kinds["noop"])
     assert PolicyKind(**declared) == POLICIES.kinds["noop"]
     for name in capabilities:

@@ -30,7 +30,7 @@ from robomme_interference_data.evaluate.language.published_prompts import (
     PUBLISHED,
     read_client,
 )
-from robomme_interference_data.evaluate.language.subgoal_writers import with_published
+from robomme_interference_data.evaluate.language.subgoal_settings import with_published
 
 pytestmark = pytest.mark.usefixtures("world", "fast_retries")
 
@@ -48,7 +48,7 @@ def client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     }
     monkeypatch.setattr(published, "PUBLISHED", known)
     monkeypatch.setattr(
-        "robomme_interference_data.evaluate.language.subgoal_writers.PUBLISHED", known
+        "robomme_interference_data.evaluate.language.subgoal_settings.PUBLISHED", known
     )
     return tmp_path
 

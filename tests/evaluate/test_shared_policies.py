@@ -76,27 +76,27 @@ def ask(batches: Batcher[int], key: int, goal: str = "go") -> None:
 def test_a_batch_is_due_when_it_is_full_when_no_more_can_come_or_in_time() -> None:
     policy = Adding()
     batches = batcher(policy, size=3, timeout_s=1.0)
-    assert batches.due_s(0.0) is None
+    assert batches.until_batch_s(0.0) is None
     for key in range(5):
         batches.open(key)
     ask(batches, 0, "a")
-    assert batches.due_s(10.0) == 1.0
+    assert batches.until_batch_s(10.0) == 1.0
     ask(batches, 1, "b")
-    assert batches.due_s(10.5) == 0.5  # from the oldest request
-    assert batches.due_s(11.5) == 0.0
+    assert batches.until_batch_s(10.5) == 0.5  # from the oldest request
+    assert batches.until_batch_s(11.5) == 0.0
     ask(batches, 2, "c")
     ask(batches, 3, "d")
-    assert batches.due_s(10.75) == 0.0  # full
+    assert batches.until_batch_s(10.75) == 0.0  # full
     assert [*batches.act()] == [0, 1, 2]
-    assert batches.due_s(12.0) == 1.0  # from the end of the batch
-    assert batches.due_s(12.25) == 0.75
+    assert batches.until_batch_s(12.0) == 1.0  # from the end of the batch
+    assert batches.until_batch_s(12.25) == 0.75
     for key in (0, 1, 2, 4):
         batches.drop(key)
-    assert batches.due_s(12.25) == 0.0  # no other session is open
+    assert batches.until_batch_s(12.25) == 0.0  # no other session is open
     assert batches.act() == {3: ([(0, "d")], None)}
     ask(batches, 3)
     batches.drop(3)  # its worker is gone, and its request with it
-    assert batches.due_s(12.25) is None
+    assert batches.until_batch_s(12.25) is None
     assert policy.batches == [["a", "b", "c"]]  # alone, it is no batch
     batches.close()
     assert policy.closed == 1
@@ -175,7 +175,7 @@ def test_sessions_never_mix(
         else:
             ask(batches, turn, "bad" if call == "bad" else f"goal {turn}")
             waiting.add(turn)
-        if batches.due_s(now) == 0:
+        if batches.until_batch_s(now) == 0:
             answer()
     while waiting:
         answer()

@@ -33,8 +33,8 @@ from robomme_interference_data.evaluate.language.models import (
     Video,
 )
 from robomme_interference_data.evaluate.language.subgoal_prompt import SubgoalPrompt
+from robomme_interference_data.evaluate.language.subgoal_settings import make_writer
 from robomme_interference_data.evaluate.language.subgoal_writer import OracleWriter
-from robomme_interference_data.evaluate.language.subgoal_writers import make_writer
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.rollout.checks import check_settings, check_system

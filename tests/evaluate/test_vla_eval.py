@@ -203,7 +203,7 @@ def test_a_fault_of_the_server_is_an_error_row_that_is_repeated(tmp_path: Path) 
     first, second = errors
     assert "PolicyServerError" in first["MoveCube"] and "closed the conn" in first["MoveCube"]
     assert second.keys() == {"VideoRepick"}
-    assert "PolicyError" in second["VideoRepick"] and "float32 (1, 7)" in second["VideoRepick"]
+    assert "PolicyError" in second["VideoRepick"] and "shape (1, 7)" in second["VideoRepick"]
 
 
 @pytest.mark.usefixtures("world")

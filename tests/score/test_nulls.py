@@ -70,7 +70,7 @@ def made_up(
         difficulty=np.zeros(len(EPISODES), int),
         chance=np.full(len(EPISODES), np.nan),
         expected=np.ones(len(EPISODES), bool),
-        due=np.ones((systems, len(conditions)), bool),
+        in_tables=np.ones((systems, len(conditions)), bool),
         without_revision=np.zeros(systems, bool),
         facts=(frozenset({SystemFacts()}),) * systems,
     )

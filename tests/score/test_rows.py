@@ -153,7 +153,7 @@ def test_a_scene_may_lack_its_seed_but_no_rollout_the_models(tmp_path: Path, gap
     with raises(FormatError):
         read_rows([path])
     found = read_rows([path], lenient=True)
-    assert (len(found), found.refused, found.names("model_seed")) == (106, 1, [0, 5])
+    assert (len(found), found.bad_count, found.names("model_seed")) == (106, 1, [0, 5])
 
 
 # --- bad rows ----------------------------------------------------------------------------------
@@ -185,8 +185,8 @@ def test_bad_rows_are_refused_with_file_line_and_reason(
     assert raised.value.hint is not None and "lenient=True" in raised.value.hint
     # Leniently it is left out and counted; the others stay.
     found = read_rows([path], lenient=True)
-    assert (found.refused, len(found)) == (1, 2)
-    assert found.refusals[0].startswith(f"{path}, line 3: ") and reason in found.refusals[0]
+    assert (found.bad_count, len(found)) == (1, 2)
+    assert found.bad_reasons[0].startswith(f"{path}, line 3: ") and reason in found.bad_reasons[0]
 
 
 OF_RUNS = {
@@ -208,15 +208,15 @@ def test_bad_rows_of_runs_are_refused(tmp_path: Path, change: dict[str, Any], re
     first = raised.value.message.splitlines()[1]
     assert first.startswith(f"{path}, line 22: ") and reason in first
     found = read_rows([path], lenient=True)
-    assert (found.refused, len(found)) == (1, 106)
+    assert (found.bad_count, len(found)) == (1, 106)
 
 
 def test_leniently_the_most_frequent_revision_is_kept(tmp_path: Path) -> None:
     rows = made.rows()
     rows[0] = replace(rows[0], revision="cd" * 32)
     found = read_rows([made.write_csv(tmp_path / "a.csv", rows)], lenient=True)
-    assert found.refused == 1 and found.revisions == {"tabletop": made.REVISION}
-    assert "line 2: revision 'cdcd" in found.refusals[0]
+    assert found.bad_count == 1 and found.revisions == {"tabletop": made.REVISION}
+    assert "line 2: revision 'cdcd" in found.bad_reasons[0]
 
 
 def test_lines_are_right_after_quoted_line_breaks(tmp_path: Path) -> None:
@@ -231,10 +231,10 @@ def test_lines_are_right_after_quoted_line_breaks(tmp_path: Path) -> None:
     )
     found = read_rows([path], lenient=True)
     assert len(found) == 1
-    assert [text.removeprefix(f"{path}, line ")[:10] for text in found.refusals] == [
+    assert [text.removeprefix(f"{path}, line ")[:10] for text in found.bad_reasons] == [
         *("2: 'X/Y' i", "5: the lin", "6: the sam", "9: '2Cubes")
     ]
-    assert f"as {path}, line 4" in found.refusals[2]
+    assert f"as {path}, line 4" in found.bad_reasons[2]
 
 
 def test_many_bad_rows_are_counted_and_ten_are_named(tmp_path: Path) -> None:
@@ -244,7 +244,7 @@ def test_many_bad_rows_are_counted_and_ten_are_named(tmp_path: Path) -> None:
         read_rows([path])
     shown = raised.value.message.splitlines()
     assert (shown[0], len(shown), shown[-1]) == ("25 bad rows:", 12, "… and 15 more")
-    assert len(read_rows([path], lenient=True).refusals) == 10
+    assert len(read_rows([path], lenient=True).bad_reasons) == 10
 
 
 def test_rows_of_one_rollout_that_contradict_each_other_all_go(tmp_path: Path) -> None:
@@ -267,7 +267,7 @@ def test_rows_of_one_rollout_that_contradict_each_other_all_go(tmp_path: Path) -
     kept = made.write_csv(tmp_path / "kept.csv", [*rows[:8], *rows[9:50], rows[60]])
     for paths in ([one, two, three], [three, two, one], [two, one, three]):
         found = read_rows(paths, lenient=True)
-        assert (told(found), found.refused) == (told(read_rows([kept])), 4)
+        assert (told(found), found.bad_count) == (told(read_rows([kept])), 4)
 
 
 def test_nothing_but_bad_rows_and_no_rows_are_no_score(tmp_path: Path) -> None:

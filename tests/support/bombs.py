@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from support.buffer_sets import GOLDEN
 
-from robomme_interference_data.storage.video import MOST_PIXELS
+from robomme_interference_data.storage.video import MAX_PIXELS
 
 _VIDEO = GOLDEN / "demonstrations/videos/observation.images.front/chunk-000/file-000.mp4"
 _MEGABYTE = 1 << 20
@@ -166,7 +166,7 @@ def _add_track(container: Any, side: int) -> None:
 
 def _large_frames(path: Path) -> None:
     """Frames larger than any that are read, whatever the container says."""
-    side = int(MOST_PIXELS**0.5) + 16
+    side = int(MAX_PIXELS**0.5) + 16
     with av.open(str(path), "w", format="mp4") as container:
         _add_track(container, side)
 
@@ -174,7 +174,7 @@ def _large_frames(path: Path) -> None:
 def _larger_than_declared(path: Path) -> None:
     _large_frames(path)
     frames, box, described = path.read_bytes().rpartition(b"moov")
-    side = struct.pack(">H", int(MOST_PIXELS**0.5) + 16)
+    side = struct.pack(">H", int(MAX_PIXELS**0.5) + 16)
     path.write_bytes(frames + box + described.replace(side * 2, struct.pack(">HH", 32, 32)))
 
 

@@ -46,7 +46,7 @@ _SCENES = {
 }
 """Family to the recorded scene of an episode."""
 
-_MOST_LISTED = 64  # of what a file lists, so many are looked at: there may be any number
+_MAX_LISTED = 64  # of what a file lists, so many are looked at: there may be any number
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def _sound_datasets(root: Path) -> dict[str, Dataset]:
 
 def _dataset(root: Path) -> None:
     dataset = Dataset(LocalFiles(root / "buffer_set/demonstrations"))
-    for index, record in zip(range(_MOST_LISTED), dataset.records(), strict=False):
+    for index, record in zip(range(_MAX_LISTED), dataset.records(), strict=False):
         assert dataset.index_of(record.episode_id) in range(len(dataset))
         assert dataset.lerobot.locate(index).length == record.length
     for camera in dataset.cameras:

@@ -80,25 +80,30 @@ def draw_points(
     complete: Sequence[bool],
     *,
     bars: bool = True,
-    lying: bool = False,
+    horizontal: bool = False,
 ) -> None:
     """Draw `(place, value, low, high)` points with intervals, hollow where cells are incomplete.
 
-    Values go up, or to the right if `lying`. Intervals with NaN are left out.
+    Values go up, or to the right if `horizontal`. Intervals with NaN are left out.
     """
     known = [point for point in points if not math.isnan(point[2])]
     drawn = []
     if bars and known:
         places, _, low, high = zip(*known, strict=True)
-        lines, width = (axes.hlines, 1.5) if lying else (axes.vlines, 0.9)
+        lines, width = (axes.hlines, 1.5) if horizontal else (axes.vlines, 0.9)
         drawn.append(lines(places, low, high, color=style.color, linewidth=width, alpha=0.8))
-    for whole, face in ((True, style.color), (False, "white")):
-        chosen = [p[:2] for p, done in zip(points, complete, strict=True) if done is whole]
-        if chosen:
-            ends = zip(*(point[::-1] if lying else point for point in chosen), strict=True)
+    for is_complete, face in ((True, style.color), (False, "white")):
+        shown = [
+            (place, value)
+            for (place, value, *_), done in zip(points, complete, strict=True)
+            if done is is_complete
+        ]
+        if horizontal:
+            shown = [(value, place) for place, value in shown]
+        if shown:
             shape = style.point | {"markerfacecolor": face, "linestyle": "none"}
-            # Not clipped, so that points at 0 and at 100% are whole.
-            drawn += axes.plot(*ends, **shape, clip_on=False, zorder=3)
+            # Not clipped, so that points at 0 and at 100% are drawn fully.
+            drawn += axes.plot(*zip(*shown, strict=True), **shape, clip_on=False, zorder=3)
     mark(drawn, system)
 
 
@@ -116,7 +121,7 @@ def chance_level(axes: Any, data: Data, part: str) -> dict[str, float]:
 
 def panel_grid(figure: Any, count: int, wide: int, *, sharex: bool = True) -> list[Any]:
     """Return panels, `wide` in a row; the lowest of each column has labels below."""
-    grid = figure.subplots(-(-count // wide), wide, sharex=sharex, sharey=True, squeeze=False)
+    grid = figure.subplots(math.ceil(count / wide), wide, sharex=sharex, sharey=True, squeeze=False)
     for number, axes in enumerate(grid.flat):
         if number >= count:
             axes.set_axis_off()
@@ -209,6 +214,6 @@ def spread(
             before, count = stacks.pop()
             mean, size = (mean * size + before * count) / (size + count), size + count
         stacks.append((mean, size))
-    found = [mean + gap * (i - (size - 1) / 2) for mean, size in stacks for i in range(size)]
-    last = len(found) - 1
-    return [min(max(v, low + gap * i), high - gap * (last - i)) for i, v in enumerate(found)]
+    placed = [mean + gap * (i - (size - 1) / 2) for mean, size in stacks for i in range(size)]
+    last = len(placed) - 1
+    return [min(max(v, low + gap * i), high - gap * (last - i)) for i, v in enumerate(placed)]

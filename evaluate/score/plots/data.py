@@ -112,13 +112,13 @@ class Data:
 
     def of(self, kinds: Container[ConditionKind]) -> Self:
         """Return the data of some kinds of conditions, at the same places on the x axis."""
-        chosen = copy(self)
-        chosen.conditions = [each for each in self.conditions if each.kind in kinds]
-        names = {condition.name for condition in chosen.conditions}
-        chosen.cells = {key: cell for key, cell in self.cells.items() if key[1] in names}
-        drawn = {system for system, *_ in chosen.cells}
-        chosen.systems = [system for system in self.systems if system in drawn]
-        return chosen
+        narrowed = copy(self)
+        narrowed.conditions = [each for each in self.conditions if each.kind in kinds]
+        names = {condition.name for condition in narrowed.conditions}
+        narrowed.cells = {key: cell for key, cell in self.cells.items() if key[1] in names}
+        drawn = {system for system, *_ in narrowed.cells}
+        narrowed.systems = [system for system in self.systems if system in drawn]
+        return narrowed
 
     def x(self, condition: str) -> float:
         """Return the place on the x axis: log2(k + 1), right of conditions without a count."""

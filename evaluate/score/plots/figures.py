@@ -1,5 +1,6 @@
 """Figures of a score, one set for each simulator."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -160,7 +161,7 @@ def _panels(
         return False
     wide, bars = 3, len(systems) <= FEW
     high = 2.0 if bars else 2.4
-    figure.set_size_inches(curves.WIDTH, 0.9 + high * -(-len(panels) // wide))
+    figure.set_size_inches(curves.WIDTH, 0.9 + high * math.ceil(len(panels) / wide))
     grid = curves.panel_grid(figure, len(panels), wide)
     ends: list[dict[str, float]] = []
     for axes, (title, (shown, part)) in zip(grid, panels.items(), strict=True):

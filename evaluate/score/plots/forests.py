@@ -10,7 +10,7 @@ from robomme_interference_data.evaluate.score.tables.contrast import (
     COMPARISONS,
     START,
     Contrast,
-    Role,
+    Effect,
 )
 from robomme_interference_data.schema.conditions import KINDS, parse_condition
 from robomme_interference_data.stats.bootstrap import Interval
@@ -74,7 +74,7 @@ def _forest(
         for key, contrast in group.items():
             point = (places[key], *(scale * number for number in value(contrast)))
             style = data.styles[contrast.system]
-            draw_points(axes, [point], style, contrast.system, [contrast.complete], lying=True)
+            draw_points(axes, [point], style, contrast.system, [contrast.complete], horizontal=True)
         tidy(axes)
         axes.set_title(fill(name, 26), size=HEADING, color=INK)
     grid[0].set_yticks(range(len(rows)), list(rows.values()))
@@ -109,11 +109,11 @@ def effects(figure: Any, data: Data) -> bool:
     groups: _Groups = {}
     for contrast in counted:
         name = ""
-        if contrast.role is Role.HISTORY and contrast.condition == START:
+        if contrast.effect is Effect.HISTORY and contrast.condition == START:
             name = f"{START} − {short(contrast.against[1])}"
-        elif contrast.role is Role.SESSIONS:
+        elif contrast.effect is Effect.SESSIONS:
             name = f"{contrast.condition} − {START}"
-        elif contrast.role is Role.RETRIEVAL and parse_condition(contrast.condition).k == last:
+        elif contrast.effect is Effect.RETRIEVAL and parse_condition(contrast.condition).k == last:
             name = f"{contrast.condition}, with − without retrieval"
         if name:
             groups.setdefault(name, {})[contrast.system] = contrast
@@ -122,6 +122,7 @@ def effects(figure: Any, data: Data) -> bool:
     flips = _FLIPS if data.flips is None else data.flips
     source = "assumed without repeats" if data.flips is None else "measured between repeats"
     most = max(c.pairs.n for group in groups.values() for c in group.values())
+    # 1.96 standard deviations of the difference, in points; see `PowerPlan.noise`.
     band = 196 * math.sqrt(flips / most)
     note = (
         f"gray: ±{band:.1f} points, the 95% range of noise for {most} episodes if "
@@ -136,7 +137,7 @@ def ceiling(figure: Any, data: Data) -> bool:
     """Draw how far systems are below the ideal observer with their memory."""
     groups: _Groups = {}
     for contrast in data.contrasts:
-        if contrast.role is Role.CEILING and contrast.pairs.n:
+        if contrast.effect is Effect.CEILING and contrast.pairs.n:
             groups.setdefault(contrast.condition, {})[contrast.system] = contrast
     if not groups:
         return False
@@ -150,7 +151,7 @@ def retention(figure: Any, data: Data) -> bool:
     lifts = [
         contrast
         for contrast in data.contrasts
-        if contrast.role is Role.HISTORY and not math.isnan(contrast.retention.value)
+        if contrast.effect is Effect.HISTORY and not math.isnan(contrast.retention.value)
     ]
     if not lifts:
         return False
@@ -192,20 +193,20 @@ def interference(figure: Any, data: Data) -> bool:
     systems = [system for system in data.systems if system in asked]
     if not systems:
         return False
-    groups = _most_common([contrast for contrast in data.contrasts if contrast.system in asked])
+    groups = _at_one_k([contrast for contrast in data.contrasts if contrast.system in asked])
     panels = {
         data.styles[system].label: {
             name: group[system] for name, group in groups.items() if system in group
         }
         for system in systems
     }
-    figure.set_size_inches(WIDTH, 0.9 + (0.5 + 0.34 * len(groups)) * -(-len(systems) // 3))
+    figure.set_size_inches(WIDTH, 0.9 + (0.5 + 0.34 * len(groups)) * math.ceil(len(systems) / 3))
     title = f"Effect of each kind of interference, {data.simulator}"
     _forest(figure, data, panels, {name: name for name in groups}, title, f"points; {_BARS}")
     return True
 
 
-def _most_common(contrasts: Sequence[Contrast]) -> _Groups:
+def _at_one_k(contrasts: Sequence[Contrast]) -> _Groups:
     """Return each comparison of kinds of conditions by system, at one number of sessions.
 
     It is the number that most comparisons have, the larger if several; a comparison without it
@@ -214,7 +215,7 @@ def _most_common(contrasts: Sequence[Contrast]) -> _Groups:
     by_question: dict[str, dict[int, list[Contrast]]] = {}
     for contrast in contrasts:
         condition = parse_condition(contrast.condition)
-        asks = condition.kind.asks if contrast.role is Role.SESSIONS else contrast.asks
+        asks = condition.kind.asks if contrast.effect is Effect.SESSIONS else contrast.asks
         if asks and contrast.pairs.n:
             by_question.setdefault(asks, {}).setdefault(condition.k, []).append(contrast)
     counts = Counter(k for by_k in by_question.values() for k in by_k)
@@ -222,9 +223,9 @@ def _most_common(contrasts: Sequence[Contrast]) -> _Groups:
     shown = {}
     for asks in (KINDS["k"].asks, *(comparison.asks for comparison in COMPARISONS.values())):
         if by_k := by_question.get(asks):
-            chosen = by_k.get(most) or by_k[max(by_k)]
-            name = f"{asks}\n{chosen[0].condition} − {chosen[0].against[1]}"
-            shown[name] = {contrast.system: contrast for contrast in chosen}
+            at_k = by_k.get(most) or by_k[max(by_k)]
+            name = f"{asks}\n{at_k[0].condition} − {at_k[0].against[1]}"
+            shown[name] = {contrast.system: contrast for contrast in at_k}
     return shown
 
 
@@ -236,7 +237,7 @@ def by_evidence_kept(figure: Any, data: Data) -> bool:
     if not systems:
         return False
     wide = min(3, len(systems))
-    figure.set_size_inches(WIDTH, 1.1 + 2.3 * -(-len(systems) // wide))
+    figure.set_size_inches(WIDTH, 1.1 + 2.3 * math.ceil(len(systems) / wide))
     panels = panel_grid(figure, len(systems), wide)
     ends: dict[str, dict[str, float]] = {system: {} for system in systems}
     for axes, system in zip(panels, systems, strict=True):

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from robomme_interference_data.evaluate.score.tables.contrast import Contrast, Role
+from robomme_interference_data.evaluate.score.tables.contrast import Contrast, Effect
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.viz.figure import INK, cell_box, ink_on, mapped
@@ -53,7 +53,7 @@ def heatmap(figure: Any, data: Data) -> bool:
 
 def matrix(figure: Any, data: Data) -> bool:
     """Draw all pairs of systems at k0 and at the most sessions: the row's rate − the column's."""
-    pairs = [contrast for contrast in data.contrasts if contrast.role is Role.SYSTEMS]
+    pairs = [contrast for contrast in data.contrasts if contrast.effect is Effect.SYSTEMS]
     last = max((parse_condition(contrast.condition).k for contrast in pairs), default=0)
     panels: dict[str, list[Contrast]] = {}
     for condition in data.conditions:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.cells import SuccessCell
-from robomme_interference_data.evaluate.score.tables.contrast import START, Contrast, Role
+from robomme_interference_data.evaluate.score.tables.contrast import START, Contrast, Effect
 from robomme_interference_data.evaluate.systems import display_name, published_base
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.stats.intervals import wilson
@@ -51,7 +51,7 @@ def _leading(
     falls = [
         contrast
         for contrast in score.contrasts
-        if contrast.role is Role.SESSIONS
+        if contrast.effect is Effect.SESSIONS
         and (contrast.simulator, contrast.system) == (leader.simulator, leader.system)
         and contrast.pairs.n
     ]
@@ -124,12 +124,14 @@ def _nothing_complete(cells: Sequence[SuccessCell]) -> str:
     counting = [cell for cell in cells if cell.n]
     if not counting:
         return f"In {cells[0].simulator}, no rollout counts yet."
-    nearest = min(counting, key=lambda cell: (len(cell.missing) + len(cell.other), -cell.n))
-    other = f", and {len(nearest.other)} are outside the grid" if nearest.other else ""
+    nearest = min(counting, key=lambda cell: (len(cell.missing) + len(cell.unexpected), -cell.n))
+    outside = ""
+    if nearest.unexpected:
+        outside = f", and {len(nearest.unexpected)} are outside the grid"
     return (
         f"In {nearest.simulator}, no cell is complete, so no system leads. The most complete is "
         f"{display_name(nearest.system)} under {named(nearest.condition)}: {len(nearest.missing)} "
-        f"of {nearest.expected} episodes are missing{other}."
+        f"of {nearest.expected} episodes are missing{outside}."
     )
 
 
@@ -138,7 +140,7 @@ def _from_start(score: Score, fall: Contrast) -> str:
     falls = [
         contrast
         for contrast in score.contrasts
-        if contrast.role is Role.SESSIONS
+        if contrast.effect is Effect.SESSIONS
         and (contrast.simulator, contrast.condition) == (fall.simulator, fall.condition)
         and (contrast is fall or contrast.complete)
         and (contrast is fall or not score.is_reference(contrast.simulator, contrast.system))
@@ -158,7 +160,7 @@ def _hurting(score: Score, leader: SuccessCell) -> list[str]:
     effects = [
         contrast
         for contrast in score.contrasts
-        if contrast.role is Role.INTERFERENCE
+        if contrast.effect is Effect.INTERFERENCE
         and (contrast.simulator, contrast.system) == (leader.simulator, leader.system)
         and contrast.complete
     ]

@@ -159,8 +159,9 @@ def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
             rates = success(outcomes.status[place]).T.tolist()
             measured = errors[place].T.tolist()
             for number in np.flatnonzero(outcomes.has_episode[place]).tolist():
-                episode, hard = outcomes.episodes[number], int(outcomes.difficulty[number])
-                came = {
+                episode = outcomes.episodes[number]
+                difficulty = int(outcomes.difficulty[number])
+                outcome_under = {
                     c: _outcome(statuses, error)
                     for c, statuses, error in zip(
                         outcomes.conditions, counts[number], measured[number], strict=True
@@ -174,8 +175,8 @@ def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
                     system,
                     episode.family,
                     f"{episode.split}/{episode.index}",
-                    DIFFICULTIES[hard] if hard >= 0 else "",
-                    [came.get(c, "") for c in conditions],
+                    DIFFICULTIES[difficulty] if difficulty >= 0 else "",
+                    [outcome_under.get(c, "") for c in conditions],
                     flips(outcomes.conditions, rates[number]),
                     [_address(video, folder) if video else "" for video in shown],
                 )
@@ -227,7 +228,7 @@ def _source(path: Path, run: RunHeader | None) -> dict[str, list[str]]:
     """Return the facts about a file: its checksum, commands, and `run.json`."""
     facts = {"SHA-256": [sha256_file(path)]}
     if run is not None:
-        lines = [line for start in run.invocations for line in start.command]
+        lines = [line for invocation in run.invocations for line in invocation.command]
         facts |= {"command": [*dict.fromkeys(lines)]} if lines else {}
         facts["run.json"] = [json.dumps(to_dict(run), indent=2, sort_keys=True, ensure_ascii=False)]
     return facts
@@ -255,6 +256,6 @@ def _facts(score: Score, command: str | None) -> dict[str, list[str]]:
         facts[f"revision of the buffer set, {name}"] = revision
     if score.notes:
         facts["note"] = " ".join(score.notes)
-    if rows.refused:
-        facts["bad rows left out"] = f"{rows.refused:,}: {'; '.join(rows.refusals)}"
+    if rows.bad_count:
+        facts["bad rows left out"] = f"{rows.bad_count:,}: {'; '.join(rows.bad_reasons)}"
     return {name: [text] for name, text in facts.items()}

@@ -4,17 +4,17 @@ import math
 from collections.abc import Sequence
 
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.score.tables.contrast import Contrast, Measure, Role
+from robomme_interference_data.evaluate.score.tables.contrast import Contrast, Effect, Measure
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.stats.significance import ALPHA, holm
 from robomme_interference_data.stats.signs import simultaneous
 from robomme_interference_data.viz.tables import error_change, points
 
-_ROLES = {
+_EFFECTS = {
     # Not that against no history: that memory helps is expected.
-    Measure.SUCCESS: (Role.SESSIONS, Role.RETRIEVAL, Role.INTERFERENCE),
-    Measure.ACTION_ERROR: (Role.HISTORY, Role.SESSIONS, Role.INTERFERENCE),
+    Measure.SUCCESS: (Effect.SESSIONS, Effect.RETRIEVAL, Effect.INTERFERENCE),
+    Measure.ACTION_ERROR: (Effect.HISTORY, Effect.SESSIONS, Effect.INTERFERENCE),
 }
 """The paired effects on a system among which the strongest is chosen."""
 
@@ -29,7 +29,7 @@ def strongest(score: Score, simulator: str) -> str:
         contrast
         for contrast in score.contrasts
         if contrast.simulator == simulator
-        and contrast.role in _ROLES[contrast.measure]
+        and contrast.effect in _EFFECTS[contrast.measure]
         and contrast.complete
         and contrast.pairs.n
     ]

@@ -47,8 +47,8 @@ def export(rows: CheckedRows, folder: Path) -> list[Path]:
         wrong.append(f"{other_splits:,} rows of train or val episodes")
     if offline:
         wrong.append(f"{counted(offline, 'row')} of offline runs")
-    if rows.refused:
-        wrong.append(f"{rows.refused:,} bad rows")
+    if rows.bad_count:
+        wrong.append(f"{rows.bad_count:,} bad rows")
     if wrong:
         raise InvalidOptionError(
             f"rows to export: {', '.join(wrong)}; expected valid rows of rollouts of test "

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 import pyarrow.json as pa_json
 
-from robomme_interference_data.constants import MOST_ROW_BYTES, RUN_HEADER, RUN_RECORD, RUN_TABLES
+from robomme_interference_data.constants import MAX_ROW_BYTES, RUN_HEADER, RUN_RECORD, RUN_TABLES
 from robomme_interference_data.errors import (
     FormatError,
     InvalidOptionError,
@@ -150,7 +150,7 @@ def _read_parquet(path: Path, names: Sequence[str], has_system: bool) -> FileCol
 
 
 def _read_csv(path: Path, names: Sequence[str], has_system: bool) -> FileColumns:
-    text = read_bytes(path, MOST_ROW_BYTES).removeprefix(codecs.BOM_UTF8).decode()
+    text = read_bytes(path, MAX_ROW_BYTES).removeprefix(codecs.BOM_UTF8).decode()
     csv.field_size_limit(len(text) + 1)
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows: dict[int, list[str]] = {}
@@ -238,7 +238,7 @@ def _read_vla_eval(path: Path, names: Sequence[str], has_system: bool) -> FileCo
     An episode's metrics are a row. One that has a reason of a failure instead is an error: it says
     nothing about the policy, though vla-eval counts it as no success.
     """
-    results = parse_json(read_bytes(path, MOST_ROW_BYTES), str(path))
+    results = parse_json(read_bytes(path, MAX_ROW_BYTES), str(path))
     rows: dict[int, list[Any]] = {}
     malformed: dict[int, str] = {}
     try:

@@ -40,16 +40,16 @@ class CheckedRows:
         sources: The files that were read (see `files.find_sources`).
         revisions: Simulator to the revision of its buffer set, where rows name one.
         without_revision: Simulator and system of rows that name no revision, such as released ones.
-        refusals: The first bad rows that were left out: location and reason.
-        refused: The number of bad rows.
+        bad_reasons: The first bad rows that were left out: location and reason.
+        bad_count: The number of bad rows.
     """
 
     rows: tuple[Row, ...]
     sources: "Mapping[Path, RunHeader | None]"
     revisions: Mapping[str, str] = field(default_factory=dict)
     without_revision: frozenset[tuple[str, str]] = frozenset()
-    refusals: tuple[str, ...] = ()
-    refused: int = 0
+    bad_reasons: tuple[str, ...] = ()
+    bad_count: int = 0
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -86,11 +86,13 @@ def read_rows(
         checks.check_alike(column, _EPISODE, "an episode has one")
     checks.check_facts()
     checks.check_repeats()
-    refusals = [f"{checks.locate(at)}: {reason}" for at, reason in sorted(checks.reasons.items())]
-    if refusals and not lenient:
-        lines = [f"{counted(len(refusals), 'bad row')}:", *refusals[:_SHOWN]]
-        if len(refusals) > _SHOWN:
-            lines.append(f"… and {len(refusals) - _SHOWN:,} more")
+    bad_reasons = [
+        f"{checks.locate(at)}: {reason}" for at, reason in sorted(checks.reasons.items())
+    ]
+    if bad_reasons and not lenient:
+        lines = [f"{counted(len(bad_reasons), 'bad row')}:", *bad_reasons[:_SHOWN]]
+        if len(bad_reasons) > _SHOWN:
+            lines.append(f"… and {len(bad_reasons) - _SHOWN:,} more")
         raise FormatError("\n".join(lines), "Correct them, or leave them out with lenient=True.")
     rows = tuple(checks.sound.values())
     cells = {(row.simulator, row.system, row.revision) for row in rows}
@@ -105,8 +107,8 @@ def read_rows(
                 "set, others name no revision, like released rows",
                 "Their histories may differ: score the files separately, or compare them.",
             )
-    shown = tuple(refusals[:_SHOWN])
-    return CheckedRows(rows, sources, revisions, without_revision, shown, len(refusals))
+    shown = tuple(bad_reasons[:_SHOWN])
+    return CheckedRows(rows, sources, revisions, without_revision, shown, len(bad_reasons))
 
 
 _Location = tuple[int, int]
@@ -156,7 +158,7 @@ class _Checks:
     def check_alike(
         self, name: str, group: Sequence[str], why: str, *, none_counts: bool = False
     ) -> None:
-        """Refuse rows whose value differs from the most frequent one of the same group.
+        """Leave out rows whose value differs from the most frequent one of the same group.
 
         None is an unknown value, which fits all others, unless it counts.
         """
@@ -167,14 +169,14 @@ class _Checks:
             if none_counts or value is not None:
                 counts[key][value] += 1
         usual = {key: count.most_common(1)[0][0] for key, count in counts.items()}
-        self._refuse(
+        self._leave_out(
             (at, f"{name} {value!r} beside {usual[key]!r}: {why}")
             for at, key, value in zip(self.sound, keys, values, strict=True)
             if (none_counts or value is not None) and value != usual[key]
         )
 
     def check_facts(self) -> None:
-        """Refuse rows whose facts differ from the most frequent ones of their system.
+        """Leave out rows whose facts differ from the most frequent ones of their system.
 
         Rows of several model seeds may be of different weights.
         """
@@ -197,10 +199,10 @@ class _Checks:
             reason = "the same rollout as {}"
             if contradicted:
                 reason += "; its rows contradict each other"
-                self._refuse([(first, reason.format(self.locate(repeats[0])))])
-            self._refuse((at, reason.format(self.locate(first))) for at in repeats)
+                self._leave_out([(first, reason.format(self.locate(repeats[0])))])
+            self._leave_out((at, reason.format(self.locate(first))) for at in repeats)
 
-    def _refuse(self, rows: Iterable[tuple[_Location, str]]) -> None:
+    def _leave_out(self, rows: Iterable[tuple[_Location, str]]) -> None:
         for at, reason in list(rows):
             del self.sound[at]
             self.reasons[at] = reason

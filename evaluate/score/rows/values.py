@@ -21,7 +21,7 @@ from robomme_interference_data.evaluate.systems import SystemFacts, name_system
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import arrow_schema
 from robomme_interference_data.schema.conditions import parse_condition
-from robomme_interference_data.schema.rollouts import FINAL, Outcome, RolloutKey, Status
+from robomme_interference_data.schema.rollouts import FINAL, OutcomeColumns, RolloutKey, Status
 from robomme_interference_data.schema.shifts import NO_SHIFT, parse_shift
 
 RELEASED_SIMULATOR = OFFICIAL
@@ -95,7 +95,7 @@ def record_schema(names: Iterable[str]) -> pa.Schema:
     """
     required = {
         field.name: field
-        for group in (RolloutKey, Outcome, SystemFacts)
+        for group in (RolloutKey, OutcomeColumns, SystemFacts)
         for field in arrow_schema(group)
     }
     hints = get_type_hints(Row)

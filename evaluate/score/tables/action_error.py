@@ -39,7 +39,7 @@ def error_cells(outcomes: Outcomes, draws: int) -> list[ErrorCell]:
     everywhere: Flags = np.ones(len(outcomes.episodes), bool)
     parts = {"": everywhere}
     parts |= {family: outcomes.of_family(family) for family in outcomes.families}
-    places = np.argwhere(outcomes.due).tolist()
+    places = np.argwhere(outcomes.in_tables).tolist()
     intervals = {
         part: bootstrap(
             np.stack([errors[s, c, here] for s, c in places], axis=1), outcomes.simulator, draws

@@ -19,14 +19,14 @@ from .comparison import (
     ComparisonTable,
     comparison_table,
 )
-from .contrast import START, Contrast, Measure, Role, comparable
+from .contrast import START, Contrast, Effect, Measure, comparable
 from .pairs import pair_errors
 
 _Cell = tuple[str, str]  # system and condition
 
 
 def _between_systems(contrast: Contrast) -> bool:
-    return contrast.role is Role.SYSTEMS
+    return contrast.effect is Effect.SYSTEMS
 
 
 ACTION_ERROR_EFFECTS = ComparisonTable(
@@ -54,10 +54,10 @@ def error_effects_table(contrasts: Iterable[Contrast]) -> Table:
 
 def error_contrasts(outcomes: Outcomes, draws: int = DRAWS) -> list[Contrast]:
     """Compare the conditions of each system, and all pairs of systems under each condition."""
-    compared = list[tuple[Role, _Cell, _Cell]]()
+    compared = list[tuple[Effect, _Cell, _Cell]]()
     for system in outcomes.systems:
         compared += _of(outcomes, system)
-    compared += [(Role.SYSTEMS, against, cell) for against, cell in _between(outcomes)]
+    compared += [(Effect.SYSTEMS, against, cell) for against, cell in _between(outcomes)]
     if not compared:
         return []
     errors = mean_errors(outcomes.action_l1)
@@ -68,7 +68,7 @@ def error_contrasts(outcomes: Outcomes, draws: int = DRAWS) -> list[Contrast]:
     changes = np.stack([(after - before).round(12) for before, after in sides], axis=1)
     tests = sign_flips(changes, outcomes.simulator, draws)
     contrasts = []
-    for (role, against, cell), (before, after), test in zip(compared, sides, tests, strict=True):
+    for (effect, against, cell), (before, after), test in zip(compared, sides, tests, strict=True):
         pairs = pair_errors(before, after, test)
         if pairs.n:
             contrasts.append(
@@ -76,7 +76,7 @@ def error_contrasts(outcomes: Outcomes, draws: int = DRAWS) -> list[Contrast]:
                     outcomes.simulator,
                     *cell,
                     against,
-                    role,
+                    effect,
                     pairs,
                     complete=_complete(outcomes, against) and _complete(outcomes, cell),
                     measure=Measure.ACTION_ERROR,
@@ -89,19 +89,19 @@ def _complete(outcomes: Outcomes, cell: _Cell) -> bool:
     return bool(outcomes.complete[outcomes.cell(*cell)])
 
 
-def _of(outcomes: Outcomes, system: str) -> Iterator[tuple[Role, _Cell, _Cell]]:
+def _of(outcomes: Outcomes, system: str) -> Iterator[tuple[Effect, _Cell, _Cell]]:
     """Yield no-history, k0 and the other kind that each condition of a system is compared with."""
     conditions = outcomes.ran(system)
     floor = (system, NO_HISTORY) if NO_HISTORY in conditions else None
-    roles = dict[tuple[_Cell, _Cell], Role]()
-    for reference, role in ((NO_HISTORY, Role.HISTORY), (START, Role.SESSIONS)):
+    effects = dict[tuple[_Cell, _Cell], Effect]()
+    for reference, effect in ((NO_HISTORY, Effect.HISTORY), (START, Effect.SESSIONS)):
         for condition in conditions if reference in conditions else ():
             if condition not in (NO_HISTORY, reference):
-                roles[(system, reference), (system, condition)] = role
+                effects[(system, reference), (system, condition)] = effect
     for condition, against in comparable(system, conditions, floor):
-        roles.setdefault((against, (system, condition)), Role.INTERFERENCE)
-    for (against, cell), role in roles.items():
-        yield role, against, cell
+        effects.setdefault((against, (system, condition)), Effect.INTERFERENCE)
+    for (against, cell), effect in effects.items():
+        yield effect, against, cell
 
 
 def _between(outcomes: Outcomes) -> Iterator[tuple[_Cell, _Cell]]:

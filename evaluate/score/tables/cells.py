@@ -70,12 +70,13 @@ class Coverage:
     # Expected, but do not count with every model seed.
     missing: Sequence[EpisodeId] = field(default=(), kw_only=True)
     broken: Sequence[EpisodeId] = field(default=(), kw_only=True)  # with an error
-    other: Sequence[EpisodeId] = field(default=(), kw_only=True)  # count without being expected
+    # Count without being expected.
+    unexpected: Sequence[EpisodeId] = field(default=(), kw_only=True)
 
     @property
     def complete(self) -> bool:
         """Whether exactly the expected episodes count, with every model seed."""
-        return self.n > 0 and not self.missing and not self.other
+        return self.n > 0 and not self.missing and not self.unexpected
 
     @property
     def errors(self) -> int:
@@ -109,17 +110,21 @@ class SuccessCell(Coverage):
 
 
 def coverage_of(
-    outcomes: Outcomes, system: int, condition: int, here: Flags, due: Flags
+    outcomes: Outcomes, system: int, condition: int, here: Flags, maybe_here: Flags
 ) -> dict[str, Any]:
-    """Return what is counted of a cell: its episodes `here`, those expected in it are `due`."""
+    """Return what is counted of a cell over the episodes `here`.
+
+    Among the expected episodes are those that only may be of this part (`maybe_here`): of an
+    episode without rows the difficulty is unknown.
+    """
     counts = outcomes.counts[system, condition]
     return {
         "reference": outcomes.is_reference(outcomes.systems[system]),
         "counts": tuple(counts[here].sum(axis=0).tolist()),
-        "expected": int((due & outcomes.expected).sum()),
-        "missing": outcomes.episodes_of(due & outcomes.missing[system, condition]),
+        "expected": int((maybe_here & outcomes.expected).sum()),
+        "missing": outcomes.episodes_of(maybe_here & outcomes.missing[system, condition]),
         "broken": outcomes.episodes_of(here & (counts[:, _ERROR] > 0)),
-        "other": outcomes.episodes_of(here & outcomes.other[system, condition]),
+        "unexpected": outcomes.episodes_of(here & outcomes.unexpected[system, condition]),
     }
 
 
@@ -134,7 +139,7 @@ def cells_of(all_outcomes: Iterable[Outcomes]) -> list[SuccessCell]:
 
 def _cells(outcomes: Outcomes) -> list[SuccessCell]:
     everywhere: Flags = np.ones(len(outcomes.episodes), bool)
-    # Name of a part to its episodes, and to those that are expected in it.
+    # Name of a part to its episodes, and to those that may be of it.
     parts = {"": (everywhere, everywhere)}
     for family in outcomes.families:
         here = outcomes.of_family(family)
@@ -143,9 +148,10 @@ def _cells(outcomes: Outcomes) -> list[SuccessCell]:
         here = outcomes.difficulty == place
         parts[difficulty] = (here, here | (outcomes.difficulty < 0))
     cells = []
-    for s, c in np.argwhere(outcomes.due).tolist():
-        for part, (here, due) in parts.items():
-            if not ((here & outcomes.has_episode[s]) | (due & outcomes.expected)).any():
+    for s, c in np.argwhere(outcomes.in_tables).tolist():
+        for part, (here, maybe_here) in parts.items():
+            occurs = here & outcomes.has_episode[s]
+            if not (occurs | (maybe_here & outcomes.expected)).any():
                 continue
             counted = here & outcomes.counted[s, c]
             status = outcomes.status[s, c, here]
@@ -164,7 +170,7 @@ def _cells(outcomes: Outcomes) -> list[SuccessCell]:
                     fixed=fixed,
                     if_errors_fail=rate_of(np.where(status == _ERROR, _FAIL, status)).value,
                     chance=float(outcomes.chance[counted].mean()) if rate.n else math.nan,
-                    **coverage_of(outcomes, s, c, here, due),
+                    **coverage_of(outcomes, s, c, here, maybe_here),
                 )
             )
     return _ranked(outcomes, cells, {part: here for part, (here, _) in parts.items()})
@@ -323,7 +329,7 @@ def episodes_record(cell: Coverage, *, listed: bool) -> dict[str, Any]:
         "expected": cell.expected,
         "missing_episodes": _numbers(cell.missing) if listed else "",
         "error_episodes": _numbers(cell.broken) if listed else "",
-        "other_episodes": _numbers(cell.other) if listed else "",
+        "other_episodes": _numbers(cell.unexpected) if listed else "",
     }
 
 

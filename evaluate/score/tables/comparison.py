@@ -130,7 +130,7 @@ def _values(contrast: Contrast) -> dict[str, Any]:
         "condition": contrast.condition,
         "against_system": against_system,
         "against_condition": against_condition,
-        "effect": contrast.role,
+        "effect": contrast.effect,
         "asks": contrast.asks,
         "family": contrast.family or "all",
         "n": pairs.n,

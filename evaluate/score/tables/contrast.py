@@ -15,7 +15,7 @@ START = "k0"
 """The condition that changes and retention are measured from."""
 
 
-class Role(StrEnum):
+class Effect(StrEnum):
     """What a comparison measures; in tables, the value of the column `effect`."""
 
     HISTORY = "history"  # against no history: the lift
@@ -68,7 +68,7 @@ class Contrast:
     system: str
     condition: str
     against: tuple[str, str]  # system and condition of the first side
-    role: Role
+    effect: Effect
     pairs: Pairs
     complete: bool  # whether both cells are
     measure: Measure = Measure.SUCCESS
@@ -80,7 +80,7 @@ class Contrast:
     @property
     def asks(self) -> str:
         """What a comparison between kinds of conditions measures; empty for any other."""
-        if self.role is not Role.INTERFERENCE:
+        if self.effect is not Effect.INTERFERENCE:
             return ""
         return COMPARISONS[parse_condition(self.condition).kind.name].asks
 

@@ -25,21 +25,21 @@ from .comparison import (
     comparison_table,
     detectable,
 )
-from .contrast import START, Contrast, Role, comparable
+from .contrast import START, Contrast, Effect, comparable
 from .pairs import pair
 
 TESTED_TOGETHER = {
-    Role.HISTORY: "history",
-    Role.SESSIONS: "sessions and retrieval",
-    Role.RETRIEVAL: "sessions and retrieval",
-    Role.INTERFERENCE: "interference",
-    Role.CEILING: "the ideal observer",
+    Effect.HISTORY: "history",
+    Effect.SESSIONS: "sessions and retrieval",
+    Effect.RETRIEVAL: "sessions and retrieval",
+    Effect.INTERFERENCE: "interference",
+    Effect.CEILING: "the ideal observer",
 }
 """The comparisons of the table `effects`, and the effects that each is corrected with."""
 
 
 def _group(contrast: Contrast) -> tuple[str, str]:
-    return contrast.simulator, TESTED_TOGETHER[contrast.role]
+    return contrast.simulator, TESTED_TOGETHER[contrast.effect]
 
 
 EFFECTS = ComparisonTable(
@@ -75,11 +75,11 @@ EFFECTS = ComparisonTable(
 
 
 def effects_table(contrasts: Iterable[Contrast]) -> Table:
-    """Return the effects among some comparisons, one role after the other."""
+    """Return the effects among some comparisons, one kind of effect after the other."""
     groups: dict[str, list[Contrast]] = {name: [] for name in TESTED_TOGETHER.values()}
     for contrast in contrasts:
-        if contrast.role in TESTED_TOGETHER:
-            groups[TESTED_TOGETHER[contrast.role]].append(contrast)
+        if contrast.effect in TESTED_TOGETHER:
+            groups[TESTED_TOGETHER[contrast.effect]].append(contrast)
     table = comparison_table(EFFECTS, [contrast for group in groups.values() for contrast in group])
     notes = [detectable(group, _group, effect) for effect, group in groups.items()]
     return replace(table, note=" ".join([table.note, *filter(None, notes)]))
@@ -112,29 +112,31 @@ def effects_of(
     later = [name for name in ks if name != START] if START in ks else []
     floors = [(name, NO_HISTORY) for name in (system, base) if name]
     floor = next((cell for cell in floors if cell in at), None)
-    roles: dict[tuple[str, tuple[str, str]], Role] = {}
+    effects: dict[tuple[str, tuple[str, str]], Effect] = {}
     if floor:
-        roles |= {(name, floor): Role.HISTORY for name in ks}
+        effects |= {(name, floor): Effect.HISTORY for name in ks}
     for name in later:
-        roles[name, (system, START)] = Role.SESSIONS
+        effects[name, (system, START)] = Effect.SESSIONS
     if base:
-        roles |= {(name, (base, name)): Role.RETRIEVAL for name in ran if (base, name) in at}
+        effects |= {(name, (base, name)): Effect.RETRIEVAL for name in ran if (base, name) in at}
         if (base, START) in at:
-            roles |= {(name, (base, START)): Role.RETRIEVAL_FALL for name in later}
+            effects |= {(name, (base, START)): Effect.RETRIEVAL_FALL for name in later}
     for name, against in comparable(system, ran, floor):
-        roles[name, against] = Role.INTERFERENCE
+        effects[name, against] = Effect.INTERFERENCE
     if ceiling:
-        roles |= {(name, (ceiling, name)): Role.CEILING for name in ran if (ceiling, name) in at}
+        effects |= {
+            (name, (ceiling, name)): Effect.CEILING for name in ran if (ceiling, name) in at
+        }
 
     contrasts = {}
-    for (name, against), role in roles.items():
+    for (name, against), effect in effects.items():
         first, second = at[against], at[system, name]
         contrasts[name, against] = Contrast(
             outcomes.simulator,
             system,
             name,
             against,
-            role,
+            effect,
             pair(sides[first], sides[second]),
             complete[first] and complete[second],
         )
@@ -163,8 +165,8 @@ def retained(values: Floats, lift: Interval, fall: Interval) -> Interval:
     if not len(values) or whole.mean() <= 0:
         return Interval(math.nan)
     ratio = float(share.mean() / whole.mean())
-    for exact, other, change in ((0.0, none, lift), (1.0, start, fall)):
-        if (end == other).all():
+    for exact, reference, change in ((0.0, none, lift), (1.0, start, fall)):
+        if (end == reference).all():
             return Interval(exact, *(exact + bound / float(whole.mean()) for bound in change[1:]))
     if len(values) < 2:
         return Interval(ratio)

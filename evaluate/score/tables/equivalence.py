@@ -9,7 +9,7 @@ from robomme_interference_data.viz.tables import Columns, Table
 
 from .cells import SuccessCell
 from .comparison import SIDES, ComparisonTable, comparison_table
-from .contrast import START, Contrast, Role
+from .contrast import START, Contrast, Effect
 from .pairs import Pairs, compare_unpaired
 
 EQUIVALENT, BEYOND, OPEN = "equivalent", "beyond", "not shown"
@@ -43,7 +43,7 @@ def equivalence_table(
     own = [
         contrast
         for contrast in contrasts
-        if contrast.role in (Role.SESSIONS, Role.RETRIEVAL, Role.RETRIEVAL_FALL)
+        if contrast.effect in (Effect.SESSIONS, Effect.RETRIEVAL, Effect.RETRIEVAL_FALL)
     ]
     with_base = {(c.simulator, c.system) for c in own if c.system != c.against[0]}
     without_base = [cell for cell in cells if (cell.simulator, cell.system) not in with_base]
@@ -90,7 +90,7 @@ def _with_published(
                 cell.system,
                 cell.condition,
                 (start.system, START),
-                Role.RETRIEVAL_FALL,
+                Effect.RETRIEVAL_FALL,
                 compare_unpaired(start.as_rate, cell.as_rate),
                 cell.complete,
             )

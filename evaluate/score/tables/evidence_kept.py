@@ -189,7 +189,7 @@ USE: Columns = {
 
 def _use(cells: Iterable[_KeptCell]) -> Table:
     """Return the failures although all evidence was kept, split by a control's own."""
-    records, some_alone = list[dict[str, Any]](), False
+    records, lacks_control = list[dict[str, Any]](), False
     for cell in cells:
         if (cell.outcomes.chance >= 0).any():
             continue  # answers to questions are not executed
@@ -200,11 +200,11 @@ def _use(cells: Iterable[_KeptCell]) -> Table:
             continue
         control = control_of(cell.outcomes, cell.system)
         if control is None:
-            some_alone = True
+            lacks_control = True
             records.append(cell.record | _failures(kept))
         elif record := _beside_control(cell, kept, control):
             records.append(cell.record | record)
-    note = f"{_USE_NOTE} {_ADVICE}" if some_alone else _USE_NOTE
+    note = f"{_USE_NOTE} {_ADVICE}" if lacks_control else _USE_NOTE
     return record_table(
         "evidence_use", "Failures although all evidence was kept", USE, records, note
     )

@@ -20,12 +20,12 @@ from robomme_interference_data.stats.significance import holm
 from robomme_interference_data.viz.tables import Table
 
 from .comparison import COMPLETE, SIDES, ComparisonTable, comparison_table
-from .contrast import Contrast, Role
+from .contrast import Contrast, Effect
 
 DRAWS = 2000
 """Random signs, and draws of families and episodes."""
 
-_ROLES = (Role.HISTORY, Role.SESSIONS, Role.RETRIEVAL, Role.INTERFERENCE)
+_EFFECTS = (Effect.HISTORY, Effect.SESSIONS, Effect.RETRIEVAL, Effect.INTERFERENCE)
 
 FAMILIES = ComparisonTable(
     name="families",
@@ -71,7 +71,7 @@ def families_table(all_outcomes: Iterable[Outcomes], contrasts: Sequence[Contras
         labels = outcomes.family
         effects, differences, counts = list[Contrast](), list[Floats](), list[int]()
         for contrast in contrasts:
-            if contrast.simulator != outcomes.simulator or contrast.role not in _ROLES:
+            if contrast.simulator != outcomes.simulator or contrast.effect not in _EFFECTS:
                 continue
             before = success(outcomes.status[outcomes.cell(*contrast.against)])
             after = success(outcomes.status[outcomes.cell(contrast.system, contrast.condition)])
@@ -112,9 +112,8 @@ def over_families(
     """Return, for each comparison, how its difference varies over families.
 
     Intervals are NaN if fewer than ten episodes differ. `values` are second − first of each
-    episode, NaN where not both count, `(E,
-    K)`; `labels` are the families, `(E,)`; `key` seeds the draws. Unknown families and episodes
-    take no part in any draw.
+    episode, NaN where not both count, `(E, K)`; `labels` are the families, `(E,)`; `key` seeds the
+    draws. Unknown families and episodes take no part in any draw.
 
     With the mean mᶠ and the variance sᶠ² of a family's nᶠ differences, the standard deviation
     between families is that of the means less their noise: √max(0, var(mᶠ) − mean(sᶠ² / nᶠ)).
@@ -129,19 +128,20 @@ def over_families(
     residuals); the deviation between groups: Searle (1971), Linear Models, chapter 9.
     """
     masks, place = np.unique(~np.isnan(values), axis=1, return_inverse=True)
-    found: dict[int, OverFamilies] = {}
+    by_column: dict[int, OverFamilies] = {}
     # Most comparisons lack the same episodes, or none: each distinct set is drawn from once.
     for at, known in enumerate(masks.T):
         columns = np.flatnonzero(place == at)
         estimates = _over(values[np.ix_(known, columns)], labels[known], key, draws)
-        found |= zip(columns.tolist(), estimates, strict=True)
-    return [found[column] for column in range(values.shape[1])]
+        by_column |= zip(columns.tolist(), estimates, strict=True)
+    return [by_column[column] for column in range(values.shape[1])]
 
 
 def _over(
     values: Floats, labels: NDArray[np.int64], key: str, draws: int
 ) -> Iterator[OverFamilies]:
     """Yield what `over_families` returns, for values without NaN."""
+    # The rows of a family lie together, so that sums over families are sums over ranges of rows.
     order = np.argsort(labels, kind="stable")
     labels, values = labels[order], values[order]
     starts = np.flatnonzero(np.diff(labels, prepend=-1))
@@ -169,6 +169,7 @@ def _over(
     without = (means.sum(axis=0) - means) / (count - 1)
     taken = generator.multinomial(len(starts), np.full(len(starts), 1 / len(starts)), draws)
     parts, intervals = np.split(values, starts[1:]), []
+    # Each family once, for just these families; then as often as drawn, for a sample of families.
     for often in (np.ones_like(taken), taken):
         drawn = sum(_resampled(part, often[:, n], generator) for n, part in enumerate(parts))
         intervals.append(np.quantile(drawn / len(starts), (0.025, 0.975), axis=0))

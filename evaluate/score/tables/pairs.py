@@ -93,9 +93,10 @@ def pair(
     known = ~np.isnan(before + after)
     before, after, first, second = before[known], after[known], first[known], second[known]
     n = len(before)
+    # As many rollouts as episodes: no repeats.
     if n == counting(first).sum() == counting(second).sum():
         return _of_single(before, after)
-    at = partial(_clusters, first, second)
+    at = partial(_clusters, first, second)  # over all repeats; `matched` is for gained and lost
     if matched is not None:
         first_seeds, second_seeds = zip(*matched, strict=True)
         first, second = first[:, first_seeds], second[:, second_seeds]

@@ -23,7 +23,7 @@ from .comparison import (
     comparison_table,
     detectable,
 )
-from .contrast import Contrast, Measure, Role
+from .contrast import Contrast, Effect, Measure
 from .pairs import Pairs, compare_unpaired, pair
 
 _Compared = Mapping[tuple[str, str], Pairs]
@@ -94,9 +94,9 @@ def standings(rates: Mapping[str, float], compared: _Compared) -> dict[str, Stan
     best = max(rates, key=lambda name: rates[name])
     ps = holm([pairs.p for pairs in compared.values()])
     p_holm = {frozenset(both): p for both, p in zip(compared, ps, strict=True)}
-    found = {}
+    standing_of = {}
     for name, rate in rates.items():
-        found[name] = Standing(
+        standing_of[name] = Standing(
             rank=1 + sum(other > rate for other in rates.values()),
             rank_low=bounds[name][0],
             rank_high=bounds[name][1],
@@ -104,7 +104,7 @@ def standings(rates: Mapping[str, float], compared: _Compared) -> dict[str, Stan
             behind=_behind(name, best, compared),
             p_holm=p_holm.get(frozenset((name, best)), math.nan),
         )
-    return found
+    return standing_of
 
 
 def _behind(name: str, best: str, compared: _Compared) -> Interval:
@@ -115,7 +115,7 @@ def _behind(name: str, best: str, compared: _Compared) -> Interval:
     if (name, best) in compared:
         return compared[name, best].at(level)
     value, low, high = compared[best, name].at(level)
-    return Interval(0.0 - value, -high, -low)
+    return Interval(0.0 - value, -high, -low)  # -value of a tie would be -0.0
 
 
 MATRIX = ComparisonTable(
@@ -133,7 +133,7 @@ def matrix_table(contrasts: Iterable[Contrast]) -> Table:
     pairs = [
         contrast
         for contrast in contrasts
-        if contrast.role is Role.SYSTEMS and contrast.measure is Measure.SUCCESS
+        if contrast.effect is Effect.SYSTEMS and contrast.measure is Measure.SUCCESS
     ]
     table = comparison_table(MATRIX, pairs)
     return replace(table, note=f"{table.note} {detectable(pairs, MATRIX.group)}".strip())
@@ -157,7 +157,7 @@ def system_pairs(outcomes: Outcomes) -> Iterator[Contrast]:
                 system,
                 condition,
                 (other, condition),
-                Role.SYSTEMS,
+                Effect.SYSTEMS,
                 pairs,
                 complete=True,
             )

@@ -22,11 +22,11 @@ from robomme_interference_data.stats.signs import sign_flips, vector_sign_flips
 from robomme_interference_data.viz.tables import Columns, Table
 
 from .comparison import ComparisonTable, comparison_table, tested_table
-from .contrast import Contrast, Role
+from .contrast import Contrast, Effect
 from .pairs import Pairs
 
 
-def _falling(outcomes: Outcomes, *systems: str) -> list[str]:
+def _shared_ks(outcomes: Outcomes, *systems: str) -> list[str]:
     """Return the `k<n>` under which all systems have rows; none if there is only one."""
     shared = [c for c in outcomes.conditions if all(c in outcomes.ran(name) for name in systems)]
     counted = [name for name in shared if parse_condition(name).kind.name == "k"]
@@ -76,20 +76,20 @@ def decay_table(all_outcomes: Iterable[Outcomes], draws: int = DRAWS) -> Table:
 
 def _decays(outcomes: Outcomes, draws: int) -> list[dict[str, Any]]:
     key = outcomes.simulator
-    falling = {system: _falling(outcomes, system) for system in outcomes.systems}
-    falling = {system: conditions for system, conditions in falling.items() if conditions}
-    if not falling:
+    ks_of = {system: _shared_ks(outcomes, system) for system in outcomes.systems}
+    ks_of = {system: conditions for system, conditions in ks_of.items() if conditions}
+    if not ks_of:
         return []
-    values = [_values(outcomes, system, conditions) for system, conditions in falling.items()]
+    values = [_values(outcomes, system, conditions) for system, conditions in ks_of.items()]
     slopes = [
         success_by_k @ slope_weights(_numbers(conditions))
-        for success_by_k, conditions in zip(values, falling.values(), strict=True)
+        for success_by_k, conditions in zip(values, ks_of.values(), strict=True)
     ]
     tests = sign_flips(np.stack(slopes, axis=1).round(12), key, draws)
-    fits = _fits(values, list(falling.values()), key, draws)
+    fits = _fits(values, list(ks_of.values()), key, draws)
     records = []
     for (system, conditions), slope, test, p_fit in zip(
-        falling.items(), slopes, tests, fits, strict=True
+        ks_of.items(), slopes, tests, fits, strict=True
     ):
         here = outcomes.has_episode[outcomes.systems.index(system)]
         [interval] = bootstrap(slope[here, None], key, draws)
@@ -171,7 +171,7 @@ INTERACTION = ComparisonTable(
 
 def interaction_table(contrasts: Iterable[Contrast]) -> Table:
     """Return the falls of two systems compared, among some comparisons."""
-    return comparison_table(INTERACTION, [c for c in contrasts if c.role is Role.SLOPES])
+    return comparison_table(INTERACTION, [c for c in contrasts if c.effect is Effect.SLOPES])
 
 
 def interactions_of(outcomes: Outcomes, draws: int = DRAWS) -> list[Contrast]:
@@ -183,7 +183,7 @@ def interactions_of(outcomes: Outcomes, draws: int = DRAWS) -> list[Contrast]:
     systems = [name for name in outcomes.systems if not outcomes.is_reference(name)]
     pairs, slopes, apart = list[tuple[str, str, list[str]]](), [], []
     for system, other in combinations(systems, 2):
-        conditions = _falling(outcomes, system, other)
+        conditions = _shared_ks(outcomes, system, other)
         if not conditions or not outcomes.pairable(system, other):
             continue
         first, second = (_values(outcomes, name, conditions) for name in (other, system))
@@ -219,7 +219,7 @@ def interactions_of(outcomes: Outcomes, draws: int = DRAWS) -> list[Contrast]:
                 system,
                 conditions[-1],
                 (other, conditions[-1]),
-                Role.SLOPES,
+                Effect.SLOPES,
                 compared,
                 _all_complete(outcomes, [system, other], conditions),
                 columns={

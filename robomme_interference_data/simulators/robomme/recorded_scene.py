@@ -21,7 +21,7 @@ from .scenes import (
 
 # Upper bounds, so that an untrusted scene has no endless number of possible answers.
 _MOST = {"points": 25, "colors": 3, "visits": 4, "swaps": 3}
-_MOST_MOVES = 8  # of a path, or its buttons
+_MAX_MOVES = 8  # of a path, or its buttons
 
 _SCENES: dict[str, type[OfficialScene]] = {
     "VideoRepick": OfficialVideoRepick,
@@ -49,8 +49,8 @@ def read_scene(family: str, recorded: str, difficulty: str) -> OfficialScene:
         for name, most in _MOST.items():
             if name in facts and len(facts[name]) > most:
                 raise ValueError(f"{name} has over {most} entries")
-        if _longest(facts["answer"]) > _MOST_MOVES:
-            raise ValueError(f"the answer has over {_MOST_MOVES} entries")
+        if _longest(facts["answer"]) > _MAX_MOVES:
+            raise ValueError(f"the answer has over {_MAX_MOVES} entries")
         scene = _SCENES[family](facts, difficulty)
         answer = scene.own_answer(0)
         if answer not in scene.answers:

@@ -38,7 +38,7 @@ from robomme_interference_data.simulators.scene import (
 _UNRECORDED = ("static", "NO RECORD")
 """Names of tasks in which the robot rests, or that RoboMME does not record."""
 
-_MOST_SWAPPING = 5  # things where some swap places: an untrusted scene may state any number
+_MAX_SWAPPING = 5  # things where some swap places: an untrusted scene may state any number
 
 
 class Moment(NamedTuple):
@@ -121,7 +121,7 @@ class OfficialSwaps(SwapScene, OfficialScene):
     def __init__(self, facts: Mapping[str, Any], difficulty: str):
         self.swaps = [(one, other) for one, other, _, _ in facts["swaps"]]
         super().__init__(facts, difficulty)
-        if self.swaps and self.count > _MOST_SWAPPING:
+        if self.swaps and self.count > _MAX_SWAPPING:
             raise ValueError(f"{self.count} things swap places")
 
     def possible_swaps(self) -> Mapping[tuple[Pair, ...], tuple[str, ...]]:

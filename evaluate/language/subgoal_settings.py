@@ -1,4 +1,4 @@
-"""Subgoal writers by their text: `oracle`, or a vision-language model.
+"""What the settings of a run say of its subgoals: `oracle`, or a vision-language model.
 
 Its functions are called, through `evaluate/optional.py`, for runs with subgoals only.
 """
