@@ -93,7 +93,7 @@ class QuestionRunner(Runner[AskConfig]):
         """Return the function that asks questions."""
         return AskFunction(run)
 
-    def identity(self, plan: RunPlan) -> dict[str, Any]:
+    def identity(self) -> dict[str, Any]:
         """Return what of questions and model can change an answer."""
         config = self.config
         return {

@@ -159,7 +159,7 @@ class RolloutRunner(Runner[RunConfig]):
             _run_first(pool, start, config.simulator_timeout_s, _simulator_fault)
             check_servers_memory(config.policy, config.policy_options, self._system)
 
-    def identity(self, plan: RunPlan) -> dict[str, Any]:
+    def identity(self) -> dict[str, Any]:
         """Return what of simulator, policy and subgoals can change a result."""
         subgoals = None
         if self.config.subgoals is not None:

@@ -37,7 +37,7 @@ def run_identity(runner: Runner[Any], plan: RunPlan) -> dict[str, Any]:
         "model_seed": config.model_seed,
         "retrieval_index": _retrieval_index(runner, plan),
         "protocol_version": PROTOCOL_VERSION,
-        **runner.identity(plan),
+        **runner.identity(),
     }
 
 

@@ -268,5 +268,5 @@ class Runner[C: RunConfig | AskConfig](ABC):
         """Let a worker open what the run uses, and check it."""
 
     @abstractmethod
-    def identity(self, plan: RunPlan) -> dict[str, Any]:
+    def identity(self) -> dict[str, Any]:
         """Return what can change a result, as plain values."""

@@ -169,7 +169,8 @@ def test_conditions_and_limits_beyond_the_paper(tmp_path: Path) -> None:
 def test_nothing_unknown_is_asserted(
     tmp_path: Path, query: Any, unit: Any, simulated: bool
 ) -> None:
-    buffer_set = made_up(tmp_path, query={"simulator": query}, unit={"simulator": unit})
+    lesson = {"simulator": query, "difficulty": "easy"}
+    buffer_set = made_up(tmp_path, query=lesson, unit={"simulator": unit})
     facts = buffer_set_facts(buffer_set)
     text = card_text(facts, OF_BUFFER_SET)
     assert ("The simulator defines the difficulty" in text) == simulated
