@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +78,14 @@ def roll(condition: str, policy: Any, *, simulator: Any = None, **changes: Any) 
 def untimed(rows: tuple[Rollout, ...]) -> list[dict[str, Any]]:
     return [
         {name: value for name, value in to_dict(row).items() if name not in TIMING_COLUMNS}
+        for row in rows
+    ]
+
+
+def of_any_policy(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return rows without the columns that say which policy it was."""
+    return [
+        {name: value for name, value in row.items() if name not in ("policy", "policy_id")}
         for row in rows
     ]
 
