@@ -23,7 +23,7 @@ def check_episode(
     """
     recorded_shapes = {"state": query.dataset.features[STATE]}
     live_shapes = {"state": first.state.shape}
-    for camera in first.images.keys() & {*query.dataset.cameras}:
+    for camera in sorted(first.images.keys() & {*query.dataset.cameras}):
         recorded_shapes[camera] = query.dataset.shape(camera)
         live_shapes[camera] = first.images[camera].shape
     if live_shapes != recorded_shapes:

@@ -187,7 +187,8 @@ def test_the_answer_that_a_row_chose(right: Path) -> None:
     from robomme_interference_data.evaluate.run.log import read_run
 
     question = questions()[LOCK]
-    row = next(one for one in read_run(right)[1].values() if one.episode_id == LOCK)
+    rows = [row for row in read_run(right)[1].values() if row.episode_id == LOCK]
+    row = min(rows, key=lambda row: row.condition)
     assert chosen_answer(row, question) == question.answers[question.right]
     wrong = replace(row, answer=wrong_letter(), success=False, status=str(Status.FAIL))
     index = (question.right + 1) % len(question.letters)

@@ -39,6 +39,10 @@ _VARYING = (
     ),
     (re.compile(re.escape(str(_PROJECT))), "PROJECT"),
     (re.compile(r"(127\.0\.0\.1|localhost|\[::1\]):\d+"), r"\1:PORT"),
+    (re.compile(r"\bprocess \d+\b"), "process ID"),
+    # How a connection ends depends on which side is faster.
+    (re.compile(r"(closed the connection: ).*", re.DOTALL), r"\1REASON"),
+    (re.compile(r"(cannot be reached: )(\[Errno|Server disconnected|it does not).*"), r"\1REASON"),
     (re.compile(r"\b0x[0-9a-f]{6,}\b"), "ADDRESS"),
     (re.compile(r"\b[0-9a-f]{12,64}\b"), "DIGEST"),
 )

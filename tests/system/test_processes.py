@@ -130,7 +130,7 @@ def test_errors_after_which_a_task_is_started_again(run: Run) -> None:
 def test_a_worker_that_retires_leaves_its_task_to_the_others(run: Run) -> None:
     outcomes = run([("retire", (0,))] * 5, workers=2)
     assert [(o.value, o.error, o.attempts) for o in outcomes] == [(1, None, 1)] * 5
-    with raises(WorkerRetiredError) as raised:
+    with pytest.raises(WorkerRetiredError) as raised:
         run([("retire", (0, 1))] * 5, workers=2)
     assert raised.value.hint == "Start it."
 

@@ -167,7 +167,7 @@ def test_servers_that_go_away_cost_no_rollout(tmp_path: Path, monkeypatch: Any) 
         monkeypatch.setenv("SERVERS", urls)
         result = runs.run(tmp_path / "one", Processes(2), progress=Stopper(stops[1:]), **served)
         assert [(row.status, row.attempt) for row in result.rows] == [("fail", 1)] * ROLLOUTS
-        with raises(WorkerRetiredError):
+        with pytest.raises(WorkerRetiredError):
             runs.run(tmp_path / "two", Processes(1), progress=Stopper(stops[:1]), **served)
     rows = read_record(tmp_path / "two")
     assert 1 <= len(rows) < ROLLOUTS and {row.status for row in rows.values()} == {"fail"}

@@ -44,7 +44,7 @@ def test_a_run_resumes_after_its_server_died_in_a_rollout(tmp_path: Path) -> Non
     settings: dict[str, Any] = {"conditions": CONDITIONS}
     with servers.serving("Dying") as url:
         settings["policy"] = f"vla-eval:{url}"
-        with raises(WorkerRetiredError):
+        with pytest.raises(WorkerRetiredError):
             runs.run(tmp_path / "run", policy_options=(*NAMED, "connect_s=1"), **settings)
     assert len(runs.finished_rows(tmp_path / "run")) < 6
     with servers.serving("Dying", int(url.rpartition(":")[2])):
