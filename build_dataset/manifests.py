@@ -88,13 +88,14 @@ def plan_manifests(
                 f"build BUFFER_SET --only {name} --source KIND:PATH",
             )
     check_features(opened)
-    for name in {*UNITS} & opened.keys():
+    for name in sorted({*UNITS} & opened.keys()):
         splits = {record.episode_id.split for record in opened[name].records()}
         if splits != {"train"}:
             raise SourceError(
                 "distractor units must come from train episodes, so that no query's scene leaks "
                 f"into another buffer; found {', '.join(sorted(splits))}",
-                f"Build the {name} with {named('split', 'train')}.",
+                f"Move {opened[name].files.describe()} away, and build the {name} with "
+                f"{named('split', 'train')}.",
             )
         if DISTRACTORS in opened and opened[name].unit != opened[DISTRACTORS].unit.in_dataset(name):
             raise SourceError(
