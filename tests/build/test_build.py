@@ -47,6 +47,7 @@ def ids(root: Path) -> list[str]:
     return [str(one.episode_id) for one in Dataset(LocalFiles(root)).records()]
 
 
+@pytest.mark.slow
 def test_the_golden_units_come_out_again_and_grow_to_the_same_bytes(tmp_path: Path) -> None:
     """In three steps, the later episodes first, as in one: videos are taken over as they are."""
     out, golden = tmp_path / "out", GOLDEN / "distractors"
@@ -389,6 +390,7 @@ def test_views_under_shifts_and_executions_are_of_the_queries(tmp_path: Path) ->
     assert (change.added, change.loses) == (("k1",), False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["contradictions", "shifted", "executions"])
 def test_what_goes_with_demonstrations_has_their_episodes_and_cameras(
     kind: str, tmp_path: Path

@@ -79,6 +79,7 @@ def of(made: Iterable[Made], family: str) -> list[Made]:
 # --- options --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", FAMILIES)
 def test_the_right_option_is_the_scenes_answer_and_there_once(
     made: list[Made], family: str

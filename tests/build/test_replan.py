@@ -120,6 +120,7 @@ def _abort() -> None:
     raise console.typer.Abort
 
 
+@pytest.mark.slow
 def test_more_units_need_a_confirmation(tmp_path: Path, run: Any) -> None:
     """Of the distractors, of everything and, for units that are built, of the manifests alone."""
     root = copy_buffer_set(tmp_path / "set")

@@ -87,6 +87,7 @@ ONE_OF_EACH = [name for name in FILES if "file-0" not in name or "file-000" in n
 ONE_OF_EACH.remove(HEADER)  # its hash is the buffer set's revision
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", ONE_OF_EACH)
 def test_a_flipped_bit_anywhere(own_buffers: Path, path: str) -> None:
     for _ in flipped_bits(own_buffers / path, 3):
@@ -198,6 +199,7 @@ INFO, STATS, REPORT, IDENTITY = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("path", "change", "message"),
     [
@@ -291,6 +293,7 @@ def test_a_dataset_that_is_gone(own_buffers: Path) -> None:
 # --- questions -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_questions_are_planned_anew(tmp_path: Path) -> None:
     assert violations(TABLETOP, decode=False) == []
     root = copy_tabletop(tmp_path / "buffer_set")
@@ -327,6 +330,7 @@ def painted(view: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return view
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [np.zeros_like, painted, lambda view: view[::2, ::2].copy()])
 def test_a_picture_of_something_else(tmp_path: Path, change: Callable[[Any], Any]) -> None:
     root = copy_tabletop(tmp_path / "buffer_set")
@@ -337,6 +341,7 @@ def test_a_picture_of_something_else(tmp_path: Path, change: Callable[[Any], Any
     expect(root, r"questions\.parquet VideoRepick/test/0: has a picture of", decode=True)
 
 
+@pytest.mark.slow
 def test_exchanged_pictures(tmp_path: Path) -> None:
     root = copy_tabletop(tmp_path / "buffer_set")
 
