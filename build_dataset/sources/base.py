@@ -88,7 +88,7 @@ class Robot:
 
     def check_names(self, features: Mapping[str, Sequence[int]]) -> None:
         """Check that the known names are one for each value of a vector."""
-        for feature in self.names.keys() & features.keys():
+        for feature in sorted(self.names.keys() & features.keys()):
             names, size = self.names[feature], features[feature][0]
             if not len({*names}) == len(names) == size:
                 raise SourceError(

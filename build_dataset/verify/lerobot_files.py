@@ -102,7 +102,7 @@ def _columns(dataset: Dataset, table: pa.Table) -> Iterator[tuple[str, str]]:
     copy = dataset.lerobot.table
     yield from _names(EPISODES_DIR, table.column_names, lean | statistics)
     yield from _names(RECORDS_PATH, copy.column_names, lean)
-    for name in lean & {*copy.column_names} & {*table.column_names}:
+    for name in sorted(lean & {*copy.column_names} & {*table.column_names}):
         if copy[name] != table[name]:
             yield RECORDS_PATH, f"column {name} differs from that of {EPISODES_DIR}"
         elif name in records.names and copy.schema.field(name).type != records.field(name).type:

@@ -69,7 +69,7 @@ class QuestionRunner(Runner[AskConfig]):
         """Check that the images fit, and that the ideal observer knows the possible answers."""
         config = self.config
         if config.model == "recall":
-            for episode in {item.episode for item in items}:
+            for episode in dict.fromkeys(item.episode for item in items):
                 if recorded_scene(self.buffer_set.query(episode)) is None:
                     raise InvalidOptionError(
                         f"recall does not know the possible answers in {episode}",

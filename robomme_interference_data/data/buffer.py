@@ -324,7 +324,8 @@ class Buffer:
         """
         self._reader.verified = True
         query, manifest = self.query, self.manifest
-        for dataset in {query.dataset, *(self._datasets[e.dataset] for e in manifest.sessions)}:
+        sources = [self._datasets[entry.dataset] for entry in manifest.sessions]
+        for dataset in dict.fromkeys([query.dataset, *sources]):
             dataset.check_records()
         if self._check_rules is not None:  # else no rule made the buffer
             self._check_rules(manifest)

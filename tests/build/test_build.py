@@ -78,6 +78,7 @@ def test_the_golden_demonstrations_hold_what_the_source_gives(tmp_path: Path) ->
     assert contents(out) == contents(GOLDEN / "demonstrations")
 
 
+@pytest.mark.slow
 def test_build_resumes_from_staged_episodes(tmp_path: Path) -> None:
     out = tmp_path / "out"
     source = MadeUpSource(TRAIN, {"B/train/0": {9: SourceError("broke off", "record it again")}})
@@ -157,6 +158,7 @@ def test_a_dataset_is_of_one_robot_and_keeps_what_it_is(tmp_path: Path) -> None:
         assert difference in caught.value.message and "{" not in caught.value.message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fps", [12.5, 30000 / 1001, 15.0])
 def test_a_frame_rate_is_kept_as_it_is(tmp_path: Path, fps: float) -> None:
     """LeRobot's files have it, LeRobot opens them, and the frames are the recorded ones."""

@@ -104,6 +104,7 @@ def test_a_source_without_actions_is_one_error(tmp_path: Path) -> None:
     assert not (tmp_path / EXECUTIONS).exists()
 
 
+@pytest.mark.slow
 def test_a_buffer_set_with_executions(tmp_path: Path) -> None:
     source = MadeUpSource(QUERIES)
     root = buffer_set(tmp_path, source)
@@ -121,6 +122,7 @@ def test_a_buffer_set_with_executions(tmp_path: Path) -> None:
     assert len(load_buffer(QUERY, "k1", buffer_set=root, verify=True)) == 5 + 32
 
 
+@pytest.mark.slow
 def test_executions_begin_with_the_query_frame(tmp_path: Path) -> None:
     other = MadeUpSource(QUERIES)
     shown = other.frame(QUERY, 5, 5)

@@ -159,6 +159,7 @@ def test_datasets_that_do_not_fit(tmp_path: Path) -> None:
         plan_manifests(datasets_in(root))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", range(4))
 def test_an_interrupted_build_leaves_the_old_manifests_or_the_new_ones(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, steps: int

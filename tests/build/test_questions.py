@@ -100,6 +100,7 @@ def test_the_right_option_is_the_scenes_answer_and_there_once(
         assert question.letters == "ABCDE"[: len(choices)]
 
 
+@pytest.mark.slow
 def test_marks_and_their_letters_lie_inside_the_view_and_apart(made: list[Made]) -> None:
     for one in made:
         for y, x in (point for option in one.marks for point in option):
@@ -214,6 +215,7 @@ def bare(questions: Iterable[Question]) -> list[Question]:
     return [replace(one, picture=b"") for one in questions]
 
 
+@pytest.mark.slow
 def test_the_golden_questions_come_out_again() -> None:
     buffer_set = load_buffer_set(TABLETOP)
     kept, again = read_questions(buffer_set), list(make_questions(buffer_set))

@@ -94,6 +94,7 @@ def test_a_flipped_bit_anywhere(own_buffers: Path, path: str) -> None:
         expect(own_buffers, re.escape(Path(path).name) + "|" + path.split("/", maxsplit=1)[0])
 
 
+@pytest.mark.slow
 def test_a_flipped_bit_in_the_header_of_an_index(own_buffers: Path) -> None:
     make_index(own_buffers)
     assert violations(own_buffers, decode=False) == []
@@ -113,6 +114,7 @@ def test_indexes_of_different_encoders(own_buffers: Path) -> None:
     expect(own_buffers, "demonstrations/index/thumbnail: .*another encoder")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("path", "message"),
     [
@@ -395,6 +397,7 @@ def test_data_files_out_of_order(own_buffers: Path) -> None:
     expect(own_buffers, "does not have the data files in the order of the episodes")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("path", "place"),
     [
@@ -440,6 +443,7 @@ def test_where_a_dataset_is_downloaded_from_is_no_content(own_buffers: Path) -> 
     assert load_buffer_set(own_buffers).revision == revision
 
 
+@pytest.mark.slow
 def test_an_index_of_other_numbers(own_buffers: Path) -> None:
     make_index(own_buffers)
     path = "distractors/index/thumbnail/index.json"
@@ -469,6 +473,7 @@ def test_a_dataset_that_is_a_link_out_of_the_buffer_set(own_buffers: Path, name:
     assert load_buffer_set(own_buffers).load("MoveCube/test/0", "k1")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", [EPISODES, RECORDS, ROWS, DATA, "distractors/meta/tasks.parquet"])
 def test_two_columns_of_one_name(own_buffers: Path, path: str) -> None:
     def twice(table: pa.Table) -> pa.Table:

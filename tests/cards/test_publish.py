@@ -256,6 +256,7 @@ def placed(hub: HubServer, tmp_path: Path, commit: str | None = None) -> Path:
     return root
 
 
+@pytest.mark.slow
 def test_a_buffer_set_of_published_demonstrations(hub: HubServer, tmp_path: Path) -> None:
     root = placed(hub, tmp_path)
     assert len(publish(root)) == 1
@@ -335,6 +336,7 @@ class Terminal(io.StringIO):
         return True
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_unchecked")
 def test_the_command(
     hub: HubServer, run: Run, monkeypatch: pytest.MonkeyPatch, extended: Path

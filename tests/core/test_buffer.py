@@ -78,6 +78,7 @@ def test_lesson_first_then_the_units(condition: str, episode: str) -> None:
     made.verify()
 
 
+@pytest.mark.slow
 @given(
     st.sampled_from(["no-history", "k0", "k3", "unusual"]),
     st.integers(1, 150),

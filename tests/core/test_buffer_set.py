@@ -226,6 +226,7 @@ def test_datasets_are_opened_on_first_use(own_buffers: Path) -> None:
         buffer_set.datasets["shifted"]
 
 
+@pytest.mark.slow
 def test_imports_are_lazy_and_loading_needs_light_libraries_only() -> None:
     code = (
         "import sys\n"

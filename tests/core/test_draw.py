@@ -208,6 +208,7 @@ def test_consecutive_queries_draw_different_units() -> None:
         assert all(not one & other for one, other in pairwise(draws))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("k", [1, 3])
 def test_small_families_are_used_in_proportion(k: int, seed: int) -> None:

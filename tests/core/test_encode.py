@@ -84,6 +84,7 @@ def test_the_same_frames_give_the_same_bytes_and_nothing_is_printed(
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("height", "width"), [(98, 50), (64, 66), (34, 36)])
 def test_clips_are_the_same_whatever_memory_held_before(
     tmp_path: Path, height: int, width: int

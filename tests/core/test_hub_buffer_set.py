@@ -100,6 +100,7 @@ def test_a_version_stays_when_its_tag_is_moved_or_gone(hub: HubServer, tmp_path:
     assert again.location == first.location and again.location.startswith(f"{BUFFER_SET}@")
 
 
+@pytest.mark.slow
 def test_a_buffer_set_has_one_revision_wherever_it_lies(hub: HubServer, tmp_path: Path) -> None:
     published, local = load_buffer_set(BUFFER_SET), load_buffer_set(GOLDEN)
     assert published.revision == local.revision
@@ -213,6 +214,7 @@ def test_only_text_can_name_a_repository(hub: HubServer, run: Any) -> None:
     assert code == 1 and f"{BASE}@" in error  # the command reads it as a repository
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("centered", [True, False])
 def test_a_part_comes_with_its_embeddings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Any, centered: bool
@@ -236,6 +238,7 @@ def test_a_part_comes_with_its_embeddings(
 # --- every command takes a repository -------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_commands_print_the_same_for_a_repository_and_a_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Any
 ) -> None:

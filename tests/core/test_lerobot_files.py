@@ -164,6 +164,7 @@ FEATURE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("of_feature", "name", "value"),
     [

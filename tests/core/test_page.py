@@ -115,6 +115,7 @@ def test_text_of_a_data_set_is_no_markup(own_buffers: Path, tmp_path: Path) -> N
         assert page.complaints() == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("condition", ["no-history", "k0"])
 def test_pages_of_short_histories(tmp_path: Path, condition: str) -> None:
     out = tmp_path / "page.html"

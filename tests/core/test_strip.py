@@ -124,6 +124,7 @@ def test_shows_the_right_frames_in_order_and_the_live_one_last(strip: Path, buff
         assert np.abs(coarse(image) - coarse(frame)).max() < 12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "frames", [[36], [1, 1], [1100, *[32] * 15]], ids=["k0", "tiny", "long-k15"]
 )
@@ -144,6 +145,7 @@ def test_any_number_of_sessions(tiny_buffers: Path, tmp_path: Path, frames: list
     assert float(view[3]) < 16 * 72
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("goal", "line", "count"),
     [

@@ -86,6 +86,7 @@ def videos(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Video]:
 # --- spans ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_every_start_and_the_whole(videos: dict[str, Video], name: str) -> None:
     """Just before, at and just after key frames: where seeking goes wrong if it does."""
@@ -168,6 +169,7 @@ def is_whole(path: Path, video: Video, start: int, stop: int) -> bool:
     return whole
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["lossless.mp4", "ffv1.mkv", "h264-reordered.mp4"])
 def test_files_cut_anywhere(videos: dict[str, Video], name: str, tmp_path: Path) -> None:
     """Wherever the file is cut, frames that still decode are right, and the end raises."""

@@ -60,6 +60,7 @@ def wrong_letter() -> str:
     return question.letters[(question.right + 1) % len(question.letters)]
 
 
+@pytest.mark.slow
 def test_right_answers_succeed_and_wrong_ones_fail(tmp_path: Path, right: Path) -> None:
     result = act_out(tmp_path / "acted", right, conditions=("k0", "k1"))
     assert [(row.system, row.success) for row in result.rows] == 8 * [("acted", True)]

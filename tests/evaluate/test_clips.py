@@ -86,6 +86,7 @@ def test_the_video_shows_the_history_that_the_policy_got(
     assert found == sessions[start:stop] + [None] * (64 - (stop - start))
 
 
+@pytest.mark.slow
 def test_a_rollout_that_breaks_writes_its_video_if_it_had_begun(
     tmp_path: Path, trouble: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -109,6 +110,7 @@ def test_a_rollout_that_breaks_writes_its_video_if_it_had_begun(
     assert not list((tmp_path / "run" / "videos").iterdir())  # the old one is gone
 
 
+@pytest.mark.slow
 def test_a_video_that_cannot_be_written_leaves_the_row_unchanged(tmp_path: Path) -> None:
     run_one(tmp_path / "run", conditions=("k0",), policy="noop")
     (tmp_path / "run" / "videos").symlink_to(tmp_path / "gone" / "videos")  # a disk taken out
@@ -118,6 +120,7 @@ def test_a_video_that_cannot_be_written_leaves_the_row_unchanged(tmp_path: Path)
     assert "videos/MoveCube_test_0_k1.mp4 could not be written" in log
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("when", [0, 7, 45])
 def test_a_video_that_fails_leaves_the_row_unchanged(
     when: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

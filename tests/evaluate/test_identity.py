@@ -129,6 +129,7 @@ def test_a_privileged_policy_is_recorded(tmp_path: Path, caplog: pytest.LogCaptu
 # --- questions ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_another_run_of_questions_is_an_error_that_names_the_difference(tmp_path: Path) -> None:
     prompt = tmp_path / "mine.toml"
     prompt.write_text('system = "s"\nquestion = "<history><picture>{goal}{question}{options}"\n')

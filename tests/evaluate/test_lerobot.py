@@ -79,6 +79,7 @@ def test_act_acts_as_in_lerobots_loop(act: Path, tmp_path: Path) -> None:
     policy.close()
 
 
+@pytest.mark.slow
 def test_temporal_ensembling_returns_one_averaged_action(act: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(act, tmp_path / "ensemble")
     small.edit(folder, lambda config: config.update(n_action_steps=1, temporal_ensemble_coeff=0.01))
@@ -91,6 +92,7 @@ def test_temporal_ensembling_returns_one_averaged_action(act: Path, tmp_path: Pa
     np.testing.assert_allclose(found[1][0], mean, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_queue_is_filled_with_the_end_of_the_history(vqbet: Path) -> None:
     policy = made(vqbet)
     assert (policy.wants_history, policy.every_frame) == (True, True)

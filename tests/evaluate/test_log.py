@@ -65,6 +65,7 @@ def nested(depth: int) -> Any:
     return [nested(depth - 1)] if depth else "deep"
 
 
+@pytest.mark.slow
 @settings(max_examples=50)
 @given(tokens=st.lists(st.integers(), max_size=3), metadata=HOSTILE, text=st.text(max_size=99))
 @example(tokens=[10**30], metadata=nested(200), text="\ud800\x1b[2J")

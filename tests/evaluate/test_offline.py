@@ -293,6 +293,7 @@ def test_buffer_sets_without_executions(tmp_path: Path, own_buffers: Path) -> No
     assert evaluate(root, tmp_path / "run", families=("OpenDrawer",)).planned == 2
 
 
+@pytest.mark.slow
 def test_the_command(buffers: Path, tmp_path: Path, run: Callable[..., Any]) -> None:
     """Holding the first live state (5) is 19.5 from −5 to −24; 10.5 from −5 and −6."""
     words = ("--policy", "noop", "--offline", "--conditions", "no-history", "--workers", "1")

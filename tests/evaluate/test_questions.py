@@ -98,6 +98,7 @@ def test_guesses_are_right_by_chance() -> None:
 # --- which frames a model gets -----------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "kept"),
     [
@@ -138,6 +139,7 @@ def test_more_frames_than_the_model_takes_are_an_error(tmp_path: Path) -> None:
             assert ask(tmp_path / changes["memory"], **ONE, **options).counts["error"] == 0
 
 
+@pytest.mark.slow
 def test_a_model_that_looks_is_right_where_evidence_was_kept(tmp_path: Path) -> None:
     with ChatServer(look) as server:
         settings = behind(server, conditions=("no-history", "k0", "k1"), memory="framesamp:4")
@@ -151,6 +153,7 @@ def test_a_model_that_looks_is_right_where_evidence_was_kept(tmp_path: Path) -> 
     assert {row.success for row in rows if row.condition == "no-history"} == {False}
 
 
+@pytest.mark.slow
 def test_controls_hide_the_past_or_all_images(tmp_path: Path) -> None:
     with ChatServer(look) as server:
         rows = ask(
@@ -274,6 +277,7 @@ def test_a_name_of_the_table_needs_its_model(
         ask(tmp_path / "run", families=("Nothing",), **given)
 
 
+@pytest.mark.slow
 def test_the_command_prints_results_and_how_to_resume(
     tmp_path: Path, run: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -225,6 +225,7 @@ def test_a_run_with_a_faulty_endpoint_loses_no_row(tmp_path: Path) -> None:
     assert len([*(tmp_path / "subgoals").iterdir()]) == 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("executor", [Serial(), Processes(1)], ids=["serial", "processes"])
 def test_an_error_row_has_the_steps_and_calls_before_it(tmp_path: Path, executor: Executor) -> None:
     options = ("repeats=0", "frames=4")

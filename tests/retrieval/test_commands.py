@@ -75,6 +75,7 @@ def test_only_what_is_asked_for(run: Run, indexed: Path) -> None:
     assert code == 1 and "condition 'k2' is not in" in err
 
 
+@pytest.mark.slow
 def test_rules_side_by_side(run: Run, tmp_path: Path, indexed: Path) -> None:
     options = ("--rules", "oracle,last,max/-1", "--out", tmp_path)
     code, out, err = run("retrieval-score", indexed, *options)

@@ -29,6 +29,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_views_are_frames_in_the_order_of_shifts(seen: Path) -> None:
     views, buffer_set = dataset(seen, SHIFTED), load_buffer_set(seen)
     assert (views.kind, len(views), views.identity.counts.frames) == ("shifted", 3, 27)
@@ -76,6 +77,7 @@ def test_views_of_other_scenes_are_an_error(
         add_shifted(own_buffers, *families, kind=kind)
 
 
+@pytest.mark.slow
 def test_retrieve_shows_what_the_robot_sees_under_a_shift(
     run: Run, seen: Path, tmp_path: Path
 ) -> None:

@@ -80,6 +80,7 @@ def test_retrieval_steps_of_one_system_differ_in_color_and_marker() -> None:
 WHOLE = [row for row in made.rows() if row.system == BASE]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rows", "paper", "expected"),
     [
@@ -184,6 +185,7 @@ def test_two_systems_have_no_matrix(tmp_path: Path, figure: Any) -> None:
     assert not draw_figure("matrix", figure, data(tmp_path, cells(given)))
 
 
+@pytest.mark.slow
 def test_figures_are_as_wide_as_each_other_and_hold_their_notes(tmp_path: Path) -> None:
     """A page scales all figures to one width: then letters of one size look alike."""
     found = Data(made.kinds(tmp_path), "tabletop")
@@ -201,6 +203,7 @@ def test_figures_are_as_wide_as_each_other_and_hold_their_notes(tmp_path: Path) 
     assert drawn > 6
 
 
+@pytest.mark.slow
 def test_conditions_beyond_the_papers_come_first(tmp_path: Path) -> None:
     found = made.kinds(tmp_path)
     names = [name.partition("-")[0] for name in draw_figures(found, tmp_path / "figures")]

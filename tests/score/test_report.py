@@ -164,6 +164,7 @@ def test_the_report_works_in_a_browser(report: Path, small: Score) -> None:
         assert page.complaints() == []
 
 
+@pytest.mark.slow
 def test_the_report_can_be_used_by_keyboard_and_read_aloud_and_printed(report: Path) -> None:
     with open_page() as page:
         page.open(report)

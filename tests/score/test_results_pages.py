@@ -360,6 +360,7 @@ def test_rates_by_condition(trained: Outcomes, first: str) -> None:
             assert rate == percent(trained, system, condition), (system, condition)
 
 
+@pytest.mark.slow
 def test_rates_by_training_seed(trained: Outcomes) -> None:
     for line in table(TRAINING, "by seed"):
         system, seed = line.pop("by seed").split()

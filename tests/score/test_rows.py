@@ -360,6 +360,7 @@ def test_files_that_cannot_be_read(tmp_path: Path, capfd: pytest.CaptureFixture[
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [1, 3, 40_000])
 @pytest.mark.parametrize("damage", [(b"{", b"{x"), (b'"MoveCube"', b"[]")])
 def test_a_damaged_line_of_a_record_is_numbered_as_in_an_editor(

@@ -115,6 +115,7 @@ def test_played_as_computed(blind: TabletopSimulator, family: str, index: int) -
         assert status is expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "family", ["VideoUnmask", *(pytest.param(one, marks=pytest.mark.slow) for one in FAMILIES)]
 )
@@ -133,6 +134,7 @@ def test_a_given_answer_is_carried_out(blind: TabletopSimulator, family: str) ->
     assert ends["answer", 1][1] is Status.FAIL
 
 
+@pytest.mark.slow
 def test_only_answers_of_the_scene_are_carried_out(blind: TabletopSimulator) -> None:
     blind.reset("MoveCube/test/0", demonstration=False)
     for number in (None, -1, len(blind.env.episode.answers)):
@@ -140,6 +142,7 @@ def test_only_answers_of_the_scene_are_carried_out(blind: TabletopSimulator) -> 
             blind.act("answer", answer=number)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", [0, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("family", families("VideoUnmaskSwap", "RouteStick"))
 def test_every_part_is_shown_in_the_lesson(
@@ -154,6 +157,7 @@ def test_every_part_is_shown_in_the_lesson(
         assert one.part < other.part and one.start <= other.start
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", [0, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("family", families("VideoRepick"))
 def test_a_lesson_reveals_its_answer_in_its_evidence_only(

@@ -25,6 +25,7 @@ BEFORE = 0.03
 """Distance in m from which a peg approaches the box."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", families("VideoUnmaskSwap", "InsertPeg"))
 def test_the_right_option_alone_is_marked_where_it_is(
     blind: TabletopSimulator, family: str

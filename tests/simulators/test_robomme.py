@@ -99,6 +99,7 @@ def test_it_provides_robommes_subgoals(simulator: RoboMMESimulator) -> None:
         simulator.subgoal()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cameras", "subgoals", "drawn"),
     [
@@ -175,6 +176,7 @@ def test_the_front_camera_is_drawn_until_a_subgoal_is_located(robomme_python: Pa
     assert [one for ((one, _),) in points] == [0, 0, 2, 2]
 
 
+@pytest.mark.slow
 def test_a_process_plays_few_episodes_and_none_depends_on_it(simulator: RoboMMESimulator) -> None:
     # A second reset of one of the stand-in's environments would shift all frames.
     episodes = [f"MoveCube/test/{index}" for index in range(EPISODES + 1)]
@@ -207,6 +209,7 @@ def test_unknown_robomme_names(simulator: RoboMMESimulator) -> None:
 # --- other ManiSkill versions ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_what_differs_from_the_fork_is_patched(
     robomme_python: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -35,6 +35,7 @@ DIES, HANGS, RAISES, BREAKS = 40, 41, 42, 43
 # --- failures ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_death_shows_the_end_of_its_log_without_escapes(simulator: RoboMMESimulator) -> None:
     with raises(SimulatorCrashError) as caught:
         simulator.reset(f"MoveCube/test/{DIES}")
@@ -45,6 +46,7 @@ def test_a_death_shows_the_end_of_its_log_without_escapes(simulator: RoboMMESimu
     assert len(simulator.reset("MoveCube/test/0")[0]) == 2
 
 
+@pytest.mark.slow
 def test_a_process_that_was_killed(simulator: RoboMMESimulator) -> None:
     simulator.reset("MoveCube/test/3")
     for call in (lambda: simulator.step(HOLD), lambda: simulator.reset("MoveCube/test/3")):
@@ -150,6 +152,7 @@ def test_unusable_interpreter(
     refused(sys.executable, MissingExtraError, f"numpy is {np.__version__}; RoboMME needs numpy")
 
 
+@pytest.mark.slow
 def test_unsupported_maniskill_is_an_error(
     robomme_python: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -69,6 +69,7 @@ def test_seeds_and_difficulties_are_fixed() -> None:
         assert difficulty_of(seed) == difficulty
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", FAMILIES)
 def test_each_answer_occurs_equally_often_to_within_one(family: str) -> None:
     for split, difficulty in product(SPLITS, DIFFICULTIES):
@@ -86,6 +87,7 @@ def test_answers_are_these() -> None:
     assert all(sorted(turns[block : block + 3]) == [0, 1, 2] for block in range(0, 12, 3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [3, 12])
 def test_guess_is_independent_of_the_answer(count: int) -> None:
     """Of 1,800 guesses 1,800 / count are right, give or take four standard deviations."""
@@ -186,6 +188,7 @@ def test_nothing_that_moves_comes_within_5_mm_of_anything_else(family: str) -> N
                 now[number] = way[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", FAMILIES)
 def test_everything_on_the_table_is_in_view_and_large_enough(family: str) -> None:
     """Every thing where it lies, and where it moves during swaps."""

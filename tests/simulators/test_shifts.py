@@ -41,6 +41,7 @@ def apart(one: Observation, other: Observation, camera: str) -> float:
     return float(np.abs(first - second).mean())
 
 
+@pytest.mark.slow
 def test_each_shift_is_seen_and_the_stronger_the_more(shifted: TabletopSimulator) -> None:
     plain = begin(shifted, EPISODE, None)
     views = dict(zip(SHIFTS, shifted.views(SHIFTS), strict=True))
@@ -76,6 +77,7 @@ def test_a_shift_comes_after_the_demonstration_and_is_the_episodes_own(
     assert apart(begin(shifted, EPISODE, None), plain[1], "front") == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kinds", [("clutter",), pytest.param(("light", "camera"), marks=pytest.mark.slow)]
 )

@@ -154,6 +154,7 @@ def test_pictures_are_lit_by_the_scenes_own_lights(scene: TabletopEnv) -> None:
 # --- fairness -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", [0, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("family", families("VideoRepick", "VideoUnmask", "PatternLock"))
 def test_an_answer_solves_its_scene_and_no_other_which_looks_the_same(
@@ -255,6 +256,7 @@ def test_motion_out_of_reach_is_an_error(scene: TabletopEnv) -> None:
         list(scene.arm.move((-0.3, 0.28, 0.02), -math.pi / 2))
 
 
+@pytest.mark.slow
 def test_invalid_input(blind: TabletopSimulator) -> None:
     blind.reset("PatternLock/test/0")
     with raises(UnknownNameError):

@@ -98,6 +98,7 @@ def test_help_shows_options_in_groups_and_examples(run: Run) -> None:
     assert [word for word in sorted(order, key=out.index)] == list(order)
 
 
+@pytest.mark.slow
 def test_examples_are_not_wrapped_in_80_columns(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """They are copied."""
     monkeypatch.setenv("COLUMNS", "80")
@@ -299,6 +300,7 @@ def test_list_as_json_is_one_value(
     assert all(row in json.loads(json.dumps(known)) for row in rows)
 
 
+@pytest.mark.slow
 def test_folder_names_that_are_not_utf8(own_buffers: Path) -> None:
     renamed = os.fsencode(own_buffers.parent) + b"/\xff\xfe"
     os.rename(own_buffers, renamed)  # noqa: PTH104
@@ -401,6 +403,7 @@ def test_output_folder_that_cannot_be_created(run: Run, tmp_path: Path) -> None:
     assert "Traceback" not in err
 
 
+@pytest.mark.slow
 def test_closed_stdout(tiny_buffers: Path) -> None:
     """As with `robomme-interference list … | head`."""
     with subprocess.Popen(
@@ -425,6 +428,7 @@ def examples() -> list[str]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", examples())
 def test_examples_parse(line: str) -> None:
     from support.command_lines import parse

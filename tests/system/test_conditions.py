@@ -44,6 +44,7 @@ def _logged_in(login: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> N
     plain_cards(monkeypatch)
 
 
+@pytest.mark.slow
 def test_buffers_of_other_conditions(own_buffers: Path, finish: Callable[..., None]) -> None:
     names = "k1,before-k1,held-k1,same-k1,parts-k1,absent-k1"
     finish("build", own_buffers, "--only", "manifests", "--conditions", names)

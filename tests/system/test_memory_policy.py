@@ -141,6 +141,7 @@ def test_an_interrupted_run_ends_like_another(
     assert (parts / "log.csv").is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trunk, memory", [("transformer", "framesamp:8"), ("gru", "full")])
 def test_the_trained_policy_in_rollouts(
     trunk: str,
@@ -241,6 +242,7 @@ def test_what_a_run_must_not_do(program: Any, tmp_path: Path) -> None:
         program("answer", tmp_path, TABLETOP, "--system", "x", "--out", rows)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("places", [1, 3])
 def test_questions_with_other_points(places: int, program: Any, tmp_path: Path) -> None:
     """Padding of another buffer set changes no score; points beyond the model's are cut."""

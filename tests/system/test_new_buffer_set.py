@@ -150,6 +150,7 @@ def test_published_demonstrations_without_an_index(
     assert code == 0 and "cannot check" in err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "words"),
     [

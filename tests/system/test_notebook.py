@@ -21,6 +21,7 @@ def shell() -> InteractiveShell:
     return shell
 
 
+@pytest.mark.slow
 def test_the_example_runs(shell: InteractiveShell, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("BUFFER_SET", str(GOLDEN))
     shown = []

@@ -72,6 +72,7 @@ def test_every_task_once_in_other_processes(run: Run) -> None:
     assert run([]) == []
 
 
+@pytest.mark.slow
 def test_failing_tasks_do_not_stop_others(tmp_path: Path, run: Run) -> None:
     """Two workers meet every kind of trouble; what raised is final, what died is tried again."""
     tasks = [

@@ -69,6 +69,7 @@ def test_siglip_is_transformers_own_pipeline(model: str) -> None:
     assert encoder.fingerprint["transformers"] == transformers.__version__
 
 
+@pytest.mark.slow
 def test_siglip_makes_an_index(own_buffers: Path, model: str) -> None:
     encoder = make_encoder(model, device="cpu")
     make_index(own_buffers, encoder)

@@ -181,6 +181,7 @@ def test_servers_that_go_away_cost_no_rollout(tmp_path: Path, monkeypatch: Any) 
         assert runs.run(tmp_path / "two", Processes(2), **served).counts["fail"] == ROLLOUTS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "sent", [pytest.param(signal.SIGKILL, marks=pytest.mark.slow), signal.SIGINT]
 )

@@ -96,6 +96,7 @@ def test_memory_is_of_the_buffer_and_the_execution(
     assert item["task"] == buffer.goal and item["condition"] == condition
 
 
+@pytest.mark.slow
 def test_the_evidence_of_each_memory_frame(make: Make, buffers: Path) -> None:
     item = make(["k3"], memory="full")[0]
     buffer = load_buffer(QUERIES[0], "k3", buffer_set=buffers)
@@ -204,6 +205,7 @@ def test_a_batch_of_questions_and_shifts(make: Make, tmp_path: Path) -> None:
 # --- draws -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_items_are_a_function_of_seed_epoch_and_index(make: Make) -> None:
     def drawn(data: HistoryDataset, workers: int = 0) -> list[str]:
         loader = torch.utils.data.DataLoader(data, 64, num_workers=workers)
@@ -307,6 +309,7 @@ def test_a_buffer_set_without_executions(tiny_buffers: Path, tmp_path: Path) -> 
     assert HistoryDataset(tiny_buffers, ["k0"], chunk=0, store=tmp_path, quiet=True)[0]
 
 
+@pytest.mark.slow
 def test_manifests_planned_before_the_executions(executed_buffers: Path, tmp_path: Path) -> None:
     root = copy_buffer_set(tmp_path / "buffers", executed_buffers)
     shutil.copytree(GOLDEN / MANIFESTS, root / MANIFESTS, dirs_exist_ok=True)
