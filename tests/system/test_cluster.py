@@ -17,7 +17,6 @@ from support import runs, worlds
 from support.buffer_sets import GOLDEN, contents
 from support.lazy import lazy
 from support.made_up import MadeUpSource
-from support.messages import raises
 from support.serve_policy import command
 from support.shared_policies import FAULT
 from support.worker_calls import Marked, behave, wait_until_gone
@@ -159,7 +158,7 @@ def test_a_policy_is_shared_on_a_cluster_and_started_again(cluster: Any, tmp_pat
 def test_a_node_that_differs_is_one_error_that_says_how(cluster: Any) -> None:
     node = ray_cluster.add_node(cluster, cpus=2, MARK="other")
     try:
-        with raises(WorkerError):
+        with pytest.raises(WorkerError) as raised:
             list(
                 ray_workers.RayWorkers(1, cluster.address, ray_workers.Resources(cpus=2)).run(
                     Marked(), [7]
@@ -167,6 +166,7 @@ def test_a_node_that_differs_is_one_error_that_says_how(cluster: Any) -> None:
             )
     finally:
         cluster.remove_node(node, allow_graceful=False)
+    assert "mark is other there, none here" in raised.value.message
 
 
 def connect(address: str, **environment: str) -> str:

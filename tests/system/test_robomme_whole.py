@@ -4,7 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from support.messages import raises
 
 from robomme_interference_data.build_dataset.config import BuildConfig
 from robomme_interference_data.build_dataset.dataset.build import build_dataset
@@ -44,8 +43,9 @@ def test_an_evaluation_on_it(tmp_path: Path, robomme_python: Path) -> None:
     assert build(DEMONSTRATIONS, replace(queries, cameras=("front",))) == 3
     assert build(DEMONSTRATIONS, replace(queries, cameras=("front",))) == 0
     # The stand-in hides the answers of this family, so its oracle cannot complete an episode.
-    with raises(BuildError):
+    with pytest.raises(BuildError) as raised:
         build(DISTRACTORS, replace(queries, buffer_set=tmp_path / "units"))
+    assert "hides its answers" in raised.value.message
     units = BuildConfig(
         source=("sample:VideoRepick",), buffer_set=tmp_path, split="train", cameras=("front",)
     )
