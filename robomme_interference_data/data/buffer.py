@@ -316,13 +316,10 @@ class Buffer:
     def verify(self) -> None:
         """Check the manifest, decode everything, and compare it with the recorded SHA-256.
 
-        Later reads from a cache are compared as well.
-
         Raises:
             HashMismatchError: The manifest is not the one that the rules give, a dataset does not
                 have its revision, or frames or states differ from the recorded ones.
         """
-        self._reader.verified = True
         query, manifest = self.query, self.manifest
         sources = [self._datasets[entry.dataset] for entry in manifest.sessions]
         for dataset in dict.fromkeys([query.dataset, *sources]):
