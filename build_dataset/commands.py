@@ -115,7 +115,7 @@ def _confirm(change: "NextBuffers", *, yes: bool) -> None:
 
 
 def _build_dataset(plan: "DatasetPlan", out: Path, workers: WorkersConfig) -> dict[str, Any]:
-    from robomme_interference_data.runtime.progress import WorkProgress
+    from robomme_interference_data.progress import WorkProgress
 
     from .dataset.build import build_dataset
 
@@ -145,7 +145,7 @@ def _plan_buffers(
     root: Path, files: "Mapping[str, Files]", change: "NextBuffers"
 ) -> dict[str, Any]:
     from robomme_interference_data.data.loading import load_buffer_set
-    from robomme_interference_data.runtime.progress import WorkProgress
+    from robomme_interference_data.progress import WorkProgress
 
     from .manifests import plan_manifests, write_manifests
 
@@ -168,7 +168,7 @@ def _plan_buffers(
 
 def _make_questions(root: Path) -> dict[str, Any]:
     from robomme_interference_data.data.loading import load_buffer_set
-    from robomme_interference_data.runtime.progress import WorkProgress
+    from robomme_interference_data.progress import WorkProgress
 
     from .plan.planned import check_is_own
     from .questions import make_questions, write_questions

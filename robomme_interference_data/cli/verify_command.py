@@ -45,7 +45,7 @@ def verify(
         verify_buffer_set,
     )
     from robomme_interference_data.data.loading import load_buffer_set
-    from robomme_interference_data.runtime.progress import WorkProgress
+    from robomme_interference_data.progress import WorkProgress
 
     opened, progress = load_buffer_set(buffer_set), WorkProgress()
     checks = verify_buffer_set(opened, decode=decode, progress=progress)

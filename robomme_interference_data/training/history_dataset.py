@@ -19,8 +19,8 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
 )
 from robomme_interference_data.ids import EpisodeId, parse_numbers, whole_number
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.retrieval.stored_selector import StoredSelector
-from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.manifest import ManifestHeader
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.schema.shifts import NO_SHIFT, Shift, parse_shift
@@ -183,19 +183,17 @@ class HistoryDataset:
         draws = (seed, units) if redraw else None
         self._histories = Histories(self.buffer_set, self._rows, step, draws)
         self._questions = QuestionTensors(self.buffer_set, self.episode_ids) if questions else None
-        with WorkProgress(unit="episodes", quiet=quiet) as progress:
-            # Sessions that are drawn anew are opened when they are drawn: not all of them may be.
-            now = self._live_rows()
-            used = now
-            if not redraw:
-                with progress.status("Laying out histories"):
-                    self._histories.plan(
-                        self._conditions.names, self.episode_ids, self._shift_of.values()
-                    )
-                used = np.concatenate([now, self._histories.rows])
-            self._rows.prepare((*self.cameras, STATE), used, progress)
-            if actions:
-                self._rows.prepare((ACTION,), now, progress)
+        # Sessions that are drawn anew are opened when they are drawn: not all of them may be.
+        now = used = self._live_rows()
+        if not redraw:
+            with WorkProgress(quiet=quiet) as progress, progress.status("Laying out histories"):
+                self._histories.plan(
+                    self._conditions.names, self.episode_ids, self._shift_of.values()
+                )
+            used = np.concatenate([now, self._histories.rows])
+        self._rows.prepare((*self.cameras, STATE), used, quiet=quiet)
+        if actions:
+            self._rows.prepare((ACTION,), now, quiet=quiet)
         self._size = self.memory_frames
         import torch
 

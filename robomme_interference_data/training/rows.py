@@ -18,7 +18,7 @@ from robomme_interference_data.constants import CAMERA_PREFIX
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.frame_reader import cached_session
 from robomme_interference_data.errors import HashMismatchError, InvalidOptionError
-from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.storage.arrays import FeatureDigests
 from robomme_interference_data.storage.cache import DecodedCache
 
@@ -69,10 +69,8 @@ class StoredRows:
         """Return the row of an episode's first frame."""
         return self._first[dataset][episode]
 
-    def prepare(
-        self, features: Iterable[str], rows: NDArray[np.int64], progress: WorkProgress
-    ) -> None:
-        """Open features of the sessions of some rows, on several threads.
+    def prepare(self, features: Iterable[str], rows: NDArray[np.int64], *, quiet: bool) -> None:
+        """Open features of the sessions of some rows, on several threads, with a progress bar.
 
         Raises:
             InvalidOptionError: They do not fit into the cache.
@@ -88,7 +86,10 @@ class StoredRows:
         for name, dataset in self._datasets.items():
             files = (dataset.files_of(episode, cameras) for episode in episodes.get(name, ()))
             dataset.files.fetch(path for paths in files for path in paths)
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
+        with (
+            WorkProgress(unit="sessions", quiet=quiet) as progress,
+            ThreadPoolExecutor(os.cpu_count()) as pool,
+        ):
             try:
                 for feature in features:
                     progress.start(feature.rpartition(".")[2], len(used))

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from support.buffer_sets import copy_buffer_set, dataset, stored_frames, stored_states
 from support.messages import raises
-from support.retrieval import QUIET
 
 from robomme_interference_data import DecodedCache
 from robomme_interference_data.errors import HashMismatchError, InvalidOptionError
-from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.training import resize
 from robomme_interference_data.training.rows import PADDING, StoredRows
 
@@ -66,13 +64,13 @@ def test_only_what_is_used_is_stored_and_not_decoded_again(
 ) -> None:
     cache, used = tmp_path / "cache", np.array([5, 40, 41])  # of units 0 and 1
     stored = rows_of(own_buffers, "distractors", DecodedCache(cache))
-    stored.prepare([FRONT, STATE], used, QUIET)
+    stored.prepare([FRONT, STATE], used, quiet=True)
     expected = stored.take(FRONT, used)
     assert [path.stat().st_size for path in cache.iterdir()] == [UNIT_BYTES + 32] * 2
     for video in own_buffers.glob("distractors/videos/*/*/*.mp4"):
         video.unlink()
     again = rows_of(own_buffers, "distractors", DecodedCache(cache))
-    again.prepare([FRONT, STATE], used, QUIET)
+    again.prepare([FRONT, STATE], used, quiet=True)
     np.testing.assert_array_equal(again.take(FRONT, used), expected)
 
 
@@ -84,8 +82,7 @@ def test_a_bar_fits_into_a_line(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     stored = rows_of(tiny_buffers, "demonstrations", DecodedCache(tmp_path))
-    with WorkProgress(unit="sessions") as progress:
-        stored.prepare([FRONT], np.array([0]), progress)
+    stored.prepare([FRONT], np.array([0]), quiet=False)
     [line] = filter(str.strip, capsys.readouterr().err.splitlines())
     assert line.startswith("front ")
 
@@ -97,15 +94,15 @@ def test_damaged_frames_are_not_stored(tmp_path: Path) -> None:
     one.write_bytes(other.read_bytes())
     stored = rows_of(root, "distractors", DecodedCache(tmp_path / "cache"))
     with raises(HashMismatchError):
-        stored.prepare([FRONT], np.array([0]), QUIET)
+        stored.prepare([FRONT], np.array([0]), quiet=True)
     assert not [*(tmp_path / "cache").iterdir()]
 
 
 def test_a_cache_that_is_too_small(tiny_buffers: Path, tmp_path: Path) -> None:
     used = np.array([5, 40])
     fits = DecodedCache(tmp_path, max_bytes=2 * UNIT_BYTES + 64)
-    rows_of(tiny_buffers, "distractors", fits).prepare([FRONT], used, QUIET)
+    rows_of(tiny_buffers, "distractors", fits).prepare([FRONT], used, quiet=True)
     small = DecodedCache(tmp_path / "none", max_bytes=2 * UNIT_BYTES - 1)
     with raises(InvalidOptionError) as raised:
-        rows_of(tiny_buffers, "distractors", small).prepare([FRONT], used, QUIET)
+        rows_of(tiny_buffers, "distractors", small).prepare([FRONT], used, quiet=True)
     assert raised.value.option == "cache" and not small.folder.exists()
