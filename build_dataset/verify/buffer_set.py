@@ -27,9 +27,9 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.fetched_copy import FetchedCopy
-from robomme_interference_data.data.manifest_table import pending_rows
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.questions import Question, read_questions
+from robomme_interference_data.data.set_files import pending_rows
 from robomme_interference_data.errors import FormatError, InterferenceError
 from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.schema.codec import arrow_schema, to_dict
