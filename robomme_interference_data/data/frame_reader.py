@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import KEY_FRAMES
 from robomme_interference_data.errors import FormatError, HashMismatchError, InterferenceError
 from robomme_interference_data.schema.manifest import Session, SessionEntry
+from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.arrays import FeatureDigests
 from robomme_interference_data.storage.files import digest_json
 
@@ -162,15 +163,26 @@ def cached_session(
             digests.update(feature, frame)
             yield frame if convert is None else convert(frame)
         # Nothing is stored under a digest that an untrusted dataset only claims.
-        if digests.current()[feature] != recorded:
-            raise HashMismatchError.damaged(
-                f"{dataset.files.describe()}: {feature} of {record.episode_id} does not have the "
-                "recorded SHA-256"
-            )
+        check_session(dataset, record, feature, digests)
 
     whole = (stop - start, *(shape or dataset.shape(camera)))
     layout = "HWC" if convert is None else "CHW"
     return cache.frames(digest_json([recorded, layout, whole]), whole, decode)
+
+
+def check_session(
+    dataset: Dataset, record: EpisodeRecord, feature: str, digests: FeatureDigests
+) -> None:
+    """Compare the digest of a feature of an episode's session with the recorded one.
+
+    Raises:
+        HashMismatchError: They differ.
+    """
+    if digests.current()[feature] != record.feature_sha256.get(feature):
+        raise HashMismatchError.damaged(
+            f"{dataset.files.describe()}: {feature} of {record.episode_id} does not have the "
+            "recorded SHA-256"
+        )
 
 
 def _warn_once(folder: Path, error: OSError) -> None:

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import CAMERA_PREFIX
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.data.frame_reader import cached_session
-from robomme_interference_data.errors import HashMismatchError, InvalidOptionError
+from robomme_interference_data.data.frame_reader import cached_session, check_session
+from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.storage.arrays import FeatureDigests
 from robomme_interference_data.storage.cache import DecodedCache
@@ -151,11 +151,7 @@ class StoredRows:
         record = dataset.record(span.episode)
         values = dataset.read_vectors(span.episode, feature, 0, record.length)
         digests.update(feature, values[slice(*record.session)])
-        if digests.current()[feature] != record.feature_sha256.get(feature):
-            raise HashMismatchError.damaged(
-                f"{dataset.files.describe()}: {feature} of {record.episode_id} does not have the "
-                "recorded SHA-256"
-            )
+        check_session(dataset, record, feature, digests)
         return values[span.start : span.stop]
 
     def _converted(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -13,6 +13,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from support.buffer_sets import GOLDEN, QUERIES, copy_buffer_set, plan_again
+from support.hub import BUFFER_SET, push_buffer_set
+from support.hub_server import HubServer
 from support.messages import raises
 from support.retrieval import make_index
 from support.shifted import add_shifted
@@ -315,6 +317,15 @@ def test_only_the_sessions_in_use_are_stored(make: Make, tmp_path: Path) -> None
         make([condition], families=["MoveCube"], cache=cache)
         sizes = sorted(path.stat().st_size for path in cache.iterdir())
         assert sizes == [count * 3 * 16 * 16 + 32 for count in frames]
+
+
+def test_only_the_videos_in_use_are_downloaded(hub: HubServer, tmp_path: Path) -> None:
+    push_buffer_set(hub, GOLDEN, tmp_path / "work")
+    options: dict[str, Any] = {"chunk": 0, "cache": tmp_path / "cache", "quiet": True}
+    data = HistoryDataset(BUFFER_SET, ["k1"], families=["MoveCube"], **options)
+    assert len(data) == 1
+    videos = [path for path in hub.downloads() if path.startswith("videos/")]
+    assert len(videos) == 2 and not any("wrist" in path for path in videos)
 
 
 # --- what it refuses ---------------------------------------------------------------------------
