@@ -29,7 +29,7 @@ def default_system(config: RunConfig) -> str:
         raise InvalidOptionError(
             f"the rows of {unidentified} need a name: its text does not identify it",
             f"Set {named('system')}, such as perceptual-framesamp-modul, or a name of your own: "
-            "see docs/how-to/paper-systems.md.",
+            "see docs/how-to/official-simulator.md.",
         )
     memory = policy_memory(config.policy)
     parts = [spec.target if memory is None else Memory.parse(memory).label]
@@ -60,7 +60,8 @@ def check_name(config: RunConfig, system: System) -> None:
     fault = _fault_of_name(config, system)
     if fault is not None:
         raise InvalidOptionError(
-            fault, f"Set {named('system')} to a name of your own: see docs/how-to/paper-systems.md."
+            fault,
+            f"Set {named('system')} to a name of your own: see docs/how-to/official-simulator.md.",
         )
 
 
