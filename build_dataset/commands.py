@@ -13,12 +13,7 @@ from robomme_interference_data.cli.console import (
     print_status,
 )
 from robomme_interference_data.cli.options import AsJson, Yes, with_settings
-from robomme_interference_data.constants import (
-    DEMONSTRATIONS,
-    MANIFEST_PATH,
-    MANIFESTS,
-    REPORT_PATH,
-)
+from robomme_interference_data.constants import DEMONSTRATIONS, MANIFESTS, REPORT_PATH
 from robomme_interference_data.errors import MissingFileError, counted
 from robomme_interference_data.runtime.executor import WorkersConfig, make_executor
 
@@ -69,6 +64,7 @@ def build(
     ```
     """
     from robomme_interference_data.data.dataset import Dataset
+    from robomme_interference_data.data.loading import next_build
     from robomme_interference_data.storage.files import LocalFiles
 
     from .plan.parts import plan_build
@@ -102,8 +98,8 @@ def build(
         raise typer.Exit(1)
     if plan.manifests:
         print_status(f"Next: robomme-interference verify {root} --audit")
-    elif plan.datasets and (root / MANIFEST_PATH).is_file():  # the buffers are of the old datasets
-        print_status(f"Next: robomme-interference build {root} --only manifests")
+    elif plan.datasets:  # the buffers, if there are any, are of the old datasets
+        print_status(f"Next: robomme-interference {next_build(root)}")
 
 
 def _confirm(change: "NextBuffers", *, yes: bool) -> None:

@@ -2,6 +2,7 @@
 
 import math
 import re
+import shlex
 from collections.abc import Container, Sequence
 
 from robomme_interference_data.build_dataset.config import NO_CAMERAS, BuildConfig, parse_unit
@@ -33,7 +34,8 @@ def plan_dataset(
     _check_values(config)
     unit = parse_unit(config.unit)
     split = config.split
-    if split is None and kind in UNITS:
+    if kind in UNITS:
+        _check_split_of_units(config)
         split = "train"
     sources = _open_sources(kind, config, unit)
     episodes = choose_episodes(
@@ -63,6 +65,26 @@ def plan_dataset(
         time_limit_s=config.time_limit_s,
         unit=unit,
         fps=config.fps,
+    )
+
+
+def _check_split_of_units(config: BuildConfig) -> None:
+    """Check that units are of train episodes: no query's scene may be in another buffer."""
+    if config.split in (None, "train"):
+        return
+    command = ["build", str(config.buffer_set)]
+    if config.only is not None:
+        command += ["--only", config.only]
+    if config.demonstrations is not None:
+        command += ["--demonstrations", config.demonstrations]
+    for source in config.source:
+        command += ["--source", source]
+    raise InvalidOptionError(
+        f"{named('split', config.split)}: distractor units must come from train episodes, so that "
+        "no query's scene leaks into another buffer",
+        f"Leave out {named('split')}.",
+        shlex.join(command),
+        "split",
     )
 
 
