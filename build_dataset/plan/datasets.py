@@ -12,6 +12,7 @@ from robomme_interference_data.build_dataset.sources import Source, open_source,
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
     EXECUTIONS,
+    FAMILIES_PATH,
     LESSONS,
     SHIFTED,
     UNITS,
@@ -107,13 +108,14 @@ def _check_values(config: BuildConfig) -> None:
 
 
 def _open_sources(kind: str, config: BuildConfig, unit: Unit) -> tuple[Source, ...]:
-    columns = _columns(config.columns)
+    columns, kept = _columns(config.columns), config.buffer_set / FAMILIES_PATH
     return tuple(
         open_source(
             text,
             shifted=kind == SHIFTED,
             columns=columns,
             families_file=config.families_file,
+            kept_families=kept if kept.is_file() else None,
             robomme_python=config.robomme_python,
             # A simulator draws only the frames that a unit stores.
             every=unit.in_dataset(kind).stride if kind in UNITS else 1,
