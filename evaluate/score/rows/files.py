@@ -151,7 +151,14 @@ def _read_parquet(path: Path, names: Sequence[str], has_system: bool) -> FileCol
 
 def _read_csv(path: Path, names: Sequence[str], has_system: bool) -> FileColumns:
     text = read_bytes(path, MAX_ROW_BYTES).removeprefix(codecs.BOM_UTF8).decode()
-    csv.field_size_limit(len(text) + 1)
+    before = csv.field_size_limit(len(text) + 1)  # of the whole process
+    try:
+        return _parse_csv(path, text, names, has_system)
+    finally:
+        csv.field_size_limit(before)
+
+
+def _parse_csv(path: Path, text: str, names: Sequence[str], has_system: bool) -> FileColumns:
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows: dict[int, list[str]] = {}
     malformed: dict[int, str] = {}
