@@ -91,12 +91,9 @@ def read_families(path: Path, tasks: Sequence[Sequence[str]]) -> list[dict[str, 
         header, rows = _read_rows(path, len(tasks))
     except (OSError, ValueError, csv.Error) as error:
         raise SourceError(f"families file {path}: {error}", _FORM) from None
+    wanted: dict[int, list[Any]] = {episode: [episode] for episode in range(len(tasks))}
     if header[0] == "task":
-        wanted = {
-            episode: [_one_line(text) for text in texts] for episode, texts in enumerate(tasks)
-        }
-    else:
-        wanted = {episode: [episode] for episode in range(len(tasks))}
+        wanted = {episode: [*map(_one_line, texts)] for episode, texts in enumerate(tasks)}
     names = dict.fromkeys(name for keys in wanted.values() for name in keys)
     if missing := [name for name in names if name not in rows]:
         what = "tasks" if header[0] == "task" else "episodes"
