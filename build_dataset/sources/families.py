@@ -89,7 +89,9 @@ def read_families(path: Path, tasks: Sequence[Sequence[str]]) -> list[dict[str, 
     """
     try:
         header, rows = _read_rows(path, len(tasks))
-    except (OSError, ValueError, csv.Error) as error:
+    except OSError as error:
+        raise SourceError(f"families file {path}: {error.strerror}", _FORM) from None
+    except (ValueError, csv.Error) as error:
         raise SourceError(f"families file {path}: {error}", _FORM) from None
     wanted: dict[int, list[Any]] = {episode: [episode] for episode in range(len(tasks))}
     if header[0] == "task":

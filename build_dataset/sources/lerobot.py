@@ -213,8 +213,8 @@ class LeRobotSource(Source):
             return blocks, OFFICIAL
         raise SourceError(
             f"the families of the {len(rows)} episodes of {self._where} are unknown: it has no "
-            "per-episode column episode_id or family, and is not one of RoboMME's with "
-            f"{len(blocks)} of {len(BLOCKS)} families",
+            "per-episode column episode_id or family, and is not RoboMME's with "
+            f"{len(blocks):,} episodes of {len(BLOCKS)} families",
             f"Write a CSV file and give it with {named('families_file')}. Its lines, with the "
             f"names of families:\n{template(self._tasks)}",
         )

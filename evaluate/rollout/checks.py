@@ -101,14 +101,18 @@ def _policies_for_any_robot(config: RunConfig) -> str:
     """Return the advice to set a policy that needs neither this robot nor its cameras."""
     if config.offline:
         return "Set hold, mean or a policy for this robot, python:module:factory."
-    return "Set a policy for this robot, such as python:module:factory."
+    return (
+        "Set a policy for this robot, such as python:module:factory; to act along the recordings "
+        f"of this buffer set, without a simulator, also {named('offline')}."
+    )
 
 
 def _baseline(config: RunConfig) -> str | None:
     """Return the command that evaluates a policy for any robot, if one can act here."""
     if not config.offline:
         return None
-    return shlex.join(["evaluate", config.buffer_set, "--offline", "--policy", "hold"])
+    command = ["evaluate", config.buffer_set, "--offline", "--policy", "hold"]
+    return shlex.join([*command, "--out", str(config.out)])
 
 
 def _check_robot(config: RunConfig, buffer_set: BufferSet, kind: PolicyKind) -> None:
