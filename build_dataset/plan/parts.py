@@ -170,7 +170,7 @@ def _plan_whole(config: BuildConfig, request: BuffersConfig) -> BuildPlan:
         names = [name for name in needed if name in UNITS] + further
         queries = {record.episode_id for record in base.records()}
         available = {*datasets_in(root), *names}
-        check_needs(next_buffers(planned, request).conditions, available)
+        check_needs(next_buffers(planned, request).conditions, available, root)
     units = _settings_of_units(config, alone=base is not None)
     plans = {}
     for name in names:
@@ -197,6 +197,7 @@ def _plan_manifests(root: Path, request: BuffersConfig) -> BuildPlan:
     revision = Dataset(files[DISTRACTORS]).revision
     changed = recorded is not None and recorded.revision != revision
     change = next_buffers(planned, request, queries=queries, units_change=changed)
+    check_needs(change.conditions, files, root)
     return BuildPlan(buffers=change, manifests=True, base=base)
 
 
