@@ -166,6 +166,16 @@ def read_record(folder: Path) -> dict[WorkItem, Rollout]:
     return rows
 
 
+def unfinished(folder: Path, items: Iterable[WorkItem]) -> list[WorkItem]:
+    """Return the work items without a finished row in a folder, which may hold no run.
+
+    It is read without the lock, which `open_log` takes only once servers have identified the run.
+    So this decides what to start, and the rows that `open_log` reads what to run.
+    """
+    rows = read_record(folder)
+    return [item for item in items if item not in rows or not is_done(rows[item])]
+
+
 def row_of(line: bytes) -> Rollout:
     """Read a line of a record."""
     row = from_dict(Rollout, parse_json(line, "its text"), "its fields", strict=True)

@@ -63,28 +63,6 @@ def test_a_policy_may_get_only_the_observations_before_actions() -> None:
     assert world.drawn == 2  # after 16 and 32 steps; the 40th ends it
 
 
-def test_history_is_decoded_while_a_simulator_in_another_process_resets(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    decoding, stream = threading.Event(), Buffer.stream
-
-    class Patient(World):
-        remote = True
-
-        def reset(self, episode_id: str, demonstration: bool = True) -> Any:
-            assert decoding.wait(20)
-            return super().reset(episode_id, demonstration)
-
-    def noted(*options: Any) -> Any:
-        decoding.set()
-        yield from stream(*options)
-
-    monkeypatch.setattr(Buffer, "stream", noted)
-    policy = Cheat()
-    assert roll("k1", policy, simulator=Patient(), history_chunk=50).success
-    assert policy.chunks == [(50, 80), (30, 80)]
-
-
 def test_a_cache_that_cannot_be_written_costs_no_rollout(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
