@@ -20,6 +20,7 @@ from robomme_interference_data.evaluate.policies.identity import (
     check_memory_kind,
     check_metadata,
     check_servers_memory,
+    declared_memory,
     describe_policy,
     lock_servers,
     policy_identity,
@@ -28,7 +29,6 @@ from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import (
     POLICIES,
     policy_kind,
-    policy_memory,
     policy_options,
     starts_server,
 )
@@ -116,7 +116,7 @@ def _describe_run(
     facts = SystemFacts(
         policy=POLICIES.parse(config.policy).kind,
         policy_id=short_digest(identity),
-        memory=policy_memory(config.policy) or published.memory,
+        memory=declared_memory(policy, policy_metadata) or published.memory,
         retrieval=retrieval_text(config, buffer_set),
         subgoals=subgoals,
         # A policy without memory may have a subgoal writer that reads the history.
@@ -156,16 +156,19 @@ def _start_server(run: RunContext[RunConfig], pool: WorkerPool) -> RunContext[Ru
     """Let a worker start the policy's server; return the run with what the server reports."""
     config, system = run.config, name_system(run.system)
     asks = system.keeps_frames is not None
-    reported, keeps = _run_first(pool, StartServer(asks), None, _server_fault)
+    reported, memory, keeps = _run_first(pool, StartServer(asks), None, _server_fault)
     options = policy_options(config.policy, config.policy_options)
     check_metadata([reported], options["checkpoint"])
     if keeps is not None:
         check_memory_kind(keeps, reported["server"], system)
     identity = policy_identity(config.policy, config.policy_options, reported)
+    facts = dataclasses.replace(
+        run.facts, policy_id=short_digest(identity), memory=memory or run.facts.memory
+    )
     # Until now the policy's metadata were empty; those of a writer of subgoals are kept.
     return dataclasses.replace(
         run,
-        facts=dataclasses.replace(run.facts, policy_id=short_digest(identity)),
+        facts=facts,
         metadata=reported | dict(run.metadata),
         identity=dict(run.identity) | identity,
     )

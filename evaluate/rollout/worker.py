@@ -106,13 +106,19 @@ class RolloutFunction(RunFunction[RunConfig]):
             cameras = used_cameras(self.config, policy.cameras, self._demonstrations)
             self._try_out(simulator, episode, cameras, worker)
 
-    def _start_server(self, asks: bool, worker: Worker) -> tuple[dict[str, Any], bool | None]:
-        """Return the metadata of the policy's server, and whether it keeps frames, if asked."""
-        from robomme_interference_data.evaluate.policies.identity import policy_metadata
+    def _start_server(
+        self, asks: bool, worker: Worker
+    ) -> tuple[dict[str, Any], str | None, bool | None]:
+        """Return the server's metadata and memory, and whether it keeps frames, if asked."""
+        from robomme_interference_data.evaluate.policies.identity import (
+            declared_memory,
+            policy_metadata,
+        )
 
         policy: Any = self._open_policy(worker)
         metadata = policy_metadata(self.config.policy, policy)
-        return metadata, policy.keeps_frames() if asks else None
+        keeps = policy.keeps_frames() if asks else None
+        return metadata, declared_memory(policy, metadata), keeps
 
     def _run(self, job: Job[RunConfig], worker: Worker) -> tuple[Rollout, str | None]:
         item, config, clip = job.item, self.config, None
