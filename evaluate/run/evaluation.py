@@ -41,9 +41,9 @@ from robomme_interference_data.storage.files import atomic_path
 
 from .config import AskConfig, RunConfig, check_shared, with_camera
 from .identity import invocation, now, plain, run_identity
-from .log import RunLog, count_statuses, is_done, open_log, row_line, row_of
+from .log import RunLog, count_statuses, open_log
 from .plan import WorkItem, shuffle_work
-from .row import Rollout
+from .row import Rollout, is_done, row_line, row_of
 from .worker import Job, PlannedRun, RunContext
 
 if TYPE_CHECKING:

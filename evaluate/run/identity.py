@@ -19,7 +19,7 @@ from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.storage.files import digest_json
 
 from .config import RetrievalConfig
-from .header import Invocation
+from .log import Invocation
 from .plan import RunPlan
 from .worker import RunContext, make_selector, package_versions
 

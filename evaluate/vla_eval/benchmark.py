@@ -19,8 +19,8 @@ from robomme_interference_data.errors import InvalidOptionError, RunError, Unkno
 from robomme_interference_data.evaluate.rollout.runner import plan_rollouts
 from robomme_interference_data.evaluate.rollout.worker import RolloutFunction
 from robomme_interference_data.evaluate.run.config import RunConfig
-from robomme_interference_data.evaluate.run.log import row_line, row_of
 from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.evaluate.run.row import row_line, row_of
 from robomme_interference_data.evaluate.run.worker import Job
 from robomme_interference_data.ids import EpisodeId, count_numbers, nth_number
 from robomme_interference_data.runtime.worker import Worker
