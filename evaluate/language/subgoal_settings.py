@@ -13,7 +13,7 @@ from robomme_interference_data.constants import ORACLE
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.policies.registry import policy_options
 from robomme_interference_data.evaluate.run.config import RunConfig
-from robomme_interference_data.evaluate.run.runner import short_digest
+from robomme_interference_data.evaluate.run.identity import short_digest
 from robomme_interference_data.runtime.specs import bind_options
 
 from .model_writer import ModelWriter

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.errors import (
+    InterferenceError,
     InvalidOptionError,
     PolicyError,
     PolicyServerError,
@@ -18,6 +19,7 @@ from robomme_interference_data.evaluate import optional
 from robomme_interference_data.evaluate.run.identity import plain
 from robomme_interference_data.evaluate.systems import System
 from robomme_interference_data.schema.conditions import NO_HISTORY
+from robomme_interference_data.schema.sampling import MEMORY_FORM, Memory
 from robomme_interference_data.storage.files import indented_json
 
 from .capabilities import Role
@@ -102,6 +104,30 @@ def policy_metadata(text: str, policy: Policy) -> dict[str, Any]:
     raise PolicyError(
         f"policy {text!r}: metadata() {fault}",
         'Expected a dict that identifies the policy, such as {"policy": "mine"}.',
+    )
+
+
+def declared_memory(policy: Policy, metadata: Mapping[str, Any]) -> str | None:
+    """Return the memory that a policy declares, or its server in the metadata; None if unknown.
+
+    A server declares it as `{"capabilities": {"memory": "framesamp:32"}}`.
+
+    Raises:
+        PolicyServerError: A server declares something else.
+    """
+    declared = metadata.get("server_metadata", {}).get("capabilities", {})
+    if not isinstance(declared, Mapping) or {*declared} - {"memory"}:
+        fault = f"the capabilities {declared}"
+    elif (memory := declared.get("memory", policy.memory)) is None:
+        return None
+    else:
+        with suppress(InterferenceError, AttributeError):  # not text
+            return str(Memory.parse(memory))
+        fault = f"the memory {memory!r}"
+    raise PolicyServerError(
+        f"the policy server {metadata.get('server', '')} declares {fault}; expected "
+        f'{{"memory": RULE}}, where RULE is {MEMORY_FORM}, or null if it keeps no frames',
+        "Correct the metadata that it sends: see docs/reference/policies.md.",
     )
 
 
