@@ -40,6 +40,7 @@ class Codec:
     interpolation: str | None = None
 
 
+# The encoder's fastest mode: without loss, more effort saves bytes but changes no pixel.
 _AOM_LOSSLESS = {"usage": 1, "cpu-used": 8, "row-mt": 1, "aom-params": "lossless=1"}
 
 CODECS = {

@@ -155,6 +155,7 @@ class LeRobotFiles:
         location = self.locate(index)
         path = self.files.path(location.data)
         file = RowSpan(path)
+        # By value: row numbers in the metadata count over all files, and may be damaged.
         found = np.flatnonzero(file.scalars("episode_index") == index)
         start = int(found[0]) if len(found) else 0
         rows = file.part(start, start + len(found))
@@ -277,6 +278,7 @@ def fill_template(template: str, where: object, **values: str | int) -> str:
             raise invalid
         return f"{value:0{match[2]}d}" if match[2] else str(value)
 
+    # Not by `str.format`, with which a template can reach attributes of the values.
     filled = _FIELD.sub(fill, template)
     if "{" in filled or "}" in filled:
         raise invalid
@@ -308,6 +310,7 @@ def _locate_episode(
         valid = isinstance(start, int | float) and 0 <= start < 1e9
         if not valid or (frame := round(start * fps)) > _MAX_FRAME:
             raise FormatError.damaged(where, f"{name} is {start!r}")
+        # Rounded seconds miss a frame by far less than a tenth of its duration.
         if abs(frame - start * fps) > 0.1:
             raise FormatError.damaged(where, f"{name} {start!r} lies between two frames")
         return frame

@@ -194,6 +194,7 @@ class HistoryDataset:
         self._rows.prepare((*self.cameras, STATE), used, quiet=quiet)
         if actions:
             self._rows.prepare((ACTION,), now, quiet=quiet)
+        # All items have as many places, so that they can be batched.
         self._size = self.memory_frames
         import torch
 
@@ -285,6 +286,7 @@ class HistoryDataset:
             kept = np.asarray(self.memory.earlier(len(past) + drawn.moment), np.int64)
             count, ended = len(kept), int(kept.searchsorted(len(past)))
             rows[place, :ended] = past[kept[:ended]]
+            # Frames after the history are of the execution, which begins at its own row.
             rows[place, ended:count] = kept[ended:] + (
                 self._moments.first[drawn.number] - len(past)
             )
@@ -306,6 +308,7 @@ class HistoryDataset:
         if self.chunk:
             steps = moment[:, None] + np.arange(self.chunk)
             last = self._moments.actions[numbers][:, None] - 1
+            # After the end the last action repeats, as LeRobot pads its chunks.
             batch[ACTION] = self._rows.take(ACTION, first[:, None] + np.minimum(steps, last))
             batch["action_is_pad"] = steps > last
         batch["frame_index"] = moment

@@ -148,6 +148,7 @@ def choose_moments(
         raise InvalidOptionError.expected("episodes", episodes, expected, hint)
     records = [recorded[episode] for episode in chosen]
     counts = np.array([record.length if actions else 0 for record in records])
+    # In the demonstrations, the first live frame follows the lesson; executions begin with it.
     first = [
         rows.first(live.kind, record.episode_index) + (record.exec_start_idx or 0)
         for record in records
