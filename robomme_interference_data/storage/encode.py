@@ -174,6 +174,7 @@ def png(image: NDArray[np.uint8]) -> bytes:
     height, width, _ = image.shape
     encoder = av.CodecContext.create("png", "w")
     encoder.width, encoder.height, encoder.pix_fmt = width, height, "rgb24"
+    # None flushes the encoder, which may hold the picture back.
     packets = [*encoder.encode(av.VideoFrame.from_ndarray(image, "rgb24")), *encoder.encode(None)]
     return b"".join(map(bytes, packets))
 

@@ -96,6 +96,7 @@ class LeRobotFiles:
         feature = self.info["features"][column]
         shape = tuple(feature["shape"])
         if feature["dtype"] in ("video", "image"):
+            # LeRobot's older datasets have the channels first.
             if len(shape) == 3 and shape[2] != 3:
                 shape = (*shape[1:], shape[0])
             if len(shape) != 3 or shape[2] != 3:
@@ -115,6 +116,7 @@ class LeRobotFiles:
             column = table[name] if name in table.column_names else pa.nulls(1)
             if column.null_count or not pa.types.is_integer(column.type):
                 raise FormatError.damaged(where, f"its episodes have no whole numbers {name!r}")
+        # Its lines may come in any order, since they are found by number.
         if self.version == "v2.1":
             table = table.sort_by("episode_index")
         # LeRobot finds an episode of v3.0 by its place, not by its number.
@@ -132,6 +134,7 @@ class LeRobotFiles:
             rows = list(self._json_lines(_V21_TASKS))
         else:
             rows = RowSpan(self.files.path(TASKS_PATH)).table().to_pylist()
+        # LeRobot stores the texts as pandas' index, which pandas names so if it has no name.
         texts = (str(row.get("task", row.get("__index_level_0__"))) for row in rows)
         return {text: row.get("task_index") for text, row in zip(texts, rows, strict=True)}
 
