@@ -319,6 +319,14 @@ def test_only_the_sessions_in_use_are_stored(make: Make, tmp_path: Path) -> None
         assert sizes == [count * 3 * 16 * 16 + 32 for count in frames]
 
 
+def test_units_that_may_not_be_drawn_are_not_stored(make: Make, buffers: Path, tmp_path: Path):
+    """Three lessons, and the units of episodes 0."""
+    make(["k5"], redraw=True, unit_episodes="0", chunk=0, memory="window:400", cache=tmp_path)
+    units = load_buffer_set(buffers).datasets["distractors"].records()
+    allowed = sum(record.episode_id.index == 0 for record in units)
+    assert len([*tmp_path.iterdir()]) == 3 + allowed
+
+
 def test_only_the_videos_in_use_are_downloaded(hub: HubServer, tmp_path: Path) -> None:
     push_buffer_set(hub, GOLDEN, tmp_path / "work")
     options: dict[str, Any] = {"chunk": 0, "cache": tmp_path / "cache", "quiet": True}
