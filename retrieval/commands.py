@@ -74,7 +74,7 @@ def index(
     ```
     """
     from robomme_interference_data.data.loading import load_buffer_set
-    from robomme_interference_data.runtime.progress import WorkProgress
+    from robomme_interference_data.progress import WorkProgress
     from robomme_interference_data.schema.codec import to_dict
 
     from .encoders import make_encoder
@@ -326,7 +326,7 @@ def _measured(
 ) -> tuple[dict[str, Any], list["Similarities"]]:
     """Return what the buffers belong to, and the similarities of each with frames of the lesson."""
     from robomme_interference_data.data.views import live_embedding
-    from robomme_interference_data.runtime.progress import WorkProgress
+    from robomme_interference_data.progress import WorkProgress
 
     from .select import measure
 
