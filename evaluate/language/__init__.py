@@ -7,5 +7,4 @@
 | `question_run`, `question_prompt`, `responders` | runs of questions |
 | `subgoal_settings` | the writer of subgoals that the settings of a run name |
 | `subgoal_writer`, `model_writer`, `subgoal_prompt` | writers of subgoals |
-| `columns` | columns of rows about answers and models |
 """

@@ -17,7 +17,7 @@ from robomme_interference_data.evaluate.run.history import history_columns
 from robomme_interference_data.evaluate.run.identity import retrieval_text, short_digest
 from robomme_interference_data.evaluate.run.log import unfinished
 from robomme_interference_data.evaluate.run.plan import WorkItem, plan_run
-from robomme_interference_data.evaluate.run.row import Rollout
+from robomme_interference_data.evaluate.run.row import Rollout, model_columns
 from robomme_interference_data.evaluate.run.worker import Job, PlannedRun, RunContext, RunFunction
 from robomme_interference_data.evaluate.systems import SYSTEMS, SystemFacts, name_system
 from robomme_interference_data.ids import EpisodeId
@@ -27,7 +27,6 @@ from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.simulators.registry import recorded_scene
 
-from .columns import model_columns
 from .images import HistoryFrames
 from .models import MODELS, model_identity
 from .responders import CONTROLS, WITHOUT_MODEL, ModelResponder, Prompted

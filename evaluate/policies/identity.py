@@ -22,7 +22,7 @@ from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.sampling import MEMORY_FORM, Memory
 from robomme_interference_data.storage.files import indented_json
 
-from .capabilities import Role
+from .kinds import Role
 from .policy import Policy
 from .registry import (
     POLICIES,
