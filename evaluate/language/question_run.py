@@ -28,8 +28,9 @@ from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.simulators.registry import recorded_scene
 
 from .images import HistoryFrames
-from .models import MODELS, model_identity
-from .responders import CONTROLS, WITHOUT_MODEL, ModelResponder, Prompted
+from .models import MODELS
+from .prompt_files import prompted_identity
+from .questions import CONTROLS, WITHOUT_MODEL, ModelResponder, Prompted
 
 
 @contextmanager
@@ -82,8 +83,7 @@ def _describe_run(
     """Return what is known of a run from its settings, and from what its model reports."""
     has_model, model = config.model not in WITHOUT_MODEL, metadata
     if has_model:
-        model = model_identity(config.model, config.model_options, metadata["model"])
-        model |= {"prompt_sha256": metadata["prompt_sha256"]}
+        model = prompted_identity(config.model, config.model_options, metadata)
     facts = SystemFacts(
         policy=MODELS.parse(config.model).kind if has_model else config.model,
         policy_id=short_digest({"model": model, "control": config.control}),

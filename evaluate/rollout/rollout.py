@@ -35,7 +35,7 @@ from robomme_interference_data.simulators.episode import ACTION_SIZE, Observatio
 from .checks import check_episode, check_lesson
 
 if TYPE_CHECKING:
-    from robomme_interference_data.evaluate.language.subgoal_writer import SubgoalWriter
+    from robomme_interference_data.evaluate.language.subgoal_writers import SubgoalWriter
     from robomme_interference_data.retrieval.selector import Selector
 
     from .clips import Clip

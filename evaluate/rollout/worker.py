@@ -36,7 +36,7 @@ from .rollout import run_rollout
 from .settings import simulator_options, used_cameras
 
 if TYPE_CHECKING:
-    from robomme_interference_data.evaluate.language.subgoal_writer import SubgoalWriter
+    from robomme_interference_data.evaluate.language.subgoal_writers import SubgoalWriter
     from robomme_interference_data.evaluate.policies.answers import Answers
     from robomme_interference_data.evaluate.policies.shared import Address
 
