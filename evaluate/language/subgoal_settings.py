@@ -57,7 +57,7 @@ def with_published(config: RunConfig) -> RunConfig:
     if MODELS.parse(text).kind != "openai":
         raise InvalidOptionError(
             f"{config.system} sends its history as a video, and {text} takes images",
-            "Serve the model behind an endpoint: see docs/how-to/paper-systems.md.",
+            "Serve the model behind an endpoint: see docs/how-to/official-simulator.md.",
         )
     names = {option.partition("=")[0] for option in config.subgoal_options}
     added = [f"{name}={value}" for name, value in published.options.items() if name not in names]

@@ -1,6 +1,7 @@
 """Checks of a run of rollouts: before the first one, and when each of them begins."""
 
 import math
+import shlex
 from collections.abc import Sequence
 from typing import Any
 
@@ -79,6 +80,7 @@ def _check_cameras(config: RunConfig, demonstrations: Dataset, policy: Policy) -
                 f"the policy {config.policy} reads the camera {camera!r}, which is not in {where}",
                 f"Its cameras: {', '.join(demonstrations.cameras)}. "
                 f"{_policies_for_any_robot(config)}",
+                _baseline(config),
             )
     for camera in sorted(used - {*live.cameras}):
         raise UnknownNameError(
@@ -102,7 +104,18 @@ def _policies_for_any_robot(config: RunConfig) -> str:
     """Return the advice to set a policy that needs neither this robot nor its cameras."""
     if config.offline:
         return "Set hold, mean or a policy for this robot, python:module:factory."
-    return "Set a policy for this robot, such as python:module:factory."
+    return (
+        "Set a policy for this robot, such as python:module:factory; to act along the recordings "
+        f"of this buffer set, without a simulator, also {named('offline')}."
+    )
+
+
+def _baseline(config: RunConfig) -> str | None:
+    """Return the command that evaluates a policy for any robot, if one can act here."""
+    if not config.offline:
+        return None
+    command = ["evaluate", config.buffer_set, "--offline", "--policy", "hold"]
+    return shlex.join([*command, "--out", str(config.out)])
 
 
 def _check_robot(config: RunConfig, buffer_set: BufferSet, kind: PolicyKind) -> None:
@@ -117,6 +130,7 @@ def _check_robot(config: RunConfig, buffer_set: BufferSet, kind: PolicyKind) -> 
             f"{kind.action_size} action values, 7 joints and a gripper; this robot has {state} and "
             f"{action}",
             _policies_for_any_robot(config),
+            _baseline(config),
         )
 
 

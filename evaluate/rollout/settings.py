@@ -64,7 +64,7 @@ def default_system(config: RunConfig) -> str:
         raise InvalidOptionError(
             f"the rows of {unidentified} need a name: its text does not identify it",
             f"Set {named('system')}, such as perceptual-framesamp-modul, or a name of your own: "
-            "see docs/how-to/paper-systems.md.",
+            "see docs/how-to/official-simulator.md.",
         )
     memory = policy_memory(config.policy)
     parts = [spec.target if memory is None else Memory.parse(memory).label]
@@ -101,7 +101,8 @@ def _check_name(config: RunConfig, system: System) -> None:
     fault = _fault_of_name(config, system)
     if fault is not None:
         raise InvalidOptionError(
-            fault, f"Set {named('system')} to a name of your own: see docs/how-to/paper-systems.md."
+            fault,
+            f"Set {named('system')} to a name of your own: see docs/how-to/official-simulator.md.",
         )
 
 
