@@ -150,59 +150,11 @@ def run_evaluation(
         return _write_rows(run, planned.items, pool, buffer_set, log, callbacks)
 
 
-<<<<<<< HEAD
-def plan_run(runner: Runner[Any]) -> tuple[RunPlan, tuple[WorkItem, ...]]:
-    """Return the plan of a prepared run and its work items, and check them."""
-    config, buffer_set, facts = runner.config, runner.buffer_set, runner.facts()
-    conditions = config.conditions or tuple(
-        name for name in buffer_set.conditions if facts.applies(name)
-    )
-    if not conditions:  # no planned one applies; raises
-        _check_condition(facts, buffer_set.conditions[0], buffer_set)
-    plan = plan_work(
-        buffer_set.episodes_under(conditions),
-        conditions=conditions,
-        families=config.families,
-        episodes=config.episodes,
-        split=config.split,
-        shard=config.shard,
-    )
-    items = plan.items()
-    for condition in plan.conditions:
-        _check_condition(facts, condition, buffer_set)
-    buffer_set.check_tables(plan.conditions)
-    runner.check(plan, items)
-    return plan, items
-
-
-def _check_condition(facts: SystemFacts, condition: str, buffer_set: BufferSet) -> None:
-    """Reject a condition that does not apply to a system."""
-    if facts.applies(condition):
-        return
-    if condition == NO_HISTORY:
-        raise nothing_to_retrieve(
-            f"Leave {NO_HISTORY} out of {named('conditions')}: without history, the system is the "
-            "one without a retrieval step."
-        )
-    planned = NO_HISTORY in buffer_set.conditions
-    raise InvalidOptionError(
-        f"the system takes no history, so {condition} has no effect",
-        f"Set {named('conditions')} to {NO_HISTORY}."
-        if planned
-        else f"It runs under {NO_HISTORY}, which is not planned yet.",
-        None if planned else buffer_set.planning(NO_HISTORY),
-        "conditions",
-    )
-
-
-def _make_runner(config: RunConfig | AskConfig, buffer_set: BufferSet) -> Runner[Any]:
-=======
 def _open_run(
     config: RunConfig | AskConfig, buffer_set: BufferSet, executor: Executor
 ) -> AbstractContextManager[tuple[PlannedRun[Any], WorkerPool | None]]:
     """Plan a run, and keep its workers in the block; None if there is nothing to do for them."""
     # Here, because a run of one kind imports nothing of the other.
->>>>>>> refs/heads/evaluate
     if isinstance(config, AskConfig):
         from robomme_interference_data.evaluate.language.question_run import open_questions
 

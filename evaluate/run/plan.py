@@ -125,6 +125,8 @@ def plan_run(config: WorkConfig, facts: SystemFacts, buffer_set: BufferSet) -> R
     conditions = config.conditions or tuple(
         name for name in buffer_set.conditions if facts.applies(name)
     )
+    if not conditions:  # no planned one applies; raises
+        _check_condition(facts, buffer_set.conditions[0], buffer_set)
     plan = plan_work(
         buffer_set.episodes_under(conditions),
         conditions=conditions,
@@ -134,12 +136,12 @@ def plan_run(config: WorkConfig, facts: SystemFacts, buffer_set: BufferSet) -> R
         shard=config.shard,
     )
     for condition in plan.conditions:
-        _check_condition(facts, condition)
+        _check_condition(facts, condition, buffer_set)
     buffer_set.check_tables(plan.conditions)
     return plan
 
 
-def _check_condition(facts: SystemFacts, condition: str) -> None:
+def _check_condition(facts: SystemFacts, condition: str, buffer_set: BufferSet) -> None:
     """Reject a condition that does not apply to a system."""
     if facts.applies(condition):
         return
@@ -148,9 +150,14 @@ def _check_condition(facts: SystemFacts, condition: str) -> None:
             f"Leave {NO_HISTORY} out of {named('conditions')}: without history, the system is the "
             "one without a retrieval step."
         )
+    fault = f"the system takes no history, so {condition} has no effect"
+    if NO_HISTORY in buffer_set.conditions:
+        raise InvalidOptionError(fault, f"Set {named('conditions')} to {NO_HISTORY}.")
     raise InvalidOptionError(
-        f"the system takes no history, so {condition} has no effect",
-        f"Set {named('conditions')} to {NO_HISTORY}.",
+        fault,
+        f"It runs under {NO_HISTORY}, which is not planned yet.",
+        buffer_set.planning(NO_HISTORY),
+        "conditions",
     )
 
 
