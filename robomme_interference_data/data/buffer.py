@@ -199,6 +199,7 @@ class Buffer:
         Raises:
             UnknownNameError: There is no such camera.
             MissingFileError, FormatError: A video cannot be read.
+            HashMismatchError: With a cache: frames do not have the recorded SHA-256.
         """
         name = self.query.dataset.camera(camera)
         out = allocate_frames(len(self), self.query.dataset.shape(name))
