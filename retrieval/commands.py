@@ -67,7 +67,7 @@ def index(
     ```
     """
     from robomme_interference_data.data.loading import load_buffer_set
-    from robomme_interference_data.runtime.progress import WorkProgress
+    from robomme_interference_data.progress import WorkProgress
     from robomme_interference_data.schema.codec import to_dict
 
     from .encoders import make_encoder
@@ -214,7 +214,7 @@ def retrieval_score(
     ```
     """
     from robomme_interference_data.data.loading import load_buffer_set
-    from robomme_interference_data.runtime.progress import WorkProgress
+    from robomme_interference_data.progress import WorkProgress
     from robomme_interference_data.schema.codec import to_dict
     from robomme_interference_data.storage.files import write_text
 

@@ -46,8 +46,8 @@ from robomme_interference_data.errors import (
     first_line,
     named,
 )
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Executor, Serial, Worker
-from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.storage.arrays import write_array
 from robomme_interference_data.storage.files import (

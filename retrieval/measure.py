@@ -6,7 +6,7 @@ from typing import Any
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.views import live_embedding
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.schema.shifts import Shift
 
 from .select import Similarities, measure

@@ -150,13 +150,13 @@ def _check_condition(facts: SystemFacts, condition: str, buffer_set: BufferSet) 
             f"Leave {NO_HISTORY} out of {named('conditions')}: without history, the system is the "
             "one without a retrieval step."
         )
-    planned = NO_HISTORY in buffer_set.conditions
+    fault = f"the system takes no history, so {condition} has no effect"
+    if NO_HISTORY in buffer_set.conditions:
+        raise InvalidOptionError(fault, f"Set {named('conditions')} to {NO_HISTORY}.")
     raise InvalidOptionError(
-        f"the system takes no history, so {condition} has no effect",
-        f"Set {named('conditions')} to {NO_HISTORY}."
-        if planned
-        else f"It runs under {NO_HISTORY}, which is not planned yet.",
-        None if planned else buffer_set.planning(NO_HISTORY),
+        fault,
+        f"It runs under {NO_HISTORY}, which is not planned yet.",
+        buffer_set.planning(NO_HISTORY),
         "conditions",
     )
 

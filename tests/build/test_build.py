@@ -23,8 +23,8 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     SourceError,
 )
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Serial
-from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.storage.files import LocalFiles, read_json
 from robomme_interference_data.storage.staging import file_lock, staging_path
 

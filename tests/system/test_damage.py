@@ -30,8 +30,8 @@ from robomme_interference_data.build_dataset.verify.buffer_set import verify_buf
 from robomme_interference_data.errors import HashMismatchError, InterferenceError
 from robomme_interference_data.evaluate.ceiling import ceiling
 from robomme_interference_data.evaluate.run.config import CeilingConfig
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.retrieval.measure import measure_all
-from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.storage.files import read_json, sha256_file, write_json
 
 pytestmark = pytest.mark.slow
