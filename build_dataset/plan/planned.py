@@ -1,5 +1,6 @@
 """What the buffer set in a folder holds and plans now."""
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,6 +59,15 @@ def check_is_own(buffer_set: BufferSet) -> None:
             "published buffer set never changes",
             "Build one of your own with the same demonstrations:",
             buffer_set.planning(),
+        )
+    if buffer_set.header.datasets[DISTRACTORS].location == ".":
+        lessons = buffer_set.dataset_files(DEMONSTRATIONS).location
+        raise BuildError(
+            f"{buffer_set.location} has the files of a repository, for which no buffers are planned",
+            "Build one of your own with the same demonstrations:",
+            shlex.join(
+                ["build", "BUFFER_SET", "--demonstrations", lessons, "--source", "KIND:PATH"]
+            ),
         )
 
 
