@@ -63,11 +63,9 @@ def check_is_own(buffer_set: BufferSet) -> None:
     if buffer_set.header.datasets[DISTRACTORS].location == ".":
         lessons = buffer_set.dataset_files(DEMONSTRATIONS).location
         raise BuildError(
-            f"{buffer_set.location} has the files of a repository, for which no buffers are planned",
+            f"{buffer_set.location} has the layout of a repository, which never changes",
             "Build one of your own with the same demonstrations:",
-            shlex.join(
-                ["build", "BUFFER_SET", "--demonstrations", lessons, "--source", "KIND:PATH"]
-            ),
+            f"build BUFFER_SET --demonstrations {shlex.quote(lessons)} --source KIND:PATH",
         )
 
 
