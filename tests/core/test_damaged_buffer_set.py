@@ -26,10 +26,17 @@ from robomme_interference_data.storage.encode import CODECS, VideoEncoder
 
 
 def test_what_is_no_buffer_set(tmp_path: Path) -> None:
-    for folder in (tmp_path, GOLDEN / "demonstrations"):
-        with raises(MissingFileError) as caught:
-            load_buffer_set(folder)
-        assert "build BUFFER_SET" in str(caught.value.command)
+    with raises(MissingFileError) as caught:
+        load_buffer_set(tmp_path)
+    assert caught.value.command == "build BUFFER_SET --source KIND:PATH"
+    with raises(MissingFileError) as caught:
+        load_buffer_set(GOLDEN / "demonstrations")
+    assert caught.value.command is None and "the folder that holds it" in str(caught.value.hint)
+    (tmp_path / "recordings" / "meta").mkdir(parents=True)
+    (tmp_path / "recordings" / "meta" / "info.json").write_text("{}")
+    with pytest.raises(MissingFileError) as caught:
+        load_buffer_set(tmp_path / "recordings")
+    assert f"lerobot:{tmp_path / 'recordings'}" in str(caught.value.command)
     (tmp_path / "begun" / ".demonstrations.building").mkdir(parents=True)
     with pytest.raises(MissingFileError) as caught:
         load_buffer_set(tmp_path / "begun")
