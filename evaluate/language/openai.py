@@ -13,6 +13,7 @@ from openai import OpenAI
 
 from robomme_interference_data.errors import InvalidOptionError, ModelError, first_line
 from robomme_interference_data.evaluate.deadline import shutdown_after
+from robomme_interference_data.retry import growing, retry
 from robomme_interference_data.storage.encode import png
 
 from .images import data_url, mp4, within
@@ -96,8 +97,10 @@ class OpenAIModel(ChatModel):
             {"role": message.role, "content": _content(message.parts)}
             for message in within(messages, self.images)
         ]
-        began, calls, fault = time.perf_counter(), 0, ""
-        while calls <= self._repeats:
+        began, calls = time.perf_counter(), 0
+
+        def ask() -> Reply:
+            nonlocal calls
             try:
                 client = self._client.with_options(max_retries=self._repeats - calls)
                 response = client.chat.completions.with_raw_response.create(
@@ -109,16 +112,19 @@ class OpenAIModel(ChatModel):
             except openai.APIError as error:
                 raise self._error(error) from error
             calls += response.retries_taken + 1
-            try:
-                return _read(response.parse(), calls, time.perf_counter() - began)
-            except _UNREADABLE as error:
-                fault = f"{type(error).__name__}: {first_line(error)}"
-            if calls <= self._repeats:
-                time.sleep(min(_PAUSE_S * 2 ** (calls - 1), _LONGEST_PAUSE_S))
-        raise ModelError(
-            f"{self._url} answers {calls} calls without a chat completion ({fault})",
-            f"Is it the base of an OpenAI-compatible endpoint, mostly ending in /v1? {_WAITS}",
-        )
+            return _read(response.parse(), calls, time.perf_counter() - began)
+
+        def is_temporary(error: Exception) -> bool:
+            return isinstance(error, _UNREADABLE) and calls <= self._repeats
+
+        try:
+            return retry(ask, is_temporary, growing(_PAUSE_S, _LONGEST_PAUSE_S))
+        except _UNREADABLE as error:
+            fault = f"{type(error).__name__}: {first_line(error)}"
+            raise ModelError(
+                f"{self._url} answers {calls} calls without a chat completion ({fault})",
+                f"Is it the base of an OpenAI-compatible endpoint, mostly ending in /v1? {_WAITS}",
+            ) from error
 
     def metadata(self) -> dict[str, Any]:
         """Return the model's name, after checking that the endpoint serves it."""
