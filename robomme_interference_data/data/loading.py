@@ -57,6 +57,7 @@ def load_buffer_set(
     _check_location("buffer_set", buffer_set, "a folder, or namespace/name")
     files: LocalFiles | HubFiles
     folder = Path(buffer_set).expanduser()
+    # With a revision, `locate` has the error that a folder has none.
     if folder.is_dir() and revision is None:
         files = LocalFiles(folder)
     else:
