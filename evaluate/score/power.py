@@ -4,8 +4,8 @@ The model: a share f of the episodes flips by chance between two equal systems, 
 and a true difference δ adds flips one way. So the share f / 2 is gained and f / 2 + δ lost, or the
 other way round.
 
-With several training runs of each system, whose rates have the standard deviation s, the difference
-has the variance f / n + 2 s² / R, of which the second term is known with 2 (R − 1) degrees of freedom.
+With R training runs of each system, whose rates have the standard deviation s, the difference has
+the variance f / n + 2 s² / R, of which the second term is known with 2 (R − 1) degrees of freedom.
 """
 
 import math

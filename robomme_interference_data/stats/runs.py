@@ -88,8 +88,9 @@ def run_spread(values: Floats) -> RunSpread:
     """Return the spread over training runs of values, `(E, R) float64`, NaN where missing.
 
     With the variance s² of the runs' means over n episodes and the residual variance r of episodes
-    and runs, the runs add max(0, s² − r / n) / R, with R − 1 degrees of freedom: the noise of single
-    rollouts is in the interval over episodes already. Episodes that a run lacks are left out.
+    and runs, the runs add max(0, s² − r / n) / R, with R − 1 degrees of freedom: the noise of
+    single rollouts is in the interval over episodes already. Episodes that a run lacks are left
+    out.
 
     Source: components of variance of two crossed random effects, Searle (1971), Linear Models,
     chapter 9.

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.evaluate.score.outcomes import (
-    Statuses,
-    SuccessRate,
     ERROR,
     Flags,
+    Statuses,
+    SuccessRate,
     counting,
     errors_as,
     rate_of,
