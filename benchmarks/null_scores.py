@@ -50,7 +50,10 @@ def main() -> None:
 
 def over_runs(path: Path, grid: NullGrid, count: int) -> list[str]:
     """Return the coverage of rates, and the size of tests, in percent."""
-    held, found = list[bool](), {name: list[bool]() for name in ("effects", "matrix", "interaction")}
+    held, found = (
+        list[bool](),
+        {name: list[bool]() for name in ("effects", "matrix", "interaction")},
+    )
     for number in range(count):
         scored = _score(grid.write(path, f"{grid}, {number}"), draws=400)
         held += [row["low"] <= grid.rate <= row["high"] for row in scored.tables["main"].records()]

@@ -47,7 +47,11 @@ class Side:
         weights, other_weights = (
             {repeat.training_seed for repeat in side.outcomes.repeats} for side in (self, other)
         )
-        return same and weights == other_weights and rows.revisions.get(name) == other_rows.revisions.get(name)
+        return (
+            same
+            and weights == other_weights
+            and rows.revisions.get(name) == other_rows.revisions.get(name)
+        )
 
     def counted(self, condition: str) -> set[EpisodeId]:
         """The episodes that count under a condition."""

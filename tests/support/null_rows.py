@@ -39,7 +39,9 @@ class NullGrid:
         of_run = self.spread / normal.pdf(limit)
         shape = (self.systems, len(self.conditions), self.runs, self.episodes)
         latent = math.sqrt(0.5) * generator.normal(size=self.episodes)
-        latent = latent + math.sqrt(0.2) * generator.normal(size=(self.systems, 1, 1, self.episodes))
+        latent = latent + math.sqrt(0.2) * generator.normal(
+            size=(self.systems, 1, 1, self.episodes)
+        )
         latent = latent + math.sqrt(0.3) * generator.normal(size=shape)
         latent = latent + of_run * generator.normal(size=(*shape[:3], 1))
         return latent < limit * math.sqrt(1 + of_run**2)

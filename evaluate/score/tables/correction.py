@@ -21,9 +21,7 @@ PRIMARY_CONDITION = "k7"
 PRIMARY_GROUP = "primary"
 
 
-def with_primary(
-    contrasts: Sequence[Contrast], all_outcomes: Iterable[Outcomes]
-) -> list[Contrast]:
+def with_primary(contrasts: Sequence[Contrast], all_outcomes: Iterable[Outcomes]) -> list[Contrast]:
     """Return comparisons with the primary ones marked, which are corrected together.
 
     Primary are, in each simulator, k7 against k0 of each system that is no reference, and the
