@@ -18,6 +18,7 @@ from .rows.reading import CheckedRows, read_rows
 from .tables import effects, families, ranks, slopes
 from .tables.cells import SuccessCell, cells_of, main_table, parts_table
 from .tables.contrast import Contrast
+from .tables.correction import correct, with_primary
 
 if TYPE_CHECKING:
     from .tables.action_error import ErrorCell
@@ -104,7 +105,8 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     simulated = tuple(outcomes.values())
     recordings = offline_outcomes(rows)
     cells = cells_of(simulated)
-    contrasts, notes = _compared(simulated, draws)
+    compared, notes = _compared(simulated, draws)
+    contrasts = correct(with_primary(compared, simulated))
     notes += [sentence for each in simulated if (sentence := _repeat_noise(each))]
     tables = [
         main_table(cells),
@@ -130,7 +132,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         from .tables import action_error, action_error_effects
 
         error_cells = action_error.error_cells(recordings, draws)
-        errors = action_error_effects.error_contrasts(recordings, draws)
+        errors = correct(action_error_effects.error_contrasts(recordings, draws))
         tables.append(action_error.error_table(error_cells))
         tables.append(action_error_effects.error_effects_table(errors))
         contrasts += errors
