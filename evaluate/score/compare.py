@@ -75,14 +75,15 @@ def compare(
     if len(conditions) == 1:
         conditions = (conditions[0], conditions[0])  # the same in both runs
     alpha = look_levels(look[1])[look[0] - 1] if look[1] > 1 else ALPHA
-    a_rows = read_rows([first], systems[0], lenient)
-    b_rows = a_rows if second is None else read_rows([second], systems[1], lenient)
+    a_rows = _read(first, systems[0], lenient=lenient)
+    b_rows = a_rows if second is None else _read(second, systems[1], lenient=lenient)
     runs = (a_rows,) if second is None else (a_rows, b_rows)
     measure = _measure(runs)
     check_scenes(a_rows, b_rows)
     a_sides, b_sides = sides_of(a_rows), sides_of(b_rows)
     matched = list(matched_sides((a_rows, b_rows), (a_sides, b_sides)))
-    notes = list(differing(a_rows, b_rows, matched))
+    notes = [*dict.fromkeys(note for rows in runs for note in rows.notes)]
+    notes += differing(a_rows, b_rows, matched)
     contrasts = list[Contrast]()
     for a, b in matched:
         own = list(_contrasts(a, b, conditions, measure, alpha))
@@ -193,6 +194,10 @@ def _group(contrast: Contrast) -> tuple[str, bool]:
     return contrast.simulator, bool(contrast.family)
 
 
+def _read(path: Path, system: str | None, *, lenient: bool) -> CheckedRows:
+    return read_rows([path], () if system is None else (system,), lenient)
+
+
 def _check_arguments(
     first: Path,
     second: Path | None,
@@ -204,7 +209,7 @@ def _check_arguments(
     for name in conditions:
         parse_condition(name)
     if len(conditions) > 2 or (second is None and len({*conditions}) < 2):
-        hint, command = _two_conditions(first, read_rows([first], system, lenient))
+        hint, command = _two_conditions(first, _read(first, system, lenient=lenient))
         raise InvalidOptionError(
             f"conditions to compare: {' '.join(conditions) or 'none'}; expected two different "
             "ones, or two runs and at most two conditions",
@@ -212,7 +217,7 @@ def _check_arguments(
             command,
         )
     if second is not None and first.exists() and second.exists() and first.samefile(second):
-        hint, command = _two_conditions(first, read_rows([first], system, lenient))
+        hint, command = _two_conditions(first, _read(first, system, lenient=lenient))
         raise InvalidOptionError(f"{first} is given twice", hint, command)
 
 

@@ -50,6 +50,7 @@ class Outcomes:
     in_tables: Flags  # the cells that are expected or have rows, (S, C)
     without_revision: Flags  # systems whose rows name no revision of a buffer set, (S,)
     facts: tuple[frozenset[SystemFacts], ...]  # of each system; only `policy_id` varies, (S,)
+    seeds_repeat: bool = True  # whether another model seed repeats an episode in the same scene
 
     def cell(self, system: str, condition: str) -> tuple[int, int]:
         """Return the place of a cell on the first two axes."""
@@ -146,6 +147,8 @@ class Outcomes:
 
         Repeats differ only in the model seed; the two lowest of an episode that count are compared.
         """
+        if not self.seeds_repeat:
+            return 0, 0
         counts = counting(self.status)
         order = counts.cumsum(axis=-1) * counts  # 1 for the lowest model seed that counts, …
         first, second = (((order == n) & (self.status == _SUCCESS)).any(axis=-1) for n in (1, 2))
@@ -202,13 +205,14 @@ def rate_of(status: Statuses) -> SuccessRate:
 
 def outcomes_of(rows: CheckedRows, expected: Expected) -> dict[str, Outcomes]:
     """Return the outcomes of each simulator, by its name; recordings have none."""
-    return {
-        name: _outcomes(
-            [r for r in rows if r.simulator == name], name, expected, rows.without_revision
-        )
-        for name in rows.names("simulator")
-        if name != RECORDINGS
-    }
+    others = {simulator for simulator, _ in rows.scenes}  # whose seeds may change the scene
+    found = {}
+    for name in rows.names("simulator"):
+        if name != RECORDINGS:
+            here = [row for row in rows if row.simulator == name]
+            outcomes = _outcomes(here, name, expected, rows.without_revision)
+            found[name] = replace(outcomes, seeds_repeat=name not in others)
+    return found
 
 
 def offline_outcomes(rows: CheckedRows) -> Outcomes | None:

@@ -104,7 +104,8 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     simulated = tuple(outcomes.values())
     recordings = offline_outcomes(rows)
     cells = cells_of(simulated)
-    contrasts, notes = _compared(simulated, draws)
+    contrasts, unpaired = _compared(simulated, draws)
+    notes = [*rows.notes, *unpaired]
     notes += [sentence for each in simulated if (sentence := _repeat_noise(each))]
     tables = [
         main_table(cells),
@@ -170,7 +171,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
 
 def _rows(settings: Settings) -> CheckedRows:
     """Read the rows, of which some must be valid and no errors."""
-    rows = read_rows(settings.rows, settings.system, settings.lenient)
+    rows = read_rows(settings.rows, settings.system, settings.lenient, settings.model_seed)
     sources = ", ".join(map(str, settings.rows))
     if not len(rows):
         if rows.bad_count:

@@ -176,7 +176,7 @@ def _run(root: Path) -> None:
 def _record(root: Path) -> None:
     path = root / "run" / RUN_RECORD
     with suppress(InterferenceError):  # which is told again below
-        read_rows([path], "mine", lenient=True)
+        read_rows([path], ["mine"], lenient=True)
     read_run(root / "run")
 
 
