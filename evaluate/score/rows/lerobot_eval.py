@@ -48,7 +48,7 @@ def _episodes(file: RowFile) -> Iterator[tuple[str, str, int, bool]]:
             if not isinstance(success, bool):
                 raise _wrong(
                     file,
-                    f"success {_shown(success)} of episode {episode} of task {number} of {group}; "
+                    f"success {success!r:.80} of episode {episode} of task {number} of {group}; "
                     "expected true or false",
                 )
             yield plain_name(group), f"task_{number}", episode, success

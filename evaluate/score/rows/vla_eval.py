@@ -92,12 +92,12 @@ def _outcomes(file: RowFile) -> Iterator[tuple[str, int, Status]]:
                 raise TypeError
             if episode.get("failure_reason"):
                 yield family, number, Status.ERROR
-            elif isinstance(success, bool):
+            elif isinstance(success, int | float) and success in (0, 1):
                 yield family, number, Status.SUCCESS if success else Status.FAIL
             else:
                 raise FormatError(
                     f"{file.path}, episode {number} of {task['task']}: success {success!r}; "
-                    "expected true or false",
+                    "expected true, false, 1 or 0",
                     _HINT,
                 )
 
