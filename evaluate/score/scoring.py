@@ -18,6 +18,7 @@ from .rows.reading import CheckedRows, read_rows
 from .tables import effects, families, ranks, slopes
 from .tables.cells import SuccessCell, cells_of, main_table, parts_table
 from .tables.contrast import Contrast
+from .tables.cost import cost_table
 
 if TYPE_CHECKING:
     from .tables.action_error import ErrorCell
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 TABLES = (
     "main",
     "parts",
-    "chance",
+    "cost",
     "effects",
     "interaction",
     "equivalence",
@@ -115,14 +116,15 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         slopes.decay_table(simulated, draws),
         families.families_table(simulated, contrasts),
         ranks.matrix_table(contrasts),
+        cost_table(rows, cells),
     ]
     error_cells = list["ErrorCell"]()
     published: Sequence[SuccessCell] = ()
     # The tables below are for some rows or settings only: what is not used is not imported.
     if any(cell.chance >= 0 for cell in cells):
-        from .tables.chance import chance_table
+        from .tables.chance import with_chance
 
-        tables.append(chance_table(outcomes, cells))
+        tables[0] = with_chance(tables[0], outcomes, cells)
     if any((each.evidence >= 0).any() for each in simulated):
         from .tables.evidence_kept import evidence_tables
 

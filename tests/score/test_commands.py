@@ -17,7 +17,7 @@ import pytest
 from support import scoring as made
 from support.bombs import write_rows_bomb
 from support.messages import raises
-from support.scoring import OWN, RETRIEVAL, run
+from support.scoring import OWN, run
 
 from robomme_interference_data.errors import (
     FormatError,
@@ -54,7 +54,7 @@ def test_score_and_export_on_the_command_line(
 ) -> None:
     out = tmp_path / "out"
     words = [
-        *("score", made.RELEASED, "--system", RETRIEVAL, "--against", "paper", "--out", out),
+        *("score", made.RELEASED, "--against", "paper", "--out", out),
         *("--export", tmp_path / "export", "--json"),
     ]
     monkeypatch.setattr(sys, "argv", ["robomme-interference", *map(str, words)])
@@ -66,7 +66,7 @@ def test_score_and_export_on_the_command_line(
     assert f"Report: {out / 'report.html'}" in done.stderr
     beyond = {"evidence_effects", "evidence_use"}  # the rows know no evidence
     beyond |= {"matrix", "interaction"}  # one system alone
-    beyond |= {"equivalence", "chance"}  # no margin, and no questions
+    beyond |= {"equivalence", "cost"}  # no margin, and no times
     beyond |= {"action_error", "action_error_effects"}  # nor offline
     assert {path.stem for path in (out / "tables").glob("*.csv")} == {*TABLES} - beyond
     drawn = sorted(path.name for path in (out / "figures").iterdir())
