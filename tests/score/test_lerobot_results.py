@@ -5,7 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support import eval_info
 from support import scoring as made
+from support.eval_info import task
 from support.messages import raises
 
 from robomme_interference_data.errors import FormatError, InvalidIdError, InvalidOptionError
@@ -16,19 +18,8 @@ SUCCESSES = {("pusht", 0): "sssf", ("pusht", 3): "sfff"}  # 4 of 8
 BETTER = {("pusht", 0): "ssss", ("pusht", 3): "sfsf"}  # 6 of 8
 
 
-def task(group: Any, number: Any, successes: Any) -> dict[str, Any]:
-    metrics = {"sum_rewards": [0.5], "max_rewards": [1.0], "successes": successes}
-    return {"task_group": group, "task_id": number, "metrics": metrics | {"video_paths": []}}
-
-
 def write(path: Path, outcomes: dict[tuple[str, int], str] = SUCCESSES) -> Path:
-    """A file as lerobot-eval writes it; a letter for each episode."""
-    tasks = [
-        task(group, number, [letter == "s" for letter in letters])
-        for (group, number), letters in outcomes.items()
-    ]
-    path.write_text(json.dumps({"per_task": tasks, "per_group": {}, "overall": {}}, indent=2))
-    return path
+    return eval_info.write(path, outcomes)
 
 
 def test_episodes_are_read_by_task_and_position(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ HOW_TO = ROOT / "docs" / "how-to"
 PAGES = sorted(path.name for path in HOW_TO.glob("*.md"))
 
 NOT_RUN = {
-    ("compare-systems.md", "score retrieval_rollouts.csv"): "a file that the paper's authors host",
+    ("compare-systems.md", "score canonical_rollouts.csv"): "files that the paper's authors host",
     ("lerobot-policy.md", "evaluate "): "a checkpoint; test_evaluate_lerobot.py makes and runs one",
     ("lerobot-policy.md", "build my-training"): "hours of simulation",
     ("many-machines.md", "evaluate namespace/name --executor ray"): "a cluster; test_cluster.py",
