@@ -26,7 +26,14 @@ def _read(file: RowFile, names: Sequence[str]) -> FileColumns:
     if path.name == _CANONICAL:
         names = [name for name in names if name in _CANONICAL_COLUMNS]
     text = read_bytes(path, MAX_ROW_BYTES).removeprefix(codecs.BOM_UTF8).decode()
-    csv.field_size_limit(len(text) + 1)
+    before = csv.field_size_limit(len(text) + 1)  # of the whole process
+    try:
+        return _parse(path, text, names)
+    finally:
+        csv.field_size_limit(before)
+
+
+def _parse(path: Path, text: str, names: Sequence[str]) -> FileColumns:
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows: dict[int, list[str]] = {}
     malformed: dict[int, str] = {}

@@ -19,7 +19,7 @@ def _read(file: RowFile, names: Sequence[str]) -> FileColumns:
 
     The types are those of a rollout's row; a row object for each line would take ten times as long.
     """
-    from robomme_interference_data.evaluate.run.header import whole_lines
+    from robomme_interference_data.evaluate.run.row import whole_lines
 
     path = file.path
     data = whole_lines(path)

@@ -11,7 +11,9 @@ from robomme_interference_data.schema.rollouts import KEY_COLUMNS, Status
 
 from .row_format import FileColumns, RowFile, RowFormat, Scenes, check_count, plain_name
 
-_HINT = "Expected a file of `vla-eval run` or `vla-eval export`: see docs/how-to/vla-eval.md."
+_HINT = (
+    "Expected a file of `vla-eval run` or `vla-eval export`: see docs/how-to/connect-a-policy.md."
+)
 
 
 def _read(file: RowFile, names: Sequence[str]) -> FileColumns:
