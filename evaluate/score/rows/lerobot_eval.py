@@ -29,7 +29,7 @@ def _read(file: RowFile, names: Sequence[str]) -> FileColumns:
             "success": [won for _, _, _, won in rows],
         },
         range(1, len(rows) + 1),
-        scenes=Scenes("lerobot-eval", "lerobot-eval", "policy and seed"),
+        scenes=Scenes("lerobot-eval", "lerobot-eval"),
     )
 
 

@@ -43,12 +43,10 @@ class Scenes:
     Attributes:
         program: The program that wrote the results.
         evaluation: What decides the scenes beside number and seed of an episode.
-        unknown: What the file does not state, for readers.
     """
 
     program: str
     evaluation: str
-    unknown: str
 
 
 class RowFile:

@@ -26,8 +26,7 @@ def with_stated(
 
     Args:
         parts: The files.
-        systems: A name for all files without a column for the system, or one for each of them;
-            by default the name that their file names state.
+        systems: A name for all files that name no system, or one for each of them in order.
         model_seeds: Likewise the seeds of files without a column for the model seed.
 
     Raises:
@@ -35,43 +34,47 @@ def with_stated(
         InvalidIdError: The name of a system is invalid.
         InvalidOptionError: The number of values is not that of the files that need one.
     """
-    names = _values("system", parts, systems)
-    seeds = _values("model_seed", parts, model_seeds)
-    completed = {}
+    completed = dict(parts)
     for path, part in parts.items():
-        columns = dict(part.columns)
-        if "system" not in columns:
-            system = names.get(path, part.system)
-            if system is None:
-                raise _no_system(path)
-            columns["system"] = [name_system(system).name] * len(part.lines)
-        if path in seeds:
-            columns["model_seed"] = [seeds[path]] * len(part.lines)
-        completed[path] = replace(part, columns=columns)
+        if part.system is not None:
+            completed[path] = _with(part, "system", name_system(part.system).name)
+    for path, system in _values("system", completed, systems).items():
+        completed[path] = _with(completed[path], "system", name_system(system).name)
+    for path, seed in _values("model_seed", completed, model_seeds).items():
+        completed[path] = _with(completed[path], "model_seed", seed)
+    for path, part in completed.items():
+        if "system" not in part.columns:
+            raise FormatError(
+                f"{path} names no system",
+                f"Name it, such as {named('system', 'my-memory')}; of several such files each, in "
+                f"their order (of two that are compared: {named('system_a')}, "
+                f"{named('system_b')}).",
+            )
     _check_apart(completed)
     return completed
 
 
-def _no_system(path: Path) -> FormatError:
-    return FormatError(
-        f"{path} names no system",
-        f"Name it, such as {named('system', 'my-memory')}; of several such files each, in their "
-        f"order (of two that are compared: {named('system_a')}, {named('system_b')}).",
-    )
+def _with(part: FileColumns, column: str, value: Any) -> FileColumns:
+    """Return a file with the same value in each row, unless it has the column."""
+    return replace(part, columns={column: [value] * len(part.lines), **part.columns})
 
 
 def _values(column: str, parts: Parts, stated: Sequence[Any]) -> dict[Path, Any]:
     """Return the stated value for each file without a column."""
     lacking = [path for path, part in parts.items() if column not in part.columns]
-    if not stated or not lacking:
+    if not stated:
         return {}
-    if len(stated) == 1:
+    if not lacking:
+        held = {str(value) for part in parts.values() for value in part.columns[column]}
+        if held.issuperset(map(str, stated)):
+            return {}  # the files say the same
+    if lacking and len(stated) == 1:
         return dict.fromkeys(lacking, stated[0])
     if len(stated) != len(lacking):
         raise InvalidOptionError(
             f"{counted(len(stated), 'value')} of {named(column)} for "
-            f"{counted(len(lacking), 'file')} without a column {column}: "
-            f"{', '.join(map(str, lacking))}",
+            f"{counted(len(lacking), 'file')} that state no {column}: "
+            f"{', '.join(map(str, lacking)) or 'all do'}",
             "Give one for all of them, or one for each in their order.",
         )
     return dict(zip(lacking, stated, strict=True))

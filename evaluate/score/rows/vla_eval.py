@@ -73,7 +73,7 @@ def _rows_of_others(file: RowFile) -> FileColumns:
     return FileColumns(
         columns,
         range(1, len(rows) + 1),
-        scenes=Scenes("vla-eval", f"{benchmark} {json.dumps(settings, sort_keys=True)}", "seed"),
+        scenes=Scenes("vla-eval", f"{benchmark} {json.dumps(settings, sort_keys=True)}"),
     )
 
 
