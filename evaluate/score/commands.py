@@ -60,8 +60,10 @@ def score(
     Examples:
     ```
     robomme-interference score my-run another-run --out my-score
-    robomme-interference score rollouts.csv --system retrieval-framesamp-modul \
+    robomme-interference score canonical_rollouts.csv retrieval_rollouts.csv \
       --against paper --out my-score
+    robomme-interference score act/eval_info.json pi0/eval_info.json \
+      --system act --system pi0 --expected observed --out my-score
     ```
     """
     from robomme_interference_data.runtime.memory import memory_limit
