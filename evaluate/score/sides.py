@@ -4,7 +4,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import InvalidOptionError, named
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.stats.intervals import wilson
 from robomme_interference_data.viz.tables import percent
@@ -106,7 +106,8 @@ def check_scenes(rows: CheckedRows, other_rows: CheckedRows) -> None:
         if len(found) > 1 or any(seed is None for scenes in found for _, seed in scenes):
             raise InvalidOptionError(
                 f"the scenes in {simulator} are not known to be the same in both files",
-                "Without pairs, `score` compares them.",
+                f"If their seeds are the same, name them: {named('model_seed')}; `score` compares "
+                "them without pairs.",
             )
     known, others = (
         {
@@ -140,6 +141,8 @@ def differing(
                 "is the effect of the shift."
             )
         revisions = [rows.revisions.get(first), other_rows.revisions.get(second)]
+        if any(simulator == first for simulator, _ in rows.scenes):
+            continue  # of another benchmark, whose scenes are known to be the same
         if rows is not other_rows and revisions == [None, None]:
             yield f"The rows of {first} name no revision of a buffer set: the histories may differ."
         elif revisions[0] != revisions[1]:

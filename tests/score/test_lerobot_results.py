@@ -12,6 +12,7 @@ from support.messages import raises
 
 from robomme_interference_data.errors import FormatError, InvalidIdError, InvalidOptionError
 from robomme_interference_data.evaluate.score.compare import compare
+from robomme_interference_data.evaluate.score.config import Expected
 from robomme_interference_data.evaluate.score.rows.reading import read_rows
 
 SUCCESSES = {("pusht", 0): "sssf", ("pusht", 3): "sfff"}  # 4 of 8
@@ -93,6 +94,22 @@ def test_compare_pairs_known_scenes_alone(tmp_path: Path) -> None:
     paths = [write(tmp_path / "act.json"), write(tmp_path / "smolvla.json", BETTER)]
     with raises(InvalidOptionError):
         compare(*paths, systems=("act", "smolvla"))
+    compared = compare(*paths, systems=("act", "smolvla"), model_seed=1000)
+    overall = compared.table.records()[0]
+    assert (overall["n"], overall["difference"], overall["gained"], overall["lost"]) == (
+        8,
+        0.25,
+        2,
+        0,
+    )
+    assert len(compared.notes) == 1
+
+
+def test_the_grid_is_that_of_the_files(tmp_path: Path) -> None:
+    """The benchmark's nine families are not expected of another benchmark."""
+    path = write(tmp_path / "eval_info.json")
+    found = made.score(path, system=("act",), expected=Expected.BENCHMARK)
+    assert [(row["n"], row["complete"]) for row in made.records(found, "main")] == [(8, True)]
 
 
 BROKEN = {

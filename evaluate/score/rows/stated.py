@@ -129,8 +129,8 @@ def notes_on(parts: Parts, scenes: ScenesOf) -> Iterator[str]:
     programs = dict.fromkeys(part.scenes.program for part in parts.values() if part.scenes)
     for program in programs:
         yield (
-            f"Results of {program} state no condition: they count as no-history, and each task as "
-            "a family."
+            f"Results of {program} state no condition: they count as no-history, each task as a "
+            "family, and a cell is complete with all episodes that occur in any file."
         )
     for simulator in dict.fromkeys(simulator for simulator, _ in scenes):
         others = [system for name, system in of_other_scenes(scenes) if name == simulator]
