@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import DISTRACTORS, STATE
-from robomme_interference_data.errors import HashMismatchError, InvalidOptionError, UnknownNameError
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId, whole_number
 from robomme_interference_data.schema.manifest import BufferManifest, SessionEntry, layout_sessions
-from robomme_interference_data.storage.arrays import combine
 
 from .dataset import Dataset
 from .frame_reader import FrameReader, allocate_frames
@@ -316,42 +315,13 @@ class Buffer:
     def verify(self) -> None:
         """Check the manifest, decode everything, and compare it with the recorded SHA-256.
 
-        Later reads from a cache are compared as well.
-
         Raises:
             HashMismatchError: The manifest is not the one that the rules give, a dataset does not
                 have its revision, or frames or states differ from the recorded ones.
         """
-        self._reader.verified = True
-        query, manifest = self.query, self.manifest
-        sources = [self._datasets[entry.dataset] for entry in manifest.sessions]
-        for dataset in dict.fromkeys([query.dataset, *sources]):
-            dataset.check_records()
-        if self._check_rules is not None:  # else no rule made the buffer
-            self._check_rules(manifest)
-        for entry in manifest.sessions:
-            span = entry.start, entry.stop
-            what = f"{entry.role} {entry.source}"
-            self._check_span(what, entry.dataset, entry.episode_index, span, entry.sha256)
-        stored, recorded = query.first_frame, query.record.span_sha256
-        span = stored.frame, stored.frame + 1
-        sha256 = recorded.query if recorded else ""
-        self._check_span("first live view", stored.dataset, stored.episode_index, span, sha256)
+        from .verified import verify_buffer  # most buffers are not verified
 
-    def _check_span(
-        self, what: str, name: str, index: int, span: tuple[int, int], sha256: str
-    ) -> None:
-        dataset = self._datasets[name]
-        [digests] = dataset.digests(index, [span])
-        if combine(digests) == sha256:
-            return
-        recorded = dataset.record(index).digests(*span)
-        differing = [name for name in digests if recorded and digests[name] != recorded.get(name)]
-        columns = f": {', '.join(differing)}" if differing else ""
-        raise HashMismatchError.damaged(
-            f"{self.manifest}: {what} ({name} episode {index}, frames {span[0]} to {span[1] - 1}) "
-            f"does not have the recorded SHA-256{columns}"
-        )
+        verify_buffer(self.manifest, self.query, self._datasets, self._check_rules)
 
     def _chosen(self, indices: Sequence[int] | None) -> NDArray[np.int64]:
         """Return the indices of the frames to stream, `(n,) int64`."""

@@ -32,9 +32,8 @@ from robomme_interference_data.storage.files import Files, LocalFiles, digest_js
 
 from .buffer import Buffer
 from .dataset import Dataset
-from .manifest_table import ManifestTable
 from .query import Query
-from .set_datasets import SetDatasets, dataset_files
+from .set_files import ManifestTable, SetDatasets, dataset_files
 
 if TYPE_CHECKING:
     import pandas
@@ -152,7 +151,7 @@ class BufferSet:
         return SetDatasets(names, self.dataset_files, self.header, (self.fix, command))
 
     def dataset_files(self, name: str) -> Files:
-        """Return access to a dataset's files; see `set_datasets.dataset_files`."""
+        """Return access to a dataset's files; see `set_files.dataset_files`."""
         return dataset_files(self.files, self.header, name)
 
     @cached_property

@@ -65,7 +65,7 @@ def load_buffer_set(
     if threads is not None:
         threads = whole_number("threads", threads, "an integer from 1, or None", 1)
     try:
-        return BufferSet(files, _cache(cache), threads)
+        return BufferSet(files, open_cache(cache), threads)
     except MissingFileError as error:
         raise _no_buffer_set(files) from error
 
@@ -141,8 +141,7 @@ def load_buffer(
             by `load_buffer_set` (then `revision`, `cache` and `threads` are ignored).
         revision: As for `load_buffer_set`.
         k: Short for the condition `k<k>`, instead of `condition`.
-        verify: Decode everything now and compare it with the recorded SHA-256, and later also
-            compare what is read from the cache.
+        verify: Decode everything now and compare it with the recorded SHA-256.
         cameras: Cameras whose videos are downloaded now, such as `["front"]`; None for all. Other
             videos are downloaded when they are used.
         cache: As for `load_buffer_set`.
@@ -195,13 +194,14 @@ def open_dataset(buffer_set: BufferSet, name: str, more: str = "") -> Dataset:
     )
 
 
-def _cache(cache: "bool | str | os.PathLike[str] | DecodedCache") -> "DecodedCache | None":
+def open_cache(cache: "bool | str | os.PathLike[str] | DecodedCache") -> "DecodedCache | None":
+    """Return the cache that an argument `cache` means, None for none; see `load_buffer_set`."""
     if cache is False or cache is None:
         return None
-    from robomme_interference_data.storage.cache import DecodedCache, default_cache_folder
+    from robomme_interference_data.storage.cache import DecodedCache
 
     if cache is True:
-        return DecodedCache(default_cache_folder())
+        return DecodedCache()
     if isinstance(cache, DecodedCache):
         return cache
     _check_location("cache", cache, "True, False, a folder or a DecodedCache")

@@ -156,16 +156,21 @@ class VideoEncoder:
             self._container.mux(self._stream.encode(None))
             self._container.close()
 
+    def abandon(self) -> None:
+        """Close the unfinished file; what goes wrong then does not matter."""
+        # Otherwise PyAV closes it during garbage collection, and prints the error there.
+        with suppress(av.error.FFmpegError):
+            self._container.close()
+
     @contextmanager
     def _errors(self) -> Iterator[None]:
         try:
             yield
         except (av.error.FFmpegError, UnknownCodecError) as error:
             if self._container is not None:
-                # Otherwise PyAV closes it during garbage collection, and prints the error again.
-                with suppress(av.error.FFmpegError):
-                    self._container.close()
-            raise BuildError(f"{self._path}: the video cannot be written: {error}") from error
+                self.abandon()
+            hint = "Check the free disk space." if isinstance(error, OSError) else None
+            raise BuildError(f"{self._path}: the video cannot be written: {error}", hint) from error
 
 
 def png(image: NDArray[np.uint8]) -> bytes:

@@ -145,17 +145,20 @@ class HubFiles(Files):
         `snapshot_download` would first list the whole repository: for one buffer of a large
         dataset, more bytes and requests than the buffer's metadata.
         """
-        from huggingface_hub.utils import tqdm
+        from huggingface_hub.utils import are_progress_bars_disabled
+
+        from robomme_interference_data.progress import WorkProgress
 
         missing = self.missing(paths)
         if not missing:
             return
         with (
-            tqdm(total=len(missing), desc=f"Fetching from {self.repo_id}", unit=" files") as bar,
+            WorkProgress(unit="files", quiet=are_progress_bars_disabled()) as progress,
             ThreadPoolExecutor(_PARALLEL_DOWNLOADS) as pool,
         ):
+            progress.start(f"Fetching from {self.repo_id}", len(missing))
             for _ in pool.map(self.path, missing):  # an error cancels the downloads in the queue
-                bar.update()
+                progress.advance(1)
 
     def missing(self, paths: Iterable[str]) -> list[str]:
         """Return the files that are not in the cache, each once."""

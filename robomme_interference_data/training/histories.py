@@ -74,6 +74,11 @@ class Histories:
         """Most frames of a planned history."""
         return max(len(history.rows) for history in self._known.values())
 
+    @property
+    def rows(self) -> NDArray[np.int64]:
+        """The rows of all planned histories."""
+        return np.concatenate([history.rows for history in self._known.values()])
+
     def plan(
         self,
         conditions: Sequence[str],

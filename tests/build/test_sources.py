@@ -143,8 +143,25 @@ def test_a_folder_without_the_kind_of_its_content(source: Source, tmp_path: Path
     with pytest.raises(InvalidOptionError) as caught:
         open_source(text)
     assert caught.value.hint == f"Write {source.provenance['kind']}:{text}"
-    with raises(UnknownNameError):
+
+
+def test_a_folder_of_another_kind_of_source(source: Source, tmp_path: Path) -> None:
+    kind, folder = source.provenance["kind"], tmp_path / "made"
+    other = "lerobot" if kind == "frames" else "frames"
+    with pytest.raises(InvalidOptionError) as caught:
+        open_source(f"{other}:{folder}")
+    assert caught.value.hint == f"Write {kind}:{folder}"
+
+
+def test_folders_that_hold_no_recordings(tmp_path: Path) -> None:
+    with raises(MissingFileError):
+        open_source(f"frames:{tmp_path / 'nowhere'}")
+    (tmp_path / "episode_0.hdf5").write_text("of another kind")
+    with raises(InvalidOptionError):
         open_source(str(tmp_path))
+    with raises(SourceError) as caught:
+        open_source(f"robomme-h5:{tmp_path}")
+    assert "your-own-recordings" in (caught.value.hint or "")
 
 
 def test_the_docs_know_all_kinds() -> None:

@@ -63,3 +63,8 @@ def files(hub: HubServer, repo_id: str, revision: str = "main") -> dict[str, byt
     """Return the files of a repository but the Hub's own."""
     found = hub.repositories[f"datasets/{repo_id}"].find(revision).files
     return {path: one.data for path, one in sorted(found.items()) if path != ".gitattributes"}
+
+
+def writes(hub: HubServer) -> list[str]:
+    """Return the requests that change the Hub."""
+    return [one for one in hub.requests if not one.startswith(("GET", "HEAD"))]

@@ -13,6 +13,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from support.buffer_sets import GOLDEN, QUERIES, copy_buffer_set, plan_again
+from support.hub import BUFFER_SET, push_buffer_set
+from support.hub_server import HubServer
 from support.messages import raises
 from support.retrieval import make_index
 from support.shifted import add_shifted
@@ -22,7 +24,12 @@ from torch.utils.data import default_collate
 from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.constants import EXECUTIONS, MANIFESTS, STATE
 from robomme_interference_data.data.questions import read_questions
-from robomme_interference_data.errors import InvalidOptionError, MissingFileError, UnknownNameError
+from robomme_interference_data.errors import (
+    HashMismatchError,
+    InvalidOptionError,
+    MissingFileError,
+    UnknownNameError,
+)
 from robomme_interference_data.retrieval.select import choose, measure
 from robomme_interference_data.retrieval.selector import Selector
 from robomme_interference_data.schema.sampling import Memory
@@ -47,11 +54,11 @@ def buffers(executed_buffers: Path, tmp_path_factory: pytest.TempPathFactory) ->
 
 @pytest.fixture(scope="session")
 def make(buffers: Path, tmp_path_factory: pytest.TempPathFactory) -> Make:
-    """Make a dataset of that buffer set; the store of frames is shared."""
-    store = tmp_path_factory.mktemp("store")
+    """Make a dataset of that buffer set; the cache is shared."""
+    store = tmp_path_factory.mktemp("cache")
 
     def call(conditions: Any = ("k3",), **options: Any) -> HistoryDataset:
-        usual: dict[str, Any] = {"store": store, "quiet": True, "image_size": 16}
+        usual: dict[str, Any] = {"cache": store, "quiet": True, "image_size": 16}
         return HistoryDataset(buffers, conditions, **usual | options)
 
     return call
@@ -146,7 +153,7 @@ def test_views_under_shifts(make: Make, buffers: Path) -> None:
 
 @pytest.mark.slow
 def test_questions_as_tensors(tmp_path: Path) -> None:
-    options: dict[str, Any] = {"chunk": 0, "questions": True, "store": tmp_path, "quiet": True}
+    options: dict[str, Any] = {"chunk": 0, "questions": True, "cache": tmp_path, "quiet": True}
     data = HistoryDataset(TABLETOP, ["k0"], image_size=8, **options)
     questions = read_questions(load_buffer_set(TABLETOP))
     for number, episode in enumerate(data.episode_ids):
@@ -193,7 +200,7 @@ def test_a_batch_is_the_collated_items(memory: str, make: Make) -> None:
 
 @pytest.mark.slow
 def test_a_batch_of_questions_and_shifts(make: Make, tmp_path: Path) -> None:
-    options: dict[str, Any] = {"chunk": 0, "questions": True, "store": tmp_path, "quiet": True}
+    options: dict[str, Any] = {"chunk": 0, "questions": True, "cache": tmp_path, "quiet": True}
     asked = HistoryDataset(TABLETOP, ["k0"], image_size=8, **options)
     shifted = make(["k0"], chunk=0, shifts={"none": 1, str(SHIFTS[2]): 1}, seed=3)
     assert len({shifted[index]["shift"] for index in range(3)}) == 2
@@ -266,6 +273,61 @@ def test_sessions_drawn_anew_keep_the_rules(make: Make, buffers: Path) -> None:
     assert len(drawn) > 3  # other draws in other epochs
 
 
+# --- other processes ---------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_spawned_workers_open_the_same_items(make: Make) -> None:
+    data = make({"k0": 1, "k3": 1}, chunk=0)
+    loader = torch.utils.data.DataLoader(
+        data, num_workers=1, batch_size=None, multiprocessing_context="spawn"
+    )
+    for index, item in enumerate(loader):
+        assert item["condition"] == data[index]["condition"]
+        assert torch.equal(item["memory.images.front"], data[index]["memory.images.front"])
+
+
+def test_a_buffer_set_that_changed_is_an_error_of_its_items(
+    executed_buffers: Path, tmp_path: Path
+) -> None:
+    root = copy_buffer_set(tmp_path / "buffers", executed_buffers)
+    data = HistoryDataset(root, ["k0"], chunk=0, cache=tmp_path / "cache", quiet=True)
+    same = pickle.dumps(data)
+    assert pickle.loads(same)[0]["episode_id"] == data[0]["episode_id"]
+    plan_again(root, ["k0", "k1"])
+    with raises(HashMismatchError):
+        pickle.loads(same)[0]
+
+
+@pytest.mark.slow
+def test_a_spawned_worker_reports_a_changed_set(executed_buffers: Path, tmp_path: Path) -> None:
+    root = copy_buffer_set(tmp_path / "buffers", executed_buffers)
+    data = HistoryDataset(root, ["k0"], chunk=0, cache=tmp_path / "cache", quiet=True)
+    plan_again(root, ["k0", "k1"])
+    loader = torch.utils.data.DataLoader(data, num_workers=1, multiprocessing_context="spawn")
+    with pytest.raises(HashMismatchError) as raised:
+        next(iter(loader))
+    assert "was changed since the training began" in str(raised.value)
+
+
+def test_only_the_sessions_in_use_are_stored(make: Make, tmp_path: Path) -> None:
+    """A lesson of 48 frames, an execution of 212, and for k1 a unit of 32."""
+    for condition, frames in (("k0", [48, 212]), ("k1", [32, 48, 212])):
+        cache = tmp_path / condition
+        make([condition], families=["MoveCube"], cache=cache)
+        sizes = sorted(path.stat().st_size for path in cache.iterdir())
+        assert sizes == [count * 3 * 16 * 16 + 32 for count in frames]
+
+
+def test_only_the_videos_in_use_are_downloaded(hub: HubServer, tmp_path: Path) -> None:
+    push_buffer_set(hub, GOLDEN, tmp_path / "work")
+    options: dict[str, Any] = {"chunk": 0, "cache": tmp_path / "cache", "quiet": True}
+    data = HistoryDataset(BUFFER_SET, ["k1"], families=["MoveCube"], **options)
+    assert len(data) == 1
+    videos = [path for path in hub.downloads() if path.startswith("videos/")]
+    assert len(videos) == 2 and not any("wrist" in path for path in videos)
+
+
 # --- what it refuses ---------------------------------------------------------------------------
 
 
@@ -295,6 +357,7 @@ def test_sessions_drawn_anew_keep_the_rules(make: Make, buffers: Path) -> None:
         ({"questions": True}, MissingFileError),
         ({"conditions": ["raw-k1"], "redraw": True}, MissingFileError),
         ({"memory": "full", "redraw": True}, InvalidOptionError),
+        ({"cache": False}, InvalidOptionError),
     ],
 )
 def test_bad_input(options: dict[str, Any], error: type[Exception], make: Make) -> None:
@@ -304,9 +367,9 @@ def test_bad_input(options: dict[str, Any], error: type[Exception], make: Make) 
 
 def test_a_buffer_set_without_executions(tiny_buffers: Path, tmp_path: Path) -> None:
     with raises(MissingFileError) as raised:
-        HistoryDataset(tiny_buffers, ["k0"], store=tmp_path)
+        HistoryDataset(tiny_buffers, ["k0"], cache=tmp_path)
     assert raised.value.command == f"build {tiny_buffers} --only executions --source KIND:PATH"
-    assert HistoryDataset(tiny_buffers, ["k0"], chunk=0, store=tmp_path, quiet=True)[0]
+    assert HistoryDataset(tiny_buffers, ["k0"], chunk=0, cache=tmp_path, quiet=True)[0]
 
 
 @pytest.mark.slow
@@ -314,7 +377,7 @@ def test_manifests_planned_before_the_executions(executed_buffers: Path, tmp_pat
     root = copy_buffer_set(tmp_path / "buffers", executed_buffers)
     shutil.copytree(GOLDEN / MANIFESTS, root / MANIFESTS, dirs_exist_ok=True)
     with pytest.raises(MissingFileError) as caught:
-        HistoryDataset(root, ["k0"], store=tmp_path)
+        HistoryDataset(root, ["k0"], cache=tmp_path)
     assert str(caught.value.command).endswith("--only manifests")
     plan_again(root)
-    assert len(HistoryDataset(root, ["k0"], store=tmp_path, quiet=True)) == 3 * LIVE
+    assert len(HistoryDataset(root, ["k0"], cache=tmp_path, quiet=True)) == 3 * LIVE
