@@ -24,12 +24,11 @@ from .tables import column_table
 
 README = "README.md"
 
-PAPER = "https://robotmemorybench.com"
+PAPER = "https://arxiv.org/abs/2606.22338"
 BIBTEX = f"""@article{{rathi2026robommeinterference,
   title  = {{RoboMME-Interference: Benchmarking Robot Memory Under Interference}},
   author = {{Rathi, Soumil}},
   year   = {{2026}},
-  month  = {{8}},
   url    = {{{PAPER}}}
 }}"""
 """The paper; `CITATION.cff` of the project says the same."""
