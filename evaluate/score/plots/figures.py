@@ -11,7 +11,7 @@ from robomme_interference_data.evaluate.systems import published_base
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
 from robomme_interference_data.viz.figure import INK, open_figure, save_figure
 
-from . import curves, forests, matrices
+from . import cost, curves, forests, matrices
 from .curves import curve, explained, legend
 from .data import FEW, PUBLISHED, Data
 
@@ -33,6 +33,7 @@ FIGURES = {
     "retrieval": "Systems with and without retrieval",
     "by_evidence_kept": "Success by whether the memory kept the evidence",
     "ceiling": "Gap to the ideal observer with the same memory",
+    "cost": "Success against the seconds of a rollout",
     "matrix": "Which systems differ significantly",
     "action_error": "Action error by condition",
 }
@@ -194,5 +195,6 @@ _DRAWERS = {
     "retrieval": _retrieval,
     "by_evidence_kept": forests.by_evidence_kept,
     "ceiling": forests.ceiling,
+    "cost": cost.cost,
     "matrix": matrices.matrix,
 }

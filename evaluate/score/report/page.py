@@ -38,7 +38,7 @@ _LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
 
 _SHOWN_IN = {
     "effects": ("effects",),
-    "success": ("main", "chance", "paper"),
+    "success": ("main", "paper"),
     "families": ("parts",),
     "heatmap": ("parts",),
     "difficulty": ("parts",),
@@ -48,6 +48,7 @@ _SHOWN_IN = {
     "interference": ("effects",),
     "by_evidence_kept": ("evidence_effects", "evidence_use"),
     "ceiling": ("effects",),
+    "cost": ("cost",),
     "matrix": ("matrix", "main"),
     "action_error": ("action_error", "action_error_effects"),
 }

@@ -50,7 +50,7 @@ def main_grids(cells: Sequence[SuccessCell]) -> list[Table]:
         chances = [cell.chance for cell in own if not math.isnan(cell.chance)]
         if chances:
             levels = dict.fromkeys([percent(min(chances)), percent(max(chances))])
-            notes.append(f"Guessing succeeds in {' to '.join(levels)}: see the table chance.")
+            notes.append(f"Guessing succeeds in {' to '.join(levels)}: see the table main.")
         errors = sum(cell.errors for cell in own)
         notes.append(f"Errors: {errors}." if errors else "No errors.")
         title = f"Success by system and condition, {simulator}"
