@@ -20,7 +20,7 @@ from robomme_interference_data.evaluate.score.config import Expected, Settings
 from robomme_interference_data.evaluate.score.outcomes import STATUSES
 from robomme_interference_data.evaluate.score.plots.data import Data
 from robomme_interference_data.evaluate.score.plots.figures import draw_error_figure, draw_figure
-from robomme_interference_data.evaluate.score.report.page import headlines
+from robomme_interference_data.evaluate.score.report.headline import headlines
 from robomme_interference_data.evaluate.score.scoring import Score, score
 from robomme_interference_data.evaluate.score.tables.cells import Coverage
 from robomme_interference_data.evaluate.score.writing import write_score

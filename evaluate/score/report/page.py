@@ -30,8 +30,7 @@ from robomme_interference_data.storage.files import sha256_file, write_text
 from robomme_interference_data.viz.tables import Table
 from robomme_interference_data.viz.templates import fill
 
-from .headline import headline
-from .strongest import strongest
+from .headline import headlines
 
 _LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
 """Libraries that numbers and figures depend on."""
@@ -67,7 +66,6 @@ def write_report(
     conditions = [condition.name for condition in in_order(names)] if names else []
     values = {
         "headlines": headlines(score),
-        "strongest": {name: strongest(score, name) for name in _simulators(score)},
         "grids": score.grids,
         "tables": score.tables.values(),
         "systems": _names(score),
@@ -85,11 +83,6 @@ def write_report(
     }
     html = fill(__package__, "report.html.j2", values, what="the report", autoescape=True)
     write_text(out, html)
-
-
-def headlines(score: Score) -> dict[str, str]:
-    """Return the main finding of each simulator, and of recordings."""
-    return {name: headline(score, name) for name in _simulators(score)}
 
 
 def _simulators(score: Score) -> list[str]:
