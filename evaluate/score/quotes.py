@@ -1,7 +1,7 @@
 """Sentences whose numbers are quoted from tables, so that a sentence and a table never differ."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from string import Formatter
 from typing import Any
@@ -21,7 +21,7 @@ class Quote:
     Attributes:
         table: Name of the table.
         rows: Places of its rows.
-        column: The column whose values in these rows are added up; empty for the number of rows.
+        column: The column of the one row; empty for the number of rows.
         text: The number as the sentence prints it.
     """
 
@@ -73,22 +73,12 @@ def rows_of(table: Table | None, **equal: Any) -> list[TableRow]:
 
 
 def number_of(rows: Sequence[TableRow]) -> Quote:
-    """Return the number of some rows, of which there is at least one."""
-    return Quote(rows[0].table.name, _places(rows), "", f"{len(rows):,}")
+    """Return the number of some rows of one table."""
+    table = rows[0].table.name if rows else ""
+    return Quote(table, tuple(row.place for row in rows), "", f"{len(rows):,}")
 
 
-def total(rows: Sequence[TableRow], column: str) -> Quote:
-    """Return the sum of a column of counts over some rows, of which there is at least one."""
-    return Quote(
-        rows[0].table.name, _places(rows), column, f"{sum(row[column] or 0 for row in rows):,}"
-    )
-
-
-def _places(rows: Iterable[TableRow]) -> tuple[int, ...]:
-    return tuple(row.place for row in rows)
-
-
-def say(template: str, row: TableRow | None = None, **words: "str | Quote | Sentence") -> Sentence:
+def say(template: str, row: TableRow | None = None, /, **words: str | Quote | Sentence) -> Sentence:
     """Fill a template with words, quotes and parts of sentences.
 
     A field that is none of the `words` is a column of the row, as in `{rate} of {n} episodes`: a
@@ -116,7 +106,7 @@ def say(template: str, row: TableRow | None = None, **words: "str | Quote | Sent
 
 
 def joined(parts: Sequence[Sentence], separator: str, last: str = "") -> Sentence:
-    """Return parts of a sentence as one, with another separator before the last, such as ` and `."""
+    """Return parts of a sentence as one; `last` is another separator before the last part."""
     text = ""
     for number, part in enumerate(parts):
         if number:

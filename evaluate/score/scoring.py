@@ -105,7 +105,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     recordings = offline_outcomes(rows)
     cells = cells_of(simulated)
     contrasts, notes = _compared(simulated, draws)
-    notes += [sentence for each in simulated if (sentence := _repeat_noise(each))]
+    notes += [sentence for each in simulated if (sentence := repeat_noise(each))]
     tables = [
         main_table(cells),
         parts_table(cells),
@@ -207,7 +207,7 @@ def _compared(all_outcomes: Sequence[Outcomes], draws: int) -> tuple[list[Contra
     return contrasts, notes
 
 
-def _repeat_noise(outcomes: Outcomes) -> str:
+def repeat_noise(outcomes: Outcomes) -> str:
     """Return a sentence on how often two repeats of a rollout disagree; empty without repeats."""
     pairs, flips = outcomes.repeat_flips
     if not pairs:

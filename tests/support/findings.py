@@ -84,7 +84,9 @@ def _tiny() -> list[Rollout]:
     """Twelve episodes of four families."""
     four = FAMILIES[:4]
     rows = cell("alpha", "k0", "ssssssffffff", four) + cell("alpha", "k7", "sssfffffffff", four)
-    return rows + cell("beta", "k0", "sssfffffffff", four) + cell("beta", "k7", "sssfffffffff", four)
+    return (
+        rows + cell("beta", "k0", "sssfffffffff", four) + cell("beta", "k7", "sssfffffffff", four)
+    )
 
 
 FINDINGS: dict[str, Callable[[], list[Rollout]]] = {

@@ -45,6 +45,7 @@ class Data:
         flips: Share of outcomes that differ between repeats; None without repeats.
         distinguishable: Condition and pair of systems that differ significantly.
         by_evidence_kept: The rate of each level of evidence, as rows of `evidence_effects`.
+        family_falls: The fall of each system in each family, as rows of `family_falls`.
         chance: Success of guessing by part of the episodes, if all are questions.
     """
 
@@ -69,6 +70,7 @@ class Data:
             for record in _records(score, "evidence_effects", simulator)
             if not record["against_kept"]
         ]
+        self.family_falls = _records(score, "family_falls", simulator)
         asked = sorted((cell for cell in own if cell.chance >= 0), key=lambda cell: cell.n)
         self.chance = {cell.part: cell.chance for cell in asked}
         bases = [base for name in self.systems if (base := published_base(name))]

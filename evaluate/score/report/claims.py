@@ -12,10 +12,10 @@ from robomme_interference_data.evaluate.score.quotes import (
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.schema.conditions import NO_HISTORY
 
-from .falls import Fall, Verdict
+from .falls import Fall, Finding
 
-_ALONE = 2
-"""The most systems with a verdict that are stated with their numbers."""
+FEW = 2
+"""The most systems, or cells, that a sentence names one by one with their numbers."""
 
 
 def named(condition: str) -> str:
@@ -23,67 +23,88 @@ def named(condition: str) -> str:
     return "no history" if condition == NO_HISTORY else condition
 
 
-def verdicts(falls: Sequence[Fall]) -> Sentence:
-    """State what is concluded about falls; empty without any."""
-    parts = []
-    for verdict in Verdict:
-        own = [fall for fall in falls if fall.verdict is verdict]
-        if own:
-            few = len(falls) <= _ALONE
-            parts += [_one(fall) for fall in own] if few else [_several(own, verdict)]
-    if not parts:
+def sentence(clauses: Sequence[Sentence]) -> Sentence:
+    """Return clauses as a sentence; an empty one without any."""
+    if not clauses:
         return Sentence("")
-    if not all(fall.complete for fall in falls):
-        parts.append(Sentence("all provisional"))
-    return _capital(joined(parts, "; "))
+    whole = joined(clauses, "; ")
+    return Sentence(f"{whole.text[0].upper()}{whole.text[1:]}.", whole.quotes)
 
 
-def _one(fall: Fall) -> Sentence:
-    """State the verdict of one system with its numbers."""
+# --- falls -----------------------------------------------------------------------------------
+
+
+def findings(falls: Sequence[Fall], compared: int) -> Sentence:
+    """State what is concluded about falls; empty without any.
+
+    `compared` is the number of comparisons that were corrected together.
+    """
+    clauses = list[Sentence]()
+    for finding in Finding:
+        own = [fall for fall in falls if fall.finding is finding]
+        if own and len(falls) <= FEW:
+            clauses += [_finding(fall, compared) for fall in own]
+        elif own:
+            clauses.append(_several(own, finding))
+    concluded = [fall for fall in falls if fall.finding is not Finding.ERRORS]
+    if any(not fall.complete for fall in concluded):
+        clauses.append(Sentence("provisional, because a cell is incomplete"))
+    return sentence(clauses)
+
+
+def _finding(fall: Fall, compared: int) -> Sentence:
+    """State what is concluded about one system, with its numbers."""
     row, name = fall.row, display_name(fall.system)
-    match fall.verdict:
-        case Verdict.FALL:
-            return say(
+    match fall.finding:
+        case Finding.FALL:
+            text = (
                 "a fall is shown: {name}'s {condition} is {joint_high:size} to {joint_low:size} "
-                "points below its own {against_condition} (95% interval, {p})",
-                row,
-                name=name,
-                p=p_of(row),
+                "points below its own {against_condition} ({level} interval, {p})"
             )
-        case Verdict.RISE:
-            return say(
+        case Finding.RISE:
+            text = (
                 "a rise is shown: {name}'s {condition} is {joint_low:size} to {joint_high:size} "
-                "points above its own {against_condition} (95% interval, {p})",
-                row,
-                name=name,
-                p=p_of(row),
+                "points above its own {against_condition} ({level} interval, {p})"
             )
-        case Verdict.EXCLUDED:
+        case Finding.EXCLUDED:
             assert fall.equivalence is not None
             return say(
-                "a fall of more than {margin:size} points is excluded: {name}'s {condition} minus "
-                "its own {against_condition} is {low_90} to {high_90} points (90% interval)",
+                "a fall of {name} of more than {margin:size} points is excluded (90% interval of "
+                "{condition} − {against_condition}: {low_90} to {high_90})",
                 fall.equivalence,
                 name=name,
             )
-        case _:
-            excluded = ""
-            if row["joint_low"] is not None and row["joint_low"] < 0:
-                excluded = say(", and one of up to {joint_low:size} points is not excluded", row)
-            return say(
-                "no fall of {name} from {against_condition} to {condition} is shown{excluded} (95% "
-                "interval {joint_low} to {joint_high}, {p})",
-                row,
-                name=name,
-                excluded=excluded,
-                p=p_of(row),
+        case Finding.ERRORS:
+            text = (
+                "no conclusion on {name} before its broken rollouts are run again: {condition} − "
+                "{against_condition} is {if_failures} points if all of them are failures, and "
+                "{if_successes} if all are successes"
             )
+        case Finding.OPEN:
+            text = "no fall of {name} from {against_condition} to {condition} is shown"
+            # Without an interval, or where it excludes 0 although p does not, this is all.
+            if row["joint_low"] is not None and row["joint_low"] < 0:
+                text += ", and up to {joint_low:size} points is not excluded"
+            text += " ({interval}{p})"
+    level = _level(compared)
+    return say(text, row, name=name, p=p_of(row), level=level, interval=_interval(row, level))
 
 
-def _several(falls: Sequence[Fall], verdict: Verdict) -> Sentence:
+def _level(compared: int) -> str:
+    return "corrected 95%" if compared > 1 else "95%"
+
+
+def _interval(row: TableRow, level: str) -> Sentence:
+    """State an interval before a p; empty without one."""
+    if row["joint_low"] is None:
+        return Sentence("")
+    return say("{level} interval {joint_low} to {joint_high}, ", row, level=level)
+
+
+def _several(falls: Sequence[Fall], finding: Finding) -> Sentence:
     names = joined([Sentence(display_name(fall.system)) for fall in falls], ", ", " and ")
     count = number_of([fall.row for fall in falls])
-    return say("{verdict} for {count}: {names}", verdict=verdict, count=count, names=names)
+    return say("{finding} for {count}: {names}", finding=finding, count=count, names=names)
 
 
 def p_of(row: TableRow) -> Sentence:
@@ -94,18 +115,47 @@ def p_of(row: TableRow) -> Sentence:
     return say("p {equals}{p}", equals=equals, p=quote)
 
 
+def falls_apart(rows: Sequence[TableRow]) -> Sentence:
+    """State whether two systems fall differently, or in how many pairs; empty without any."""
+    if len(rows) == 1:
+        return sentence([_apart(rows[0])])
+    shown = [row for row in rows if row["verdict"] == "shown"]
+    if not rows:
+        return Sentence("")
+    count, of = number_of(shown), number_of(rows)
+    text = "the falls of two systems differ in {count} of {of} pairs"
+    return sentence([say(text, count=count, of=of)])
+
+
+def _apart(row: TableRow) -> Sentence:
+    """State the difference of two falls, in points for each doubling of the sessions."""
+    names = [display_name(row[column]) for column in ("system", "against_system")]
+    match row["verdict"]:
+        case "shown":
+            text = (
+                "the falls differ: each time that the sessions double, {a} changes by {slope} "
+                "points and {b} by {against_slope} ({p})"
+            )
+        case "depends on errors":
+            text = "no conclusion on the falls of {a} and {b} before errors are run again"
+        case _:
+            text = "no difference between the falls of {a} and {b} is shown ({p})"
+    return say(text, row, a=names[0], b=names[1], p=p_of(row))
+
+
+# --- what is missing ---------------------------------------------------------------------------
+
+
 def lacks(cells: Sequence[TableRow], apart: Sequence[Fall] = ()) -> Sentence:
     """State which rollouts broke or are missing in some cells with rows; empty if none.
 
     `apart` are the falls over fewer episodes than those of the first sentence.
     """
-    broken = [row for row in cells if row["errors"]]
     # An episode that broke is missing, too.
     short = [row for row in cells if row["missing"] > row["errors"]]
-    outside = [row for row in cells if not row["complete"] and not row["missing"]]
-    parts = [
+    clauses = [
         *_each(
-            broken,
+            [row for row in cells if row["errors"]],
             "{errors} rollouts of {name} under {under} broke{bound}",
             "rollouts broke in {count} cells",
         ),
@@ -115,13 +165,12 @@ def lacks(cells: Sequence[TableRow], apart: Sequence[Fall] = ()) -> Sentence:
             "episodes are missing in {count} cells",
         ),
         *_each(
-            outside,
+            [row for row in cells if not row["complete"] and not row["missing"]],
             "episodes of {name} under {under} are outside the grid",
             "episodes are outside the grid in {count} cells",
         ),
     ]
-    parts += [over_both(fall) for fall in apart[:_ALONE]]
-    return _capital(joined(parts, "; "))
+    return sentence([*clauses, *map(over_both, apart[:FEW])])
 
 
 def over_both(fall: Fall) -> Sentence:
@@ -136,7 +185,7 @@ def over_both(fall: Fall) -> Sentence:
 
 def _each(rows: Sequence[TableRow], text: str, several: str) -> list[Sentence]:
     """Fill a text for each of a few rows, or state the number of many."""
-    if len(rows) > _ALONE:
+    if len(rows) > FEW:
         return [say(several, count=number_of(rows))]
     return [
         say(
@@ -155,10 +204,3 @@ def _bound(row: TableRow) -> Sentence:
     if "if_errors_fail" not in row.table.columns:
         return Sentence("")
     return say(", and its rate is {if_errors_fail} if they count as failures", row)
-
-
-def _capital(clause: Sentence) -> Sentence:
-    """Return a clause as a sentence of its own; an empty one stays empty."""
-    if not clause.text:
-        return clause
-    return Sentence(f"{clause.text[0].upper()}{clause.text[1:]}.", clause.quotes)

@@ -1,4 +1,4 @@
-"""What a score concludes about the fall of each system from k0 to the most sessions."""
+"""What the primary analysis concludes about the fall of each system."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,20 +6,21 @@ from enum import StrEnum
 
 from robomme_interference_data.evaluate.score.quotes import TableRow, rows_of
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.score.tables.contrast import START, Effect
+from robomme_interference_data.evaluate.score.tables.contrast import START
 from robomme_interference_data.evaluate.score.tables.equivalence import EQUIVALENT
-from robomme_interference_data.schema.conditions import parse_condition
-from robomme_interference_data.stats.significance import ALPHA
+
+CHECKPOINT = "checkpoint"
+"""The scope of an interval that holds for these weights only."""
 
 
-class Verdict(StrEnum):
-    """What is concluded about a fall."""
+class Finding(StrEnum):
+    """What is concluded about a fall, in the order of sentences."""
 
     FALL = "a fall is shown"
     RISE = "a rise is shown"
     EXCLUDED = "a fall beyond the margin is excluded"
     OPEN = "no fall is shown"
-    NONE = "no conclusion"  # another one if the errors were failures, or successes
+    ERRORS = "no conclusion before broken rollouts are run again"
 
 
 @dataclass(frozen=True)
@@ -27,10 +28,10 @@ class Fall:
     """The fall of a system: rows of tables.
 
     Attributes:
-        row: The comparison of its last condition with its own k0.
-        equivalence: The same with the margin, if one was stated.
-        start: Its rate under k0.
-        end: Its rate under the last condition.
+        row: The primary comparison with its own k0, in `effects`.
+        equivalence: The same with a margin, if one was stated.
+        start: Its rate under k0, in `main`.
+        end: Its rate under the condition that is compared.
     """
 
     row: TableRow
@@ -54,35 +55,31 @@ class Fall:
         return bool(self.row["complete"])
 
     @property
-    def verdict(self) -> Verdict:
+    def finding(self) -> Finding:
         """What is concluded."""
-        if self.row["p_holm"] is not None and self.row["p_holm"] < ALPHA:
-            return Verdict.FALL if self.row["difference"] < 0 else Verdict.RISE
+        match self.row["verdict"]:
+            case "shown":
+                return Finding.FALL if self.row["difference"] < 0 else Finding.RISE
+            case "depends on errors":
+                return Finding.ERRORS
         if self.equivalence is not None and self.equivalence["verdict"] == EQUIVALENT:
-            return Verdict.EXCLUDED
-        return Verdict.OPEN
+            return Finding.EXCLUDED
+        return Finding.OPEN
 
 
 def falls_of(score: Score, simulator: str) -> list[Fall]:
-    """Return the fall of each system that ran k0 and a condition after it.
+    """Return the fall of each system of a simulator that ran k0 and a condition after it.
 
-    References are left out where other systems have rows. All falls are to one condition: the most
-    sessions that any system ran.
+    References are left out where other systems have falls.
     """
-    sessions = rows_of(score.tables.get("effects"), simulator=simulator, effect=Effect.SESSIONS)
-    sessions = ranked(score, simulator, sessions)
-    last = max((str(row["condition"]) for row in sessions), key=_sessions, default="")
-    return [_fall(score, row) for row in sessions if row["condition"] == last and row["n"]]
+    rows = rows_of(score.tables.get("effects"), simulator=simulator, primary=True)
+    return [_fall(score, row) for row in ranked(score, rows) if row["n"]]
 
 
-def ranked(score: Score, simulator: str, rows: Sequence[TableRow]) -> list[TableRow]:
+def ranked(score: Score, rows: Sequence[TableRow]) -> list[TableRow]:
     """Return rows without those of references, or all where there are no others."""
-    kept = [row for row in rows if not score.is_reference(simulator, row["system"])]
+    kept = [row for row in rows if not score.is_reference(row["simulator"], row["system"])]
     return kept or [*rows]
-
-
-def _sessions(condition: str) -> int:
-    return parse_condition(condition).k
 
 
 def _fall(score: Score, row: TableRow) -> Fall:

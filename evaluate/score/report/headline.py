@@ -16,12 +16,9 @@ from robomme_interference_data.evaluate.score.tables.contrast import START
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.schema.conditions import in_order
 
-from .claims import lacks, named, over_both, verdicts
-from .falls import Fall, falls_of, ranked
+from .claims import FEW, falls_apart, findings, lacks, named, over_both
+from .falls import CHECKPOINT, Fall, falls_of, ranked
 from .steps import next_step
-
-FEW = 3
-"""The most systems that sentences name one by one with their numbers."""
 
 
 def headline(score: Score, simulator: str) -> list[Sentence]:
@@ -42,6 +39,7 @@ def headline(score: Score, simulator: str) -> list[Sentence]:
         ]
     falls = falls_of(score, simulator)
     complete = [fall for fall in falls if fall.complete]
+    apart = rows_of(score.tables.get("interaction"), simulator=simulator, primary=True)
     # Rates of different episodes say nothing about a fall: those of incomplete cells are over the
     # episodes that both have.
     if complete:
@@ -49,14 +47,16 @@ def headline(score: Score, simulator: str) -> list[Sentence]:
     elif falls:
         rates = joined([over_both(fall) for fall in falls[:FEW]], "; ")
     else:
-        rates = _rates(score, ranked(score, simulator, [row for row in cells if row["n"]]))
+        rates = _rates(score, ranked(score, [row for row in cells if row["n"]]))
+    lacking = lacks(
+        [row for row in cells if row["n"] or row["errors"]],
+        apart=[fall for fall in falls if not fall.complete] if complete else [],
+    )
     sentences = [
         say("In {simulator}, {rates}.", simulator=simulator, rates=rates),
-        verdicts(complete or falls),
-        lacks(
-            [row for row in cells if row["n"] or row["errors"]],
-            apart=[fall for fall in falls if not fall.complete] if complete else [],
-        ),
+        findings(complete or falls, compared=len(falls) + len(apart)),
+        # Four sentences at most: what is missing comes before a finer comparison.
+        lacking if lacking.text else falls_apart(apart),
         next_step(score, simulator, falls),
     ]
     return [sentence for sentence in sentences if sentence.text]
@@ -74,28 +74,48 @@ def _fall_rates(score: Score, falls: Sequence[Fall]) -> Sentence:
     """State the rates of complete falls under k0 and at their ends."""
     of = _episodes(score, falls[0].start)
     if len(falls) > FEW:
-        start, end = (_range([fall.start for fall in falls]), _range([fall.end for fall in falls]))
-        text = "{count} systems succeed in {start} of {of} at {k0} and in {end} at {last}"
-        last = falls[0].condition
-        count = number_of([fall.row for fall in falls])
-        rates = say(text, count=count, start=start, of=of, k0=START, end=end, last=last)
+        lasts = dict.fromkeys(fall.condition for fall in falls)
+        rates = say(
+            "{count} systems succeed in {start} of {of} at {k0} and in {end} at {last}",
+            count=number_of([fall.row for fall in falls]),
+            start=_range([fall.start for fall in falls]),
+            of=of,
+            k0=START,
+            end=_range([fall.end for fall in falls]),
+            last=" or ".join(lasts),
+        )
     else:
         parts = []
         for place, fall in enumerate(falls):
-            start, end = (_rate(row) for row in (fall.start, fall.end))
             text = "{name} in {start} at {k0} and in {end} at {last}"
             if not place:
                 text = "{name} succeeds in {start} of {of} at {k0} and in {end} at {last}"
-            name = display_name(fall.system)
-            words = {"name": name, "k0": START, "last": fall.condition, "of": of}
-            parts.append(say(text, start=start, end=end, **words))
-        rates = joined(parts, ", ", ", and ")
-    return say("{rates} (95% intervals, for {whose})", rates=rates, whose=_weights(len(falls)))
+            parts.append(
+                say(
+                    text,
+                    name=display_name(fall.system),
+                    start=_rate(fall.start),
+                    of=of,
+                    k0=START,
+                    end=_rate(fall.end),
+                    last=fall.condition,
+                )
+            )
+        rates = joined(parts, ", and ")
+    cells = [cell for fall in falls for cell in (fall.start, fall.end)]
+    return say("{rates} (95% intervals, {scope})", rates=rates, scope=_scope(cells))
 
 
-def _weights(systems: int) -> str:
-    # One training run says nothing about the next one.
-    return "this checkpoint" if systems == 1 else "these checkpoints"
+def _scope(cells: Sequence[TableRow]) -> str:
+    """State what intervals hold for: one training run says nothing about the next one."""
+    systems = dict.fromkeys(str(cell["system"]) for cell in cells)
+    lone = dict.fromkeys(str(cell["system"]) for cell in cells if cell["scope"] == CHECKPOINT)
+    if not lone:
+        return "for other training runs, too"
+    if len(lone) < len(systems):
+        names = " and ".join(map(display_name, lone))
+        return f"for other training runs, too, except those of {names}"
+    return "for this checkpoint" if len(lone) == 1 else "for these checkpoints"
 
 
 def _rate(row: TableRow) -> Sentence:
@@ -131,7 +151,7 @@ def _rates(score: Score, cells: Sequence[TableRow]) -> Sentence:
     for condition in shown:
         rows = [row for row in cells if row["condition"] == condition]
         of = _episodes(score, rows[0])
-        words = {"of": of, "under": named(condition)}
+        words: dict[str, str | Sentence] = {"of": of, "under": named(condition)}
         if len(rows) > FEW:
             text = "{count} systems succeed in {rates} of {of} under {under}"
             parts.append(say(text, count=number_of(rows), rates=_range(rows), **words))
@@ -142,4 +162,5 @@ def _rates(score: Score, cells: Sequence[TableRow]) -> Sentence:
         ]
         listed = joined(each, ", ", " and ")
         parts.append(say("{listed} of {of} under {under}", listed=listed, **words))
-    return joined(parts, "; ")
+    rates = joined(parts, "; ")
+    return say("{rates} (95% intervals, {scope})", rates=rates, scope=_scope(cells))
