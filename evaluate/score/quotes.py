@@ -73,9 +73,8 @@ def rows_of(table: Table | None, **equal: Any) -> list[TableRow]:
 
 
 def number_of(rows: Sequence[TableRow]) -> Quote:
-    """Return the number of some rows of one table."""
-    table = rows[0].table.name if rows else ""
-    return Quote(table, tuple(row.place for row in rows), "", f"{len(rows):,}")
+    """Return the number of some rows of one table, of which there is at least one."""
+    return Quote(rows[0].table.name, tuple(row.place for row in rows), "", f"{len(rows):,}")
 
 
 def say(template: str, row: TableRow | None = None, /, **words: str | Quote | Sentence) -> Sentence:

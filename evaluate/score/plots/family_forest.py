@@ -3,13 +3,16 @@
 import math
 from typing import Any
 
+from robomme_interference_data.evaluate.score.tables.contrast import START
 from robomme_interference_data.viz.figure import GRAY, INK, tidy
 
-from .curves import HEADING, LABEL, SMALL, TITLE, WIDTH, draw_points, legend, mark, panel_grid
+from .curves import HEADING, SMALL, TITLE, WIDTH, draw_points, legend, mark, panel_grid
 from .data import Data
 
 _WIDE = 4
 """The most panels in a row."""
+
+_OWN = ("difference", "low", "high")
 
 
 def family_falls(figure: Any, data: Data) -> bool:
@@ -39,12 +42,11 @@ def family_falls(figure: Any, data: Data) -> bool:
         axes.set_title(style.label, size=HEADING, color=INK)
     panels[0].set_yticks(range(len(families)), families, size=SMALL)
     panels[0].set_ylim(len(families) - 0.4, -0.6)
-    first = data.family_falls[0]
-    compared = f"{first['condition']} − {first['against_condition']}"
-    figure.supxlabel(f"{compared}, points", size=LABEL, color=INK)
+    ends = dict.fromkeys(row["condition"] for row in data.family_falls)
+    compared = f"{' or '.join(ends)} − {START}"
     figure.suptitle(f"Falls by family, {data.simulator}", size=TITLE, color=INK)
-    legend(figure, "points: in the family, with 95% intervals; upright lines: all other families")
+    notes = [f"{compared}, points, with 95% intervals", "upright lines: all other families"]
+    if not all(row["complete"] for row in data.family_falls):
+        notes.append("hollow: incomplete cell")
+    legend(figure, "; ".join(notes))
     return True
-
-
-_OWN = ("difference", "low", "high")

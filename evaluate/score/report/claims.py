@@ -45,7 +45,7 @@ def findings(falls: Sequence[Fall], compared: int) -> Sentence:
         if own and len(falls) <= FEW:
             clauses += [_finding(fall, compared) for fall in own]
         elif own:
-            clauses.append(_several(own, finding))
+            clauses.append(_several(own, finding, falls))
     concluded = [fall for fall in falls if fall.finding is not Finding.ERRORS]
     if any(not fall.complete for fall in concluded):
         clauses.append(Sentence("provisional, because a cell is incomplete"))
@@ -101,10 +101,15 @@ def _interval(row: TableRow, level: str) -> Sentence:
     return say("{level} interval {joint_low} to {joint_high}, ", row, level=level)
 
 
-def _several(falls: Sequence[Fall], finding: Finding) -> Sentence:
-    names = joined([Sentence(display_name(fall.system)) for fall in falls], ", ", " and ")
-    count = number_of([fall.row for fall in falls])
-    return say("{finding} for {count}: {names}", finding=finding, count=count, names=names)
+def _several(own: Sequence[Fall], finding: Finding, falls: Sequence[Fall]) -> Sentence:
+    """Name the systems, among many, of which one finding is concluded."""
+    return say(
+        "{finding} for {count} of {of}: {names}",
+        finding=finding,
+        count=number_of([fall.row for fall in own]),
+        of=number_of([fall.row for fall in falls]),
+        names=joined([Sentence(display_name(fall.system)) for fall in own], ", ", " and "),
+    )
 
 
 def p_of(row: TableRow) -> Sentence:
@@ -117,14 +122,15 @@ def p_of(row: TableRow) -> Sentence:
 
 def falls_apart(rows: Sequence[TableRow]) -> Sentence:
     """State whether two systems fall differently, or in how many pairs; empty without any."""
-    if len(rows) == 1:
-        return sentence([_apart(rows[0])])
+    if len(rows) <= 1:
+        return sentence([_apart(row) for row in rows])
     shown = [row for row in rows if row["verdict"] == "shown"]
-    if not rows:
-        return Sentence("")
-    count, of = number_of(shown), number_of(rows)
-    text = "the falls of two systems differ in {count} of {of} pairs"
-    return sentence([say(text, count=count, of=of)])
+    of = number_of(rows)
+    if not shown:
+        text = "in none of {of} pairs of systems is a difference of falls shown"
+        return sentence([say(text, of=of)])
+    text = "the falls of two systems are shown to differ in {count} of {of} pairs"
+    return sentence([say(text, count=number_of(shown), of=of)])
 
 
 def _apart(row: TableRow) -> Sentence:
@@ -156,13 +162,13 @@ def lacks(cells: Sequence[TableRow], apart: Sequence[Fall] = ()) -> Sentence:
     clauses = [
         *_each(
             [row for row in cells if row["errors"]],
-            "{errors} rollouts of {name} under {under} broke{bound}",
+            "of {name}'s rollouts under {under}, {errors} broke{bound}",
             "rollouts broke in {count} cells",
         ),
         *_each(
             short,
-            "{missing} episodes of {name} under {under} are missing",
-            "episodes are missing in {count} cells",
+            "of {name}'s episodes under {under}, the rows lack {missing}",
+            "the rows lack episodes in {count} cells",
         ),
         *_each(
             [row for row in cells if not row["complete"] and not row["missing"]],

@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 
+from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.config import Expected
+from robomme_interference_data.evaluate.score.outcomes import TEST_EPISODES
 from robomme_interference_data.evaluate.score.quotes import Sentence, TableRow, rows_of
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.contrast import START
@@ -21,7 +23,7 @@ def next_step(score: Score, simulator: str, falls: Sequence[Fall]) -> Sentence:
     if any(row["errors"] or row["missing"] for row in ran) or not falls:
         step = _to_compare(ran, expected)
     else:
-        step = _to_conclude(falls, expected)
+        step = _to_conclude(falls)
     return Sentence(f"Next: {step}.")
 
 
@@ -37,11 +39,11 @@ def _to_compare(ran: Sequence[TableRow], expected: Expected) -> str:
     return f"run k7, to compare it with {START}"
 
 
-def _to_conclude(falls: Sequence[Fall], expected: Expected) -> str:
+def _to_conclude(falls: Sequence[Fall]) -> str:
     """Return the step that makes a conclusion about falls firmer."""
-    # The benchmark has no more episodes than its grid.
-    more = expected is Expected.OBSERVED
-    if more and any(fall.finding is Finding.OPEN for fall in falls):
+    # The benchmark has no more test episodes than these.
+    most = len(FAMILIES) * TEST_EPISODES
+    if any(fall.finding is Finding.OPEN and fall.row["n"] < most for fall in falls):
         return "plan more episodes with the command power, and run them"
     if len(falls) == 1:
         return "run a second system on the same episodes, to compare their falls"

@@ -94,11 +94,11 @@ def family_grid(cells: Sequence[SuccessCell]) -> Table:
 
 def _of_family(cell: SuccessCell | None) -> str:
     """Return the rate of a family without its interval, n and errors."""
-    if cell is None or not any(cell.counts):
-        return "missing†"
+    if cell is None:
+        return NOT_EXPECTED
     errors = f", errors: {cell.errors}" if cell.errors else ""
     if not cell.n:
-        return f"no result†{errors}"
+        return f"no result†{errors}" if any(cell.counts) else "missing†"
     return f"{percent(cell.rate)}{cell.mark} n={cell.n}{errors}"
 
 
