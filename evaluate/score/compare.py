@@ -5,6 +5,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from robomme_interference_data.constants import RECORDINGS
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.schema.conditions import parse_condition
@@ -13,7 +15,8 @@ from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.stats.signs import sign_flips
 from robomme_interference_data.viz.tables import Table
 
-from .outcomes import mean_errors
+from .outcomes import Repeat, Statuses, mean_errors
+from .partners import related
 from .rows.reading import CheckedRows, read_rows
 from .sides import (
     Side,
@@ -36,7 +39,8 @@ from .tables.comparison import (
     detectable,
 )
 from .tables.contrast import START, Contrast, Effect, Measure
-from .tables.pairs import Pairs, pair, pair_errors
+from .tables.correction import correct
+from .tables.pairs import Pairs, compare_cells, pair_errors
 
 
 @dataclass(frozen=True)
@@ -102,6 +106,7 @@ def compare(
             f"no episode of {paths} counts on both sides under {under}",
             f"They hold {' and '.join(dict.fromkeys(held))}. Compare the same episodes.",
         )
+    contrasts = correct(contrasts, alpha)
     notes += stopped_early("a", a_sides.values())
     if second is not None:
         notes += stopped_early("b", b_sides.values())
@@ -162,6 +167,7 @@ def _contrasts(
                     measure=measure,
                     family=family,
                     columns={"low": bounds.low, "high": bounds.high},
+                    group=bool(family),
                 )
 
 
@@ -172,7 +178,6 @@ def _table(contrasts: Sequence[Contrast], measure: Measure, alpha: float, title:
         name="compare",
         title=title,
         columns=SIDES | {"family": "text"} | (RATES if success else ACTION_ERRORS) | COMPLETE,
-        group=_group,
         corrected="the rows of all families, and among those of single families, of a simulator",
         note=(
             "system and condition are of b, those against are of a. Over the n episodes that count "
@@ -183,14 +188,10 @@ def _table(contrasts: Sequence[Contrast], measure: Measure, alpha: float, title:
     )
     table = comparison_table(spec, contrasts)
     if success:
-        more = detectable(contrasts, _group)
+        more = detectable(contrasts)
     else:
         more = f"A negative difference is better. {ACTION_ERRORS_NOTE}"
     return replace(table, note=f"{table.note} {more}".strip())
-
-
-def _group(contrast: Contrast) -> tuple[str, bool]:
-    return contrast.simulator, bool(contrast.family)
 
 
 def _check_arguments(
@@ -245,9 +246,35 @@ def _pairs(a: Side, b: Side, conditions: tuple[str, str], family: str) -> Pairs:
         after = mean_errors(b.outcomes.action_l1)[b_cell][b_shared]
         [test] = sign_flips((after - before).round(12)[:, None], RECORDINGS)
         return pair_errors(before, after, test)
-    # Shared model seeds are paired; without any, the lowest with the lowest, and so on.
-    seeds, others = a.outcomes.model_seeds, b.outcomes.model_seeds
-    matched = [(seeds.index(seed), others.index(seed)) for seed in seeds if seed in others]
-    if not matched:
-        matched = [(place, place) for place in range(min(len(seeds), len(others)))]
-    return pair(a.outcomes.status[a_cell][a_shared], b.outcomes.status[b_cell][b_shared], matched)
+    repeats, (before, after) = _aligned(
+        (a.outcomes.repeats, b.outcomes.repeats),
+        (a.outcomes.status[a_cell][a_shared], b.outcomes.status[b_cell][b_shared]),
+    )
+    seeds = [repeat.training_seed for repeat in repeats]
+    runs = {seed: place for place, seed in enumerate(dict.fromkeys(seeds))}
+    return compare_cells(
+        before,
+        after,
+        np.array([runs[seed] for seed in seeds]),
+        same_weights=a.system == b.system or related(a.facts, b.facts),
+    )
+
+
+def _aligned(
+    repeats: tuple[Sequence[Repeat], Sequence[Repeat]], sides: tuple[Statuses, Statuses]
+) -> tuple[list[Repeat], list[Statuses]]:
+    """Return all repeats of two sides, and both sides with an axis of these.
+
+    If they have none in common, the lowest of both are paired, and so on, as those of the first.
+    """
+    first, second = repeats
+    if not {*first} & {*second}:
+        renamed = [*first[: len(second)], *second[len(first) :]]
+        second = renamed if len({*renamed}) == len(second) else second
+    every = list(dict.fromkeys([*first, *second]))
+    aligned = []
+    for own, status in zip((first, second), sides, strict=True):
+        whole = np.full((len(status), len(every)), -1, np.int8)
+        whole[:, [every.index(repeat) for repeat in own]] = status
+        aligned.append(whole)
+    return every, aligned

@@ -15,9 +15,10 @@ from .config import Against, Expected, Settings
 from .outcomes import Outcomes, offline_outcomes, outcomes_of
 from .partners import base_of, ceilings_of
 from .rows.reading import CheckedRows, read_rows
-from .tables import effects, families, ranks, slopes
+from .tables import effects, families, family_falls, ranks, slopes
 from .tables.cells import SuccessCell, cells_of, main_table, parts_table
 from .tables.contrast import Contrast
+from .tables.correction import correct, with_primary
 
 if TYPE_CHECKING:
     from .tables.action_error import ErrorCell
@@ -33,6 +34,7 @@ TABLES = (
     "evidence_use",
     "decay",
     "families",
+    "family_falls",
     "matrix",
     "action_error",
     "action_error_effects",
@@ -104,7 +106,8 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     simulated = tuple(outcomes.values())
     recordings = offline_outcomes(rows)
     cells = cells_of(simulated)
-    contrasts, notes = _compared(simulated, draws)
+    compared, notes = _compared(simulated, draws)
+    contrasts = correct(with_primary(compared))
     notes += [sentence for each in simulated if (sentence := repeat_noise(each))]
     tables = [
         main_table(cells),
@@ -113,6 +116,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         slopes.interaction_table(contrasts),
         slopes.decay_table(simulated, draws),
         families.families_table(simulated, contrasts),
+        family_falls.family_falls_table(simulated, contrasts),
         ranks.matrix_table(contrasts),
     ]
     error_cells = list["ErrorCell"]()
@@ -130,7 +134,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         from .tables import action_error, action_error_effects
 
         error_cells = action_error.error_cells(recordings, draws)
-        errors = action_error_effects.error_contrasts(recordings, draws)
+        errors = correct(action_error_effects.error_contrasts(recordings, draws))
         tables.append(action_error.error_table(error_cells))
         tables.append(action_error_effects.error_effects_table(errors))
         contrasts += errors

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.stats.intervals import wilson
 from robomme_interference_data.viz.tables import percent
@@ -23,6 +24,11 @@ class Side:
     outcomes: Outcomes
     system: str
     planned: Mapping[str, set[EpisodeId]]  # by condition, in all plans of its runs
+
+    @property
+    def facts(self) -> frozenset[SystemFacts]:
+        """What the system is."""
+        return self.outcomes.facts_of(self.system)
 
     @property
     def conditions(self) -> list[str]:
@@ -154,13 +160,13 @@ def noise_floor(a: Side, b: Side, pairs: Mapping[str, Pairs]) -> Iterator[str]:
             )
     if not shares:
         return
-    seeds, other_seeds = {*a.outcomes.model_seeds}, {*b.outcomes.model_seeds}
+    seeds, other_seeds = {*a.outcomes.repeats}, {*b.outcomes.repeats}
     if seeds == other_seeds:
         which = "the same"
     else:
         which = "partly other" if seeds & other_seeds else "other"
     yield (
-        f"{a.system} ran in both, with {which} model seeds, in "
+        f"{a.system} ran in both, with {which} seeds, in "
         f"{a.outcomes.simulator}. If nothing else differs, this share of episodes flips by chance "
         f"(the noise floor): {', '.join(shares)}."
     )

@@ -89,6 +89,17 @@ def _tiny() -> list[Rollout]:
     )
 
 
+def _several_runs() -> list[Rollout]:
+    """Three training runs of each system: those of alpha lose 20, 4 and 12 points, of beta none."""
+    losses = {"alpha": (90, 18, 54), "beta": (9, 8, 10)}
+    return [
+        replace(row, training_seed=seed)
+        for system, lost_by_run in losses.items()
+        for seed, lost in enumerate(lost_by_run)
+        for row in fall(system, 200 - lost, lost, 9 if system == "beta" else 0, 241)
+    ]
+
+
 FINDINGS: dict[str, Callable[[], list[Rollout]]] = {
     "fall": lambda: fall("alpha", 120, 137, 11, 182) + fall("beta", 150, 20, 14, 266),
     "no fall": lambda: fall("alpha", 180, 16, 14, 240) + fall("beta", 100, 20, 22, 308),
@@ -98,6 +109,7 @@ FINDINGS: dict[str, Callable[[], list[Rollout]]] = {
     "one system": _one_system,
     "missing": _missing,
     "errors": _errors,
+    "several runs": _several_runs,
 }
 """Name of a finding to its rows."""
 

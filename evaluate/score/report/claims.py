@@ -9,6 +9,7 @@ from robomme_interference_data.evaluate.score.quotes import (
     number_of,
     say,
 )
+from robomme_interference_data.evaluate.score.tables.contrast import Verdict
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.schema.conditions import NO_HISTORY
 
@@ -124,7 +125,7 @@ def falls_apart(rows: Sequence[TableRow]) -> Sentence:
     """State whether two systems fall differently, or in how many pairs; empty without any."""
     if len(rows) <= 1:
         return sentence([_apart(row) for row in rows])
-    shown = [row for row in rows if row["verdict"] == "shown"]
+    shown = [row for row in rows if row["verdict"] == Verdict.SHOWN]
     of = number_of(rows)
     if not shown:
         text = "in none of {of} pairs of systems is a difference of falls shown"
@@ -137,12 +138,12 @@ def _apart(row: TableRow) -> Sentence:
     """State the difference of two falls, in points for each doubling of the sessions."""
     names = [display_name(row[column]) for column in ("system", "against_system")]
     match row["verdict"]:
-        case "shown":
+        case Verdict.SHOWN:
             text = (
                 "the falls differ: each time that the sessions double, {a} changes by {slope} "
                 "points and {b} by {against_slope} ({p})"
             )
-        case "depends on errors":
+        case Verdict.DEPENDS:
             text = "no conclusion on the falls of {a} and {b} before errors are run again"
         case _:
             text = "no difference between the falls of {a} and {b} is shown ({p})"

@@ -6,11 +6,8 @@ from enum import StrEnum
 
 from robomme_interference_data.evaluate.score.quotes import TableRow, rows_of
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.score.tables.contrast import START
+from robomme_interference_data.evaluate.score.tables.contrast import START, Verdict
 from robomme_interference_data.evaluate.score.tables.equivalence import EQUIVALENT
-
-CHECKPOINT = "checkpoint"
-"""The scope of an interval that holds for these weights only."""
 
 
 class Finding(StrEnum):
@@ -58,9 +55,9 @@ class Fall:
     def finding(self) -> Finding:
         """What is concluded."""
         match self.row["verdict"]:
-            case "shown":
+            case Verdict.SHOWN:
                 return Finding.FALL if self.row["difference"] < 0 else Finding.RISE
-            case "depends on errors":
+            case Verdict.DEPENDS:
                 return Finding.ERRORS
         if self.equivalence is not None and self.equivalence["verdict"] == EQUIVALENT:
             return Finding.EXCLUDED

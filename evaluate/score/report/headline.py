@@ -12,12 +12,12 @@ from robomme_interference_data.evaluate.score.quotes import (
     say,
 )
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.score.tables.contrast import START
+from robomme_interference_data.evaluate.score.tables.contrast import START, Scope
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.schema.conditions import in_order
 
 from .claims import FEW, falls_apart, findings, lacks, named, over_both
-from .falls import CHECKPOINT, Fall, falls_of, ranked
+from .falls import Fall, falls_of, ranked
 from .steps import next_step
 
 
@@ -109,7 +109,7 @@ def _fall_rates(score: Score, falls: Sequence[Fall]) -> Sentence:
 def _scope(cells: Sequence[TableRow]) -> str:
     """State what intervals hold for: one training run says nothing about the next one."""
     systems = dict.fromkeys(str(cell["system"]) for cell in cells)
-    lone = dict.fromkeys(str(cell["system"]) for cell in cells if cell["scope"] == CHECKPOINT)
+    lone = dict.fromkeys(str(cell["system"]) for cell in cells if cell["scope"] == Scope.CHECKPOINT)
     if not lone:
         return "for other training runs, too"
     if len(lone) < len(systems):

@@ -70,7 +70,7 @@ def _part(score: Score, outcomes: Outcomes) -> dict[str, Any]:
         "rollouts": sum(sum(cell.counts) for cell in cells),
         "episodes": len(present),
         "families": len({outcomes.episodes[place].family for place in present}),
-        "seeds": len(outcomes.model_seeds),
+        "seeds": len(outcomes.repeats),
         "complete": sum(cell.complete for cell in cells),
         "cells": len(cells),
         "errors": sum(cell.errors for cell in cells),

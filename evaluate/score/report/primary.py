@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 from robomme_interference_data.evaluate.score.outcomes import Outcomes
 from robomme_interference_data.evaluate.score.quotes import Sentence, TableRow, rows_of
 from robomme_interference_data.evaluate.score.scoring import Score, repeat_noise
-from robomme_interference_data.evaluate.score.tables.contrast import START
+from robomme_interference_data.evaluate.score.tables.contrast import START, Scope
 from robomme_interference_data.evaluate.score.tables.grids import family_grid
 from robomme_interference_data.viz.tables import Table
 
-from .falls import CHECKPOINT
 from .headline import headline
 
 _BOUNDS = ("if_failures", "if_successes")
@@ -169,7 +168,7 @@ def _checks(score: Score, outcomes: Outcomes) -> dict[str, str]:
     """Return a sentence on each check that no table above answers."""
     cells = [row for row in rows_of(score.tables["main"], simulator=outcomes.simulator) if row["n"]]
     checks = {}
-    if all(row["scope"] == CHECKPOINT for row in cells):
+    if all(row["scope"] == Scope.CHECKPOINT for row in cells):
         checks["training runs"] = (
             "Fewer than three of each system: intervals and p hold for these checkpoints, not for "
             "other runs of the same training."

@@ -7,9 +7,9 @@ from robomme_interference_data.evaluate.score.config import Expected
 from robomme_interference_data.evaluate.score.outcomes import TEST_EPISODES
 from robomme_interference_data.evaluate.score.quotes import Sentence, TableRow, rows_of
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.score.tables.contrast import START
+from robomme_interference_data.evaluate.score.tables.contrast import START, Scope
 
-from .falls import CHECKPOINT, Fall, Finding
+from .falls import Fall, Finding
 
 AGAIN = "run the same evaluate command again, which repeats what broke and runs what is missing"
 """How a run becomes complete."""
@@ -47,6 +47,6 @@ def _to_conclude(falls: Sequence[Fall]) -> str:
         return "plan more episodes with the command power, and run them"
     if len(falls) == 1:
         return "run a second system on the same episodes, to compare their falls"
-    if all(fall.row["scope"] == CHECKPOINT for fall in falls):
+    if all(fall.row["scope"] == Scope.CHECKPOINT for fall in falls):
         return "train each system again with other seeds, to see how much its rates differ"
     return "run other conditions, such as held-k7, to see what a fall is due to"

@@ -28,7 +28,7 @@ _SHOWN = 10  # bad rows that are listed; the others are counted
 
 _SUCCESS = {str(status): success_of(status) for status in FINAL}
 _EPISODE = ("simulator", "family", "split", "episode")
-_ROLLOUT = ("system", "condition", "model_seed", *_EPISODE)
+_ROLLOUT = ("system", "condition", "training_seed", "model_seed", *_EPISODE)
 
 
 @dataclass(frozen=True)
@@ -178,12 +178,12 @@ class _Checks:
     def check_facts(self) -> None:
         """Leave out rows whose facts differ from the most frequent ones of their system.
 
-        Rows of several model seeds may be of different weights.
+        Rows of several seeds may be of different weights.
         """
         for column in FACT_COLUMNS:
             group = ["system", "simulator"]
             if column == "policy_id":
-                group.append("model_seed")
+                group += ["training_seed", "model_seed"]
             self.check_alike(column, group, "a system has one", none_counts=True)
 
     def check_repeats(self) -> None:

@@ -43,6 +43,7 @@ class Row(NamedTuple):
     split: str
     episode: int
     shift: str
+    training_seed: int | None
     model_seed: int
     protocol_version: int
     seed: int | None
@@ -141,7 +142,7 @@ def parse(name: str, value: Any) -> Any:
             if text.lower() not in _TRUTH:
                 raise ValueError("1, 0, true, false or nothing")
             return _TRUTH[text.lower()]
-        case "episode" | "model_seed" | "seed" | "steps" | "protocol_version":
+        case "episode" | "training_seed" | "model_seed" | "seed" | "steps" | "protocol_version":
             return _whole(text, *_RANGES.get(name, (0, 10**18 - 1)))  # as in episode ids
         case _ if name in _MOST:
             return _number(text, _MOST[name])

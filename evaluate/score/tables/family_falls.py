@@ -9,8 +9,8 @@ from robomme_interference_data.evaluate.score.outcomes import Outcomes
 from robomme_interference_data.viz.tables import Table
 
 from .comparison import COMPLETE, SIDES, ComparisonTable, comparison_table
-from .contrast import Contrast
-from .pairs import pair
+from .contrast import Contrast, Effect
+from .pairs import compare_cells
 
 FAMILY_FALLS = ComparisonTable(
     name="family_falls",
@@ -37,9 +37,9 @@ FAMILY_FALLS = ComparisonTable(
 )
 
 
-def family_falls_table(all_outcomes: Iterable[Outcomes], falls: Iterable[Contrast]) -> Table:
-    """Return each of some falls in each family; those over a single family have no rows."""
-    falls = list(falls)
+def family_falls_table(all_outcomes: Iterable[Outcomes], contrasts: Iterable[Contrast]) -> Table:
+    """Return the primary falls in each family; a fall over a single family has no rows."""
+    falls = [c for c in contrasts if c.primary and c.effect is Effect.SESSIONS]
     rows = [
         row
         for outcomes in all_outcomes
@@ -58,7 +58,7 @@ def _in_families(outcomes: Outcomes, fall: Contrast) -> Iterator[Contrast]:
     own = {}
     for family in outcomes.families:
         here = outcomes.of_family(family)
-        pairs = pair(first[here], second[here])
+        pairs = compare_cells(first[here], second[here], outcomes.training, same_weights=True)
         if pairs.n:
             own[family] = pairs
     if len(own) < 2:
