@@ -43,10 +43,11 @@ def _to_conclude(falls: Sequence[Fall]) -> str:
     """Return the step that makes a conclusion about falls firmer."""
     # The benchmark has no more test episodes than these.
     most = len(FAMILIES) * TEST_EPISODES
-    if any(fall.finding is Finding.OPEN and fall.row["n"] < most for fall in falls):
+    open_falls = [fall for fall in falls if fall.finding is Finding.OPEN]
+    if any(fall.row["n"] < most for fall in open_falls):
         return "plan more episodes with the command power, and run them"
     if len(falls) == 1:
         return "run a second system on the same episodes, to compare their falls"
-    if all(fall.row["scope"] == Scope.CHECKPOINT for fall in falls):
+    if open_falls or all(fall.row["scope"] == Scope.CHECKPOINT for fall in falls):
         return "train each system again with other seeds, to see how much its rates differ"
     return "run other conditions, such as held-k7, to see what a fall is due to"
