@@ -70,7 +70,7 @@ def test_score_and_export_on_the_command_line(
     beyond |= {"action_error", "action_error_effects"}  # nor offline
     assert {path.stem for path in (out / "tables").glob("*.csv")} == {*TABLES} - beyond
     drawn = sorted(path.name for path in (out / "figures").iterdir())
-    kinds = ("difficulty", "effects", "families", "heatmap", "retrieval", "success")
+    kinds = ("difficulty", "effects", "families", "family_falls", "heatmap", "retrieval", "success")
     assert drawn == [f"{kind}-robomme.svg" for kind in kinds]
     # The released rows come back byte for byte.
     (exported,) = (tmp_path / "export").iterdir()
@@ -288,4 +288,4 @@ def test_a_score_of_a_run_imports_few_modules(tmp_path: Path) -> None:
     )
     modules = done.stdout.split()
     assert "robomme_interference_data.evaluate.score.tables.evidence_kept" in modules
-    assert len(modules) <= 45, sorted(modules)
+    assert len(modules) <= 48, sorted(modules)

@@ -5,18 +5,21 @@ import io
 import re
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import pytest
 from support import findings
 from support import scoring as made
 from support.screens import first_screen
 
-from robomme_interference_data.evaluate.score.plots.figures import draw_figures
+from robomme_interference_data.evaluate.score.plots.data import Data
+from robomme_interference_data.evaluate.score.plots.figures import draw_figure
 from robomme_interference_data.evaluate.score.quotes import Quote, Sentence
 from robomme_interference_data.evaluate.score.report.headline import headline
 from robomme_interference_data.evaluate.score.report.page import write_report
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import display_name
+from robomme_interference_data.viz.figure import open_figure, save_figure
 from robomme_interference_data.viz.tables import Table
 
 GOLDEN = made.ROOT / "tests" / "golden" / "first_screens.md"
@@ -31,12 +34,16 @@ def scores(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Score]:
 
 
 def screens(scores: dict[str, Score], folder: Path) -> str:
-    """The first screens of findings."""
+    """The first screens of findings, with their figures."""
     texts = []
     for name, found in scores.items():
-        out = folder / name
-        write_report(found, draw_figures(found, out / "figures"), out / "report.html")
-        page = (out / "report.html").read_text(encoding="utf-8")
+        figures = {}
+        with open_figure() as figure:
+            if draw_figure("family_falls", figure, Data(found, "tabletop")):
+                figures["family_falls-tabletop"] = folder / f"{name}.svg"
+                save_figure(figure, folder / f"{name}.svg")
+        write_report(found, figures, folder / f"{name}.html")
+        page = (folder / f"{name}.html").read_text(encoding="utf-8")
         texts.append(f"# {name}\n\n{first_screen(page)}")
     return "\n".join(texts)
 
@@ -73,7 +80,7 @@ def numbers(sentence: Sentence, systems: list[str]) -> list[str]:
     """The numbers in a sentence, besides those in names of systems and conditions, and levels."""
     text = sentence.text
     for name in sorted(map(display_name, systems), key=len, reverse=True):
-        text = text.replace(name, "")
+        text = re.sub(rf"(?<!\w){re.escape(name)}(?!\w)", "", text)
     text = re.sub(r"\b([a-z]+-)?k[0-9]+\b|9[05]% interval", "", text)
     return re.findall(
         r"< 0\.001|[+\N{MINUS SIGN}]?[0-9][0-9.,]*[0-9]%?|[+\N{MINUS SIGN}]?[0-9]%?", text
@@ -106,3 +113,77 @@ def test_every_number_of_other_scores_is_in_a_table(
 ) -> None:
     for found in (small, kinds, questions, full):
         check(found)
+
+
+# --- which systems a sentence is about -----------------------------------------------------------
+
+
+Cell = tuple[str, str]
+
+
+def sentences(tmp_path: Path, outcomes: dict[Cell, str], **options: Any) -> list[Sentence]:
+    """The headline of cells of one family: a letter an episode."""
+    path = made.write_csv(tmp_path / "a.csv", made.cells(outcomes))
+    found = made.score(path, **options)
+    check(found)
+    return headline(found, "tabletop")
+
+
+def test_a_lucky_episode_does_not_lead(tmp_path: Path) -> None:
+    given = {("lucky", "k0"): "s----", ("mine", "k0"): "sssff", ("mine", "k7"): "sffff"}
+    rates, falls, lacking, _ = sentences(tmp_path, given)
+    assert "mine succeeds in 60.0%" in rates.text
+    assert "lucky" not in rates.text + falls.text and "lucky" in lacking.text
+
+
+def test_rates_of_an_incomplete_fall_are_over_the_episodes_of_both_cells(tmp_path: Path) -> None:
+    given = {("a", "k0"): "sssss", ("a", "k7"): "sssf-", ("b", "k0"): "ssfff", ("b", "k7"): "sffff"}
+    rates, falls, lacking, step = sentences(tmp_path, given)
+    assert "b succeeds" in rates.text and "of b" in falls.text
+    # Over four episodes, 4 of which succeed under k0 and 3 under k7.
+    assert "over the 4 episodes that finished under both, a succeeds in 100.0% at k0" in (
+        lacking.text
+    )
+    assert "75.0% at k7" in lacking.text and "evaluate" in step.text
+    alone = {cell: letters for cell, letters in given.items() if cell[0] == "a"}
+    rates, falls, *_ = sentences(tmp_path, alone)
+    assert "over the 4 episodes" in rates.text and "provisional" in falls.text
+
+
+def test_all_systems_have_a_verdict_of_their_own(tmp_path: Path) -> None:
+    given = {(name, "k0"): "s" * 12 for name in ("a", "b", "c")}
+    given |= {(name, "k7"): "f" * n + "s" * (12 - n) for name, n in (("a", 12), ("b", 1), ("c", 0))}
+    given |= {("oracle", "k0"): "s" * 12, ("oracle", "k7"): "f" * 12}  # a reference
+    rates, falls, *_ = sentences(tmp_path, given)
+    assert rates.text.startswith("In tabletop, 3 systems succeed")
+    # Of a, p is 2/2¹² for each of nine or fewer comparisons.
+    assert falls.text == "A fall is shown for 1 of 3: a; no fall is shown for 2 of 3: b and c."
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "rates", "step"),
+    [
+        ({("a", "k1"): "sf", ("b", "k1"): "fs", ("b", "k7"): "ff"}, "under k1", "run k0"),
+        ({("a", "no-history"): "sffffffffffff"}, "under no history", "run k0"),
+        ({("a", "k0"): "sfs"}, "under k0", "run k7"),
+        ({("oracle", "k0"): "s", ("a", "k0"): "f"}, "a in 0.0%", "run k7"),
+        ({("oracle", "k0"): "s"}, "Oracle in 100.0%", "run k7"),
+    ],
+)
+def test_without_a_fall_only_rates_are_stated(
+    tmp_path: Path, outcomes: dict[Cell, str], rates: str, step: str
+) -> None:
+    first, *_, last = sentences(tmp_path, outcomes)
+    assert rates in first.text and step in last.text
+
+
+def test_nobody_whose_rollouts_all_broke_has_a_rate(tmp_path: Path) -> None:
+    path = made.write_csv(tmp_path / "a.csv", made.cells({("a", "k0"): "e", ("b", "k0"): "s"}))
+    rates, lacking, _ = headline(made.score(path), "tabletop")
+    assert "a in" not in rates.text and "1 broke" in lacking.text
+
+
+def test_no_more_sessions_than_k7_are_primary(tmp_path: Path) -> None:
+    given = {("a", name): "sfsf" for name in ("k0", "k7", "k31")}
+    rates, falls, _ = sentences(tmp_path, given)
+    assert "k31" not in rates.text + falls.text

@@ -110,12 +110,13 @@ FINDINGS: dict[str, Callable[[], list[Rollout]]] = {
     "missing": _missing,
     "errors": _errors,
     "several runs": _several_runs,
+    "no complete cell": _tiny,
 }
 """Name of a finding to its rows."""
 
 
 def scored(name: str, folder: Path) -> Score:
-    """The score of a finding, on the benchmark's grid but for tiny ones; a margin for falls."""
+    """The score of a finding: on the benchmark's grid, and in one case with a margin."""
     path = made.write_parquet(folder / f"{name.replace(' ', '-')}.parquet", FINDINGS[name]())
     expected = Expected.OBSERVED if name == "tiny" else Expected.BENCHMARK
     return made.score(path, expected=expected, margin=5 if name == "no fall" else None)

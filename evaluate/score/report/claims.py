@@ -24,6 +24,11 @@ def named(condition: str) -> str:
     return "no history" if condition == NO_HISTORY else condition
 
 
+def episodes(row: TableRow) -> str:
+    """Return the noun for the n of a row."""
+    return "episode" if row["n"] == 1 else "episodes"
+
+
 def sentence(clauses: Sequence[Sentence]) -> Sentence:
     """Return clauses as a sentence; an empty one without any."""
     if not clauses:
@@ -183,9 +188,10 @@ def lacks(cells: Sequence[TableRow], apart: Sequence[Fall] = ()) -> Sentence:
 def over_both(fall: Fall) -> Sentence:
     """State the rates of a system over the episodes that count under k0 and at the end."""
     return say(
-        "over the {n} episodes that finished under both, {name} succeeds in {against_rate} at "
+        "over the {n} {episodes} that finished under both, {name} succeeds in {against_rate} at "
         "{against_condition} and in {rate} at {condition}",
         fall.row,
+        episodes=episodes(fall.row),
         name=display_name(fall.system),
     )
 

@@ -52,6 +52,11 @@ class Fall:
         return bool(self.row["complete"])
 
     @property
+    def same_episodes(self) -> bool:
+        """Whether its cells are over the episodes that it is paired over."""
+        return bool(self.row["n"] == self.start["n"] == self.end["n"])
+
+    @property
     def finding(self) -> Finding:
         """What is concluded."""
         match self.row["verdict"]:

@@ -16,7 +16,7 @@ from robomme_interference_data.evaluate.score.tables.contrast import START, Scop
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.schema.conditions import in_order
 
-from .claims import FEW, falls_apart, findings, lacks, named, over_both
+from .claims import FEW, episodes, falls_apart, findings, lacks, named, over_both
 from .falls import Fall, falls_of, ranked
 from .steps import next_step
 
@@ -40,10 +40,9 @@ def headline(score: Score, simulator: str) -> list[Sentence]:
     falls = falls_of(score, simulator)
     complete = [fall for fall in falls if fall.complete]
     apart = rows_of(score.tables.get("interaction"), simulator=simulator, primary=True)
-    # Rates of different episodes say nothing about a fall: those of incomplete cells are over the
-    # episodes that both have.
-    if complete:
-        rates = _fall_rates(score, complete)
+    # Rates of different episodes say nothing about a fall: then they are over those of both cells.
+    if complete or (falls and all(fall.same_episodes for fall in falls)):
+        rates = _fall_rates(score, complete or falls)
     elif falls:
         rates = joined([over_both(fall) for fall in falls[:FEW]], "; ")
     else:
@@ -138,8 +137,9 @@ def _episodes(score: Score, row: TableRow) -> Sentence:
     parts = rows_of(score.tables.get("parts"), **key, by="family")
     parts = [part for part in parts if part["n"]]
     if len(parts) < len(FAMILIES) and all(part["part"] in FAMILIES for part in parts):
-        return say("{n} episodes of {count} of the nine families", row, count=number_of(parts))
-    return say("{n} episodes", row)
+        text = "{n} {episodes} of {count} of the nine families"
+        return say(text, row, episodes=episodes(row), count=number_of(parts))
+    return say("{n} {episodes}", row, episodes=episodes(row))
 
 
 def _rates(score: Score, cells: Sequence[TableRow]) -> Sentence:
