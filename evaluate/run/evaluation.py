@@ -144,7 +144,12 @@ def run_evaluation(
             log.begin(invocation(runner, plan, command))
             # The buffer set may have moved to another folder: its label in rows stays the same.
             # And what a server reports is known since `open`.
-            run = dataclasses.replace(run, facts=runner.facts(), buffer_set=log.header.buffer_set)
+            run = dataclasses.replace(
+                run,
+                facts=runner.facts(),
+                buffer_set=log.header.buffer_set,
+                training_seed=runner.training_seed(),
+            )
             callbacks = [] if progress is None else [progress]
             if config.track is not None:
                 opened = partial(optional.open_tracker, config.track, folder, plain(identity))
@@ -267,7 +272,12 @@ def _save_files(
     if error is None:
         row, trace = outcome.value
         # Workers began before the label in the log, and what servers report, were known.
-        row = dataclasses.replace(row, buffer_set=run.buffer_set, policy_id=run.facts.policy_id)
+        row = dataclasses.replace(
+            row,
+            buffer_set=run.buffer_set,
+            policy_id=run.facts.policy_id,
+            training_seed=run.training_seed,
+        )
         try:
             row_of(row_line(row))
         except (ValueError, OverflowError, RecursionError) as unstorable:

@@ -34,6 +34,7 @@ def run_identity(runner: Runner[Any], plan: RunPlan) -> dict[str, Any]:
         "revision": runner.buffer_set.revision,
         "split": config.split,
         "shift": config.shift,
+        "training_seed": runner.training_seed(),
         "model_seed": config.model_seed,
         "retrieval_index": _retrieval_index(runner, plan),
         "protocol_version": PROTOCOL_VERSION,

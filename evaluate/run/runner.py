@@ -61,6 +61,7 @@ class RunContext[C: RunConfig | AskConfig]:
         facts: What the system is.
         buffer_set: Label of the buffer set in its rows.
         revision: `BufferSet.revision`.
+        training_seed: Seed of the training run that made the weights; None if unknown.
     """
 
     config: C
@@ -68,6 +69,7 @@ class RunContext[C: RunConfig | AskConfig]:
     facts: SystemFacts
     buffer_set: str
     revision: str
+    training_seed: int | None = None
 
     def key(self, item: WorkItem) -> dict[str, Any]:
         """Return what identifies the row of a work item: its `KEY_COLUMNS`."""
@@ -81,6 +83,7 @@ class RunContext[C: RunConfig | AskConfig]:
             "split": item.episode.split,
             "episode": item.episode.index,
             "shift": self.config.shift,
+            "training_seed": self.training_seed,
             "model_seed": self.config.model_seed,
             "protocol_version": PROTOCOL_VERSION,
         }
@@ -247,6 +250,20 @@ class Runner[C: RunConfig | AskConfig](ABC):
     @abstractmethod
     def facts(self) -> SystemFacts:
         """Return what the system is; after `open`, with what its servers report."""
+
+    def training_seed(self) -> int | None:
+        """Return the seed of the training run: the setting, or else what the policy reports.
+
+        A policy reports it as `training_seed` in its metadata, a server in that of the server.
+        None if nobody knows it.
+        """
+        if self.config.training_seed is not None:
+            return self.config.training_seed
+        for reported in (self.metadata, self.metadata.get("server_metadata")):
+            seed = reported.get("training_seed") if isinstance(reported, Mapping) else None
+            if isinstance(seed, int) and not isinstance(seed, bool) and seed >= 0:
+                return seed
+        return None
 
     @abstractmethod
     def check(self, plan: RunPlan, items: Sequence[WorkItem]) -> None:

@@ -272,7 +272,7 @@ def _aligned(
         renamed = [*first[: len(second)], *second[len(first) :]]
         second = renamed if len({*renamed}) == len(second) else second
     every = list(dict.fromkeys([*first, *second]))
-    aligned = []
+    aligned = list[Statuses]()
     for own, status in zip((first, second), sides, strict=True):
         whole = np.full((len(status), len(every)), -1, np.int8)
         whole[:, [every.index(repeat) for repeat in own]] = status

@@ -238,8 +238,9 @@ def rate_of(status: Statuses, training: NDArray[np.int64] | None = None) -> Succ
 
     Without it, all repeats have the same weights.
     """
-    several = training is not None and len(training) > 1 and training.any()
-    spread = run_spread(success_by_run(status, training)) if several else ONE_RUN
+    spread = ONE_RUN
+    if training is not None and training.any():
+        spread = run_spread(success_by_run(status, training))
     won, of = (status == _SUCCESS).sum(-1), counting(status).sum(-1)
     won, of = won[of > 0], of[of > 0]
     n, counts = len(of), np.unique(of).tolist()

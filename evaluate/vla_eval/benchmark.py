@@ -38,6 +38,7 @@ SETTINGS = (
     "families",
     "episodes",
     "split",
+    "training_seed",
     "model_seed",
     # The simulator:
     "simulator",
@@ -149,7 +150,14 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
         self._plan, _ = plan_run(runner)
         # Which server plays is not known here: without an identity, its rows are paired with none.
         facts = replace(runner.facts(), policy="vla-eval", policy_id=None)
-        self._run = RunContext(runner.config, runner.system, facts, opened.name, opened.revision)
+        self._run = RunContext(
+            runner.config,
+            runner.system,
+            facts,
+            opened.name,
+            opened.revision,
+            runner.training_seed(),
+        )
         self._policy = HarnessPolicy(**options)
         self._rollouts = RolloutFunction(self._run, policy=self._policy)
         # A rollout asks its policy for actions, and vla-eval asks its benchmark for observations:

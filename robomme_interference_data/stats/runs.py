@@ -49,8 +49,7 @@ class RunSpread:
         """
         if not self.variance:
             return interval
-        t = student_quantile(level, self.freedom)
-        return _widened(interval, t * t * self.variance, limits)
+        return self._widened(interval, student_quantile(level, self.freedom), limits)
 
     def p(self, at: Callable[[float], Interval], p: float) -> float:
         """Return the p-value of a mean of 0 with the runs as a random effect.
@@ -60,34 +59,38 @@ class RunSpread:
         """
         if not self.variance or math.isnan(p) or math.isnan(at(LEVEL).low):
             return p
-        low, high = 0.0, 1e4  # Student's t
-        while high - low > 1e-6 * high:
+        # The smallest t whose interval holds 0, between the levels of 1% and all but one.
+        low, high = (student_quantile(level, self.freedom) for level in (0.01, 1 - 1e-12))
+        while high - low > 1e-5 * high:
             t = (low + high) / 2
-            level = 1 - student_tails(t, self.freedom)
-            bounds = _widened(at(level), t * t * self.variance, (-math.inf, math.inf))
-            low, high = (low, t) if bounds.low <= 0 <= bounds.high else (t, high)
+            interval = at(1 - student_tails(t, self.freedom))
+            bounds = self._widened(interval, t, (-math.inf, math.inf))
+            low, high = (t, high) if bounds.low > 0 or bounds.high < 0 else (low, t)
         return max(p, student_tails(high, self.freedom))
+
+    def _widened(self, interval: Interval, t: float, limits: tuple[float, float]) -> Interval:
+        value, low, high = interval
+        if math.isnan(low):
+            return interval
+        added = t * t * self.variance
+        return Interval(
+            value,
+            max(limits[0], value - math.sqrt((value - low) ** 2 + added)),
+            min(limits[1], value + math.sqrt((high - value) ** 2 + added)),
+        )
 
 
 ONE_RUN = RunSpread()
 """The spread of a single run: unknown, so it adds nothing."""
 
 
-def _widened(interval: Interval, added: float, limits: tuple[float, float]) -> Interval:
-    value, low, high = interval
-    return Interval(
-        value,
-        max(limits[0], value - math.sqrt((value - low) ** 2 + added)),
-        min(limits[1], value + math.sqrt((high - value) ** 2 + added)),
-    )
-
-
 def run_spread(values: Floats) -> RunSpread:
     """Return the spread over training runs of values, `(E, R) float64`, NaN where missing.
 
     With the variance s² of the runs' means over n episodes and the residual variance r of episodes
-    and runs, the runs add max(0, s² − r / n) / R, with R − 1 degrees of freedom: the noise of single
-    rollouts is in the interval over episodes already. Episodes that a run lacks are left out.
+    and runs, the runs add max(0, s² − r / n) / R, with R − 1 degrees of freedom: the noise of
+    single rollouts is in the interval over episodes already. Episodes that a run lacks are left
+    out.
 
     Source: components of variance of two crossed random effects, Searle (1971), Linear Models,
     chapter 9.
@@ -105,10 +108,9 @@ def run_spread(values: Floats) -> RunSpread:
     residuals = values - means - values.mean(axis=1, keepdims=True) + values.mean()
     noise = float((residuals**2).sum()) / ((runs - 1) * (n - 1))
     variance = max(0.0, spread - noise / n) / runs
-    # Equal means can differ in the last digits.
-    return RunSpread(runs, deviation, variance, runs - 1) if variance > 1e-18 else RunSpread(
-        runs, deviation
-    )
+    if variance < 1e-18:  # equal means can differ in the last digits
+        return RunSpread(runs, deviation)
+    return RunSpread(runs, deviation, variance, runs - 1)
 
 
 def independent(first: RunSpread, second: RunSpread) -> RunSpread:

@@ -15,7 +15,7 @@ from robomme_interference_data.schema.codec import to_dict
 
 KEY = {"system": OWN, "simulator": "tabletop", "buffer_set": "made", "revision": REVISION}
 KEY |= {"family": "MoveCube", "condition": "k0", "split": "test", "shift": "none"}
-KEY |= {"model_seed": 0, "protocol_version": 1} | to_dict(SystemFacts())
+KEY |= {"training_seed": None, "model_seed": 0, "protocol_version": 1} | to_dict(SystemFacts())
 TASK = KEY | {"name": "MoveCube/k0", "episode": "0,3-5"}
 ROW = KEY | {"episode": 0, "status": "success", "success": True}
 

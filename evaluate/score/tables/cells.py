@@ -25,15 +25,15 @@ from robomme_interference_data.stats.intervals import stratified_n, wilson
 from robomme_interference_data.stats.runs import MIN_RUNS, ONE_RUN, RunSpread
 from robomme_interference_data.viz.tables import Columns, Table
 
-from .comparison import RUNS, record_table
+from .comparison import record_table
 from .contrast import Scope, scope_of
 from .ranks import Standing, all_pairs, standings
 
 NOTE = (
     "Rates with 95% Wilson intervals. scope: they hold for other training runs, if there are "
-    f"{MIN_RUNS} runs or more, otherwise for this checkpoint alone. n: episodes that count; an error is neither success nor "
-    "failure. †: the cell lacks episodes, or has episodes outside the grid, and is not ranked; a "
-    "cell without any rollout is missing."
+    f"{MIN_RUNS} runs or more, otherwise for this checkpoint alone. n: episodes that count; an "
+    "error is neither success nor failure. †: the cell lacks episodes, or has episodes outside the "
+    "grid, and is not ranked; a cell without any rollout is missing."
 )
 BEST = (
     "Best (bold, in text *): above zero, and no other system is significantly better, by p after "
@@ -249,7 +249,14 @@ def _ranked(
 
 _CELL: Columns = {"simulator": "text", "system": "text", "condition": "text"}
 
-_RATE: Columns = {"n": "count"} | RUNS | {"rate": "rate", "low": "rate", "high": "rate"}
+_RATE: Columns = {
+    "n": "count",
+    "runs": "count",
+    "scope": "text",
+    "rate": "rate",
+    "low": "rate",
+    "high": "rate",
+}
 
 _COUNTS: Columns = {
     "successes": "count",

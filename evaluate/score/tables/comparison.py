@@ -22,12 +22,6 @@ SIDES: Columns = {
 }
 """The two sides of a comparison."""
 
-RUNS: Columns = {"runs": "count", "scope": "text"}
-"""The training runs, and what intervals and tests hold for."""
-
-ERRORS: Columns = {"if_failures": "points", "if_successes": "points"}
-"""What a difference is if all errors were failures, or successes."""
-
 RUNS_NOTE = (
     f"runs: training runs of the side with fewer. scope: with {MIN_RUNS} runs or more, interval "
     "and test hold for other training runs too, otherwise for this checkpoint alone. if failures, "

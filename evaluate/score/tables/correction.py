@@ -38,9 +38,9 @@ def with_primary(contrasts: Sequence[Contrast]) -> list[Contrast]:
             contrast.effect is Effect.SESSIONS
             and latest[contrast.simulator, contrast.system] == contrast.condition
         )
-        if is_fall or contrast.effect is Effect.SLOPES:
-            contrast = replace(contrast, primary=True, group=PRIMARY_GROUP)
-        marked.append(contrast)
+        is_primary = is_fall or contrast.effect is Effect.SLOPES
+        group = PRIMARY_GROUP if is_primary else contrast.group
+        marked.append(replace(contrast, primary=is_primary, group=group))
     return marked
 
 
@@ -63,12 +63,7 @@ def correct(contrasts: Iterable[Contrast], alpha: float = ALPHA) -> list[Contras
     if_failures = corrected([_p(c.pairs, c.pairs.if_failures) for c in contrasts], groups)
     if_successes = corrected([_p(c.pairs, c.pairs.if_successes) for c in contrasts], groups)
     return [
-        replace(
-            contrast,
-            tests=sizes[group],
-            p_holm=p,
-            verdict=verdict_of(p, possible, alpha),
-        )
+        replace(contrast, tests=sizes[group], p_holm=p, verdict=verdict_of(p, possible, alpha))
         for contrast, group, p, *possible in zip(
             contrasts, groups, ps, if_failures, if_successes, strict=True
         )

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.evaluate.score.outcomes import (
-    Statuses,
-    SuccessRate,
     ERROR,
     Flags,
+    Statuses,
+    SuccessRate,
     counting,
     errors_as,
     rate_of,
@@ -174,7 +174,7 @@ def pair(first: Statuses, second: Statuses) -> Pairs:
     # As many rollouts as episodes: no repeats.
     if n == counting(first).sum() == counting(second).sum():
         return _of_single(before, after)
-    at = partial(_clusters, first, second)
+    at = _clusters(first, second)
     both = counting(first) & counting(second)
     if not both.any():  # no repeat in common, such as other seeds: each side's lowest
         first, second = _lowest(first), _lowest(second)
@@ -227,15 +227,20 @@ def _of_single(before: Floats, after: Floats) -> Pairs:
     )
 
 
-def _clusters(first: Statuses, second: Statuses, level: float) -> Interval:
-    """Return second − first with the interval of means of repeats."""
+def _clusters(first: Statuses, second: Statuses) -> Callable[[float], Interval]:
+    """Return second − first with the intervals of means of repeats, by level."""
     values = [success(side) for side in (first, second)]
     before, after = (float(side.mean()) for side in values)
     spread = float(values[0].std() * values[1].std())
     phi = (float((values[0] * values[1]).mean()) - before * after) / spread if spread else 0.0
     trials = [rate_of(side).trials for side in (first, second)]
-    old, new = (wilson(r * m, m, level) for r, m in zip((before, after), trials, strict=True))
-    return Interval(round(after - before, 12), *mover_interval(after, new, before, old, phi))
+
+    def at(level: float) -> Interval:
+        sides = zip((before, after), trials, strict=True)
+        old, new = (wilson(rate * m, m, level) for rate, m in sides)
+        return Interval(round(after - before, 12), *mover_interval(after, new, before, old, phi))
+
+    return at
 
 
 def pair_errors(before: Floats, after: Floats, test: SignFlips) -> Pairs:

@@ -256,7 +256,9 @@ INTERACTION = ComparisonTable(
         "whether the difference between the two rates departs from a line over log2(k + 1), by "
         "sign flips, not corrected."
     ),
-    corrected="the tests of the primary analysis: these, and k7 against k0 of each system (effects)",
+    corrected=(
+        "the tests of the primary analysis: these, and k7 against k0 of each system, in effects"
+    ),
     explain=False,
 )
 
@@ -317,10 +319,7 @@ class _Apart(NamedTuple):
         first, second = self.first.departures, self.second.departures
         if self.related and first.shape == second.shape:
             return _spreads(second - first)
-        return [
-            independent(*both)
-            for both in zip(_spreads(first), _spreads(second), strict=True)
-        ]
+        return [independent(*both) for both in zip(_spreads(first), _spreads(second), strict=True)]
 
 
 def _apart(outcomes: Outcomes, system: str, other: str) -> _Apart | None:
@@ -339,7 +338,7 @@ def _apart(outcomes: Outcomes, system: str, other: str) -> _Apart | None:
         _falls(side[..., runs], training[runs], conditions)
         for side, runs in zip((first, second), both, strict=True)
     ]
-    return _Apart(system, other, conditions, *falls, related)
+    return _Apart(system, other, conditions, falls[0], falls[1], related)
 
 
 def _interactions(outcomes: Outcomes, draws: int) -> list[Contrast]:
@@ -367,9 +366,9 @@ def _interactions(outcomes: Outcomes, draws: int) -> list[Contrast]:
             lost=int((apart.change < 0).sum()),
             p=test.p,
         )
-        departures = (
-            apart.second.departures.mean(axis=1) - apart.first.departures.mean(axis=1)
-        )[:, None]
+        departures = (apart.second.departures.mean(axis=1) - apart.first.departures.mean(axis=1))[
+            :, None
+        ]
         contrasts.append(
             Contrast(
                 key,
