@@ -18,8 +18,8 @@ from robomme_interference_data.evaluate.run.plan import RunPlan
 from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.score.compare import compare
 from robomme_interference_data.evaluate.score.plots.figures import draw_error_figure
-from robomme_interference_data.evaluate.score.report.methods import methods
 from robomme_interference_data.evaluate.score.report.headline import headlines
+from robomme_interference_data.evaluate.score.report.methods import methods
 from robomme_interference_data.evaluate.score.rows.export import export
 from robomme_interference_data.evaluate.score.rows.reading import read_rows
 from robomme_interference_data.evaluate.score.writing import write_score

@@ -202,7 +202,7 @@ def test_numbers_in_figures_are_those_of_tables(full: Score) -> None:
                 ]
                 points = 100 * pair["difference"] * (1 if pair["system"] == rows[y] else -1)
                 assert int(text.get_text().replace("\N{MINUS SIGN}", "-")) == round(points)
-                assert (text.get_weight() == "bold") == (pair["p_holm"] < 0.05)
+                assert (text.get_weight() == "bold") == (pair["verdict"] == "shown")
     with open_figure() as figure:
         assert draw_figure("family_falls", figure, shown)
         for axes, system in zip(figure.axes, shown.systems[1:], strict=False):  # without π0.5

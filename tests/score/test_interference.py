@@ -6,7 +6,7 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 from support import scoring as made
-from support.scoring import BASE, OWN, REPLAY, RETRIEVAL, record
+from support.scoring import BASE, OWN, RETRIEVAL, record
 
 from robomme_interference_data.evaluate.score.plots.data import Data
 from robomme_interference_data.evaluate.score.plots.figures import draw_figure
