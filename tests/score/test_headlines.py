@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from support import findings
 from support import scoring as made
+from support.browser import open_page
 from support.screens import first_screen
 
 from robomme_interference_data.evaluate.score.plots.data import Data
@@ -33,29 +34,51 @@ def scores(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Score]:
     return {name: findings.scored(name, folder) for name in findings.FINDINGS}
 
 
-def screens(scores: dict[str, Score], folder: Path) -> str:
-    """The first screens of findings, with their figures."""
-    texts = []
+@pytest.fixture(scope="module")
+def pages(scores: dict[str, Score], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The report of each finding, with the figure of its first screen."""
+    folder = tmp_path_factory.mktemp("reports")
+    written = {}
     for name, found in scores.items():
         figures = {}
         with open_figure() as figure:
             if draw_figure("family_falls", figure, Data(found, "tabletop")):
                 figures["family_falls-tabletop"] = folder / f"{name}.svg"
                 save_figure(figure, folder / f"{name}.svg")
-        write_report(found, figures, folder / f"{name}.html")
-        page = (folder / f"{name}.html").read_text(encoding="utf-8")
-        texts.append(f"# {name}\n\n{first_screen(page)}")
-    return "\n".join(texts)
+        written[name] = folder / f"{name}.html"
+        write_report(found, figures, written[name])
+    return written
 
 
 @pytest.mark.slow
 def test_first_screens_are_the_golden_ones(
-    scores: dict[str, Score], tmp_path: Path, request: pytest.FixtureRequest
+    pages: dict[str, Path], request: pytest.FixtureRequest
 ) -> None:
-    found = screens(scores, tmp_path)
+    """Run with `--write-messages`, it writes them."""
+    texts = {name: first_screen(path.read_text(encoding="utf-8")) for name, path in pages.items()}
+    found = "\n".join(f"# {name}\n\n{text}" for name, text in texts.items())
     if request.config.getoption("--write-messages"):
         GOLDEN.write_text(found, encoding="utf-8", newline="\n")
     assert found == GOLDEN.read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_first_screens_fit_a_desktop(pages: dict[str, Path]) -> None:
+    wide = "[...document.querySelectorAll('.screen :is(.wide, .picture)')]"
+    with open_page() as page:
+        size = {"width": 1280, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+        page.call("Emulation.setDeviceMetricsOverride", **size)
+        for name, path in pages.items():
+            page.events.clear()
+            page.open(path)
+            assert page.run("document.documentElement.scrollWidth") <= 1280, name
+            # Nothing is cut off to the right, and no part is empty.
+            assert page.run(f"{wide}.filter(e => e.scrollWidth > e.clientWidth + 1).length") == 0
+            assert page.run(f"{wide}.filter(e => e.clientHeight < 40).length") == 0
+            # The headline is above the fold.
+            end = "document.querySelector('.headline').getBoundingClientRect().bottom"
+            assert page.run(end) < 600, name
+            assert page.complaints() == []
 
 
 # --- numbers -----------------------------------------------------------------------------------
