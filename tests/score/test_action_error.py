@@ -204,7 +204,7 @@ def test_the_lowest_error_is_named_and_each_system_that_is_worse_than_a_baseline
     text = headline_of(tmp_path, {**BASELINES, **systems})
     first, second, *rest = text.split(". ")
     assert "good has the lowest" in first and "0.1000 under k0" in first
-    assert second.startswith("bad is worse") and "Hold (0.1797)" in second
+    assert second.startswith("Under k0, bad (0.2000) is worse") and "Hold (0.1797)" in second
     assert "worse" not in "".join(rest)
 
 

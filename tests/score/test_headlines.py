@@ -3,6 +3,7 @@
 import csv
 import io
 import re
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,9 @@ from support.screens import first_screen
 
 from robomme_interference_data.evaluate.score.plots.data import Data
 from robomme_interference_data.evaluate.score.plots.figures import draw_figure
-from robomme_interference_data.evaluate.score.quotes import Quote, Sentence
 from robomme_interference_data.evaluate.score.report.headline import headline
 from robomme_interference_data.evaluate.score.report.page import write_report
+from robomme_interference_data.evaluate.score.report.quotes import Quote, Sentence
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.viz.figure import open_figure, save_figure
@@ -136,6 +137,25 @@ def test_every_number_of_other_scores_is_in_a_table(
 ) -> None:
     for found in (small, kinds, questions, full):
         check(found)
+
+
+def test_every_number_of_offline_runs_is_in_a_table(tmp_path: Path) -> None:
+    errors = {("mine", "k0"): 0.2, ("mine", "no-history"): 0.1, ("hold", "no-history"): 0.15}
+    rows = [
+        replace(made.recording(condition, number, (error + number / 1000,)), system=system)
+        for (system, condition), error in errors.items()
+        for number in range(12)
+    ]
+    found = made.score(made.write_parquet(tmp_path / "a.parquet", rows))
+    check(found)
+    # The mean of 0.2 to 0.211, and of the others.
+    worse = str(headline(found, "recordings")[1])
+    assert "mine (0.2055) is worse than itself without history (0.1055) and than Hold" in worse
+    rows.append(replace(made.recording("k0", 12, None), system="mine"))
+    broken = made.score(made.write_parquet(tmp_path / "b.parquet", rows))
+    check(broken)
+    first, lacking, _ = map(str, headline(broken, "recordings"))
+    assert "mine has an action error of 0.1055" in first and "1 broke" in lacking
 
 
 # --- which systems a sentence is about -----------------------------------------------------------

@@ -2,18 +2,12 @@
 
 from collections.abc import Sequence
 
-from robomme_interference_data.evaluate.score.quotes import (
-    Sentence,
-    TableRow,
-    joined,
-    number_of,
-    say,
-)
 from robomme_interference_data.evaluate.score.tables.contrast import Verdict
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.schema.conditions import NO_HISTORY
 
 from .falls import Fall, Finding
+from .quotes import Sentence, TableRow, joined, number_of, say
 
 FEW = 2
 """The most systems, or cells, that a sentence names one by one with their numbers."""

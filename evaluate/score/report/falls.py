@@ -4,10 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from robomme_interference_data.evaluate.score.quotes import TableRow, rows_of
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.contrast import START, Verdict
 from robomme_interference_data.evaluate.score.tables.equivalence import EQUIVALENT
+
+from .quotes import TableRow, rows_of
 
 
 class Finding(StrEnum):

@@ -3,14 +3,6 @@
 from collections.abc import Sequence
 
 from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.evaluate.score.quotes import (
-    Sentence,
-    TableRow,
-    joined,
-    number_of,
-    rows_of,
-    say,
-)
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.contrast import START, Scope
 from robomme_interference_data.evaluate.systems import display_name
@@ -18,6 +10,7 @@ from robomme_interference_data.schema.conditions import in_order
 
 from .claims import FEW, episodes, falls_apart, findings, lacks, named, over_both
 from .falls import Fall, falls_of, ranked
+from .quotes import Sentence, TableRow, joined, number_of, rows_of, say
 from .steps import next_step
 
 
@@ -58,7 +51,7 @@ def headline(score: Score, simulator: str) -> list[Sentence]:
         lacking if lacking.text else falls_apart(apart),
         next_step(score, simulator, falls),
     ]
-    return [sentence for sentence in sentences if sentence.text]
+    return [stated for stated in sentences if stated.text]
 
 
 def headlines(score: Score) -> dict[str, str]:

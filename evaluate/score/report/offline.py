@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 
-from robomme_interference_data.evaluate.score.quotes import Sentence, TableRow, joined, rows_of, say
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.contrast import Effect
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.schema.conditions import NO_HISTORY, parse_condition
 
-from .claims import lacks, named
+from .claims import lacks, named, sentence
+from .quotes import Sentence, TableRow, joined, rows_of, say
 from .steps import AGAIN
 
 
@@ -23,13 +23,19 @@ def offline_headline(score: Score) -> list[Sentence]:
     # The least history is where systems are compared: k0, where there is one.
     seen = sorted((c["condition"] for c in complete if c["condition"] != NO_HISTORY), key=_place)
     starts = [cell for cell in complete if seen and cell["condition"] == seen[0]]
-    first = _first(starts or complete, complete) if complete else Sentence("")
+    # Without a complete cell, nothing is called the lowest.
+    shown = starts or complete or [cell for cell in cells if cell["n"]]
     ran = [cell for cell in cells if cell["n"] or cell["errors"]]
     step = "Next: run rollouts, because an action error is no success rate."
     if len(complete) < len(cells):
         step = f"Next: {AGAIN}."
-    sentences = [first, _better_without(score, starts), lacks(ran), Sentence(step)]
-    return [sentence for sentence in sentences if sentence.text]
+    sentences = [
+        _first(shown, complete),
+        _better_without(score, starts),
+        lacks(ran),
+        Sentence(step),
+    ]
+    return [stated for stated in sentences if stated.text]
 
 
 def _place(condition: str) -> tuple[int, ...]:
@@ -79,14 +85,14 @@ def _better_without(score: Score, starts: Sequence[TableRow]) -> Sentence:
             name, under = display_name(cell["system"]), named(cell["condition"])
             parts.append(
                 say(
-                    "{name} is worse under {under} ({action_l1}) than {listed}",
+                    "under {under}, {name} ({action_l1}) is worse than {listed}",
                     cell,
                     name=name,
                     under=under,
                     listed=listed,
                 )
             )
-    return say("{parts}.", parts=joined(parts, "; ")) if parts else Sentence("")
+    return sentence(parts)
 
 
 def _against(row: TableRow) -> str:

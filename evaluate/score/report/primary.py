@@ -4,13 +4,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from robomme_interference_data.evaluate.score.outcomes import Outcomes
-from robomme_interference_data.evaluate.score.quotes import Sentence, TableRow, rows_of
 from robomme_interference_data.evaluate.score.scoring import Score, repeat_noise
 from robomme_interference_data.evaluate.score.tables.contrast import START, Scope
 from robomme_interference_data.evaluate.score.tables.grids import family_grid
 from robomme_interference_data.viz.tables import Table
 
 from .headline import headline
+from .quotes import Sentence, TableRow, rows_of
 
 _BOUNDS = ("if_failures", "if_successes")
 """Columns that are shown only if a rollout broke: without errors, both are the difference."""

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.config import Expected
 from robomme_interference_data.evaluate.score.outcomes import TEST_EPISODES
-from robomme_interference_data.evaluate.score.quotes import Sentence, TableRow, rows_of
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.contrast import START, Scope
 
 from .falls import Fall, Finding
+from .quotes import Sentence, TableRow, rows_of
 
 AGAIN = "run the same evaluate command again, which repeats what broke and runs what is missing"
 """How a run becomes complete."""
