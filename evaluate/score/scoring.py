@@ -107,7 +107,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     recordings = offline_outcomes(rows)
     cells = cells_of(simulated)
     compared, notes = _compared(simulated, draws)
-    contrasts = correct(with_primary(compared))
+    contrasts = correct(with_primary(compared, simulated))
     notes += [sentence for each in simulated if (sentence := repeat_noise(each))]
     tables = [
         main_table(cells),

@@ -41,10 +41,17 @@ class Side:
         return bool(whole) and self.planned.get(condition, set()) <= self.counted(condition)
 
     def repeats(self, other: "Side", rows: CheckedRows, other_rows: CheckedRows) -> bool:
-        """Whether another run's side is the same system with the same scenes and histories."""
+        """Whether another run's side is the same weights with the same scenes and histories."""
         name = self.outcomes.simulator
         same = (self.system, name) == (other.system, other.outcomes.simulator)
-        return same and rows.revisions.get(name) == other_rows.revisions.get(name)
+        weights, other_weights = (
+            {repeat.training_seed for repeat in side.outcomes.repeats} for side in (self, other)
+        )
+        return (
+            same
+            and weights == other_weights
+            and rows.revisions.get(name) == other_rows.revisions.get(name)
+        )
 
     def counted(self, condition: str) -> set[EpisodeId]:
         """The episodes that count under a condition."""
@@ -160,13 +167,15 @@ def noise_floor(a: Side, b: Side, pairs: Mapping[str, Pairs]) -> Iterator[str]:
             )
     if not shares:
         return
-    seeds, other_seeds = {*a.outcomes.repeats}, {*b.outcomes.repeats}
+    seeds, other_seeds = (
+        {repeat.model_seed for repeat in side.outcomes.repeats} for side in (a, b)
+    )
     if seeds == other_seeds:
         which = "the same"
     else:
         which = "partly other" if seeds & other_seeds else "other"
     yield (
-        f"{a.system} ran in both, with {which} seeds, in "
+        f"{a.system} ran in both, with {which} model seeds, in "
         f"{a.outcomes.simulator}. If nothing else differs, this share of episodes flips by chance "
         f"(the noise floor): {', '.join(shares)}."
     )

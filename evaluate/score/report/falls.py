@@ -1,6 +1,5 @@
 """What the primary analysis concludes about the fall of each system."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -71,18 +70,12 @@ class Fall:
 
 
 def falls_of(score: Score, simulator: str) -> list[Fall]:
-    """Return the fall of each system of a simulator that ran k0 and a condition after it.
+    """Return the fall of each system that ran k0 and a condition after it.
 
-    References are left out where other systems have falls.
+    A reference has none: it is no part of the primary analysis.
     """
     rows = rows_of(score.tables.get("effects"), simulator=simulator, primary=True)
-    return [_fall(score, row) for row in ranked(score, rows) if row["n"]]
-
-
-def ranked(score: Score, rows: Sequence[TableRow]) -> list[TableRow]:
-    """Return rows without those of references, or all where there are no others."""
-    kept = [row for row in rows if not score.is_reference(row["simulator"], row["system"])]
-    return kept or [*rows]
+    return [_fall(score, row) for row in rows if row["n"]]
 
 
 def _fall(score: Score, row: TableRow) -> Fall:

@@ -9,7 +9,7 @@ from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.schema.conditions import in_order
 
 from .claims import FEW, episodes, falls_apart, findings, lacks, named, over_both
-from .falls import Fall, falls_of, ranked
+from .falls import Fall, falls_of
 from .quotes import Sentence, TableRow, joined, number_of, rows_of, say
 from .steps import next_step
 
@@ -39,7 +39,9 @@ def headline(score: Score, simulator: str) -> list[Sentence]:
     elif falls:
         rates = joined([over_both(fall) for fall in falls[:FEW]], "; ")
     else:
-        rates = _rates(score, ranked(score, [row for row in cells if row["n"]]))
+        counting = [row for row in cells if row["n"]]
+        ranked = [row for row in counting if not score.is_reference(simulator, row["system"])]
+        rates = _rates(score, ranked or counting)
     lacking = lacks(
         [row for row in cells if row["n"] or row["errors"]],
         apart=[fall for fall in falls if not fall.complete] if complete else [],

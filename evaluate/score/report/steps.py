@@ -21,20 +21,26 @@ def next_step(score: Score, simulator: str, falls: Sequence[Fall]) -> Sentence:
     ran = [row for row in cells if row["n"] or row["errors"]]
     expected = score.settings.expected
     if any(row["errors"] or row["missing"] for row in ran) or not falls:
-        step = _to_compare(ran, expected)
+        ranked = [row for row in ran if not score.is_reference(simulator, row["system"])]
+        step = _to_compare(ran, ranked, expected)
     else:
         step = _to_conclude(falls)
     return Sentence(f"Next: {step}.")
 
 
-def _to_compare(ran: Sequence[TableRow], expected: Expected) -> str:
-    """Return the step that completes cells, or adds one that falls are measured with."""
+def _to_compare(ran: Sequence[TableRow], ranked: Sequence[TableRow], expected: Expected) -> str:
+    """Return the step that completes cells, or adds one that falls are measured with.
+
+    `ranked` are those of `ran` without references, which have no part in the primary analysis.
+    """
     if expected is Expected.BENCHMARK and not any(row["complete"] for row in ran):
         # Whoever planned fewer episodes than the benchmark has needs no others.
         return f"{AGAIN}; or, if no more episodes are planned, score with --expected observed"
     if any(row["errors"] or row["missing"] for row in ran):
         return AGAIN
-    if START not in {row["condition"] for row in ran}:
+    if not ranked:
+        return "run a system that is no reference"
+    if START not in {row["condition"] for row in ranked}:
         return f"run {START}, from which falls are measured"
     return f"run k7, to compare it with {START}"
 

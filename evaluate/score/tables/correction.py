@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import replace
 
+from robomme_interference_data.evaluate.score.outcomes import Outcomes
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.stats.significance import ALPHA, holm
 
@@ -20,23 +21,29 @@ PRIMARY_CONDITION = "k7"
 PRIMARY_GROUP = "primary"
 
 
-def with_primary(contrasts: Sequence[Contrast]) -> list[Contrast]:
+def with_primary(contrasts: Sequence[Contrast], all_outcomes: Iterable[Outcomes]) -> list[Contrast]:
     """Return comparisons with the primary ones marked, which are corrected together.
 
-    Primary are, in each simulator, k7 against k0 of each system, and the differences between the
-    falls of two systems.
+    Primary are, in each simulator, k7 against k0 of each system that is no reference, and the
+    differences between the falls of two systems.
     """
+    compared = {
+        (outcomes.simulator, system)
+        for outcomes in all_outcomes
+        for system in outcomes.systems
+        if not outcomes.is_reference(system)
+    }
     conditions: dict[tuple[str, str], list[str]] = {}
     for contrast in contrasts:
-        if contrast.effect is Effect.SESSIONS:
-            cell = (contrast.simulator, contrast.system)
+        cell = (contrast.simulator, contrast.system)
+        if contrast.effect is Effect.SESSIONS and cell in compared:
             conditions.setdefault(cell, []).append(contrast.condition)
     latest = {cell: _primary_condition(names) for cell, names in conditions.items()}
     marked = []
     for contrast in contrasts:
         is_fall = (
             contrast.effect is Effect.SESSIONS
-            and latest[contrast.simulator, contrast.system] == contrast.condition
+            and latest.get((contrast.simulator, contrast.system)) == contrast.condition
         )
         is_primary = is_fall or contrast.effect is Effect.SLOPES
         group = PRIMARY_GROUP if is_primary else contrast.group

@@ -73,25 +73,29 @@ def families_table(all_outcomes: Iterable[Outcomes], contrasts: Sequence[Contras
     rows = list[Contrast]()
     for outcomes in all_outcomes:
         labels = outcomes.family
-        effects, differences, counts = list[Contrast](), list[Floats](), list[int]()
+        effects, differences, counts = list[Contrast](), list[Floats](), list[NDArray[np.int64]]()
         for contrast in contrasts:
             if contrast.simulator != outcomes.simulator or contrast.effect not in _EFFECTS:
                 continue
             before = success(outcomes.status[outcomes.cell(*contrast.against)])
             after = success(outcomes.status[outcomes.cell(contrast.system, contrast.condition)])
-            families = {*labels[~np.isnan(after - before)].tolist()}
-            if len(families) > 1:
+            _, sizes = np.unique(labels[~np.isnan(after - before)], return_counts=True)
+            if len(sizes) > 1:
                 effects.append(contrast)
                 differences.append(after - before)
-                counts.append(len(families))
+                counts.append(sizes)
         if not effects:
             continue
         estimates = over_families(np.stack(differences, axis=1), labels, outcomes.simulator)
+        estimates = [
+            estimate if sizes.min() >= MIN_IN_FAMILY else estimate._replace(p_families=math.nan)
+            for estimate, sizes in zip(estimates, counts, strict=True)
+        ]
         holms = holm([estimate.p_families for estimate in estimates])
-        for contrast, count, estimate, p_holm in zip(
+        for contrast, sizes, estimate, p_holm in zip(
             effects, counts, estimates, holms, strict=True
         ):
-            columns = {"families": count, **estimate._asdict(), "p_families_holm": p_holm}
+            columns = {"families": len(sizes), **estimate._asdict(), "p_families_holm": p_holm}
             rows.append(replace(contrast, columns=columns))
     return comparison_table(FAMILIES, rows)
 
@@ -107,7 +111,7 @@ class OverFamilies(NamedTuple):
     without_low: float  # lowest and highest mean without one of the families
     without_high: float
     spread: float  # standard deviation between families
-    p_families: float  # NaN if a family has fewer than `MIN_IN_FAMILY` episodes
+    p_families: float  # holds with `MIN_IN_FAMILY` episodes of each family or more
 
 
 def over_families(
@@ -215,7 +219,7 @@ def _spread(families: _Families) -> Floats:
 
 
 def _p_families(families: _Families, generator: np.random.Generator, draws: int) -> Floats:
-    """Return p of equal differences in all families, `(K,)`; NaN where a family is too small."""
+    """Return p of equal differences in all families, `(K,)`."""
     sizes, episodes = families.sizes, len(families.values)
     # Residuals vary less than the differences do, in small families most.
     scale = np.sqrt(sizes / np.maximum(1, sizes - 1))
@@ -230,8 +234,7 @@ def _p_families(families: _Families, generator: np.random.Generator, draws: int)
         return np.asarray(((sums * sums / sizes).sum(axis=-2) - whole).round(9))
 
     reached = (variation(flipped) >= variation(families.means * sizes)).sum(axis=0)
-    p = (1 + reached) / (1 + draws)
-    return np.asarray(p if sizes.min() >= MIN_IN_FAMILY else np.full(p.shape, math.nan))
+    return np.asarray((1 + reached) / (1 + draws))
 
 
 def _bootstrap(
