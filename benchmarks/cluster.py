@@ -32,7 +32,7 @@ from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.log import open_log
 from robomme_interference_data.evaluate.run.plan import WorkItem, shuffle_work
 from robomme_interference_data.evaluate.run.progress import RunProgress
-from robomme_interference_data.evaluate.run.runner import RunContext
+from robomme_interference_data.evaluate.run.worker import RunContext
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.process import Processes

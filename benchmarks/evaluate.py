@@ -24,7 +24,7 @@ from robomme_interference_data.evaluate.policies.policy import Policy, RolloutIn
 from robomme_interference_data.evaluate.rollout.rollout import run_rollout
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout
-from robomme_interference_data.evaluate.run.runner import RunContext
+from robomme_interference_data.evaluate.run.worker import RunContext
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Executor

@@ -3,7 +3,7 @@
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout
-from robomme_interference_data.evaluate.run.runner import RunContext
+from robomme_interference_data.evaluate.run.worker import RunContext
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.rollouts import Status
 

@@ -13,12 +13,7 @@ from robomme_interference_data.cli.console import (
     print_status,
 )
 from robomme_interference_data.cli.options import AsJson, Yes, with_settings
-from robomme_interference_data.constants import (
-    DEMONSTRATIONS,
-    MANIFEST_PATH,
-    MANIFESTS,
-    REPORT_PATH,
-)
+from robomme_interference_data.constants import DEMONSTRATIONS, MANIFESTS, REPORT_PATH
 from robomme_interference_data.errors import MissingFileError, counted
 from robomme_interference_data.runtime.executor import WorkersConfig, make_executor
 
@@ -68,8 +63,7 @@ def build(
       --demonstrations namespace/name@data-1.0.0
     ```
     """
-    from robomme_interference_data.data.dataset import Dataset
-    from robomme_interference_data.storage.files import LocalFiles
+    from robomme_interference_data.data.loading import next_build
 
     from .plan.parts import plan_build
 
@@ -81,12 +75,7 @@ def build(
         if plan.datasets:
             counts = (f"{kind} {len(part.episodes):,}" for kind, part in plan.datasets.items())
             print_status(f"Recorded episodes: {', '.join(counts)}")
-        for kind, planned in plan.datasets.items():
-            dataset = planned
-            if kind != DEMONSTRATIONS and DEMONSTRATIONS in plan.datasets:
-                # They are built first, so that other sizes and rates are found early.
-                dataset = planned.matching(Dataset(LocalFiles(root / DEMONSTRATIONS)))
-            results[kind] = _build_dataset(dataset, root / kind, config)
+            results |= _build_datasets(plan.datasets, config)
         if plan.manifests and plan.buffers is not None:
             if plan.base is not None:
                 _copy_demonstrations(plan.base.files, root)
@@ -102,8 +91,8 @@ def build(
         raise typer.Exit(1)
     if plan.manifests:
         print_status(f"Next: robomme-interference verify {root} --audit")
-    elif plan.datasets and (root / MANIFEST_PATH).is_file():  # the buffers are of the old datasets
-        print_status(f"Next: robomme-interference build {root} --only manifests")
+    elif plan.datasets:  # the buffers, if there are any, are of the old datasets
+        print_status(f"Next: robomme-interference {next_build(root)}")
 
 
 def _confirm(change: "NextBuffers", *, yes: bool) -> None:
@@ -112,6 +101,24 @@ def _confirm(change: "NextBuffers", *, yes: bool) -> None:
         print_status(line)
     if change.loses:
         confirm("Replace these planned buffers?", "replacing planned buffers", yes=yes)
+
+
+def _build_datasets(plans: "Mapping[str, DatasetPlan]", config: BuildConfig) -> dict[str, Any]:
+    from robomme_interference_data.data.dataset import Dataset
+    from robomme_interference_data.storage.files import LocalFiles
+
+    from .sources.families import keep_families
+
+    root, results = config.buffer_set, {}
+    for kind, planned in plans.items():
+        dataset = planned
+        if kind != DEMONSTRATIONS and DEMONSTRATIONS in plans:
+            # They are built first, so that other sizes and rates are found early.
+            dataset = planned.matching(Dataset(LocalFiles(root / DEMONSTRATIONS)))
+        results[kind] = _build_dataset(dataset, root / kind, config)
+    if config.families_file is not None:
+        keep_families(config.families_file, root)
+    return results
 
 
 def _build_dataset(plan: "DatasetPlan", out: Path, workers: WorkersConfig) -> dict[str, Any]:

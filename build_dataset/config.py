@@ -119,7 +119,8 @@ class BuildConfig(WorkersConfig):
     )
     families_file: Path | None = setting(
         None,
-        help="Source lerobot: CSV file with each episode's family and, if needed, exec_start_idx.",
+        help="Source lerobot: CSV file with the family of each task or episode and, if needed, "
+        "exec_start_idx; later builds of the buffer set use it too.",
         group="Sources",
     )
     fps: float | None = setting(

@@ -1,6 +1,8 @@
 """Whether the datasets of a buffer set fit each other, and the conditions that are planned."""
 
+import shlex
 from collections.abc import Collection, Iterable, Mapping
+from pathlib import Path
 
 from robomme_interference_data.constants import DEMONSTRATIONS, EXECUTIONS, SHIFTED
 from robomme_interference_data.data.dataset import Dataset
@@ -11,15 +13,18 @@ from robomme_interference_data.schema.conditions import Condition
 from .alike import differences, in_buffers, unequal
 
 
-def check_needs(conditions: Iterable[Condition], available: Collection[str]) -> None:
-    """Check that the available datasets are all that conditions need."""
+def check_needs(
+    conditions: Iterable[Condition], available: Collection[str], root: Path | None = None
+) -> None:
+    """Check that all datasets that conditions need are available; `root` is the set's folder."""
+    where = "BUFFER_SET" if root is None else shlex.quote(str(root))
     for condition in conditions:
         for name in condition.kind.needs:
             if name not in available:
                 raise SourceError(
                     f"{condition} needs the dataset {name}, which the buffer set lacks",
                     f"Build it first, or leave {condition} out.",
-                    f"build BUFFER_SET --only {name} --source KIND:PATH",
+                    f"build {where} --only {name} --source KIND:PATH",
                 )
 
 

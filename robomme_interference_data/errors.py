@@ -2,8 +2,8 @@
 
 Each is also a fitting builtin, so that callers can catch either, and carries a `hint` on what to do
 next. Messages and hints name settings with `named`: as in Python, or as the options of the command
-that runs. Hints name pages of the documentation as in a checkout, `docs/how-to/vla-eval.md`, and
-show their address.
+that runs. Hints name pages of the documentation as in a checkout,
+`docs/how-to/connect-a-policy.md`, and show their address.
 """
 
 import re

@@ -1,9 +1,11 @@
-"""Go from recordings to a report: buffers, retrieval, a dozen rollouts, a score. Run: `make demo`.
+"""Show that other sessions bury a lesson and that retrieval finds it again. Run: `make demo`.
 
-The embedded simulator plays the episodes here, and is what the policy is evaluated in. Everything
-lands in demo/. A second run repeats no episode and no rollout, and an interrupted one resumes.
+Buffers are built, a policy is rolled out with and without a retrieval step, and the results are
+scored. The embedded simulator plays the episodes, and is what the policy is evaluated in. All is
+written into demo/. A second run repeats no episode and no rollout, and an interrupted one resumes.
 """
 
+import json
 import os
 import shlex
 import subprocess
@@ -14,34 +16,40 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 COMMAND = Path(sys.executable).parent / "robomme-interference"
 
-ROLLOUTS = "--conditions k0,k7"
+LESSON_ONLY = "k0"
+BURIED = "raw-k7"
+FRAMESAMP = "demo/runs/framesamp"
+RETRIEVAL = "demo/runs/retrieval"
+
 STEPS = {
-    "Play three test episodes and nine others, and plan buffers of them": (
-        "build demo/buffers --source tabletop --split test --episodes 0 "
-        "--families MoveCube,PatternLock,RouteStick --unit-episodes 2 --cameras front "
-        "--conditions no-history,k0,k3,k7"
+    "Play nine test episodes and eight or more others, and plan buffers of them": (
+        "build demo/buffers --source tabletop --split test --episodes 0-2 "
+        "--families MoveCube,PatternLock,RouteStick --unit-episodes 0 --cameras front "
+        f"--conditions no-history,{LESSON_ONLY},k3,k7,{BURIED}"
     ),
     "Draw a buffer: the lesson, and seven sessions of other tasks behind it": (
-        "show demo/buffers RouteStick/test/0 k7 --out demo/buffer.png"
+        f"show demo/buffers RouteStick/test/0 {BURIED} --out demo/buffer.png"
     ),
     "Embed every frame, for retrieval": "index demo/buffers",
     "Explain which part of that buffer is retrieved": (
-        "retrieve demo/buffers RouteStick/test/0 k7 --out demo/retrieval.png"
+        f"retrieve demo/buffers RouteStick/test/0 {BURIED} --out demo/retrieval.png"
     ),
-    "Roll out a policy that remembers frames sampled evenly from the whole buffer": (
-        f"evaluate demo/buffers --policy replay:framesamp {ROLLOUTS} --out demo/runs/framesamp"
+    "Roll out a policy that remembers 32 frames, sampled evenly from the whole buffer": (
+        "evaluate demo/buffers --policy replay:framesamp "
+        f"--conditions {LESSON_ONLY},{BURIED} --out {FRAMESAMP}"
     ),
     "The same policy behind a retrieval step": (
-        f"evaluate demo/buffers --policy replay:framesamp --retrieval thumbnail {ROLLOUTS} "
-        "--out demo/runs/retrieval"
+        "evaluate demo/buffers --policy replay:framesamp --retrieval thumbnail "
+        f"--conditions {BURIED} --out {RETRIEVAL}"
     ),
     "Compare the two": (
-        "score demo/runs/framesamp demo/runs/retrieval --expected observed --out demo/score"
+        f"score {FRAMESAMP} {RETRIEVAL} --expected observed --png --out demo/score"
     ),
 }
 
 RESULTS = {
     "demo/score/report.html": "start here: success rates, differences and figures, on one page",
+    "demo/score/figures/kinds-tabletop.png": "the figure of the sentence above",
     "demo/buffer.png": "what a policy is given before the episode: the lesson, then seven others",
     "demo/retrieval.png": "which of these frames the retrieval step passes on, and why",
     "demo/runs/retrieval/rollouts.jsonl": "one row for each rollout",
@@ -64,6 +72,7 @@ def main() -> None:
         if code:
             say("\nIf an earlier version of the project made demo/: rm -r demo && make demo")
             sys.exit(code)
+    say(f"\n{summary(Path(FRAMESAMP), Path(RETRIEVAL))}")
     say(f"\nDone in {time.monotonic() - began:.0f} s. What there is to open:\n")
     width = max(map(len, RESULTS))
     for path, what in RESULTS.items():
@@ -71,6 +80,27 @@ def main() -> None:
     say("\nNext:\n")
     for line in NEXT:
         say(f"  {line}")
+
+
+def summary(framesamp: Path, retrieval: Path) -> str:
+    """Return what the rollouts of two runs show, in one sentence with its three numbers."""
+    alone = successes(framesamp, LESSON_ONLY)
+    buried = successes(framesamp, BURIED)
+    retrieved = successes(retrieval, BURIED)
+    return (
+        f"With the lesson alone the policy succeeds in {alone} episodes, with seven other sessions "
+        f"behind the lesson in {buried}, and with retrieval in front of it in {retrieved}."
+    )
+
+
+def successes(run: Path, condition: str) -> str:
+    """Return how many rollouts of a run succeeded under a condition, such as "3 of 9"."""
+    lines = (run / "rollouts.jsonl").read_text(encoding="utf-8").splitlines()
+    rows = [json.loads(line) for line in lines]
+    # A rollout that broke has a row for each attempt: the last one counts.
+    last = {(row["family"], row["episode"]): row for row in rows if row["condition"] == condition}
+    statuses = [row["status"] for row in last.values()]
+    return f"{statuses.count('success')} of {len(statuses)}"
 
 
 def say(text: str) -> None:

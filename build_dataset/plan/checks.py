@@ -1,5 +1,6 @@
 """Checks before a build: its folder, units that suffice, planned buffers that would change."""
 
+from collections.abc import Collection
 from pathlib import Path
 
 from robomme_interference_data.build_dataset.config import BuffersConfig
@@ -57,9 +58,23 @@ def check_plans(
     available = {unit.episode.id for unit in units.episodes}
     if built is not None:
         available |= built.ids
-    check_units(UnitPool(available), queries, following.conditions)
+    _check_units(available, queries, following)
     check_manifests_folder(root)
     return following
+
+
+def _check_units(
+    available: Collection[EpisodeId], queries: Collection[EpisodeId], following: NextBuffers
+) -> None:
+    try:
+        check_units(UnitPool(available), queries, following.conditions)
+    except BuildError as error:
+        splits = {query.split for query in queries}
+        if not {"train", "test"} <= splits:
+            raise
+        # Whether they have a demonstration is known only when they are read.
+        hint = f"If train episodes are for units alone, set {named('split', 'test')}."
+        raise BuildError(error.message, f"{error.hint} {hint}") from None
 
 
 def _adds_episodes(plan: DatasetPlan, existing: ExistingDataset | None) -> bool:

@@ -2,6 +2,7 @@
 
 import math
 import re
+import shlex
 from collections.abc import Container, Sequence
 
 from robomme_interference_data.build_dataset.config import NO_CAMERAS, BuildConfig, parse_unit
@@ -11,6 +12,7 @@ from robomme_interference_data.build_dataset.sources import Source, open_source,
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
     EXECUTIONS,
+    FAMILIES_PATH,
     LESSONS,
     SHIFTED,
     UNITS,
@@ -33,7 +35,8 @@ def plan_dataset(
     _check_values(config)
     unit = parse_unit(config.unit)
     split = config.split
-    if split is None and kind in UNITS:
+    if kind in UNITS:
+        _check_split_of_units(config)
         split = "train"
     sources = _open_sources(kind, config, unit)
     episodes = choose_episodes(
@@ -66,6 +69,26 @@ def plan_dataset(
     )
 
 
+def _check_split_of_units(config: BuildConfig) -> None:
+    """Check that units are of train episodes: no query's scene may be in another buffer."""
+    if config.split in (None, "train"):
+        return
+    command = ["build", str(config.buffer_set)]
+    if config.only is not None:
+        command += ["--only", config.only]
+    if config.demonstrations is not None:
+        command += ["--demonstrations", config.demonstrations]
+    for source in config.source:
+        command += ["--source", source]
+    raise InvalidOptionError(
+        f"{named('split', config.split)}: distractor units must come from train episodes, so that "
+        "no query's scene leaks into another buffer",
+        f"Leave out {named('split')}.",
+        shlex.join(command),
+        "split",
+    )
+
+
 def _check_values(config: BuildConfig) -> None:
     get_codec(config.codec)
     if not re.fullmatch(r"\d+\.\d+\.\d+", config.version, re.ASCII):
@@ -85,13 +108,14 @@ def _check_values(config: BuildConfig) -> None:
 
 
 def _open_sources(kind: str, config: BuildConfig, unit: Unit) -> tuple[Source, ...]:
-    columns = _columns(config.columns)
+    columns, kept = _columns(config.columns), config.buffer_set / FAMILIES_PATH
     return tuple(
         open_source(
             text,
             shifted=kind == SHIFTED,
             columns=columns,
             families_file=config.families_file,
+            kept_families=kept if kept.is_file() else None,
             robomme_python=config.robomme_python,
             # A simulator draws only the frames that a unit stores.
             every=unit.in_dataset(kind).stride if kind in UNITS else 1,

@@ -3,6 +3,7 @@
 Everything that can be known before a frame is read is checked here.
 """
 
+import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from robomme_interference_data.constants import (
     DATASETS,
     DEMONSTRATIONS,
     DISTRACTORS,
+    MANIFEST_PATH,
     MANIFESTS,
     PAPER_UNIT,
     UNITS,
@@ -81,6 +83,8 @@ def plan_build(config: BuildConfig, request: BuffersConfig) -> BuildPlan:
         if part not in FURTHER_PARTS:
             raise InvalidOptionError.one_of("parts", part, FURTHER_PARTS)
     if config.only is None:
+        if _is_for_buffers_alone(config, request):
+            return _plan_manifests(config.buffer_set, request)
         _require_source(config, "a buffer set")
         return _plan_whole(config, request)
     if config.only not in PARTS:
@@ -102,22 +106,43 @@ def plan_build(config: BuildConfig, request: BuffersConfig) -> BuildPlan:
     return BuildPlan({config.only: plan}, more_units)
 
 
+def _is_for_buffers_alone(config: BuildConfig, request: BuffersConfig) -> bool:
+    """Return whether a request changes only which buffers of an existing set are planned."""
+    planned = (config.buffer_set / MANIFEST_PATH).is_file()
+    return planned and bool(_changed(request)) and not _changed(config, ("buffer_set",))
+
+
 def _require_source(config: BuildConfig, what: str) -> None:
-    if not config.source:
-        raise InvalidOptionError(
-            f"{named('source')} is missing: {what} is built from recorded episodes",
-            "Such as tabletop, which needs no recordings, or lerobot:NAMESPACE/NAME.",
-            option="source",
-        )
+    if config.source:
+        return
+    hint = "Such as tabletop, which needs no recordings, or lerobot:NAMESPACE/NAME."
+    command = None
+    if config.only is None and (config.buffer_set / MANIFEST_PATH).is_file():
+        hint += " To plan the buffers of the existing datasets again:"
+        command = shlex.join(["build", str(config.buffer_set), "--only", MANIFESTS])
+    raise InvalidOptionError(
+        f"{named('source')} is missing: {what} is built from recorded episodes",
+        hint,
+        command,
+        "source",
+    )
 
 
 def _check_unset(config: BuildConfig | BuffersConfig, part: str, used: Iterable[str]) -> None:
     """Check that settings which do not matter for a part are left out."""
-    for setting in fields(config):
+    for name in _changed(config, used):
+        raise _no_effect(name, part)
+
+
+def _changed(config: BuildConfig | BuffersConfig, used: Iterable[str] = ()) -> list[str]:
+    """Return the settings that differ from their defaults, without those of `used`."""
+    return [
+        setting.name
+        for setting in fields(config)
         # An environment variable is set for other commands.
-        ignored = setting.name in used or setting.metadata[SETTING]["env"] is not None
-        if not ignored and getattr(config, setting.name) != setting.default:
-            raise _no_effect(setting.name, part)
+        if setting.name not in used and setting.metadata[SETTING]["env"] is None
+        if getattr(config, setting.name) != setting.default
+    ]
 
 
 def _no_effect(setting: str, part: str) -> InvalidOptionError:
@@ -145,7 +170,7 @@ def _plan_whole(config: BuildConfig, request: BuffersConfig) -> BuildPlan:
         names = [name for name in needed if name in UNITS] + further
         queries = {record.episode_id for record in base.records()}
         available = {*datasets_in(root), *names}
-        check_needs(next_buffers(planned, request).conditions, available)
+        check_needs(next_buffers(planned, request).conditions, available, root)
     units = _settings_of_units(config, alone=base is not None)
     plans = {}
     for name in names:
@@ -172,6 +197,7 @@ def _plan_manifests(root: Path, request: BuffersConfig) -> BuildPlan:
     revision = Dataset(files[DISTRACTORS]).revision
     changed = recorded is not None and recorded.revision != revision
     change = next_buffers(planned, request, queries=queries, units_change=changed)
+    check_needs(change.conditions, files, root)
     return BuildPlan(buffers=change, manifests=True, base=base)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.constants import INFO_PATH
-from robomme_interference_data.errors import InvalidOptionError, nearest
+from robomme_interference_data.errors import InvalidOptionError, MissingFileError, nearest
 from robomme_interference_data.runtime.specs import (
     OWN,
     Registry,
@@ -63,8 +63,8 @@ def open_source(specification: str, *, shifted: bool = False, **options: Any) ->
         specification: `KIND:LOCATION` or `KIND`; see `SOURCES`. Or `MODULE:NAME` of a simulator of
             the user, as in `make_simulator`.
         shifted: Whether to open the first live views under shifts instead of the episodes.
-        **options: `columns` and `families_file` for `lerobot`, `robomme_python` and `every` for
-            simulators; other kinds ignore them.
+        **options: `columns`, `families_file` and `kept_families` for `lerobot`, `robomme_python`
+            and `every` for simulators; other kinds ignore them.
     """
     spec = _parse(specification)
     simulator = spec.arguments.get("name")
@@ -86,24 +86,51 @@ def takes(specification: str, option: str) -> bool:
     return option in signature_of(SOURCES.factory(_parse(specification))).parameters
 
 
-def _kind_of_folder(path: str) -> str | None:
-    """Return the kind of source that reads an existing folder, by the files in it."""
+def _kinds_of_folder(path: str) -> list[str] | None:
+    """Return the kinds of sources that read a folder, by the files in it; None if it is none."""
     signs = {"lerobot": INFO_PATH, "frames": TABLE, "robomme-h5": "record_dataset_*.h5"}
-    with suppress(OSError, ValueError):  # it is no path
-        return next((kind for kind, sign in signs.items() if any(Path(path).glob(sign))), None)
+    with suppress(OSError, ValueError, RuntimeError):  # it is no path
+        folder = Path(path).expanduser()
+        if folder.is_dir():
+            return [kind for kind, sign in signs.items() if any(folder.glob(sign))]
     return None
+
+
+def _check_folder(kind: str, path: str) -> None:
+    """Check that a source's folder exists, and is not one of another kind of source."""
+    found = _kinds_of_folder(path)
+    if found and kind not in found:
+        raise InvalidOptionError(
+            f"{path} is a folder for the source {found[0]}, not for {kind}",
+            f"Write {found[0]}:{path}",
+        )
+    # A dataset may be on the Hub, and recordings may be one file.
+    if found is None and kind == "frames":
+        raise MissingFileError(f"there is no folder {path}", "Check the path of the source.")
+
+
+def _unnamed_kind(path: str, kinds: list[str]) -> InvalidOptionError:
+    """Return the error about a folder that is given without the kind of source."""
+    hint = (
+        "None of its files is of a known kind. For recordings of any robot, see "
+        "docs/how-to/your-own-recordings.md."
+    )
+    if kinds:
+        hint = f"Write {kinds[0]}:{path}"
+    return InvalidOptionError(f"the source {path!r} names a folder, but not what it holds", hint)
 
 
 def _parse(specification: str) -> Spec:
     """Parse the text of a source; a simulator of the user is one like the embedded one."""
     module = specification.partition(":")[0]
-    if module not in SOURCES.kinds and (kind := _kind_of_folder(specification)):
-        raise InvalidOptionError(
-            f"the source {specification!r} names a folder, but not what it holds",
-            f"Write {kind}:{specification}",
-        )
+    kinds = _kinds_of_folder(specification)
+    if module not in SOURCES.kinds and kinds is not None:
+        raise _unnamed_kind(specification, kinds)
     if module in SOURCES.kinds or not OWN.fullmatch(specification):
-        return SOURCES.parse(specification)
+        spec = SOURCES.parse(specification)
+        if "location" in spec.arguments:
+            _check_folder(spec.kind, spec.arguments["location"])
+        return spec
     try:
         import_factory(f"source {specification!r}", specification)
     except InvalidOptionError as error:  # the module, or the name of a kind, is misspelled

@@ -28,6 +28,9 @@ _FILE = re.compile(r"record_dataset_(?P<family>.+)\.h5")
 _CAMERAS = {"front": "front_rgb", "wrist": "wrist_rgb"}
 _SUBGOALS = ("simple_subgoal", "grounded_subgoal")
 _AGAIN = "Record or download the file again, or move it out of the folder."
+_OTHER_ROBOT = (
+    "Write recordings of another robot as a frames folder: docs/how-to/your-own-recordings.md."
+)
 
 _SEEDS = (("val", 1_000_000, 10_000), ("test", 500_000, 10_000), ("train", 0, 1000))
 """Of each split, its first seed, and what a family's code is multiplied by."""
@@ -67,7 +70,7 @@ class H5Source(Source):
         if not self._files:
             raise SourceError(
                 f"{folder} holds no record_dataset_<Family>.h5 file",
-                "Point to the folder of RoboMME's recordings: robomme-h5:FOLDER",
+                f"Point to the folder of RoboMME's recordings: robomme-h5:FOLDER. {_OTHER_ROBOT}",
             )
 
     @override
@@ -77,7 +80,9 @@ class H5Source(Source):
             with _opened(path) as file:
                 numbers = _numbers(file, "episode_")
                 if not numbers:
-                    raise SourceError(f"{path} holds no episode_<N> group", _AGAIN)
+                    raise SourceError(
+                        f"{path} holds no episode_<N> group", f"{_AGAIN} {_OTHER_ROBOT}"
+                    )
                 ids = identify(family, {n: _seed(file[f"episode_{n}"]) for n in numbers})
             key = str(path.resolve()), file_state(path)
             listed += [SourceEpisode(ids[n], (n, *key)) for n in numbers]

@@ -22,23 +22,16 @@ from robomme_interference_data.simulators.episode import choose_cameras
 from robomme_interference_data.storage.encode import is_png
 from robomme_interference_data.storage.hub import HubFiles, locate
 from robomme_interference_data.storage.lerobot import LeRobotFiles
-from robomme_interference_data.storage.parquet import RowSpan
+from robomme_interference_data.storage.parquet import RowSpan, is_listed
 
 from .base import Recording, Robot, Source, SourceEpisode, compose, demonstration_length, file_state
 from .columns import camera_names, find_columns, recorded_robot
-from .families import ids_by_block, ids_by_columns, read_families
+from .families import ids_by_block, ids_by_columns, names_episodes, read_families, template
 from .images import decode_images, info_is_exact
 from .robomme_families import BLOCKS, ROBOMME, families_for_goal
 
 _ROBOMME_REPOS = ("lerobot/robomme", "Yinpei/robomme_data_lerobot")
 _CORRECT = "Correct the dataset, or leave the episode out."
-
-
-def _families_advice() -> str:
-    return (
-        f"Name the family of every episode in a CSV file, {named('families_file')}, with the first "
-        "line episode_index,family. docs/how-to/your-own-recordings.md shows one."
-    )
 
 
 @dataclass(frozen=True)
@@ -63,7 +56,8 @@ class LeRobotSource(Source):
     """Episodes of a LeRobot dataset, in a folder or on the Hub; see `hub.locate`.
 
     `columns` maps logical names (a camera, `state`, `action`, `is_demo`, `exec_start_idx`,
-    `subgoal`) to columns without a usual name.
+    `subgoal`) to columns without a usual name. `kept_families` is the families file of an earlier
+    build, for a dataset that does not name its families itself.
     """
 
     def __init__(
@@ -71,10 +65,11 @@ class LeRobotSource(Source):
         location: str,
         columns: dict[str, str] | None = None,
         families_file: Path | None = None,
+        kept_families: Path | None = None,
     ):
         self._files = locate(location)
         self._given_columns = columns or {}
-        self._families_file = families_file
+        self._given_families, self._kept_families = families_file, kept_families
         self.provenance = {"kind": "lerobot"}
         if isinstance(self._files, HubFiles):
             self.provenance |= {"repo": self._files.repo_id, "revision": self._files.commit}
@@ -144,11 +139,28 @@ class LeRobotSource(Source):
     def _columns(self) -> dict[str, str]:
         return find_columns(self._lerobot.features, self._given_columns, self._where)
 
+    @property
+    def _families_file(self) -> Path | None:
+        if self._given_families is None and not names_episodes(self._lerobot.table.column_names):
+            return self._kept_families
+        return self._given_families
+
     @cached_property
     def _families(self) -> list[dict[str, Any]]:
         if self._families_file is None:
             return [{}] * len(self._lerobot)
-        return read_families(self._families_file, len(self._lerobot))
+        return read_families(self._families_file, self._tasks)
+
+    @property
+    def _tasks(self) -> list[list[str]]:
+        """The tasks of each episode, as far as the dataset has them."""
+        table = self._lerobot.table
+        if "tasks" not in table.column_names or not is_listed(table.schema.field("tasks").type):
+            return [[]] * len(table)
+        return [
+            [text for text in texts or () if isinstance(text, str)]
+            for texts in table["tasks"].to_pylist()
+        ]
 
     @property
     def _where(self) -> str:
@@ -201,9 +213,10 @@ class LeRobotSource(Source):
             return blocks, OFFICIAL
         raise SourceError(
             f"the families of the {len(rows)} episodes of {self._where} are unknown: it has no "
-            "per-episode column episode_id or family, and is not one of RoboMME's with "
-            f"{len(blocks)} of {len(BLOCKS)} families",
-            _families_advice(),
+            "per-episode column episode_id or family, and is not RoboMME's with "
+            f"{len(blocks):,} episodes of {len(BLOCKS)} families",
+            f"Write a CSV file and give it with {named('families_file')}. Its lines, with the "
+            f"names of families:\n{template(self._tasks)}",
         )
 
     def _check_goals(self, index: int, name: EpisodeId, goals: tuple[str, ...]) -> None:
@@ -214,7 +227,8 @@ class LeRobotSource(Source):
                 raise SourceError(
                     f"{self._where}: episode {index} would be {name}, but its goal {goal!r} "
                     f"cannot be one of {name.family}; it fits {others}",
-                    _families_advice(),
+                    f"Name the families in a CSV file, {named('families_file')}: see "
+                    "docs/reference/sources.md.",
                 )
 
     def _state(self, index: int) -> tuple[Any, ...]:

@@ -27,6 +27,7 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.fetched_copy import FetchedCopy
+from robomme_interference_data.data.loading import built_datasets
 from robomme_interference_data.data.manifest_table import pending_rows
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.questions import Question, read_questions
@@ -34,7 +35,7 @@ from robomme_interference_data.errors import FormatError, InterferenceError
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.codec import arrow_schema, to_dict
 from robomme_interference_data.schema.conditions import datasets_of, in_order
-from robomme_interference_data.schema.manifest import BufferManifest
+from robomme_interference_data.schema.manifest import BufferManifest, ManifestHeader
 from robomme_interference_data.storage.arrays import combine
 from robomme_interference_data.storage.encode import CODECS, decode_image
 from robomme_interference_data.storage.files import LocalFiles, all_files, sha256_file
@@ -78,13 +79,7 @@ def verify_buffer_set(
         if not folder.is_relative_to(root):  # in a repository of its own
             for path in further_files(folder, ()):
                 yield Violation(f"{name}/{path}", "is not part of the dataset")
-    frames = sum(_frames(dataset, copy) for dataset in datasets.values())
-    if decode and frames:
-        progress.start("Verifying", frames)
-    for name, dataset in datasets.items():
-        units, shown = datasets.get(DISTRACTORS), progress if decode else None
-        yield from caught(name, dataset_violations(name, dataset, header, units, shown, copy))
-        yield from index_violations(name, dataset, units, copy)
+    yield from _datasets(datasets, header, copy, progress if decode else None)
     if len(datasets) == len(buffer_set.datasets):
         yield from caught(MANIFESTS, _buffers(buffer_set, datasets))
     if decode and {DEMONSTRATIONS, EXECUTIONS} <= datasets.keys():
@@ -95,6 +90,46 @@ def verify_buffer_set(
         yield from caught(QUESTIONS_PATH, _questions(buffer_set, decode=decode))
     elif (root / QUESTIONS_PATH).exists():
         yield Violation(QUESTIONS_PATH, f"is not listed in {HEADER}")
+
+
+def verify_datasets(
+    root: Path, *, decode: bool = True, progress: WorkProgress | None = None
+) -> Iterator[Violation]:
+    """Check the datasets in a folder for which no buffers are planned yet; see `verify_buffer_set`.
+
+    Args:
+        root: The folder.
+        decode: Whether to decode all data.
+        progress: Shows how many frames are decoded.
+    """
+    progress = progress or WorkProgress(quiet=True)
+    built = built_datasets(root)
+    yield from _unfinished(root)
+    for path in further_files(root, built):
+        yield Violation(path, "is not part of the buffer set")
+    datasets: dict[str, Dataset] = {}
+    for name in built:
+        try:
+            datasets[name] = Dataset(LocalFiles(root / name))
+        except InterferenceError as error:
+            yield Violation(name, error.message)
+    yield from _datasets(datasets, None, None, progress if decode else None)
+
+
+def _datasets(
+    datasets: Mapping[str, Dataset],
+    header: ManifestHeader | None,
+    copy: FetchedCopy | None,
+    progress: WorkProgress | None,
+) -> Iterator[Violation]:
+    """Check datasets and the embeddings beside them; see `dataset_violations`."""
+    frames = sum(_frames(dataset, copy) for dataset in datasets.values())
+    if progress is not None and frames:
+        progress.start("Verifying", frames)
+    units = datasets.get(DISTRACTORS)
+    for name, dataset in datasets.items():
+        yield from caught(name, dataset_violations(name, dataset, header, units, progress, copy))
+        yield from index_violations(name, dataset, units, copy)
 
 
 def undecoded_frames(buffer_set: BufferSet) -> int:
@@ -131,16 +166,24 @@ def _files(buffer_set: BufferSet, root: Path) -> Iterator[Violation]:
         yield Violation(rows, f"does not have the SHA-256 of {MANIFEST_HEADER}")
     else:
         yield from caught(MANIFESTS, _table(root, rows, BufferManifest))
-    for name in unfinished_builds(root):
-        folder = staging_path(root / name)
-        what = f"is an unfinished build of the {name}: resume it with the command that began it, or"
-        yield Violation(folder.name, f"{what} remove it with rm -r {shlex.quote(str(folder))}")
-    for path in further_files(root, buffer_set.header.datasets):
+    yield from _unfinished(root)
+    unplanned = [name for name in built_datasets(root) if name not in header.datasets]
+    for name in unplanned:
+        command = shlex.join(["robomme-interference", "build", str(root), "--only", MANIFESTS])
+        yield Violation(name, f"is built, but no buffers are planned with it: run {command}")
+    for path in further_files(root, [*header.datasets, *unplanned]):
         yield Violation(path, "is not part of the buffer set")
     recorded = buffer_set.copy.record.files if buffer_set.copy is not None else ()
     for path in recorded:
         if "/" not in path and not (root / path).is_file():
             yield Violation(path, "is missing")
+
+
+def _unfinished(root: Path) -> Iterator[Violation]:
+    for name in unfinished_builds(root):
+        folder = staging_path(root / name)
+        what = f"is an unfinished build of the {name}: resume it with the command that began it, or"
+        yield Violation(folder.name, f"{what} remove it with rm -r {shlex.quote(str(folder))}")
 
 
 def _frames(dataset: Dataset, copy: FetchedCopy | None) -> int:

@@ -80,7 +80,7 @@ def caught(where: str, violations: Iterable[Violation]) -> Iterator[Violation]:
 def dataset_violations(
     name: str,
     dataset: Dataset,
-    header: ManifestHeader,
+    header: ManifestHeader | None,
     units: Dataset | None,
     progress: WorkProgress | None,
     copy: FetchedCopy | None,
@@ -90,15 +90,17 @@ def dataset_violations(
     Args:
         name: Its name in the buffer set.
         dataset: The dataset.
-        header: Header of the manifests.
+        header: Header of the manifests; None if there are none yet.
         units: The distractors, if they can be opened.
         progress: Shows how many frames are decoded; None to decode none.
         copy: What is there, if the dataset is in a copy of a published buffer set.
     """
     unit = units.unit if units is not None and name in UNITS else PAPER_UNIT
-    yield from _files(name, dataset, header, copy)
+    if header is not None:
+        yield from _recorded(name, dataset, header)
+    yield from _files(name, dataset, copy)
     records = list(dataset.records())
-    yield from _identity(name, dataset, records, header, unit)
+    yield from _identity(name, dataset, records, unit)
     yield from _report(name, dataset, records)
     yield from (
         Violation(f"{name}/{where}", what) for where, what in lerobot_violations(dataset, copy)
@@ -115,13 +117,20 @@ def dataset_violations(
         progress.advance(record.length)
 
 
-def _files(
-    name: str, dataset: Dataset, header: ManifestHeader, copy: FetchedCopy | None
-) -> Iterator[Violation]:
-    """Check every byte of a dataset: identity, list of sums, and all files in it."""
-    files, root = dataset.files, dataset.files.snapshot()
-    if sha256_file(files.path(IDENTITY_PATH)) != header.datasets[name].identity:
+def _recorded(name: str, dataset: Dataset, header: ManifestHeader) -> Iterator[Violation]:
+    """Check that the manifests were made for this dataset."""
+    recorded, stored = header.datasets[name], dataset.identity
+    if sha256_file(dataset.files.path(IDENTITY_PATH)) != recorded.identity:
         yield Violation(f"{name}/{IDENTITY_PATH}", f"does not have the SHA-256 of {HEADER}")
+    for field in ("kind", "version", "revision"):
+        if getattr(recorded, field) != getattr(stored, field):
+            what = f"{field} of the {name} is {getattr(recorded, field)}; the dataset has "
+            yield Violation(HEADER, f"{what}{getattr(stored, field)}")
+
+
+def _files(name: str, dataset: Dataset, copy: FetchedCopy | None) -> Iterator[Violation]:
+    """Check every byte of a dataset: list of sums, and all files in it."""
+    files, root = dataset.files, dataset.files.snapshot()
     sums, existing = dataset.sums(), {*listed_files(root)}
     for path in sorted(sums.keys() | existing):
         if path not in existing and copy is not None and not copy.lists(root, path):
@@ -145,7 +154,7 @@ def _file_problem(root: Path, path: str) -> str | None:
 
 
 def _identity(
-    name: str, dataset: Dataset, records: list[EpisodeRecord], header: ManifestHeader, unit: Unit
+    name: str, dataset: Dataset, records: list[EpisodeRecord], unit: Unit
 ) -> Iterator[Violation]:
     stored, where = dataset.identity, f"{name}/{IDENTITY_PATH}"
     kept = stored.version, stored.codec, stored.sources, stored.sums
@@ -156,11 +165,6 @@ def _identity(
             yield Violation(where, what)
     if stored.codec not in CODECS:
         yield Violation(where, f"codec {stored.codec!r} is unknown")
-    recorded = header.datasets[name]
-    for field in ("kind", "version", "revision"):
-        if getattr(recorded, field) != getattr(stored, field):
-            what = f"{field} of the {name} is {getattr(recorded, field)}; the dataset has "
-            yield Violation(HEADER, f"{what}{getattr(stored, field)}")
 
 
 def _report(name: str, dataset: Dataset, records: list[EpisodeRecord]) -> Iterator[Violation]:

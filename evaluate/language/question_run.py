@@ -1,30 +1,27 @@
-"""Runs of questions: the checks before one, what identifies it, and what its workers do."""
+"""Runs of questions: what happens before the first one, and what their workers do."""
 
 import dataclasses
 import time
-from collections.abc import Sequence
-from contextlib import closing
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import closing, contextmanager
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.data.questions import Question, digest_questions, read_questions
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, named, nearest
 from robomme_interference_data.evaluate.run.config import AskConfig, check_unused, with_retrieval
-from robomme_interference_data.evaluate.run.plan import RunPlan, WorkItem
+from robomme_interference_data.evaluate.run.history import history_columns
+from robomme_interference_data.evaluate.run.identity import retrieval_text, short_digest
+from robomme_interference_data.evaluate.run.log import unfinished
+from robomme_interference_data.evaluate.run.plan import WorkItem, plan_run
 from robomme_interference_data.evaluate.run.row import Rollout
-from robomme_interference_data.evaluate.run.runner import (
-    Job,
-    RunContext,
-    RunFunction,
-    Runner,
-    history_columns,
-    retrieval_text,
-    short_digest,
-)
+from robomme_interference_data.evaluate.run.worker import Job, PlannedRun, RunContext, RunFunction
 from robomme_interference_data.evaluate.systems import SYSTEMS, SystemFacts, name_system
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.runtime.executor import Worker
+from robomme_interference_data.runtime.executor import Executor, Worker, WorkerPool
 from robomme_interference_data.schema.evidence import known_parts
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.sampling import Memory
@@ -36,79 +33,109 @@ from .models import MODELS, model_identity
 from .responders import CONTROLS, WITHOUT_MODEL, ModelResponder, Prompted
 
 
-class QuestionRunner(Runner[AskConfig]):
-    """Multiple-choice questions about what history buffers show."""
+@contextmanager
+def open_questions(
+    config: AskConfig, buffer_set: BufferSet, executor: Executor
+) -> Iterator[tuple[PlannedRun[AskConfig], WorkerPool | None]]:
+    """Plan a run, and keep its workers in the block; None if there is nothing to do for them."""
+    config, system = _complete_settings(config)
+    questions = read_questions(buffer_set)
+    metadata, images = _describe_model(config)
+    run = _describe_run(config, system, buffer_set, questions.values(), metadata)
+    plan = plan_run(config, run.facts, buffer_set)
+    items = plan.items()
+    if config.model == "recall":
+        _check_scenes(buffer_set, items)
+    if images is not None:
+        _check_images(config, buffer_set, items, images)
+    planned = PlannedRun(run, plan, items)
+    if not unfinished(Path(config.out), items):
+        yield planned, None
+        return
+    with executor.pool(AskFunction(config)) as pool:
+        yield planned, pool
 
-    def prepare(self) -> None:
-        """Check the settings, and identify the model."""
-        config = self.config
-        _check_settings(config)
-        self.memory = Memory.parse(config.memory)
-        self.config = config = dataclasses.replace(config, memory=str(self.memory))
-        self._questions = read_questions(self.buffer_set)
-        self.metadata, self._images = {"model": config.model}, None
-        if config.model not in WITHOUT_MODEL:
-            self.config = config = dataclasses.replace(config, model=MODELS.pin(config.model))
-        self.system = _name(config)
-        if config.model not in WITHOUT_MODEL:
-            with closing(ModelResponder(config)) as responder:
-                self.metadata, self._images = responder.metadata(), responder.images
 
-    def facts(self) -> SystemFacts:
-        """Return what the system is: the model, and what it sees of the past."""
-        config, has_model = self.config, self.config.model not in WITHOUT_MODEL
-        return SystemFacts(
-            policy=MODELS.parse(config.model).kind if has_model else config.model,
-            policy_id=short_digest({"model": self._model_identity(), "control": config.control}),
-            memory=None if config.model == "guess" else config.memory,
-            retrieval=retrieval_text(config, self.buffer_set),
-            reference=not has_model,
-        )
+def _complete_settings(config: AskConfig) -> tuple[AskConfig, str]:
+    """Return the settings in their one spelling, models with their commit, and the rows' label."""
+    _check_settings(config)
+    config = dataclasses.replace(config, memory=str(Memory.parse(config.memory)))
+    if config.model not in WITHOUT_MODEL:
+        config = dataclasses.replace(config, model=MODELS.pin(config.model))
+    return config, _name(config)
 
-    def check(self, plan: RunPlan, items: Sequence[WorkItem]) -> None:
-        """Check that the images fit, and that the ideal observer knows the possible answers."""
-        config = self.config
-        if config.model == "recall":
-            for episode in dict.fromkeys(item.episode for item in items):
-                if recorded_scene(self.buffer_set.query(episode)) is None:
-                    raise InvalidOptionError(
-                        f"recall does not know the possible answers in {episode}",
-                        "Ask a model, or guess.",
-                    )
-        # How many frames a retrieval step selects is unknown before; a memory of N bounds them.
-        if self._images is None or (config.retrieval is not None and self.memory.rule == "full"):
-            return
-        for item in items:
-            history = self.buffer_set.manifest(item.episode, item.condition).history_frames
-            kept = len(self.memory.earlier(history))
-            if kept + 1 > self._images:
-                raise InvalidOptionError(
-                    f"{item.episode}, {item.condition}: {kept} history frames and the picture; "
-                    f"the model takes {self._images} images at most",
-                    f"Set {named('model_options', f'images={kept + 1}')}, or a smaller "
-                    f"{named('memory')}.",
-                )
 
-    def function(self, run: RunContext[AskConfig]) -> "AskFunction":
-        """Return the function that asks questions."""
-        return AskFunction(run)
+def _describe_model(config: AskConfig) -> tuple[dict[str, Any], int | None]:
+    """Return what the model reports of itself, and its maximum of images; None without a limit."""
+    if config.model in WITHOUT_MODEL:
+        return {"model": config.model}, None
+    with closing(ModelResponder(config)) as responder:
+        return responder.metadata(), responder.images
 
-    def identity(self) -> dict[str, Any]:
-        """Return what of questions and model can change an answer."""
-        config = self.config
-        return {
-            "memory": str(self.memory),
-            "control": config.control,
-            "model": self._model_identity(),
-            "questions": digest_questions(self._questions.values()),
-        }
 
-    def _model_identity(self) -> dict[str, Any]:
-        config = self.config
-        if config.model in WITHOUT_MODEL:
-            return self.metadata
-        model = model_identity(config.model, config.model_options, self.metadata["model"])
-        return model | {"prompt_sha256": self.metadata["prompt_sha256"]}
+def _describe_run(
+    config: AskConfig,
+    system: str,
+    buffer_set: BufferSet,
+    questions: Collection[Question],
+    metadata: dict[str, Any],
+) -> RunContext[AskConfig]:
+    """Return what is known of a run from its settings, and from what its model reports."""
+    has_model, model = config.model not in WITHOUT_MODEL, metadata
+    if has_model:
+        model = model_identity(config.model, config.model_options, metadata["model"])
+        model |= {"prompt_sha256": metadata["prompt_sha256"]}
+    facts = SystemFacts(
+        policy=MODELS.parse(config.model).kind if has_model else config.model,
+        policy_id=short_digest({"model": model, "control": config.control}),
+        memory=None if config.model == "guess" else config.memory,
+        retrieval=retrieval_text(config, buffer_set),
+        reference=not has_model,
+    )
+    identity = {
+        "memory": config.memory,
+        "control": config.control,
+        "model": model,
+        "questions": digest_questions(questions),
+    }
+    return RunContext(
+        config,
+        system,
+        facts,
+        buffer_set.name,
+        buffer_set.revision,
+        metadata=metadata,
+        identity=identity,
+    )
+
+
+def _check_scenes(buffer_set: BufferSet, items: Sequence[WorkItem]) -> None:
+    """Check that the ideal observer knows the possible answers."""
+    for episode in dict.fromkeys(item.episode for item in items):
+        if recorded_scene(buffer_set.query(episode)) is None:
+            raise InvalidOptionError(
+                f"recall does not know the possible answers in {episode}", "Ask a model, or guess."
+            )
+
+
+def _check_images(
+    config: AskConfig, buffer_set: BufferSet, items: Sequence[WorkItem], images: int
+) -> None:
+    """Check that the model takes as many images as a question has."""
+    memory = Memory.parse(config.memory)
+    # How many frames a retrieval step selects is unknown before; a memory of N bounds them.
+    if config.retrieval is not None and memory.rule == "full":
+        return
+    for item in items:
+        history = buffer_set.manifest(item.episode, item.condition).history_frames
+        kept = len(memory.earlier(history))
+        if kept + 1 > images:
+            raise InvalidOptionError(
+                f"{item.episode}, {item.condition}: {kept} history frames and the picture; "
+                f"the model takes {images} images at most",
+                f"Set {named('model_options', f'images={kept + 1}')}, or a smaller "
+                f"{named('memory')}.",
+            )
 
 
 def _check_settings(config: AskConfig) -> None:
@@ -156,8 +183,8 @@ def _name(config: AskConfig) -> str:
 class AskFunction(RunFunction[AskConfig]):
     """Asks questions; makes the model at the first one, and again after an error."""
 
-    def __init__(self, run: RunContext[AskConfig]):
-        super().__init__(run)
+    def __init__(self, config: AskConfig):
+        super().__init__(config)
         self._responder: ModelResponder | None = None
 
     @cached_property
@@ -167,7 +194,7 @@ class AskFunction(RunFunction[AskConfig]):
 
     def describe(self) -> dict[str, str]:
         """Return the buffer set's revision, its questions' digest, and versions."""
-        buffer_set = load_buffer_set(self.run.config.buffer_set)
+        buffer_set = load_buffer_set(self.config.buffer_set)
         digest = digest_questions(read_questions(buffer_set).values())
         return super().describe() | {"the questions' digest": digest}
 
@@ -177,9 +204,9 @@ class AskFunction(RunFunction[AskConfig]):
             self._responder.close()
         self._responder = None
 
-    def work(self, task: Job, worker: Worker) -> tuple[Rollout, None]:
+    def work(self, task: Job[AskConfig], worker: Worker) -> tuple[Rollout, None]:
         """Ask a question, and send its transcript; return its row."""
-        item, config, began = task.item, self.run.config, time.perf_counter()
+        item, config, began = task.item, self.config, time.perf_counter()
         if self._responder is None and config.model not in WITHOUT_MODEL:
             self._responder = ModelResponder(config)
         buffer = self.buffer_set.load(item.episode, item.condition)
@@ -208,7 +235,7 @@ class AskFunction(RunFunction[AskConfig]):
                 "right": right,
             }
             worker.send_file(*item.transcript("answers", [line]))
-        row = self.run.row(
+        row = task.run.row(
             item,
             Status.SUCCESS if letter == right else Status.FAIL,
             seed=query.seed,

@@ -13,7 +13,7 @@ from robomme_interference_data.constants import ORACLE
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.policies.registry import policy_options
 from robomme_interference_data.evaluate.run.config import RunConfig
-from robomme_interference_data.evaluate.run.runner import short_digest
+from robomme_interference_data.evaluate.run.identity import short_digest
 from robomme_interference_data.runtime.specs import bind_options
 
 from .model_writer import ModelWriter
@@ -57,7 +57,7 @@ def with_published(config: RunConfig) -> RunConfig:
     if MODELS.parse(text).kind != "openai":
         raise InvalidOptionError(
             f"{config.system} sends its history as a video, and {text} takes images",
-            "Serve the model behind an endpoint: see docs/how-to/paper-systems.md.",
+            "Serve the model behind an endpoint: see docs/how-to/official-simulator.md.",
         )
     names = {option.partition("=")[0] for option in config.subgoal_options}
     added = [f"{name}={value}" for name, value in published.options.items() if name not in names]

@@ -20,9 +20,9 @@ from robomme_interference_data.errors import (
     named,
 )
 from robomme_interference_data.evaluate.run.config import AskConfig, RunConfig
-from robomme_interference_data.evaluate.run.log import is_done, read_run
+from robomme_interference_data.evaluate.run.log import read_run
 from robomme_interference_data.evaluate.run.plan import WorkItem
-from robomme_interference_data.evaluate.run.row import Rollout
+from robomme_interference_data.evaluate.run.row import Rollout, is_done
 from robomme_interference_data.schema.codec import arrow_schema, from_table
 from robomme_interference_data.simulators.episode import Observation
 from robomme_interference_data.storage.files import sha256_file

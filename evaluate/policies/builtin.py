@@ -46,7 +46,8 @@ class ReplayPolicy(Policy):
     history_cameras = ("front",)
 
     def __init__(self, memory: str = "full", *, extrapolate: bool = False):
-        self.memory, self._extrapolate = Memory.parse(memory), extrapolate
+        self._memory, self._extrapolate = Memory.parse(memory), extrapolate
+        self.memory = str(self._memory)
 
     def reset(self, info: RolloutInfo) -> None:
         """Clear the memory."""
@@ -70,11 +71,11 @@ class ReplayPolicy(Policy):
 
     def metadata(self) -> dict[str, Any]:
         """Return name and memory rule."""
-        return {"policy": "replay", "memory": str(self.memory)}
+        return {"policy": "replay", "memory": self.memory}
 
     def _start_plan(self, observation: Observation) -> NDArray[np.float32]:
         live = sum(len(states) for states in self._states)
-        kept = np.array(self.memory.earlier(live), np.int64)
+        kept = np.array(self._memory.earlier(live), np.int64)
         if not len(kept):
             return follow(observation.state, kept, observation.state[None][:0])
         views = np.concatenate(self._views)[kept]
@@ -210,7 +211,8 @@ class Recall(Privileged):
 
     def __init__(self, memory: str = "full"):
         super().__init__("recall")
-        self.memory = Memory.parse(memory)
+        self._memory = Memory.parse(memory)
+        self.memory = str(self._memory)
 
     def reset(self, info: RolloutInfo) -> None:
         """Determine which parts of the answer the memory keeps."""
@@ -220,7 +222,7 @@ class Recall(Privileged):
                 "recall needs to know which frames show the answer, which is unknown here",
                 "Build the buffer set from a source with evidence: see docs/reference/sources.md.",
             )
-        self._known = known_parts(info.evidence, self.memory.earlier(info.history_frames))
+        self._known = known_parts(info.evidence, self._memory.earlier(info.history_frames))
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the script's next action, `(1, 8) float32`; see `Privileged.act`."""
@@ -228,7 +230,7 @@ class Recall(Privileged):
 
     def metadata(self) -> dict[str, Any]:
         """Return name and memory rule."""
-        return {"policy": self.name, "memory": str(self.memory)}
+        return {"policy": self.name, "memory": self.memory}
 
 
 class Noop(Policy):

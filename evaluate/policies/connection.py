@@ -240,7 +240,7 @@ class ServerConnection(ABC):
 class OpenpiConnection(ServerConnection):
     """A connection to a server of openpi, as MME-VLA extends it: `wire.py` has its messages."""
 
-    guide = "docs/how-to/policy-server.md"
+    guide = "docs/how-to/connect-a-policy.md"
     _sent = b""
 
     def _greet(self, seconds: float) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.errors import (
+    InterferenceError,
     InvalidOptionError,
     PolicyError,
     PolicyServerError,
@@ -18,6 +19,7 @@ from robomme_interference_data.evaluate import optional
 from robomme_interference_data.evaluate.run.identity import plain
 from robomme_interference_data.evaluate.systems import System
 from robomme_interference_data.schema.conditions import NO_HISTORY
+from robomme_interference_data.schema.sampling import MEMORY_FORM, Memory
 from robomme_interference_data.storage.files import indented_json
 
 from .capabilities import Role
@@ -105,6 +107,30 @@ def policy_metadata(text: str, policy: Policy) -> dict[str, Any]:
     )
 
 
+def declared_memory(policy: Policy, metadata: Mapping[str, Any]) -> str | None:
+    """Return the memory that a policy declares, or its server in the metadata; None if unknown.
+
+    A server declares it as `{"capabilities": {"memory": "framesamp:32"}}`.
+
+    Raises:
+        PolicyServerError: A server declares something else.
+    """
+    declared = metadata.get("server_metadata", {}).get("capabilities", {})
+    if not isinstance(declared, Mapping) or {*declared} - {"memory"}:
+        fault = f"the capabilities {declared}"
+    elif (memory := declared.get("memory", policy.memory)) is None:
+        return None
+    else:
+        with suppress(InterferenceError, AttributeError):  # not text
+            return str(Memory.parse(memory))
+        fault = f"the memory {memory!r}"
+    raise PolicyServerError(
+        f"the policy server {metadata.get('server', '')} declares {fault}; expected "
+        f'{{"memory": RULE}}, where RULE is {MEMORY_FORM}, or null if it keeps no frames',
+        "Correct the metadata that it sends: see docs/reference/policies.md.",
+    )
+
+
 def check_metadata(reports: Sequence[Mapping[str, Any]], checkpoint: str | None) -> None:
     """Check that servers report the same model, and the checkpoint that the user names, if any."""
     first = reports[0]
@@ -156,7 +182,8 @@ def check_memory_kind(keeps: bool, server: str, system: System) -> None:
     raise PolicyServerError(
         f"the policy server {server} {actual}, and that of {system.name} {expected}: it serves "
         "another kind of model",
-        f"Start it with the checkpoint of {system.name} (docs/how-to/paper-systems.md lists them) "
+        f"Start it with the checkpoint of {system.name} "
+        "(docs/how-to/official-simulator.md lists them) "
         f"and the history_config.txt beside it, or set {named('system')} to a name of your own.",
     )
 

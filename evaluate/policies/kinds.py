@@ -2,10 +2,11 @@
 
 A new kind is a file with its policy, and an entry here. Checks read what it declares, never its
 name. What only the policy's object knows, because it depends on weights or on a server (`cameras`,
-`wants_history`, whether it can batch), are attributes and methods of `Policy`.
+`wants_history`, `memory`, whether it can batch), are attributes and methods of `Policy`.
 """
 
 import shlex
+from dataclasses import replace
 
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.simulators.episode import ACTION_SIZE
@@ -47,153 +48,95 @@ def _memory(target: str) -> str:
     return str(Memory.parse(target))
 
 
+_CONTROL = PolicyKind(
+    form="",
+    factory="",
+    role=Role.REFERENCE,
+    identified=True,
+    published=False,
+    option_labels={},
+    action_size=None,
+    reads_subgoals=False,
+    script=None,
+    needs_evidence=False,
+    acts_out_answers=False,
+    server=None,
+    packages=(),
+)
+"""What most policies without learned weights declare. A new capability is declared here, too:
+without it, this module cannot be imported."""
+
+_LEARNED = replace(_CONTROL, role=Role.LEARNED, identified=False, action_size=ACTION_SIZE)
+"""What most policies under test declare."""
+
+# Each kind is one of the two above, and what sets it apart.
 KINDS: dict[str, PolicyKind] = {
-    "replay": PolicyKind(
+    "replay": replace(
+        _CONTROL,
         form="replay, replay:framesamp:N or replay:window:N",
         factory=f"{_HERE}.builtin:ReplayPolicy",
         target="(?P<memory>.+)",
         default="full",
         spelled=_memory,
         role=Role.CONTROL,
-        identified=True,
-        published=False,
         option_labels={"extrapolate": "extrapolate"},
         action_size=ACTION_SIZE,
-        reads_subgoals=False,
-        script=None,
-        needs_evidence=False,
-        acts_out_answers=False,
-        server=None,
-        packages=(),
     ),
-    "recall": PolicyKind(
+    "recall": replace(
+        _CONTROL,
         form="recall, recall:framesamp:N or recall:window:N",
         factory=f"{_HERE}.builtin:Recall",
         target="(?P<memory>.+)",
         default="full",
         spelled=_memory,
-        role=Role.REFERENCE,
-        identified=True,
-        published=False,
-        option_labels={},
-        action_size=None,
-        reads_subgoals=False,
         script="recall",
         needs_evidence=True,
-        acts_out_answers=False,
-        server=None,
-        packages=(),
     ),
-    "oracle": PolicyKind(
+    "oracle": replace(
+        _CONTROL,
         form="oracle",
         factory=f"{_HERE}.builtin:Privileged",
         arguments={"name": "oracle"},
-        role=Role.REFERENCE,
-        identified=True,
-        published=False,
-        option_labels={},
-        action_size=None,
-        reads_subgoals=False,
         script="oracle",
-        needs_evidence=False,
-        acts_out_answers=False,
-        server=None,
-        packages=(),
     ),
-    "guess": PolicyKind(
+    "guess": replace(
+        _CONTROL,
         form="guess",
         factory=f"{_HERE}.builtin:Privileged",
         arguments={"name": "guess"},
-        role=Role.REFERENCE,
-        identified=True,
-        published=False,
-        option_labels={},
-        action_size=None,
-        reads_subgoals=False,
         script="guess",
-        needs_evidence=False,
-        acts_out_answers=False,
-        server=None,
-        packages=(),
     ),
-    "follow-subgoals": PolicyKind(
+    "follow-subgoals": replace(
+        _CONTROL,
         form="follow-subgoals",
         factory=f"{_HERE}.builtin:FollowSubgoals",
-        role=Role.REFERENCE,
-        identified=True,
-        published=False,
         option_labels={"points": "simple"},
-        action_size=None,
         reads_subgoals=True,
         script="follow-subgoals",
-        needs_evidence=False,
-        acts_out_answers=False,
-        server=None,
-        packages=(),
     ),
-    "noop": PolicyKind(
-        form="noop",
-        factory=f"{_HERE}.builtin:Noop",
-        role=Role.REFERENCE,
-        identified=True,
-        published=False,
-        option_labels={},
-        action_size=ACTION_SIZE,
-        reads_subgoals=False,
-        script=None,
-        needs_evidence=False,
-        acts_out_answers=False,
-        server=None,
-        packages=(),
+    "noop": replace(
+        _CONTROL, form="noop", factory=f"{_HERE}.builtin:Noop", action_size=ACTION_SIZE
     ),
-    "hold": PolicyKind(
+    "hold": replace(
+        _CONTROL,
         form="hold",
         factory=f"{_HERE}.baselines:Hold",
-        role=Role.REFERENCE,
-        identified=True,
-        published=False,
         option_labels={"chunk": "chunk{}"},
-        action_size=None,
-        reads_subgoals=False,
         script="hold",
-        needs_evidence=False,
-        acts_out_answers=False,
-        server=None,
-        packages=(),
     ),
-    "mean": PolicyKind(
-        form="mean",
-        factory=f"{_HERE}.baselines:Mean",
-        role=Role.REFERENCE,
-        identified=True,
-        published=False,
-        option_labels={},
-        action_size=None,
-        reads_subgoals=False,
-        script="mean",
-        needs_evidence=False,
-        acts_out_answers=False,
-        server=None,
-        packages=(),
-    ),
-    "answers": PolicyKind(
+    "mean": replace(_CONTROL, form="mean", factory=f"{_HERE}.baselines:Mean", script="mean"),
+    "answers": replace(
+        _LEARNED,
         form="answers:folder of a run of questions, or answers:file.csv",
         factory=f"{_HERE}.answers:ActOutAnswers",
         target="(?P<path>.+)",
         not_in_identity=("path",),
-        role=Role.LEARNED,
-        identified=False,
-        published=False,
-        option_labels={},
         action_size=None,
-        reads_subgoals=False,
         script="answer",
-        needs_evidence=False,
         acts_out_answers=True,
-        server=None,
-        packages=(),
     ),
-    "websocket": PolicyKind(
+    "websocket": replace(
+        _LEARNED,
         form="websocket://host:port, with commas between several servers, each once, or "
         "websocket:COMMAND with {port}, which each worker starts",
         factory=f"{_HERE}.websocket:WebsocketPolicy",
@@ -201,72 +144,41 @@ KINDS: dict[str, PolicyKind] = {
         extra="evaluate",
         not_in_identity=_SERVER_OPTIONS,
         valid=lambda target: _valid_addresses(target) and _valid_command(target),
-        role=Role.LEARNED,
-        identified=False,
         published=True,
-        option_labels={},
-        action_size=ACTION_SIZE,
         reads_subgoals=True,
-        script=None,
-        needs_evidence=False,
-        acts_out_answers=False,
         server=Server(one_client=True, starter="ServedPolicy"),
-        packages=(),
     ),
-    "vla-eval": PolicyKind(
+    "vla-eval": replace(
+        _LEARNED,
         form="vla-eval:ws://host:port, with commas between several servers, each once",
         factory="robomme_interference_data.evaluate.vla_eval.policy:VlaEvalPolicy",
         target=rf"ws://{_SERVER}(?:,{_SERVER})*",
         extra="vla-eval",
         not_in_identity=_SERVER_OPTIONS,
         valid=_valid_addresses,
-        role=Role.LEARNED,
-        identified=False,
-        published=False,
-        option_labels={},
-        action_size=ACTION_SIZE,
-        reads_subgoals=False,
-        script=None,
-        needs_evidence=False,
-        acts_out_answers=False,
         # Some servers have one client: their hello shows it, see `VlaEvalPolicy.one_client`.
         server=Server(one_client=False, starter=None),
         packages=("vla-eval",),
     ),
-    "lerobot": PolicyKind(
+    "lerobot": replace(
+        _LEARNED,
         form="lerobot:namespace/name[@revision] or lerobot:folder",
         factory=f"{_HERE}.lerobot:LeRobotPolicy",
         target="(?P<path>.+)",
         extra="build",
         not_in_identity=("source", "device"),
         on_hub=True,
-        role=Role.LEARNED,
-        identified=False,
-        published=False,
-        option_labels={},
-        action_size=ACTION_SIZE,
-        reads_subgoals=False,
-        script=None,
-        needs_evidence=False,
-        acts_out_answers=False,
-        server=None,
         packages=("lerobot",),
     ),
-    "python": PolicyKind(
+    "python": replace(
+        _LEARNED,
         form="python:module:factory",
-        factory="",
         target=r"[A-Za-z_][\w.]*:[A-Za-z_]\w*",
         role=Role.OWN,
         identified=True,
         published=True,
-        option_labels={},
         action_size=None,
         reads_subgoals=True,
-        script=None,
-        needs_evidence=False,
-        acts_out_answers=False,
-        server=None,
-        packages=(),
     ),
 }
 """Name to kind, in the order of messages."""

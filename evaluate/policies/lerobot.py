@@ -332,5 +332,5 @@ def _check_features(path: str, config: Any, names: dict[str, str]) -> None:
         raise PolicyError(
             f"the policy {path} does not fit: it {'; it '.join(wrong)}",
             f"Train it on {FRONT}, {WRIST}, {STATE} and {ACTION} of a buffer set's executions; "
-            "see docs/how-to/lerobot-policy.md.",
+            "see docs/how-to/connect-a-policy.md.",
         )

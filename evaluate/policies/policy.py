@@ -50,9 +50,10 @@ class Policy(ABC):
     observation; `act`; up to 16 of its actions are executed; `observe` with the observations after
     each of them; `act`; and so on, for at most 1300 actions.
 
-    A policy need not be a subclass; a subclass must define `act` and `metadata` only. Frames come
-    at 10 Hz: an action controls the robot for 0.1 s. A state is `(8,) float32`: 7 joint positions
-    in rad, then the gripper's opening in m, the way of one finger, from 0 (closed) to 0.04 (open).
+    A policy need not be a subclass: it needs the same attributes and methods. A subclass must
+    define `act` and `metadata` only. Frames come at 10 Hz: an action controls the robot for 0.1 s.
+    A state is `(8,) float32`: 7 joint positions in rad, then the gripper's opening in m, the way of
+    one finger, from 0 (closed) to 0.04 (open).
 
     Attributes:
         cameras: Cameras whose live frames it reads, such as `("front", "wrist")`: no others are
@@ -62,6 +63,9 @@ class Policy(ABC):
         privileged: Whether it gets `RolloutInfo.simulator` and `RolloutInfo.evidence`.
         every_frame: Whether `observe` gets the observations after every action; if not, only the
             one on which it acts next, and simulators need not draw the others.
+        memory: Rule by which it keeps frames, `full`, `framesamp:N` or `window:N`, from which rows
+            get `evidence_kept`, the share of the evidence that it still has. None if it keeps none,
+            or by another rule.
     """
 
     cameras: tuple[str, ...] = ()
@@ -69,6 +73,7 @@ class Policy(ABC):
     wants_history: bool = True
     privileged: bool = False
     every_frame: bool = False
+    memory: str | None = None
 
     def reset(self, info: RolloutInfo) -> None:
         """Clear the memory and prepare for a rollout."""

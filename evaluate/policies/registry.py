@@ -2,7 +2,8 @@
 
 import inspect
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from difflib import get_close_matches
 from typing import Any, get_type_hints
 
 from robomme_interference_data.errors import InterferenceError, InvalidOptionError, PolicyError
@@ -13,6 +14,7 @@ from robomme_interference_data.runtime.specs import (
     import_factory,
     signature_of,
 )
+from robomme_interference_data.schema.sampling import MEMORY_FORM, Memory
 
 from .capabilities import PolicyKind, Role
 from .kinds import KINDS, addresses
@@ -111,21 +113,63 @@ def _factory(text: str, worker: int) -> tuple[Factory, dict[str, Any]]:
 def check_members(what: str, policy: Any) -> None:
     """Compare a policy with the protocol, so that a slip shows before the first episode."""
     wrong = []
-    for name, kind in get_type_hints(Policy).items():
-        value = getattr(policy, name, None)
-        if kind is bool:
-            valid, expected = isinstance(value, bool), "True or False"
-        else:
-            valid = isinstance(value, tuple | list) and all(isinstance(name, str) for name in value)
-            expected = "a tuple of names of cameras, such as ('front', 'wrist'), or an empty one"
-        if not valid:
-            wrong.append(f"{name} {value!r}; expected {expected}")
+    declared = get_type_hints(Policy)
+    for name, kind in declared.items():
+        value = getattr(policy, name, _MISSING)
+        valid, expected = _EXPECTED[kind]
+        if not valid(value):
+            shown = f"no {name}" if value is _MISSING else f"{name} {value!r}"
+            wrong.append(f"{shown}; expected {expected}")
     for name, value in vars(Policy).items():
         method = inspect.isfunction(value) and not name.startswith("_")
         if method and not callable(getattr(policy, name, None)):
             wrong.append(f"no method {name}()")
+    # A subclass has defaults: what a misspelled attribute declares would have no effect.
+    own = _own_attributes(type(policy))
+    for name in sorted(own - declared.keys()):
+        for near in get_close_matches(name, sorted(declared.keys() - own), n=1, cutoff=0.8):
+            wrong.append(f"an attribute {name}, which declares nothing; did you mean {near!r}?")
     if wrong:
         raise PolicyError(
             f"{what}: {type(policy).__name__} has {'; '.join(wrong)}",
             "Subclass robomme_interference_data.evaluate.Policy: docs/how-to/your-own-policy.md.",
         )
+
+
+_MISSING = object()
+
+
+def _is_names(value: Any) -> bool:
+    return isinstance(value, tuple | list) and all(isinstance(name, str) for name in value)
+
+
+def _is_memory(value: Any) -> bool:
+    if not isinstance(value, str):
+        return value is None
+    try:
+        Memory.parse(value)
+    except InterferenceError:
+        return False
+    return True
+
+
+_EXPECTED: dict[Any, tuple[Callable[[Any], bool], str]] = {
+    bool: (lambda value: isinstance(value, bool), "True or False"),
+    tuple[str, ...]: (
+        _is_names,
+        "a tuple of names of cameras, such as ('front', 'wrist'), or an empty one",
+    ),
+    str | None: (_is_memory, f"{MEMORY_FORM}, or None"),
+}
+"""Type of an attribute of `Policy` to the check of its value, and what that expects."""
+
+
+def _own_attributes(policy_class: type) -> set[str]:
+    """Return the public attributes, without methods, that the user's classes define."""
+    return {
+        name
+        for base in policy_class.__mro__
+        if base.__module__ != Policy.__module__
+        for name, value in vars(base).items()
+        if not name.startswith("_") and not inspect.isroutine(value)
+    }

@@ -1,13 +1,13 @@
 """Checks of a run of rollouts before the first one."""
 
 import math
+import shlex
 from collections.abc import Sequence
 
 from robomme_interference_data.constants import (
     ACTION,
     DEMONSTRATIONS,
     EXECUTIONS,
-    ORACLE,
     RECORDINGS,
     STATE,
 )
@@ -16,22 +16,15 @@ from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, named
 from robomme_interference_data.evaluate.policies.capabilities import PolicyKind
 from robomme_interference_data.evaluate.policies.policy import BATCH_METHODS, Policy
-from robomme_interference_data.evaluate.policies.registry import POLICIES, policy_kind
+from robomme_interference_data.evaluate.policies.registry import policy_kind
 from robomme_interference_data.evaluate.run.config import RunConfig, check_unused
 from robomme_interference_data.evaluate.run.plan import RunPlan, WorkItem
-from robomme_interference_data.evaluate.systems import System, check_history, name_system
+from robomme_interference_data.evaluate.systems import System, check_history
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Resources
 from robomme_interference_data.simulators.registry import SIMULATORS, check_shift, simulator_class
 
-from .names import check_name
 from .worker import used_cameras
-
-
-def check_system(config: RunConfig, system: str) -> None:
-    """Check that policy and subgoals are those that a label of rows means, and fit each other."""
-    check_name(config, name_system(system))
-    _check_subgoals(config)
 
 
 def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> None:
@@ -76,6 +69,7 @@ def _check_cameras(config: RunConfig, demonstrations: Dataset, policy: Policy) -
                 f"the policy {config.policy} reads the camera {camera!r}, which is not in {where}",
                 f"Its cameras: {', '.join(demonstrations.cameras)}. "
                 f"{_policies_for_any_robot(config)}",
+                _baseline(config),
             )
     for camera in sorted(used - {*live.cameras}):
         raise UnknownNameError(
@@ -99,7 +93,18 @@ def _policies_for_any_robot(config: RunConfig) -> str:
     """Return the advice to set a policy that needs neither this robot nor its cameras."""
     if config.offline:
         return "Set hold, mean or a policy for this robot, python:module:factory."
-    return "Set a policy for this robot, such as python:module:factory."
+    return (
+        "Set a policy for this robot, such as python:module:factory; to act along the recordings "
+        f"of this buffer set, without a simulator, also {named('offline')}."
+    )
+
+
+def _baseline(config: RunConfig) -> str | None:
+    """Return the command that evaluates a policy for any robot, if one can act here."""
+    if not config.offline:
+        return None
+    command = ["evaluate", config.buffer_set, "--offline", "--policy", "hold"]
+    return shlex.join([*command, "--out", str(config.out)])
 
 
 def _check_robot(config: RunConfig, buffer_set: BufferSet, kind: PolicyKind) -> None:
@@ -114,6 +119,7 @@ def _check_robot(config: RunConfig, buffer_set: BufferSet, kind: PolicyKind) -> 
             f"{kind.action_size} action values, 7 joints and a gripper; this robot has {state} and "
             f"{action}",
             _policies_for_any_robot(config),
+            _baseline(config),
         )
 
 
@@ -155,24 +161,6 @@ def _fault_of_sharing(kind: PolicyKind, policy: Policy) -> str | None:
         return "it needs the simulator, which runs in the worker"
     missing = [f"{name}()" for name in BATCH_METHODS if not callable(getattr(policy, name, None))]
     return f"it has no {' and no '.join(missing)}" if missing else None
-
-
-def _check_subgoals(config: RunConfig) -> None:
-    """Reject subgoals that no policy reads, and settings of them without effect."""
-    for name in ("subgoal_prompt", "subgoal_options"):
-        if getattr(config, name) and config.subgoals in (None, ORACLE):
-            raise InvalidOptionError(
-                f"{named(name)} has no effect without a model that writes subgoals",
-                'Set subgoals="openai:URL#MODEL", or leave it out.',
-            )
-    if config.subgoals is None:
-        return
-    if not policy_kind(config.policy).reads_subgoals:
-        able = [name for name, kind in POLICIES.kinds.items() if kind.reads_subgoals]
-        raise InvalidOptionError(
-            f"the policy {config.policy} reads no subgoals",
-            f"Set {named('policy')} to {', '.join(able)}, or leave out {named('subgoals')}.",
-        )
 
 
 def check_plan(

@@ -4,7 +4,7 @@ import time
 from collections import deque
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -19,10 +19,10 @@ from robomme_interference_data.evaluate import optional
 from robomme_interference_data.evaluate.language.columns import model_columns
 from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
 from robomme_interference_data.evaluate.run.config import RunConfig
-from robomme_interference_data.evaluate.run.history import HistoryReader
+from robomme_interference_data.evaluate.run.history import HistoryReader, history_columns
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout
-from robomme_interference_data.evaluate.run.runner import RunContext, history_columns
+from robomme_interference_data.evaluate.run.worker import RunContext
 from robomme_interference_data.evaluate.systems import check_history, name_system
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.evidence import evidence_among
@@ -83,44 +83,34 @@ def run_rollout(
     cameras = policy.history_cameras if selector is None else ()
     buffer = buffer_set.load(item.episode, item.condition, cameras=cameras)
     received: Sequence[int] = range(len(buffer))
-    with ExitStack() as stack:
-        chunks = None
-        # A simulator in this process holds Python's lock: decoding beside it slows both down.
-        if selector is None and getattr(simulator, "remote", False):
-            chunks = stack.enter_context(_decode(reader, buffer, received, policy, config))
-        limit = worker.limit(config.simulator_timeout_s, "the simulator's reset")
-        with clock.part("reset_s"), limit:
-            demonstration, first, info = simulator.reset(
-                str(item.episode), demonstration=config.check_lesson
-            )
-        check_episode(buffer.query, demonstration, first, info)
-        if config.check_lesson:
-            # Under a shift the first live view differs from the recorded one.
-            check_lesson(buffer.query, demonstration, first, views=config.shift == NO_SHIFT)
+    limit = worker.limit(config.simulator_timeout_s, "the simulator's reset")
+    with clock.part("reset_s"), limit:
+        demonstration, first, info = simulator.reset(
+            str(item.episode), demonstration=config.check_lesson
+        )
+    check_episode(buffer.query, demonstration, first, info)
+    if config.check_lesson:
+        # Under a shift the first live view differs from the recorded one.
+        check_lesson(buffer.query, demonstration, first, views=config.shift == NO_SHIFT)
+    if selector is not None and len(buffer):
         with clock.part("history_s"):
-            if selector is not None and len(buffer):
-                camera = buffer.query.dataset.camera(selector.camera)
-                received = selector.select(buffer, first.images[camera]).tolist()
-                check_history(name_system(run.system), {item.condition: len(received)})
-        # Between the two parts of the history: the time of drawing belongs to neither.
-        if clip is not None:
-            clip.begin(buffer, received, first, info)
-        with clock.part("history_s"):
-            if chunks is None:
-                chunks = stack.enter_context(_decode(reader, buffer, received, policy, config))
-            rollout_info = RolloutInfo(info.goal, len(received), config.model_seed)
-            if policy.privileged:
-                evidence = buffer.evidence and evidence_among(buffer.evidence, received)
-                rollout_info = replace(
-                    rollout_info, simulator=simulator, evidence=evidence, answer=answer
-                )
-            policy.reset(rollout_info)
-            for chunk in chunks:
-                policy.add_history(chunk.frames, chunk.states, len(received))
-        if writer is not None:
-            with clock.part("model_s"):
-                frames = optional.HistoryFrames(buffer, received, reader)
-                writer.start(frames, rollout_info, simulator)
+            camera = buffer.query.dataset.camera(selector.camera)
+            received = selector.select(buffer, first.images[camera]).tolist()
+        check_history(name_system(run.system), {item.condition: len(received)})
+    if clip is not None:
+        clip.begin(buffer, received, first, info)
+    rollout_info = RolloutInfo(info.goal, len(received), config.model_seed)
+    if policy.privileged:
+        evidence = buffer.evidence and evidence_among(buffer.evidence, received)
+        rollout_info = replace(rollout_info, simulator=simulator, evidence=evidence, answer=answer)
+    with clock.part("history_s"), _decode(reader, buffer, received, policy, config) as chunks:
+        policy.reset(rollout_info)
+        for chunk in chunks:
+            policy.add_history(chunk.frames, chunk.states, len(received))
+    if writer is not None:
+        with clock.part("model_s"):
+            frames = optional.HistoryFrames(buffer, received, reader)
+            writer.start(frames, rollout_info, simulator)
     live = _Live(run.config, policy, simulator, writer, clock, clip, worker)
     try:
         status = live.run(first, info.goal)
@@ -129,7 +119,7 @@ def run_rollout(
                 f"the {config.simulator} simulator reported an error at step {live.steps}"
             )
     except Exception as error:
-        # `attempt` hands this on as the outcome's progress: columns of the error's row.
+        # The executor hands this on with the error: columns of the error's row.
         vars(error)["progress"] = {"steps": live.steps, **_model_columns(writer)}
         raise
     memory = None if run.facts.memory is None else Memory.parse(run.facts.memory)

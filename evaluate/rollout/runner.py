@@ -1,20 +1,18 @@
-"""Runs of rollouts, simulated and offline: the checks before one, and what identifies it."""
+"""Open a run of rollouts, simulated or along recordings: all that happens before the first one."""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robomme_interference_data.constants import EXECUTIONS, ORACLE, RECORDINGS
+from robomme_interference_data.constants import EXECUTIONS, ORACLE
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import open_dataset
 from robomme_interference_data.errors import (
     InterferenceError,
-    InvalidOptionError,
     PolicyServerError,
     SimulatorCrashError,
-    named,
 )
 from robomme_interference_data.evaluate import optional
 from robomme_interference_data.evaluate.policies.capabilities import Role
@@ -22,32 +20,30 @@ from robomme_interference_data.evaluate.policies.identity import (
     check_memory_kind,
     check_metadata,
     check_servers_memory,
+    declared_memory,
     describe_policy,
     lock_servers,
     policy_identity,
 )
+from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import (
     POLICIES,
     policy_kind,
-    policy_memory,
     policy_options,
     starts_server,
 )
-from robomme_interference_data.evaluate.run.config import RunConfig, check_unused
-from robomme_interference_data.evaluate.run.plan import RunPlan, WorkItem
-from robomme_interference_data.evaluate.run.runner import (
-    RunContext,
-    Runner,
-    retrieval_text,
-    short_digest,
-)
-from robomme_interference_data.evaluate.systems import SystemFacts, name_system
-from robomme_interference_data.runtime.executor import WorkerPool
+from robomme_interference_data.evaluate.run.config import RunConfig
+from robomme_interference_data.evaluate.run.identity import retrieval_text, short_digest
+from robomme_interference_data.evaluate.run.log import unfinished
+from robomme_interference_data.evaluate.run.plan import WorkItem, plan_run
+from robomme_interference_data.evaluate.run.worker import PlannedRun, RunContext
+from robomme_interference_data.evaluate.systems import System, SystemFacts, name_system
+from robomme_interference_data.runtime.executor import Executor, WorkerPool
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.registry import simulator_class, simulator_versions
 
-from .checks import check_plan, check_settings, check_system
-from .names import default_system
+from .checks import check_plan, check_settings
+from .settings import complete_settings
 from .worker import RolloutFunction, StartServer, StartSimulator
 
 if TYPE_CHECKING:
@@ -55,148 +51,137 @@ if TYPE_CHECKING:
     from robomme_interference_data.evaluate.policies.shared import Address
 
 
-class RolloutRunner(Runner[RunConfig]):
-    """Rollouts of a policy in a simulator."""
-
-    def __init__(self, config: RunConfig, buffer_set: BufferSet):
-        self.system = config.system or default_system(config)
-        self._answers: Answers | None = None
-        self._addresses: Sequence[Address] = ()
-        # The commit of a model is the same for all workers.
-        config = dataclasses.replace(config, policy=POLICIES.pin(config.policy))
-        if config.subgoals is not None:
-            config = dataclasses.replace(config, subgoals=optional.pin_subgoals(config.subgoals))
-        super().__init__(config, buffer_set)
-
-    @property
-    def retried_errors(self) -> tuple[type[Exception], ...]:
-        """Errors after which a rollout is started again."""
-        if self.config.policies is None:
-            return super().retried_errors
-        # A shared policy that hangs delays all its rollouts: which of them it hung at is unknown.
-        return (*super().retried_errors, TimeoutError)
-
-    def lock(self, folder: Path) -> AbstractContextManager[None]:
-        """Keep other runs from the policy's servers."""
-        return lock_servers(self.config.policy, folder)
-
-    def prepare(self) -> None:
-        """Check the settings, and identify the policy and the writer of its subgoals."""
-        if self.config.subgoals is not None:
-            self.config = optional.with_published(self.config)
-        config = self.config
-        check_system(config, self.system)  # before a policy server is waited for
-        self._policy, self._policy_metadata = describe_policy(
-            config.policy, config.policy_options, workers=config.workers
-        )
-        check_settings(config, self.buffer_set, self._policy)
-        self._system = name_system(self.system)
-        self._subgoal_metadata: dict[str, Any] = {}
-        if config.subgoals is not None:
-            self._subgoal_metadata = optional.describe_subgoals(config)
-        self.metadata = self._policy_metadata | self._subgoal_metadata
-        self.versions = simulator_versions(config.simulator, config.robomme_python)
-
-    def facts(self) -> SystemFacts:
-        """Return what the system is."""
-        config, spec = self.config, POLICIES.parse(self.config.policy)
-        published = self._system.facts if self._system.paper else SystemFacts()
-        subgoals = None
-        if config.subgoals is not None:
-            subgoals = optional.subgoals_text(config, self._subgoal_metadata)
-        return SystemFacts(
-            policy=spec.kind,
-            policy_id=short_digest(self._policy_identity()),
-            memory=policy_memory(config.policy) or published.memory,
-            retrieval=retrieval_text(config, self.buffer_set),
-            subgoals=subgoals,
-            # A policy without memory may have a subgoal writer that reads the history.
-            reads_history=published.reads_history
-            and (self._policy.wants_history or config.subgoals is not None),
-            reference=config.subgoals == ORACLE
-            or (policy_kind(config.policy).role is Role.REFERENCE and config.subgoals is None),
-        )
-
-    def check(self, plan: RunPlan, items: Sequence[WorkItem]) -> None:
-        """Check every rollout."""
-        check_plan(self.config, self._system, self.buffer_set, plan, items)
-        if policy_kind(self.config.policy).acts_out_answers:
-            path = Path(POLICIES.parse(self.config.policy).target)
-            self._answers = optional.read_answers(self.config, path, self.buffer_set, items)
-
-    @contextmanager
-    def shared(self) -> Iterator[None]:
-        """Run the processes of shared policies in the block."""
-        if self.config.policies is None:
-            yield
+@contextmanager
+def open_rollouts(
+    config: RunConfig, buffer_set: BufferSet, executor: Executor
+) -> Iterator[tuple[PlannedRun[RunConfig], WorkerPool | None]]:
+    """Plan a run, and keep its workers in the block; None if there is nothing to do for them."""
+    # A server may hold one memory: no other run may use it until this one has ended.
+    with lock_servers(config.policy, Path(config.out)):
+        planned = plan_rollouts(config, buffer_set)
+        run, items = planned.run, planned.items
+        answers = _read_answers(run.config, buffer_set, items)
+        todo = unfinished(Path(config.out), items)
+        # Only a server that workers start identifies itself late: it is started even if no rollout
+        # is left, so that a finished run is compared with it too.
+        if not todo and not starts_server(config.policy):
+            yield planned, None
             return
-        with optional.policy_processes(self.config) as self._addresses:
-            yield
-
-    def function(self, run: RunContext[RunConfig]) -> RolloutFunction:
-        """Return the function that runs rollouts."""
-        return RolloutFunction(run, self._answers, self._addresses)
-
-    def needs_workers(self, todo: Sequence[WorkItem]) -> bool:
-        """Whether there is work, or a server that only workers start must be identified."""
-        return bool(todo) or starts_server(self.config.policy)
-
-    def open(self, pool: WorkerPool, todo: Sequence[WorkItem]) -> None:
-        """Let a worker start the policy's server, and the simulator, before the first rollout."""
-        config = self.config
-        if starts_server(config.policy):
-            self._policy_metadata, keeps = _run_first(pool, StartServer(), None, _server_fault)
-            options = policy_options(config.policy, config.policy_options)
-            check_metadata([self._policy_metadata], options["checkpoint"])
-            if keeps is not None:
-                check_memory_kind(keeps, self._policy_metadata["server"], self._system)
-            self.metadata = self._policy_metadata | self._subgoal_metadata
-        if todo:
-            simulator = simulator_class(config.simulator)
-            # Of a function that declares no class nothing is known, not even how it begins.
-            tried = simulator.try_out and simulator is not Simulator
-            start = StartSimulator(todo[0].episode if tried else None)
-            _run_first(pool, start, config.simulator_timeout_s, _simulator_fault)
-            check_servers_memory(config.policy, config.policy_options, self._system)
-
-    def identity(self) -> dict[str, Any]:
-        """Return what of simulator, policy and subgoals can change a result."""
-        subgoals = None
-        if self.config.subgoals is not None:
-            subgoals = optional.subgoals_identity(self.config, self._subgoal_metadata)
-        return {
-            "simulator_version": dict(self.versions),
-            "subgoals": subgoals,
-            **self._policy_identity(),
-        }
-
-    def _policy_identity(self) -> dict[str, Any]:
-        config = self.config
-        return policy_identity(config.policy, config.policy_options, self._policy_metadata)
+        with (
+            _shared_policies(run.config) as addresses,
+            executor.pool(RolloutFunction(run.config, answers, addresses)) as pool,
+        ):
+            if starts_server(config.policy):
+                run = _start_server(run, pool)
+            if todo:
+                _start_simulator(run, pool, todo[0])
+            yield dataclasses.replace(planned, run=run), pool
 
 
-_UNUSED = ("simulator", "shift", "check_lesson", "videos")
-"""Settings of simulators."""
-
-
-class OfflineRunner(RolloutRunner):
-    """Rollouts along recorded executions: the policy acts, and the recording goes on."""
-
-    def __init__(self, config: RunConfig, buffer_set: BufferSet):
-        check_unused(config, _UNUSED, "an offline evaluation", "Leave it out.")
-        if config.subgoals == ORACLE:
-            raise InvalidOptionError(
-                f"subgoals of {ORACLE} need a simulator",
-                f"Set a model, or leave out {named('offline')}.",
-            )
-        super().__init__(dataclasses.replace(config, simulator=RECORDINGS), buffer_set)
-
-    def check(self, plan: RunPlan, items: Sequence[WorkItem]) -> None:
-        """Check every item, and that its episode has an execution."""
-        super().check(plan, items)
-        executions = open_dataset(self.buffer_set, EXECUTIONS)
+def plan_rollouts(config: RunConfig, buffer_set: BufferSet) -> PlannedRun[RunConfig]:
+    """Check settings and policy, and plan the run, without workers."""
+    config, system = complete_settings(config)
+    policy, metadata = describe_policy(config.policy, config.policy_options, workers=config.workers)
+    check_settings(config, buffer_set, policy)
+    run = _describe_run(config, system, buffer_set, policy, metadata)
+    plan = plan_run(config, run.facts, buffer_set)
+    items = plan.items()
+    check_plan(config, system, buffer_set, plan, items)
+    if config.offline:
+        executions = open_dataset(buffer_set, EXECUTIONS)
         for episode in dict.fromkeys(item.episode for item in items):
-            executions.index_of(episode)  # raises
+            executions.index_of(episode)  # raises if there is none
+    return PlannedRun(run, plan, items)
+
+
+def _describe_run(
+    config: RunConfig,
+    system: System,
+    buffer_set: BufferSet,
+    policy: Policy,
+    policy_metadata: Mapping[str, Any],
+) -> RunContext[RunConfig]:
+    """Return what is known of a run from its settings, and from what its policy reports."""
+    kind, published = policy_kind(config.policy), SystemFacts()
+    if system.paper:
+        published = system.facts
+    subgoals, subgoals_identity, metadata = None, None, dict(policy_metadata)
+    if config.subgoals is not None:
+        writer = optional.describe_subgoals(config)
+        subgoals = optional.subgoals_text(config, writer)
+        subgoals_identity = optional.subgoals_identity(config, writer)
+        metadata |= writer
+    identity = policy_identity(config.policy, config.policy_options, policy_metadata)
+    versions = simulator_versions(config.simulator, config.robomme_python)
+    facts = SystemFacts(
+        policy=POLICIES.parse(config.policy).kind,
+        policy_id=short_digest(identity),
+        memory=declared_memory(policy, policy_metadata) or published.memory,
+        retrieval=retrieval_text(config, buffer_set),
+        subgoals=subgoals,
+        # A policy without memory may have a subgoal writer that reads the history.
+        reads_history=published.reads_history
+        and (policy.wants_history or config.subgoals is not None),
+        reference=config.subgoals == ORACLE
+        or (kind.role is Role.REFERENCE and config.subgoals is None),
+    )
+    return RunContext(
+        config,
+        system.name,
+        facts,
+        buffer_set.name,
+        buffer_set.revision,
+        metadata=metadata,
+        identity={"simulator_version": dict(versions), "subgoals": subgoals_identity, **identity},
+        versions=versions,
+    )
+
+
+def _read_answers(
+    config: RunConfig, buffer_set: BufferSet, items: Sequence[WorkItem]
+) -> "Answers | None":
+    """Return the answers that the policy `answers` carries out; None for all other policies."""
+    if not policy_kind(config.policy).acts_out_answers:
+        return None
+    path = Path(POLICIES.parse(config.policy).target)
+    return optional.read_answers(config, path, buffer_set, items)
+
+
+def _shared_policies(config: RunConfig) -> "AbstractContextManager[Sequence[Address]]":
+    """Run the processes of shared policies in the block; none if each worker has its own."""
+    return nullcontext(()) if config.policies is None else optional.policy_processes(config)
+
+
+def _start_server(run: RunContext[RunConfig], pool: WorkerPool) -> RunContext[RunConfig]:
+    """Let a worker start the policy's server; return the run with what the server reports."""
+    config, system = run.config, name_system(run.system)
+    asks = system.keeps_frames is not None
+    reported, memory, keeps = _run_first(pool, StartServer(asks), None, _server_fault)
+    options = policy_options(config.policy, config.policy_options)
+    check_metadata([reported], options["checkpoint"])
+    if keeps is not None:
+        check_memory_kind(keeps, reported["server"], system)
+    identity = policy_identity(config.policy, config.policy_options, reported)
+    facts = dataclasses.replace(
+        run.facts, policy_id=short_digest(identity), memory=memory or run.facts.memory
+    )
+    # Until now the policy's metadata were empty; those of a writer of subgoals are kept.
+    return dataclasses.replace(
+        run,
+        facts=facts,
+        metadata=reported | dict(run.metadata),
+        identity=dict(run.identity) | identity,
+    )
+
+
+def _start_simulator(run: RunContext[RunConfig], pool: WorkerPool, first: WorkItem) -> None:
+    """Let a worker start the simulator, and check servers, before the first rollout."""
+    config, simulator = run.config, simulator_class(run.config.simulator)
+    # Of a function that declares no class nothing is known, not even how it begins.
+    tried = simulator.try_out and simulator is not Simulator
+    start = StartSimulator(first.episode if tried else None)
+    _run_first(pool, start, config.simulator_timeout_s, _simulator_fault)
+    check_servers_memory(config.policy, config.policy_options, name_system(run.system))
 
 
 def _run_first(

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from robomme_interference_data.constants import DEMONSTRATIONS, ORACLE
 from robomme_interference_data.data.dataset import Dataset
@@ -22,8 +22,7 @@ from robomme_interference_data.evaluate.policies.registry import make_policy, st
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout
-from robomme_interference_data.evaluate.run.runner import Job, RunContext, RunFunction
-from robomme_interference_data.evaluate.systems import name_system
+from robomme_interference_data.evaluate.run.worker import Job, RunFunction
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.codec import to_dict
@@ -50,7 +49,13 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class StartServer:
-    """Start the policy's server, before the first job."""
+    """Start the policy's server, before the first job.
+
+    Attributes:
+        asks: Whether to find out if it keeps frames.
+    """
+
+    asks: bool
 
 
 @dataclass(frozen=True)
@@ -73,12 +78,12 @@ class RolloutFunction(RunFunction[RunConfig]):
 
     def __init__(
         self,
-        run: RunContext[RunConfig],
+        config: RunConfig,
         answers: "Answers | None" = None,
         addresses: "Sequence[Address]" = (),
         policy: Policy | None = None,
     ):
-        super().__init__(run)
+        super().__init__(config)
         self._answers, self._addresses, self._made_policy = answers, addresses, policy
         self._simulator: Simulator | None = None
         self._policy: Policy | None = None
@@ -86,10 +91,10 @@ class RolloutFunction(RunFunction[RunConfig]):
         self._writer: SubgoalWriter | None = None
         self._logs: dict[str, bytes] = {}
 
-    def work(self, task: Job | StartServer | StartSimulator, worker: Worker) -> Any:
+    def work(self, task: Job[RunConfig] | StartServer | StartSimulator, worker: Worker) -> Any:
         """Run a rollout; return its row, and a problem of its clip. Or start something."""
         if isinstance(task, StartServer):
-            return self._start_server(worker)
+            return self._start_server(task.asks, worker)
         if isinstance(task, StartSimulator):
             return self._start_simulator(task.episode, worker)
         return self._run(task, worker)
@@ -98,27 +103,27 @@ class RolloutFunction(RunFunction[RunConfig]):
         policy = self._open_policy(worker)
         simulator = self._open_simulator(policy, worker)
         if episode is not None:
-            cameras = used_cameras(self.run.config, policy.cameras, self._demonstrations)
+            cameras = used_cameras(self.config, policy.cameras, self._demonstrations)
             self._try_out(simulator, episode, cameras, worker)
 
-    def _start_server(self, worker: Worker) -> tuple[dict[str, Any], bool | None]:
-        """Return the metadata of the policy's server, and whether it keeps frames.
-
-        The latter is None if it is unknown whether it should.
-        """
-        policy = self._open_policy(worker)
-        from robomme_interference_data.evaluate.policies.identity import policy_metadata
-
-        known = name_system(self.run.system).keeps_frames is not None
-        return (
-            policy_metadata(self.run.config.policy, policy),
-            cast("Any", policy).keeps_frames() if known else None,
+    def _start_server(
+        self, asks: bool, worker: Worker
+    ) -> tuple[dict[str, Any], str | None, bool | None]:
+        """Return the server's metadata and memory, and whether it keeps frames, if asked."""
+        from robomme_interference_data.evaluate.policies.identity import (
+            declared_memory,
+            policy_metadata,
         )
 
-    def _run(self, job: Job, worker: Worker) -> tuple[Rollout, str | None]:
-        item, config, clip = job.item, self.run.config, None
+        policy: Any = self._open_policy(worker)
+        metadata = policy_metadata(self.config.policy, policy)
+        keeps = policy.keeps_frames() if asks else None
+        return metadata, declared_memory(policy, metadata), keeps
+
+    def _run(self, job: Job[RunConfig], worker: Worker) -> tuple[Rollout, str | None]:
+        item, config, clip = job.item, self.config, None
         if config.videos:
-            clip = optional.Clip(item, self.run.system, worker.folder)
+            clip = optional.Clip(item, job.run.system, worker.folder)
         try:
             row = self._roll(job, worker, clip)
         except Exception as error:
@@ -147,7 +152,7 @@ class RolloutFunction(RunFunction[RunConfig]):
         return self._policy
 
     def _make_policy(self, worker: Worker) -> Policy:
-        config = self.run.config
+        config = self.config
         if self._made_policy is not None:
             return self._made_policy
         if not self._addresses:
@@ -156,7 +161,7 @@ class RolloutFunction(RunFunction[RunConfig]):
         return optional.SharedPolicy.open(address, worker.number)
 
     def _open_simulator(self, policy: Policy, worker: Worker) -> Simulator:
-        config = self.run.config
+        config = self.config
         if self._simulator is None:
             options = simulator_options(config, policy.cameras, self._demonstrations)
             with worker.limit(config.simulator_timeout_s, "the simulator's start"):
@@ -167,7 +172,7 @@ class RolloutFunction(RunFunction[RunConfig]):
         self, simulator: Simulator, episode: EpisodeId, cameras: set[str], worker: Worker
     ) -> None:
         """Begin an episode; raise only for what no episode can work with."""
-        limit = worker.limit(self.run.config.simulator_timeout_s, "the simulator's reset")
+        limit = worker.limit(self.config.simulator_timeout_s, "the simulator's reset")
         try:
             with limit:
                 lesson, first, info = simulator.reset(str(episode), demonstration=False)
@@ -179,11 +184,11 @@ class RolloutFunction(RunFunction[RunConfig]):
             self.close()  # the rollout of this episode becomes an error row
 
     def _open_writer(self) -> "SubgoalWriter | None":
-        if self._writer is None and self.run.config.subgoals is not None:
-            self._writer = optional.make_writer(self.run.config)
+        if self._writer is None and self.config.subgoals is not None:
+            self._writer = optional.make_writer(self.config)
         return self._writer
 
-    def _roll(self, job: Job, worker: Worker, clip: Any) -> Rollout:
+    def _roll(self, job: Job[RunConfig], worker: Worker, clip: Any) -> Rollout:
         if self._answers is not None and job.item not in self._answers:
             raise PolicyError(
                 f"the question of {job.item} broke: it has no answer",
@@ -191,11 +196,11 @@ class RolloutFunction(RunFunction[RunConfig]):
             )
         policy = self._open_policy(worker)
         if not self._checked:
-            self._check_served(policy, job.metadata)
+            self._check_served(policy, job.run.metadata)
             self._send_logs(worker)
             self._checked = True
         return run_rollout(
-            self.run,
+            job.run,
             job.item,
             simulator=self._open_simulator(policy, worker),
             policy=policy,
@@ -210,7 +215,7 @@ class RolloutFunction(RunFunction[RunConfig]):
 
     def describe(self) -> dict[str, str]:
         """Return the buffer set's revision and all versions."""
-        config = self.run.config
+        config = self.config
         return super().describe() | simulator_versions(config.simulator, config.robomme_python)
 
     def close(self) -> None:
@@ -242,7 +247,7 @@ class RolloutFunction(RunFunction[RunConfig]):
         Logs of earlier attempts are sent again, because the files of an attempt may be lost.
         """
         server: Any = self._policy
-        if server is not None and starts_server(self.run.config.policy):
+        if server is not None and starts_server(self.config.policy):
             self._logs[f"servers/{server.started}-{worker.number}.log"] = server.log()
         for log in self._logs.items():
             worker.send_file(*log)

@@ -1,8 +1,18 @@
-"""Run an evaluation: check the settings, run what is not finished, and write each row to disk."""
+"""Run an evaluation: check the settings, run what is not finished, and write each row to disk.
+
+A run has these steps, each of which takes values and returns values:
+
+1. settings: `run_evaluation` checks what rollouts and questions share;
+2. plan and workers: `open_rollouts` or `open_questions` identifies the policy or model, plans the
+   run (`plan_run`), and opens workers for what is not finished;
+3. header: `open_log` creates the folder, or compares it with the run that it holds;
+4. rows: `_write_rows` writes each as it comes;
+5. close: workers end, tables are exported, and the header gets its status.
+"""
 
 import dataclasses
 from collections.abc import Generator, Iterable, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,12 +22,12 @@ from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import (
     InterferenceError,
-    InvalidOptionError,
+    ServerDiedError,
+    ServerKeepaliveError,
+    SimulatorCrashError,
     first_line,
-    named,
 )
 from robomme_interference_data.evaluate import optional
-from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.runtime.executor import (
     Executor,
     Outcome,
@@ -26,16 +36,15 @@ from robomme_interference_data.runtime.executor import (
     make_executor,
 )
 from robomme_interference_data.schema.codec import arrow_schema, to_pandas, to_table
-from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.storage.files import atomic_path
 
-from .config import AskConfig, RunConfig, check_shared, nothing_to_retrieve, with_camera
+from .config import AskConfig, RunConfig, check_shared, with_camera
 from .identity import invocation, now, plain, run_identity
-from .log import RunLog, count_statuses, is_done, open_log, read_record, row_line, row_of
-from .plan import RunPlan, WorkItem, plan_work, shuffle_work
-from .row import Rollout
-from .runner import Job, RunContext, Runner
+from .log import RunLog, count_statuses, open_log
+from .plan import WorkItem, shuffle_work
+from .row import Rollout, is_done, row_line, row_of
+from .worker import Job, PlannedRun, RunContext
 
 if TYPE_CHECKING:
     import pandas
@@ -121,94 +130,45 @@ def run_evaluation(
     check_shared(config)  # before anything is loaded
     buffer_set, folder = load_buffer_set(config.buffer_set), Path(config.out)
     config = with_camera(config, buffer_set)
-    runner = _make_runner(dataclasses.replace(config, buffer_set=buffer_set.location), buffer_set)
-    with runner.lock(folder), ExitStack() as stack:
-        runner.prepare()
-        config = runner.config
-        plan, items = plan_run(runner)
-        # Read without the lock, which `open_log` takes only once servers have identified the run:
-        # these rows decide what to start, and those that are read again below what to run.
-        existing = read_record(folder)
-        todo = [item for item in items if item not in existing or not is_done(existing[item])]
-        executor = executor or make_executor(config)
-        run: RunContext[Any] = RunContext(
-            config, runner.system, runner.facts(), buffer_set.name, buffer_set.revision
+    config = dataclasses.replace(config, buffer_set=buffer_set.location)
+    with (
+        _open_run(config, buffer_set, executor or make_executor(config)) as (planned, pool),
+        ExitStack() as stack,
+    ):
+        run, plan = planned.run, planned.plan
+        identity = run_identity(run, plan, buffer_set)
+        log = stack.enter_context(
+            open_log(folder, identity, buffer_set.name, resume=not config.no_resume)
         )
-        pool: WorkerPool | None = None
-        if runner.needs_workers(todo):
-            stack.enter_context(runner.shared())
-            pool = stack.enter_context(executor.pool(runner.function(run)))
-            runner.open(pool, todo)
-        identity = run_identity(runner, plan)
-        with open_log(folder, identity, buffer_set.name, resume=not config.no_resume) as log:
-            log.begin(invocation(runner, plan, command))
-            # The buffer set may have moved to another folder: its label in rows stays the same.
-            # And what a server reports is known since `open`.
-            run = dataclasses.replace(
-                run,
-                facts=runner.facts(),
-                buffer_set=log.header.buffer_set,
-                training_seed=runner.training_seed(),
-            )
-            callbacks = [] if progress is None else [progress]
-            if config.track is not None:
-                opened = partial(optional.open_tracker, config.track, folder, plain(identity))
-                callbacks.append(stack.enter_context(optional.Tracking(config.track, opened)))
-            return _run_items(run, runner, pool, items, log, callbacks)
+        log.begin(invocation(run, plan, command))
+        # The buffer set may have moved to another folder: its label in rows stays the same.
+        run = dataclasses.replace(run, buffer_set=log.header.buffer_set)
+        callbacks = [] if progress is None else [progress]
+        if config.track is not None:
+            opened = partial(optional.open_tracker, config.track, folder, plain(identity))
+            callbacks.append(stack.enter_context(optional.Tracking(config.track, opened)))
+        return _write_rows(run, planned.items, pool, buffer_set, log, callbacks)
 
 
-def plan_run(runner: Runner[Any]) -> tuple[RunPlan, tuple[WorkItem, ...]]:
-    """Return the plan of a prepared run and its work items, and check them."""
-    config, buffer_set, facts = runner.config, runner.buffer_set, runner.facts()
-    conditions = config.conditions or tuple(
-        name for name in buffer_set.conditions if facts.applies(name)
-    )
-    plan = plan_work(
-        buffer_set.episodes_under(conditions),
-        conditions=conditions,
-        families=config.families,
-        episodes=config.episodes,
-        split=config.split,
-        shard=config.shard,
-    )
-    items = plan.items()
-    for condition in plan.conditions:
-        _check_condition(facts, condition)
-    buffer_set.check_tables(plan.conditions)
-    runner.check(plan, items)
-    return plan, items
-
-
-def _check_condition(facts: SystemFacts, condition: str) -> None:
-    """Reject a condition that does not apply to a system."""
-    if facts.applies(condition):
-        return
-    if condition == NO_HISTORY:
-        raise nothing_to_retrieve(
-            f"Leave {NO_HISTORY} out of {named('conditions')}: without history, the system is the "
-            "one without a retrieval step."
-        )
-    raise InvalidOptionError(
-        f"the system takes no history, so {condition} has no effect",
-        f"Set {named('conditions')} to {NO_HISTORY}.",
-    )
-
-
-def _make_runner(config: RunConfig | AskConfig, buffer_set: BufferSet) -> Runner[Any]:
+def _open_run(
+    config: RunConfig | AskConfig, buffer_set: BufferSet, executor: Executor
+) -> AbstractContextManager[tuple[PlannedRun[Any], WorkerPool | None]]:
+    """Plan a run, and keep its workers in the block; None if there is nothing to do for them."""
+    # Here, because a run of one kind imports nothing of the other.
     if isinstance(config, AskConfig):
-        from robomme_interference_data.evaluate.language.question_run import QuestionRunner
+        from robomme_interference_data.evaluate.language.question_run import open_questions
 
-        return QuestionRunner(config, buffer_set)
-    from robomme_interference_data.evaluate.rollout.runner import OfflineRunner, RolloutRunner
+        return open_questions(config, buffer_set, executor)
+    from robomme_interference_data.evaluate.rollout.runner import open_rollouts
 
-    return (OfflineRunner if config.offline else RolloutRunner)(config, buffer_set)
+    return open_rollouts(config, buffer_set, executor)
 
 
-def _run_items(
+def _write_rows(
     run: RunContext[Any],
-    runner: Runner[Any],
-    pool: WorkerPool | None,
     items: Sequence[WorkItem],
+    pool: WorkerPool | None,
+    buffer_set: BufferSet,
     log: RunLog,
     callbacks: Sequence[ProgressCallback],
 ) -> RunResult:
@@ -217,11 +177,12 @@ def _run_items(
     for callback in callbacks:
         callback.start(items, [done[item] for item in items if item in done])
     stopped: str | None = "interrupted"  # unless the loop ends in another way than by Ctrl-C
-    outcomes = _outcomes(run, runner, pool, shuffle_work(set(items) - done.keys()))
+    todo = shuffle_work(item for item in items if item not in done)
+    outcomes = _outcomes(run, pool, todo)
     errors, disk_full = 0, False
     try:
         for outcome in outcomes:
-            row, trace = _save_files(run, outcome, runner.buffer_set, log)
+            row, trace = _save_files(run, outcome, buffer_set, log)
             log.append(row, trace)
             for callback in callbacks:
                 callback.row(row, outcome.node)
@@ -248,15 +209,17 @@ def _run_items(
 
 
 def _outcomes(
-    run: RunContext[Any], runner: Runner[Any], pool: WorkerPool | None, items: Iterable[WorkItem]
+    run: RunContext[Any], pool: WorkerPool | None, items: Iterable[WorkItem]
 ) -> Generator[Outcome]:
     """Yield the outcomes of work items as they arrive; none without workers."""
+    again: tuple[type[Exception], ...]
+    again = (SimulatorCrashError, ServerKeepaliveError, ServerDiedError)
+    if isinstance(run.config, RunConfig) and run.config.policies is not None:
+        # A shared policy that hangs delays all its rollouts: which of them it hung at is unknown.
+        again += (TimeoutError,)
     if pool is not None:
-        yield from pool.run(
-            [Job(item, runner.metadata) for item in items],
-            time_limit=run.config.rollout_timeout_s,
-            again=runner.retried_errors,
-        )
+        jobs = [Job(item, run) for item in items]
+        yield from pool.run(jobs, time_limit=run.config.rollout_timeout_s, again=again)
 
 
 def _save_files(
@@ -271,13 +234,6 @@ def _save_files(
     error, trace = outcome.error, outcome.trace
     if error is None:
         row, trace = outcome.value
-        # Workers began before the label in the log, and what servers report, were known.
-        row = dataclasses.replace(
-            row,
-            buffer_set=run.buffer_set,
-            policy_id=run.facts.policy_id,
-            training_seed=run.training_seed,
-        )
         try:
             row_of(row_line(row))
         except (ValueError, OverflowError, RecursionError) as unstorable:

@@ -1,6 +1,7 @@
-"""Read history frames, and compare them with their recorded SHA-256 while they are decoded."""
+"""The history that a policy or model receives: its frames, and the columns about them."""
 
 from collections.abc import Generator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -8,12 +9,22 @@ from robomme_interference_data.constants import STATE
 from robomme_interference_data.data.buffer import Buffer, Chunk
 from robomme_interference_data.data.dataset import Dataset, camera_feature
 from robomme_interference_data.errors import HashMismatchError
+from robomme_interference_data.retrieval.columns import retrieval_columns
 from robomme_interference_data.schema.manifest import SessionEntry
+from robomme_interference_data.schema.sampling import (
+    Memory,
+    evidence_kept,
+    lesson_frames,
+    lesson_share,
+)
 from robomme_interference_data.storage.arrays import FeatureDigests, combine
 
 
 class HistoryReader:
-    """Reads frames of buffers of a buffer set, given its datasets; compares each session once."""
+    """Reads frames of buffers of a buffer set, given its datasets.
+
+    It compares each session, once, with its recorded SHA-256 while it decodes it.
+    """
 
     def __init__(self, datasets: Mapping[str, Dataset]):
         self._datasets = datasets
@@ -80,3 +91,27 @@ class HistoryReader:
             f"{', '.join(files)} in {dataset.files.describe()}: {', '.join(features)} of the "
             f"{entry.role} {entry.source} differ from the SHA-256 that the buffer set records"
         )
+
+
+def history_columns(
+    buffer: Buffer, received: Sequence[int], memory: Memory | None, *, retrieved: bool
+) -> dict[str, Any]:
+    """Return the columns about the frames of a buffer that a policy or model received.
+
+    Args:
+        buffer: The history.
+        received: The frames, as ascending indices.
+        memory: What of them the memory keeps; None if unknown.
+        retrieved: Whether a retrieval step chose them; if not, the policy received all.
+    """
+    share = lesson_share(buffer.sessions, received) if received else None
+    columns: dict[str, Any] = {
+        "history_frames": len(received),
+        "lesson_frames": lesson_frames(buffer.sessions, received),
+        "lesson_share": share,
+    }
+    if retrieved and share is not None:
+        columns |= retrieval_columns(received, share)
+    if memory is not None and buffer.evidence is not None:
+        columns["evidence_kept"] = evidence_kept(buffer.evidence, memory.kept(received))
+    return columns

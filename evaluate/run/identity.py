@@ -1,4 +1,4 @@
-"""What identifies a run, and what the record has about an invocation."""
+"""What identifies a run, and what its header has about an invocation."""
 
 import dataclasses
 import datetime
@@ -13,56 +13,76 @@ from typing import Any
 
 import numpy as np
 
-from robomme_interference_data.constants import PROTOCOL_VERSION
+from robomme_interference_data.constants import DEMONSTRATIONS, PROTOCOL_VERSION
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.schema.codec import to_dict
+from robomme_interference_data.storage.files import digest_json
 
-from .header import Invocation
+from .config import RetrievalConfig
+from .log import Invocation
 from .plan import RunPlan
-from .runner import Runner, make_selector, package_versions
+from .worker import RunContext, make_selector, package_versions
 
 _DEEPEST = 20
 """Maximum depth of lists and maps in metadata that is recorded as such."""
 
 
-def run_identity(runner: Runner[Any], plan: RunPlan) -> dict[str, Any]:
+def run_identity(run: RunContext[Any], plan: RunPlan, buffer_set: BufferSet) -> dict[str, Any]:
     """Return what can change a result, as plain values: it identifies the run."""
-    config = runner.config
+    config = run.config
     return {
-        "system": runner.system,
-        "facts": to_dict(runner.facts()),
+        "system": run.system,
+        "facts": to_dict(run.facts),
         "simulator": config.simulator,
-        "revision": runner.buffer_set.revision,
+        "revision": run.revision,
         "split": config.split,
         "shift": config.shift,
-        "training_seed": runner.training_seed(),
+        "training_seed": run.training_seed,
         "model_seed": config.model_seed,
-        "retrieval_index": _retrieval_index(runner, plan),
+        "retrieval_index": _retrieval_index(config, plan, buffer_set),
         "protocol_version": PROTOCOL_VERSION,
-        **runner.identity(),
+        **run.identity,
     }
 
 
-def _retrieval_index(runner: Runner[Any], plan: RunPlan) -> Any:
+def _retrieval_index(config: RetrievalConfig, plan: RunPlan, buffer_set: BufferSet) -> Any:
     """Return what the retrieval step depends on; raise if a planned condition lacks its index."""
-    selector = make_selector(runner.config)
+    selector = make_selector(config)
     if selector is None:
         return None
     index = None  # the same for all: the buffers of a condition need the same datasets
     for name in plan.conditions:
-        index = selector.identity(next(runner.buffer_set.buffers(condition=name)))
+        index = selector.identity(next(buffer_set.buffers(condition=name)))
     return plain(index)
 
 
-def invocation(runner: Runner[Any], plan: RunPlan, command: Sequence[str]) -> Invocation:
+def retrieval_text(config: RetrievalConfig, buffer_set: BufferSet) -> str | None:
+    """Return the retrieval step of a run as `SystemFacts` have it; None if it has none."""
+    if config.retrieval is None:
+        return None
+    from robomme_interference_data.retrieval.selector import RetrievalStep
+
+    step = RetrievalStep(
+        config.retrieval, rule=config.retrieval_rule, camera=config.retrieval_camera
+    )
+    return step.label(buffer_set.datasets[DEMONSTRATIONS])
+
+
+def short_digest(identity: Mapping[str, Any]) -> str:
+    """Return what identifies a policy or a model in a column: 16 letters of a SHA-256."""
+    return digest_json([identity])[:16]
+
+
+def invocation(run: RunContext[Any], plan: RunPlan, command: Sequence[str]) -> Invocation:
     """Return the record of an invocation that begins now."""
     return Invocation(
         command=tuple(map(plain, command)),
-        settings=plain(dataclasses.asdict(runner.config)),
+        settings=plain(dataclasses.asdict(run.config)),
         plan=plan,
-        versions=package_versions(runner.config) | dict(runner.versions),
+        versions=package_versions(run.config) | dict(run.versions),
         git=_git(),
         machine=platform.machine(),
-        policy=dict(runner.metadata),
+        policy=dict(run.metadata),
         started=now(),
     )
 

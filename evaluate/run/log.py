@@ -9,7 +9,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,24 +17,82 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
 from robomme_interference_data.constants import FORMAT_VERSION, RUN_HEADER, RUN_RECORD, RUN_TABLES
-from robomme_interference_data.errors import FormatError, RunError, first_line, named, visible
-from robomme_interference_data.schema.codec import arrow_schema, from_dict, to_dict, to_table
+from robomme_interference_data.errors import FormatError, RunError, named, visible
+from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
 from robomme_interference_data.schema.rollouts import FINAL, Status
-from robomme_interference_data.storage.files import (
-    atomic_path,
-    canonical_json,
-    parse_json,
-    read_header,
-    write_json,
-)
+from robomme_interference_data.storage.files import atomic_path, read_header, write_json
 from robomme_interference_data.storage.parquet import writing
 from robomme_interference_data.storage.staging import file_lock
 
-from .header import Invocation, RunHeader, whole_lines
-from .plan import WorkItem
-from .row import Rollout
+from .plan import RunPlan, WorkItem
+from .row import Rollout, is_done, read_record, row_line, whole_lines
 
 ERRORS_LOG = "errors.log"
+
+_MAX_ROLLOUTS = 1 << 20
+"""Maximum rollouts of all plans of a run: the paper's grid has 25,200."""
+
+
+@dataclass(frozen=True)
+class Invocation:
+    """One invocation of the command: its settings, its plan, and where it ran.
+
+    Attributes:
+        command: The command line; empty from Python.
+        versions: Of Python, this package, what it used, and the simulator.
+        git: Commit of the source tree, with `-dirty` if it was changed; None if there is none.
+        policy: Metadata of the policy.
+        started: When, UTC, `2026-01-31T12:00:00Z`.
+        ended: When; None while it runs, or if it was killed.
+        stopped: Why it ended early, or None.
+    """
+
+    command: tuple[str, ...]
+    settings: dict[str, Any]
+    plan: RunPlan
+    versions: dict[str, str]
+    git: str | None
+    machine: str
+    policy: dict[str, Any]
+    started: str
+    ended: str | None = None
+    stopped: str | None = None
+
+
+@dataclass(frozen=True)
+class RunHeader:
+    """`run.json`.
+
+    Attributes:
+        identity: What can change a result: it identifies the run.
+        buffer_set: Label of the buffer set in all rows.
+        plans: The plans of all invocations, each once.
+        status: `running`, `complete`, or, if something is missing or broke, `incomplete`.
+        planned: Rollouts of all plans together.
+        counts: Rows by status.
+        invocations: One for each time that the command was started or resumed.
+        merged: Names of the folders that a merged run is made of.
+    """
+
+    format_version: int
+    identity: dict[str, Any]
+    buffer_set: str
+    plans: tuple[RunPlan, ...] = ()
+    status: str = "running"
+    planned: int = 0
+    counts: dict[str, int] = field(default_factory=dict)
+    invocations: tuple[Invocation, ...] = ()
+    merged: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        planned = sum(plan.most for plan in self.plans)
+        if planned > _MAX_ROLLOUTS:
+            raise FormatError(f"plans of {planned} rollouts; expected at most {_MAX_ROLLOUTS}")
+
+    @property
+    def items(self) -> tuple[WorkItem, ...]:
+        """All planned rollouts, each once, in canonical order."""
+        return tuple(sorted({item for plan in self.plans for item in plan.items()}))
 
 
 def with_counts(header: RunHeader, rows: Mapping[WorkItem, Rollout], status: str = "") -> RunHeader:
@@ -143,41 +201,14 @@ def read_run(folder: Path) -> tuple[RunHeader, dict[WorkItem, Rollout]]:
     return with_counts(header, rows), rows
 
 
-def read_record(folder: Path) -> dict[WorkItem, Rollout]:
-    """Read the row that counts of each rollout; none from a missing file."""
-    path = folder / RUN_RECORD
-    rows: dict[WorkItem, Rollout] = {}
-    if not path.exists():
-        return rows
-    for number, line in enumerate(whole_lines(path).splitlines(), 1):
-        try:
-            row = row_of(line)
-            item = WorkItem.of(row)
-            if item in rows and is_done(rows[item]):
-                raise ValueError(f"it is a second one of {item}")
-            if row.video not in (None, item.clip):  # a path that would be read and written
-                raise ValueError(f"video {row.video!r}; expected {item.clip} or null")
-        except ValueError as error:
-            raise FormatError(
-                f"{path}, line {number} is no row of a rollout: {first_line(error)}",
-                "Remove the line to run that rollout again.",
-            ) from None
-        rows[item] = row
-    return rows
+def unfinished(folder: Path, items: Iterable[WorkItem]) -> list[WorkItem]:
+    """Return the work items without a finished row in a folder, which may hold no run.
 
-
-def row_of(line: bytes) -> Rollout:
-    """Read a line of a record."""
-    row = from_dict(Rollout, parse_json(line, "its text"), "its fields", strict=True)
-    # Half of a surrogate pair is valid JSON, but no table or page can hold it: encoding raises.
-    if b"\\u" in line:
-        canonical_json(to_dict(row)).encode()
-    return row
-
-
-def row_line(row: Rollout) -> bytes:
-    """Return a row's line in a record."""
-    return (canonical_json(to_dict(row)) + "\n").encode()
+    It is read without the lock, which `open_log` takes only once servers have identified the run.
+    So this decides what to start, and the rows that `open_log` reads what to run.
+    """
+    rows = read_record(folder)
+    return [item for item in items if item not in rows or not is_done(rows[item])]
 
 
 def check_same_run(folder: Path, existing: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
@@ -204,11 +235,6 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
         else:
             flat[prefix + name] = repr(value)
     return flat
-
-
-def is_done(row: Rollout) -> bool:
-    """Whether a rollout need not run again: all but errors."""
-    return row.status != Status.ERROR
 
 
 def count_statuses(rows: Iterable[Rollout]) -> dict[str, int]:

@@ -10,9 +10,9 @@ from robomme_interference_data.errors import RunError
 from robomme_interference_data.schema.rollouts import TIMING_COLUMNS
 from robomme_interference_data.storage.files import LocalFiles
 
-from .log import ERRORS_LOG, check_same_run, is_done, open_log, read_run
+from .log import ERRORS_LOG, check_same_run, open_log, read_run
 from .plan import WorkItem
-from .row import Rollout
+from .row import Rollout, is_done
 
 
 @dataclass(frozen=True)

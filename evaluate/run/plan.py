@@ -1,4 +1,4 @@
-"""The plan of a run: pure, without files or processes."""
+"""The plan of a run: which rollouts or questions, and in which order."""
 
 import hashlib
 import re
@@ -6,11 +6,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, named
+from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId, count_numbers, format_numbers, parse_numbers
-from robomme_interference_data.schema.conditions import in_order, parse_condition
+from robomme_interference_data.schema.conditions import NO_HISTORY, in_order, parse_condition
 from robomme_interference_data.schema.rollouts import RolloutKey
 from robomme_interference_data.storage.files import canonical_json
+
+from .config import WorkConfig, nothing_to_retrieve
 
 _SHARD = re.compile(r"(\d{1,6})/(\d{1,6})")
 
@@ -108,6 +112,53 @@ def _read_shard(text: str) -> tuple[int, int]:
             "shard", text, "NUMBER/OF, such as 2/8 for the second of eight"
         )
     return int(shard[1]), int(shard[2])
+
+
+def plan_run(config: WorkConfig, facts: SystemFacts, buffer_set: BufferSet) -> RunPlan:
+    """Return the plan of a run of a system, and check the tables of its conditions.
+
+    Raises:
+        UnknownNameError, InvalidOptionError: Settings name episodes that do not exist, or a
+            condition that does not apply to the system.
+        HashMismatchError: A table of the buffer set does not have its recorded hash.
+    """
+    conditions = config.conditions or tuple(
+        name for name in buffer_set.conditions if facts.applies(name)
+    )
+    if not conditions:  # no planned one applies; raises
+        _check_condition(facts, buffer_set.conditions[0], buffer_set)
+    plan = plan_work(
+        buffer_set.episodes_under(conditions),
+        conditions=conditions,
+        families=config.families,
+        episodes=config.episodes,
+        split=config.split,
+        shard=config.shard,
+    )
+    for condition in plan.conditions:
+        _check_condition(facts, condition, buffer_set)
+    buffer_set.check_tables(plan.conditions)
+    return plan
+
+
+def _check_condition(facts: SystemFacts, condition: str, buffer_set: BufferSet) -> None:
+    """Reject a condition that does not apply to a system."""
+    if facts.applies(condition):
+        return
+    if condition == NO_HISTORY:
+        raise nothing_to_retrieve(
+            f"Leave {NO_HISTORY} out of {named('conditions')}: without history, the system is the "
+            "one without a retrieval step."
+        )
+    planned = NO_HISTORY in buffer_set.conditions
+    raise InvalidOptionError(
+        f"the system takes no history, so {condition} has no effect",
+        f"Set {named('conditions')} to {NO_HISTORY}."
+        if planned
+        else f"It runs under {NO_HISTORY}, which is not planned yet.",
+        None if planned else buffer_set.planning(NO_HISTORY),
+        "conditions",
+    )
 
 
 def plan_work(

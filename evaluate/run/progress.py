@@ -14,9 +14,8 @@ from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.viz.tables import Table
 
-from .log import is_done
 from .plan import WorkItem
-from .row import Rollout
+from .row import Rollout, is_done
 
 Cell = tuple[str, str]
 """Family and condition."""

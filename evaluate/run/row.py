@@ -1,13 +1,20 @@
-"""The row of a rollout: what identifies it, how it ended, and the columns of each feature."""
+"""The row of a rollout, its line in the record of a run, and the reader of a record."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
+from robomme_interference_data.constants import MAX_ROW_BYTES, RUN_RECORD
+from robomme_interference_data.errors import FormatError, first_line
 from robomme_interference_data.evaluate.language.columns import AnswerColumns, ModelColumns
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.retrieval.columns import RetrievalColumns
-from robomme_interference_data.schema.rollouts import OutcomeColumns, RolloutKey, Timing
+from robomme_interference_data.schema.codec import from_dict, to_dict
+from robomme_interference_data.schema.rollouts import OutcomeColumns, RolloutKey, Status, Timing
 from robomme_interference_data.schema.sampling import HistoryColumns
 from robomme_interference_data.simulators.measured import ActionErrorColumns
+from robomme_interference_data.storage.files import canonical_json, parse_json, read_bytes
+
+from .plan import WorkItem
 
 
 # A feature declares its columns in its own module and is one line here. A dataclass takes the
@@ -29,3 +36,51 @@ class Rollout(
     def __post_init__(self) -> None:
         RolloutKey.__post_init__(self)
         OutcomeColumns.__post_init__(self)
+
+
+def is_done(row: Rollout) -> bool:
+    """Whether a rollout need not run again: all but errors."""
+    return row.status != Status.ERROR
+
+
+def row_of(line: bytes) -> Rollout:
+    """Read a line of a record."""
+    row = from_dict(Rollout, parse_json(line, "its text"), "its fields", strict=True)
+    # Half of a surrogate pair is valid JSON, but no table or page can hold it: encoding raises.
+    if b"\\u" in line:
+        canonical_json(to_dict(row)).encode()
+    return row
+
+
+def row_line(row: Rollout) -> bytes:
+    """Return a row's line in a record."""
+    return (canonical_json(to_dict(row)) + "\n").encode()
+
+
+def whole_lines(record: Path) -> bytes:
+    """Return the bytes of `rollouts.jsonl`, without a last line that a crash cut short."""
+    data = read_bytes(record, MAX_ROW_BYTES)
+    return data[: data.rfind(b"\n") + 1]
+
+
+def read_record(folder: Path) -> dict[WorkItem, Rollout]:
+    """Read the row that counts of each rollout; none from a missing file."""
+    path = folder / RUN_RECORD
+    rows: dict[WorkItem, Rollout] = {}
+    if not path.exists():
+        return rows
+    for number, line in enumerate(whole_lines(path).splitlines(), 1):
+        try:
+            row = row_of(line)
+            item = WorkItem.of(row)
+            if item in rows and is_done(rows[item]):
+                raise ValueError(f"it is a second one of {item}")
+            if row.video not in (None, item.clip):  # a path that would be read and written
+                raise ValueError(f"video {row.video!r}; expected {item.clip} or null")
+        except ValueError as error:
+            raise FormatError(
+                f"{path}, line {number} is no row of a rollout: {first_line(error)}",
+                "Remove the line to run that rollout again.",
+            ) from None
+        rows[item] = row
+    return rows

@@ -16,13 +16,12 @@ from vla_eval.types import Observation as ServerObservation
 from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import InvalidOptionError, RunError, UnknownNameError, counted
-from robomme_interference_data.evaluate.rollout.runner import RolloutRunner
+from robomme_interference_data.evaluate.rollout.runner import plan_rollouts
 from robomme_interference_data.evaluate.rollout.worker import RolloutFunction
 from robomme_interference_data.evaluate.run.config import RunConfig
-from robomme_interference_data.evaluate.run.evaluation import plan_run
-from robomme_interference_data.evaluate.run.log import row_line, row_of
 from robomme_interference_data.evaluate.run.plan import WorkItem
-from robomme_interference_data.evaluate.run.runner import Job, RunContext
+from robomme_interference_data.evaluate.run.row import row_line, row_of
+from robomme_interference_data.evaluate.run.worker import Job
 from robomme_interference_data.ids import EpisodeId, count_numbers, nth_number
 from robomme_interference_data.runtime.worker import Worker
 from robomme_interference_data.schema.codec import to_dict
@@ -138,8 +137,6 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
             system=system,
             **chosen,
         )
-        runner = RolloutRunner(config, opened)
-        runner.prepare()
         with_history = [name for name in config.conditions if name != NO_HISTORY]
         if with_history and not send_video_history:
             raise InvalidOptionError(
@@ -147,22 +144,16 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
                 f"send_video_history, and {', '.join(with_history)} would be {NO_HISTORY}",
                 f"Set `conditions` to [{NO_HISTORY}], or serve a model with a memory.",
             )
-        self._plan, _ = plan_run(runner)
+        planned = plan_rollouts(config, opened)
+        self._plan = planned.plan
         # Which server plays is not known here: without an identity, its rows are paired with none.
-        facts = replace(runner.facts(), policy="vla-eval", policy_id=None)
-        self._run = RunContext(
-            runner.config,
-            runner.system,
-            facts,
-            opened.name,
-            opened.revision,
-            runner.training_seed(),
-        )
+        facts = replace(planned.run.facts, policy="vla-eval", policy_id=None)
+        self._run = replace(planned.run, facts=facts)
         self._policy = HarnessPolicy(**options)
-        self._rollouts = RolloutFunction(self._run, policy=self._policy)
+        self._rollouts = RolloutFunction(self._run.config, policy=self._policy)
         # A rollout asks its policy for actions, and vla-eval asks its benchmark for observations:
         # each has its own thread. A simulator that hangs does not keep the process from its end.
-        self._jobs = SimpleQueue[Job | None]()
+        self._jobs = SimpleQueue[Job[RunConfig] | None]()
         self._thread = Thread(target=self._work, name="rollouts", daemon=True)
         self._thread.start()
         self._running = False
@@ -206,7 +197,7 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
                 f"Set `episodes_per_task` to {count}.",
             )
         episode = EpisodeId(task["family"], task["split"], number)
-        self._jobs.put(Job(WorkItem(task["condition"], episode)))
+        self._jobs.put(Job(WorkItem(task["condition"], episode), self._run))
         self._running = True
         return self._next().obs
 

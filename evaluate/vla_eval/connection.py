@@ -28,7 +28,7 @@ class VlaEvalConnection(ServerConnection):
     answer to the last message.
     """
 
-    guide = "docs/how-to/vla-eval.md"
+    guide = "docs/how-to/connect-a-policy.md"
 
     def _greet(self, seconds: float) -> dict[str, Any]:
         self._seq, self._unsent = 0, list[bytes]()

@@ -147,5 +147,5 @@ def _check_fits(server: str, hello: Mapping[str, Any]) -> None:
         raise PolicyServerError(
             f"policy server {server} ({hello['model_server']}) does not fit: it "
             f"{'; it '.join(faults)}",
-            "docs/how-to/vla-eval.md lists what is sent and what is executed.",
+            "docs/how-to/connect-a-policy.md lists what is sent and what is executed.",
         )

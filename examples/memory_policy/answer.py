@@ -19,7 +19,7 @@ from robomme_interference_data import EpisodeId, Rollout, load_buffer_set
 from robomme_interference_data.constants import DEMONSTRATIONS, PROTOCOL_VERSION
 from robomme_interference_data.data.questions import LETTERS
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evaluate.run.runner import history_columns
+from robomme_interference_data.evaluate.run.history import history_columns
 from robomme_interference_data.retrieval.stored_selector import StoredSelector
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import NO_HISTORY

@@ -40,6 +40,7 @@ class MemoryPolicy(Policy):
             raise InvalidOptionError(f"{checkpoint} was trained to answer; expected --task act.")
         self.cameras = self.history_cameras = self.config.cameras
         self._memory = Memory.parse(self.config.memory)
+        self.memory = str(self._memory)
 
     def reset(self, info: RolloutInfo) -> None:
         """Clear the memory."""

@@ -179,9 +179,9 @@ def main() -> None:
     With `--json`, an error is one line of JSON, the last one on stderr: see `ShownError`.
     """
     log_to_stderr()
-    command = typer.main.get_command(app)
     as_json = "--json" in sys.argv[1:]
     try:
+        command = typer.main.get_command(app)
         # Outside its standalone mode, Typer returns the exit code and raises errors of usage.
         sys.exit(command(prog_name=PROGRAM, standalone_mode=not as_json))
     except InterferenceError as error:

@@ -14,7 +14,7 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
 
-from robomme_interference_data.errors import naming_options, option_names
+from robomme_interference_data.errors import InvalidOptionError, named, naming_options, option_names
 from robomme_interference_data.runtime.specs import bind_options
 from robomme_interference_data.schema.settings import SETTING
 
@@ -84,7 +84,8 @@ def with_settings[**P, R](function: Callable[P, R]) -> Callable[..., R]:
         for name, (config, fields) in configs.items():
             given = {field: _as_tuple(values.pop(field)) for field in fields}
             if name in rare:
-                given |= bind_options("--set", rare[name], {}, texts)
+                _check_rare(texts, config)
+                given |= bind_options(f"--{_SET}", rare[name], {}, texts)
             settings[name] = config(**given)
         rare_names = {
             field.name: f"--{_SET} {field.name}"
@@ -115,6 +116,17 @@ def _rare_settings(config: Any) -> type | None:
         if SETTING in field.metadata and field.metadata[SETTING]["rare"]
     ]
     return dataclasses.make_dataclass("Rare", fields) if fields else None
+
+
+def _check_rare(texts: Sequence[str], config: Any) -> None:
+    """Reject a setting that has an option of its own: it would be set twice."""
+    own = {option.name for option in _options(config)}
+    for name in (text.partition("=")[0] for text in texts):
+        if name in own:
+            raise InvalidOptionError(
+                f"--{_SET} {name}: this setting has an option of its own",
+                f"Set {named(name)} instead.",
+            )
 
 
 def _set_option(rare: Any) -> inspect.Parameter:

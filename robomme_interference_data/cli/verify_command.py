@@ -1,10 +1,11 @@
 """The command `verify`."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robomme_interference_data.errors import counted
+from robomme_interference_data.errors import MissingFileError, counted
 
 from .console import echo, print_json, print_status
 from .options import AsJson, BufferSetFolder
@@ -43,17 +44,23 @@ def verify(
     from robomme_interference_data.build_dataset.verify.buffer_set import (
         undecoded_frames,
         verify_buffer_set,
+        verify_datasets,
     )
-    from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.runtime.progress import WorkProgress
 
-    opened, progress = load_buffer_set(buffer_set), WorkProgress()
-    checks = verify_buffer_set(opened, decode=decode, progress=progress)
+    opened, incomplete = _open(buffer_set)
+    progress = WorkProgress()
+    if opened is None:
+        checks = verify_datasets(Path(buffer_set), decode=decode, progress=progress)
+    else:
+        checks = verify_buffer_set(opened, decode=decode, progress=progress)
     with progress:
         violations = list(checks)
     report: dict[str, Any] = {"violations": [vars(violation) for violation in violations]}
+    skipped = 0
     # A damaged buffer set may have no rows to count or to audit.
-    skipped = undecoded_frames(opened) if decode and not violations else 0
+    if opened is not None and decode and not violations:
+        skipped = undecoded_frames(opened)
     if skipped:
         report["frames_not_decoded"] = skipped
     if not as_json:
@@ -63,18 +70,32 @@ def verify(
         print_status(
             counted(len(violations), "violation")
             if violations
-            else f"All {what} of {buffer_set} hold."
+            else f"All {what} of {buffer_set}{' so far' if opened is None else ''} hold."
         )
         if skipped:
             frames = counted(skipped, "frame")
             print_status(f"Not decoded: {frames}, of which only some cameras were fetched.")
     leaks = False
-    if audit and not violations:
+    if opened is not None and audit and not violations:
         leaks = _audit(opened, report, as_json=as_json)
     if as_json:
         print_json(report)
+    if incomplete is not None:
+        raise incomplete
     if violations or leaks:
         raise typer.Exit(1)
+
+
+def _open(buffer_set: str) -> "tuple[BufferSet | None, MissingFileError | None]":
+    """Open a buffer set; of datasets without manifests, return the error that says what lacks."""
+    from robomme_interference_data.data.loading import built_datasets, load_buffer_set
+
+    try:
+        return load_buffer_set(buffer_set), None
+    except MissingFileError as error:
+        if not built_datasets(Path(buffer_set)):
+            raise
+        return None, error
 
 
 def _audit(opened: "BufferSet", report: dict[str, Any], *, as_json: bool) -> bool:

@@ -1,16 +1,20 @@
 """Open a buffer set and load a buffer, from a folder or from the Hub."""
 
 import os
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robomme_interference_data.constants import (
     DATASETS,
+    DEMONSTRATIONS,
+    DISTRACTORS,
     EXECUTIONS,
     FETCH_RECORD,
     IDENTITY_PATH,
     MANIFEST_PATH,
+    MANIFESTS,
 )
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError, named
 from robomme_interference_data.ids import EpisodeId, whole_number
@@ -79,16 +83,38 @@ def _no_buffer_set(files: "LocalFiles | HubFiles") -> MissingFileError:
             "Resume it.",
             fetch_command(files.root, record),
         )
-    hint = "Give a folder with demonstrations/, distractors/ and manifests/, or build one."
-    command: str | None = "build BUFFER_SET --source KIND:PATH"
+    message = f"{files.describe()} is not a buffer set: {MANIFEST_PATH} is missing"
     if isinstance(files, LocalFiles):
-        folders = [files.root / name for name in DATASETS]
-        if any(path.is_dir() or staging_path(path).is_dir() for path in folders):
+        if any(staging_path(files.root / name).is_dir() for name in (*DATASETS, MANIFESTS)):
             hint = "Its build has not finished: run the same build command again to resume it."
-            command = None
+            return MissingFileError(message, hint)
+        if built := built_datasets(files.root):
+            lacking = [name for name in (DEMONSTRATIONS, DISTRACTORS) if name not in built]
+            return MissingFileError(
+                f"{files.root} is not a buffer set yet: it has {' and '.join(built)}; it lacks "
+                + " and ".join([*lacking, MANIFESTS]),
+                "Build what it lacks.",
+                next_build(files.root),
+            )
     return MissingFileError(
-        f"{files.describe()} is not a buffer set: {MANIFEST_PATH} is missing", hint, command
+        message,
+        "Give a folder with demonstrations/, distractors/ and manifests/, or build one.",
+        "build BUFFER_SET --source KIND:PATH",
     )
+
+
+def built_datasets(root: Path) -> tuple[str, ...]:
+    """Return the names of the datasets in a folder whose build has finished, in their order."""
+    return tuple(name for name in DATASETS if (root / name / IDENTITY_PATH).is_file())
+
+
+def next_build(root: Path) -> str:
+    """Return the command that builds what a buffer set in a folder lacks first."""
+    built = built_datasets(root)
+    for name in (DEMONSTRATIONS, DISTRACTORS):
+        if name not in built:
+            return shlex.join(["build", str(root), "--only", name, "--source", "KIND:PATH"])
+    return shlex.join(["build", str(root), "--only", MANIFESTS])
 
 
 def load_buffer(

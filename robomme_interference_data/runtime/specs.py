@@ -192,8 +192,13 @@ def bind_options(
     such as `policy 'replay:full'`, and lists options that something else takes, `also`.
     """
     signature, declared = signature_of(factory), _declared_types(factory)
+    parameters = _options_of(signature, given)
+    known = f"Its options: {', '.join([*parameters, *also]) or 'none'}."
     values: dict[str, Any] = {}
-    for name, text in _split_options(what, options).items():
+    for name, text in _split_options(what, options, parameters.values()).items():
+        if name not in parameters and not _takes_any(signature):
+            hint = f"{nearest(name, [*parameters, *also], more='')} {known}"
+            raise InvalidOptionError(f"{what}: there is no option {name}", hint.lstrip())
         kinds = declared.get(name)
         # `checkpoint=7` is text where text is declared: only the factory knows what it is.
         value = text if kinds and str in kinds else _parse_json(text)
@@ -201,15 +206,13 @@ def bind_options(
             value = float(value)
         if kinds and type(value) not in kinds:  # here, bool is not a number
             expected = " or ".join(_TYPES[kind] for kind in kinds)
+            expected += _example(parameters.get(name))
             raise InvalidOptionError.expected(f"{what}: option {name} is", value, expected)
         values[name] = value
-    try:
-        bound = signature.bind(**given, **values)
-    except TypeError as error:
-        names = [*(name for name in signature.parameters if name not in given), *also]
-        raise InvalidOptionError(
-            f"{what}: {error}", f"Its options: {', '.join(names) or 'none'}."
-        ) from error
+    for name, parameter in parameters.items():
+        if parameter.default is inspect.Parameter.empty and name not in values:
+            raise InvalidOptionError(f"{what}: the option {name} is missing", known)
+    bound = signature.bind(**given, **values)
     bound.apply_defaults()
     arguments: dict[str, Any] = {}
     for name, value in bound.arguments.items():
@@ -228,14 +231,45 @@ def signature_of(factory: Factory) -> inspect.Signature:
         return inspect.signature(lambda **options: None)
 
 
-def _split_options(what: str, options: Iterable[str]) -> dict[str, str]:
+_NAMED = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+
+
+def _options_of(
+    signature: inspect.Signature, given: Mapping[str, Any]
+) -> dict[str, inspect.Parameter]:
+    """Return the parameters that options set, by name."""
+    return {
+        name: parameter
+        for name, parameter in signature.parameters.items()
+        if parameter.kind in _NAMED and name not in given
+    }
+
+
+def _takes_any(signature: inspect.Signature) -> bool:
+    """Whether a factory takes options of any name."""
+    kinds = [parameter.kind for parameter in signature.parameters.values()]
+    return inspect.Parameter.VAR_KEYWORD in kinds
+
+
+def _example(parameter: inspect.Parameter | None) -> str:
+    """Return `, such as NAME=DEFAULT`; empty without a default that shows a value."""
+    if parameter is None or not isinstance(parameter.default, str | int | float):
+        return ""
+    text = parameter.default
+    if not isinstance(text, str):
+        text = json.dumps(text)
+    return f", such as {parameter.name}={text}"
+
+
+def _split_options(
+    what: str, options: Iterable[str], parameters: Iterable[inspect.Parameter]
+) -> dict[str, str]:
     values: dict[str, str] = {}
     for option in options:
         name, equals, value = option.partition("=")
         if not name.isidentifier() or not equals:
-            raise InvalidOptionError.expected(
-                f"{what}: option", option, "NAME=VALUE, such as device=cpu"
-            )
+            example = next(filter(None, map(_example, parameters)), ", such as device=cpu")
+            raise InvalidOptionError.expected(f"{what}: option", option, f"NAME=VALUE{example}")
         if name in values:
             raise InvalidOptionError(f"{what}: option {name} is set twice", "Set it once.")
         values[name] = value

@@ -43,8 +43,6 @@ class Simulator(ABC):
     Attributes:
         name: Registered name.
         about: What its episodes are, for cards, such as `the official simulator, RoboMME`.
-        remote: Whether it runs in another process; `evaluate` then decodes the history while the
-            simulator begins the episode.
         cameras: Names of its cameras, in the order of videos.
         fps: Observations per second: an action is executed for the time between two of them.
         state_names: Names of the values of a state; None if they have none.
@@ -68,7 +66,6 @@ class Simulator(ABC):
 
     name: ClassVar[str] = ""
     about: ClassVar[str] = ""
-    remote: ClassVar[bool] = False
     cameras: Sequence[str] = CAMERAS
     fps: ClassVar[float] = FPS
     state_names: ClassVar[tuple[str, ...] | None] = None

@@ -137,3 +137,18 @@ def test_more_units_need_a_confirmation(tmp_path: Path, run: Any) -> None:
     assert run("build", root, "--only", "manifests")[0] == 1
     code, out, _ = run("build", root, "--only", "manifests", "--yes", "--json")
     assert code == 0 and json.loads(out)["manifests"]["redrawn"] == ["k1"]
+
+
+def test_a_request_for_buffers_alone_needs_no_source(own_buffers: Path, run: Any) -> None:
+    conditions = load_buffer_set(own_buffers).conditions
+    assert run("build", own_buffers, "--drop", "k7", "--yes")[0] == 0
+    assert load_buffer_set(own_buffers).conditions == conditions[:-1]
+    assert run("build", own_buffers, "--conditions", "k7")[0] == 0
+    assert load_buffer_set(own_buffers).conditions == conditions
+    before = contents(own_buffers)
+    for options in ((), ("--drop", "k7", "--families", "MoveCube")):
+        code, _, err = run("build", own_buffers, *options, "--json")
+        error = json.loads(err)
+        assert (code, error["type"]) == (1, "InvalidOptionError")
+        assert error["command"] == f"robomme-interference build {own_buffers} --only manifests"
+    assert contents(own_buffers) == before

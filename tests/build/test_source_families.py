@@ -14,6 +14,7 @@ from robomme_interference_data.build_dataset.sources.families import (
     ids_by_block,
     ids_by_columns,
     read_families,
+    template,
 )
 from robomme_interference_data.build_dataset.sources.robomme_families import (
     ROBOMME,
@@ -29,7 +30,7 @@ def written(folder: Path, text: str, name: str = "families.csv") -> Path:
 
 
 def ids_by_file(path: Path, count: int) -> dict:
-    return ids_by_columns(read_families(path, count), str(path)) or {}
+    return ids_by_columns(read_families(path, [()] * count), str(path)) or {}
 
 
 def names(ids: dict | None) -> dict[int, str]:
@@ -86,6 +87,9 @@ HEADER = "episode_index,family"
         f"{HEADER},exec_start_idx\n0,A,-1\n",
         f"{HEADER},exec_start_idx\n0,A,\n",
         f"{HEADER}\n0,{'A' * 200_000}\n",
+        f"task,{HEADER}\nx,0,A\n",
+        "task,family,index\nx,A,0\n",
+        "task,family\nx,A\n x ,B\n",
     ],
 )
 def test_errors_name_the_line_or_episode(tmp_path: Path, text: str) -> None:
@@ -100,6 +104,44 @@ def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
     for name in ("none.csv", "latin.csv"):
         with raises(SourceError):
             ids_by_file(tmp_path / name, 1)
+
+
+TASKS = [["open the drawer"], ['stack, then "wait"'], ["open  the drawer "], ["push"]]
+
+
+def test_a_line_for_each_task(tmp_path: Path) -> None:
+    path = written(tmp_path, template(TASKS))
+    lines = path.read_text().splitlines()
+    assert lines[0] == "task,family" and len(lines) == 4
+    with raises(SourceError):  # the families are not filled in
+        ids_by_columns(read_families(path, TASKS), "here")
+    for name in ("Open", "Stack", "Push"):
+        path.write_text(path.read_text().replace("<family>", name, 1))
+    ids = names(ids_by_columns(read_families(path, TASKS), "here"))
+    assert ids == dict(enumerate(["Open/train/0", "Stack/train/0", "Open/train/1", "Push/train/0"]))
+
+
+def test_lines_that_a_file_lacks_are_offered(tmp_path: Path) -> None:
+    path = written(tmp_path, "family,task,split\nOpen,open the drawer,test\n")
+    with raises(SourceError) as caught:
+        read_families(path, TASKS)
+    *_, stack, push = (caught.value.hint or "").splitlines()
+    assert (stack, push) == ('"stack, then ""wait""",<family>,<split>', "push,<family>,<split>")
+    path = written(tmp_path, f"{HEADER}\n0,A\n")
+    with raises(SourceError) as caught:
+        read_families(path, [()] * 60)
+    hint = (caught.value.hint or "").splitlines()
+    assert hint[1:3] == ["1,<family>", "2,<family>"] and hint[-1] == "and 19 more"
+
+
+def test_an_episode_of_several_tasks(tmp_path: Path) -> None:
+    path = written(tmp_path, "task,family\nopen,Drawer\nclose,Drawer\npush,Push\n")
+    assert read_families(path, [["open", "close"], ["push"]]) == [
+        {"family": "Drawer"},
+        {"family": "Push"},
+    ]
+    with raises(SourceError):
+        read_families(path, [["open", "push"]])
 
 
 ROWS: list[tuple[list[dict[str, Any]], list[str] | str]] = [

@@ -1,5 +1,6 @@
 """LeRobot datasets as sources: episodes, families, column names, and invalid values."""
 
+import json
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -169,6 +170,30 @@ def test_a_families_file_can_mark_the_demonstrations(tmp_path: Path, version: st
     assert plan_dataset("demonstrations", named).episodes
     shown = [frame.is_demonstration for frame in read(root, families_file=file).frames]
     assert shown == [True] * 3 + [False]
+
+
+def test_families_are_kept_with_the_buffer_set(tmp_path: Path, run: Any) -> None:
+    recorded = {"0": make_episode(0, 40, "fold"), "1": make_episode(1, 250, "open")}
+    data = write_lerobot(tmp_path / "d", recorded, stored="png", marked=False, episode_id=None)
+    root, source = tmp_path / "set", ("--source", f"lerobot:{tmp_path / 'd'}", "--workers", "1")
+    code, _, err = run("build", root, *source, "--json")
+    hint = json.loads(err)["hint"].splitlines()
+    assert code == 1 and hint[1:] == ["task,family", "fold,<family>", "open,<family>"]
+    file = tmp_path / "families.csv"
+    lines = ["task,family,split,exec_start_idx", "fold,Fold,test,20", "open,Open,train,0"]
+    file.write_text("\n".join(lines))
+    units = ("--only", "distractors", *source)
+    assert run("build", root, *units, "--families-file", file)[0] == 0
+    file.unlink()
+    assert run("build", root, *source, "--split", "test", "--conditions", "k0,k1")[0] == 0
+    assert run("verify", root)[0] == 0
+    edit_columns(data / TABLE, episode_id=["Fold/test/7", "Open/train/0"])
+    assert [
+        str(episode.id)
+        for episode in open_source(
+            f"lerobot:{data}", kept_families=root / "families.csv"
+        ).episodes()
+    ] == ["Fold/test/7", "Open/train/0"]  # what the recordings name comes first
 
 
 @pytest.mark.parametrize(

@@ -126,7 +126,7 @@ def test_actions_marks_and_a_camera_may_be_missing(tmp_path: Path, layout: str) 
         ("frames", "frames:FOLDER"),
         ("robome-h5:recordings", "'robomme-h5'"),
         ("tabletop:fast", "tabletop"),
-        ("lamp:Lamp", "PYTHONPATH"),
+        ("no_such_module:Lamp", "PYTHONPATH"),
         ("support.nowhere:Lamp", "PYTHONPATH"),
         ("frame:recordings", "frames:FOLDER"),
         ("frame:recordings", "Did you mean 'frames'?"),

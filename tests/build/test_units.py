@@ -1,5 +1,6 @@
 """Units of another length and stride than the paper's, for episodes that are shorter."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -107,3 +108,16 @@ def test_only_short_episodes_are_an_error_that_names_the_options(tmp_path: Path)
     with pytest.raises(InvalidOptionError) as caught:
         plan_alone("demonstrations", other)
     assert caught.value.option == "unit"
+
+
+@pytest.mark.parametrize("split", ["test", "val"])
+def test_units_of_other_splits_are_an_error_before_anything_is_written(
+    split: str, tmp_path: Path, run: Any
+) -> None:
+    root, source = tmp_path / "set", ("--source", "sample:Cup,Drawer")
+    for part in (("--only", "distractors"), ("--only", "distractors-raw")):
+        code, _, err = run("build", root, *part, "--split", split, *source, "--json")
+        error = json.loads(err)
+        assert (code, error["type"]) == (1, "InvalidOptionError")
+        assert error["command"].split()[1:] == ["build", str(root), *part, *source]
+    assert not root.exists()

@@ -108,9 +108,9 @@ def test_settings_are_named_as_the_reader_writes_them() -> None:
 
 
 def test_pages_in_hints_are_addresses() -> None:
-    error = InterferenceError("docs/my.md is no prompt", "See docs/how-to/vla-eval.md.")
+    error = InterferenceError("docs/my.md is no prompt", "See docs/how-to/connect-a-policy.md.")
     assert error.message == "docs/my.md is no prompt"
-    assert error.hint == f"See {DOCS_URL}/how-to/vla-eval.html."
+    assert error.hint == f"See {DOCS_URL}/how-to/connect-a-policy.html."
     assert error.about("x").hint == error.hint
 
 

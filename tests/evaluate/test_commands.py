@@ -14,6 +14,7 @@ from support.scoring import row as scored_row
 from typer.testing import CliRunner
 
 from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate import commands
 from robomme_interference_data.evaluate.run import evaluation as run_module
 from robomme_interference_data.evaluate.run.plan import WorkItem
@@ -81,6 +82,23 @@ def test_options_of_the_policy_have_types(tmp_path: Path, tiny_buffers: Path) ->
     assert header["identity"]["policy_options"] == {"gripper": -1}
 
 
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("max_errors=many", "max_errors is 'many'; expected a whole number, such as max_errors=10"),
+        ("cache=2", "cache is 2; expected true or false, such as cache=false"),
+        ("max_errors=0", "--set max_errors 0; expected a number above 0"),
+        ("max_errors", "NAME=VALUE, such as split=test"),
+        ("max_erors=3", "Did you mean 'max_errors'?"),
+        ("workers=2", "has an option of its own"),
+    ],
+)
+def test_wrong_settings_are_errors_with_an_example(given: str, words: str) -> None:
+    done = type_in(f"evaluate nowhere --policy noop --out run --set {given}")
+    assert isinstance(done.exception, InvalidOptionError)
+    assert words in str(done.exception)
+
+
 def test_errors_are_printed_with_the_command_to_resume(
     tmp_path: Path, trouble: Path, tiny_buffers: Path
 ) -> None:
@@ -115,7 +133,7 @@ def test_an_interruption_mentions_finished_rollouts_if_there_are_any(
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run_module, "_run_items" if begun else "plan_work", stop)
+    monkeypatch.setattr(run_module, "_write_rows" if begun else "check_shared", stop)
     line = f"evaluate {tiny_buffers} --policy noop {USUAL} --families MoveCube"
     done = type_in(f"{line} --out {tmp_path / 'run'}")
     assert done.exit_code == 130 and "resume with:\nrobomme-interference" in done.stderr

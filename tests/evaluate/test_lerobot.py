@@ -263,8 +263,9 @@ def test_renamed_observations_fit(tmp_path: Path) -> None:
 def test_missing_files_and_devices_are_errors(act: Path, vqbet: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(act, tmp_path / "policy")
     shutil.copy(vqbet / "model.safetensors", folder / "model.safetensors")  # of another model
-    with raises(PolicyError):
+    with pytest.raises(PolicyError) as raised:  # LeRobot lists the missing weights in any order
         made(folder).reset(RolloutInfo("x", 0, 0))
+    assert raised.value.message.startswith(f"LeRobot cannot load the policy {folder}: ")
     for name in ("policy_postprocessor.json", "model.safetensors"):
         (folder / name).unlink()
         with raises(MissingFileError):

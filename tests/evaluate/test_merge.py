@@ -9,8 +9,8 @@ from support.runs import header, run, run_one, untimed
 
 from robomme_interference_data.errors import FormatError, RunError
 from robomme_interference_data.evaluate import merge_runs
-from robomme_interference_data.evaluate.run.log import read_record
 from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.evaluate.run.row import read_record
 from robomme_interference_data.ids import EpisodeId
 
 pytestmark = pytest.mark.usefixtures("trouble")

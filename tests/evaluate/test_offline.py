@@ -24,7 +24,7 @@ from robomme_interference_data.evaluate.rollout.rollout import run_rollout
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.progress import error_table
 from robomme_interference_data.evaluate.run.row import Rollout
-from robomme_interference_data.evaluate.run.runner import RunContext
+from robomme_interference_data.evaluate.run.worker import RunContext
 from robomme_interference_data.evaluate.score.rows.reading import read_rows
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId

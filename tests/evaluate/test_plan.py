@@ -13,7 +13,7 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     UnknownNameError,
 )
-from robomme_interference_data.evaluate.run.header import RunHeader
+from robomme_interference_data.evaluate.run.log import RunHeader
 from robomme_interference_data.evaluate.run.plan import RunPlan, WorkItem, plan_work, shuffle_work
 from robomme_interference_data.ids import EpisodeId
 

@@ -136,7 +136,7 @@ def test_malformed_or_repeated_options_are_errors(texts: list[str]) -> None:
         ("websocket://a:1", ["port=2"], "port"),
         ("websocket://a:1", ["connect_s=-1"], "expected positive numbers"),
         ("noop", ["speed=1"], "Its options: none."),
-        (f"{OWN}still", [], "missing a required argument: 'gripper'"),
+        (f"{OWN}still", [], "the option gripper is missing"),
     ],
 )
 def test_options_that_do_not_fit(text: str, options: list[str], words: str) -> None:
@@ -186,6 +186,7 @@ def test_kinds_declare_what_their_policies_are() -> None:
         policy = make_policy(name)
         scripts = {*Simulator.policies, *Recordings.policies}
         assert policy.privileged == (kind.script is not None)
+        assert policy.memory == policy_memory(name)
         assert kind.script is None or kind.script in scripts
         assert {*kind.option_labels} <= {*policy_options(name)}
         memory = policy_memory(name)
@@ -249,7 +250,7 @@ def test_users_import_everything_from_one_place() -> None:
 
 def test_every_member_of_the_protocol_is_required() -> None:
     members = [name for name in vars(Policy) if not name.startswith("_")]
-    assert len(members) == 11
+    assert len(members) == 12
     for name in members:
         with raises(PolicyError):
             make_policy(f"{OWN}lacking", [f"name={name}"])
@@ -262,6 +263,8 @@ def test_every_member_of_the_protocol_is_required() -> None:
         ("cameras", '"front"', "cameras 'front'"),
         ("every_frame", "1", "every_frame 1; expected True or False"),
         ("act", "3", r"no method act()"),
+        ("memory", '"framsamp:8"', "memory 'framsamp:8'; expected full, framesamp:N"),
+        ("memory", "[]", "memory []; expected full, framesamp:N"),
     ],
 )
 def test_members_of_another_type_are_errors(name: str, value: str, words: str) -> None:
@@ -269,6 +272,15 @@ def test_members_of_another_type_are_errors(name: str, value: str, words: str) -
         make_policy(f"{OWN}changed", [f"name={name}", f"value={value}"])
     assert words in str(raised.value)
     make_policy(f"{OWN}changed", ["name=cameras", 'value=["wrist"]'])  # a list is accepted
+
+
+def test_misspelled_declarations_are_one_error() -> None:
+    """A subclass has defaults, so nothing else would show the slip."""
+    with raises(PolicyError) as raised:
+        make_policy(f"{OWN}Misspelled")
+    for name in ("camera", "memroy"):
+        assert f"an attribute {name}, " in raised.value.message
+    assert "size" not in raised.value.message  # an attribute of the user's own
 
 
 def test_a_file_in_place_of_a_module_is_explained() -> None:

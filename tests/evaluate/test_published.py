@@ -167,7 +167,7 @@ def test_another_prompt_or_option_may_not_carry_the_name(
         given = settings(system, server.url, client / PUBLISHED[system].file)
         with raises(InvalidOptionError) as raised:
             run_one(client / "run", **given | changes)
-        assert "/paper-systems.html" in str(raised.value.hint)
+        assert "/official-simulator.html" in str(raised.value.hint)
         assert not (client / "run").exists()
 
 

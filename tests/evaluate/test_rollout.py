@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.messages import raises
-from support.runs import EPISODE, roll, run
+from support.runs import EPISODE, roll, run, run_one
 from support.worlds import Cheat, World
 
 from robomme_interference_data import load_buffer_set
@@ -63,28 +63,6 @@ def test_a_policy_may_get_only_the_observations_before_actions() -> None:
     assert world.drawn == 2  # after 16 and 32 steps; the 40th ends it
 
 
-def test_history_is_decoded_while_a_simulator_in_another_process_resets(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    decoding, stream = threading.Event(), Buffer.stream
-
-    class Patient(World):
-        remote = True
-
-        def reset(self, episode_id: str, demonstration: bool = True) -> Any:
-            assert decoding.wait(20)
-            return super().reset(episode_id, demonstration)
-
-    def noted(*options: Any) -> Any:
-        decoding.set()
-        yield from stream(*options)
-
-    monkeypatch.setattr(Buffer, "stream", noted)
-    policy = Cheat()
-    assert roll("k1", policy, simulator=Patient(), history_chunk=50).success
-    assert policy.chunks == [(50, 80), (30, 80)]
-
-
 def test_a_cache_that_cannot_be_written_costs_no_rollout(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -96,6 +74,20 @@ def test_a_cache_that_cannot_be_written_costs_no_rollout(
         result = run(tmp_path / "run", conditions=("k0", "k1"), cache=True)
     assert result.counts["success"] == 4
     assert [str(blocked) in str(one.message) for one in messages] == [True]  # once
+
+
+@pytest.mark.parametrize(
+    ("option", "memory", "kept"),
+    [("memory=window", "window:32", 0.5), ("memory=framesamp:32", "framesamp:32", 1)],
+)
+def test_a_policy_of_the_user_declares_its_memory(
+    tmp_path: Path, option: str, memory: str, kept: float
+) -> None:
+    policy = "python:support.own_policies:Remembering"
+    (row,) = run_one(
+        tmp_path / "run", policy=policy, policy_options=(option,), conditions=("k0",)
+    ).rows
+    assert (row.memory, row.evidence_kept) == (memory, kept)
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from support.worlds import World
 from robomme_interference_data.errors import HashMismatchError, RunError, SimulatorCrashError
 from robomme_interference_data.evaluate.rollout import worker
 from robomme_interference_data.evaluate.rollout.worker import StartSimulator
-from robomme_interference_data.evaluate.run.log import read_record
+from robomme_interference_data.evaluate.run.row import read_record
 from robomme_interference_data.evaluate.score.config import Expected, Settings
 from robomme_interference_data.evaluate.score.partners import base_of
 from robomme_interference_data.evaluate.score.scoring import score

@@ -67,6 +67,26 @@ def test_a_server_that_reports_its_checkpoint_needs_no_option(
         run_one(tmp_path / "empty", policy=server.url, policy_options=("checkpoint= ",))
 
 
+# --- which memory ------------------------------------------------------------------------------
+
+
+def test_a_server_declares_its_memory_in_its_metadata(tmp_path: Path, server: PolicyServer) -> None:
+    """Frames 0 to 3 and 31 to 38 of MoveCube's lesson of 48 show the answer."""
+    server.metadata = {"checkpoint": "a", "capabilities": {"memory": "window"}}
+    (row,) = run_one(tmp_path / "run", policy=server.url, conditions=("k0",)).rows
+    assert (row.memory, row.evidence_kept) == ("window:32", 0.5)
+
+
+@pytest.mark.parametrize("declared", ["window", {"memroy": "window"}, {"memory": "windw"}])
+def test_a_misspelled_declaration_of_a_server_is_an_error(
+    tmp_path: Path, server: PolicyServer, declared: Any
+) -> None:
+    server.metadata = {"checkpoint": "a", "capabilities": declared}
+    with raises(PolicyServerError):
+        run_one(tmp_path / "run", policy=server.url, conditions=("k0",))
+    assert not (tmp_path / "run").exists()
+
+
 # --- which kind --------------------------------------------------------------------------------
 
 

@@ -37,8 +37,8 @@ from robomme_interference_data.evaluate.language.subgoal_settings import make_wr
 from robomme_interference_data.evaluate.language.subgoal_writer import OracleWriter
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.evaluate.policies.registry import make_policy
-from robomme_interference_data.evaluate.rollout.checks import check_settings, check_system
-from robomme_interference_data.evaluate.rollout.names import default_system
+from robomme_interference_data.evaluate.rollout.checks import check_settings
+from robomme_interference_data.evaluate.rollout.settings import check_system, default_system
 from robomme_interference_data.evaluate.run.history import HistoryReader
 from robomme_interference_data.runtime.executor import Executor, Serial
 from robomme_interference_data.runtime.process import Processes

@@ -122,7 +122,7 @@ def test_a_chunk_is_given_action_by_action_or_whole() -> None:
 
 
 def test_the_faults_of_its_mme_vla_server() -> None:
-    """docs/how-to/vla-eval.md lists them: it is true as long as this passes."""
+    """docs/how-to/connect-a-policy.md lists them: it is true as long as this passes."""
     server = servers.MmeVlaModelServer()
     with (
         servers.running(server) as port,

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from robomme_interference_data.evaluate import Policy
 from robomme_interference_data.evaluate.policies.websocket import WebsocketPolicy
 
 
@@ -20,6 +21,7 @@ class Still:
     wants_history = False
     privileged = False
     every_frame = False
+    memory = None
 
     def __init__(self, gripper: float = 1.0, worker: int = 0):
         self.action = np.array([[0.0] * 7 + [gripper]], np.float32)
@@ -159,6 +161,28 @@ class Talker(Still):
         sys.stdout.write("closed\n")
         with Path(os.environ["CLOSED"]).open("a") as file:
             file.write(f"{os.getpid()}\n")
+
+
+class Misspelled(Policy):
+    """Declares two things in words that nobody reads."""
+
+    camera = ("front",)
+    memroy = "full"
+    size = 3
+
+    def act(self, observation: Any, goal: str) -> Any:
+        return np.zeros((1, 8), np.float32)
+
+    def metadata(self) -> dict[str, Any]:
+        return {"policy": "misspelled"}
+
+
+class Remembering(Hashing):
+    """Declares a memory, by an option."""
+
+    def __init__(self, memory: str = "window"):
+        super().__init__()
+        self.memory: Any = memory
 
 
 def with_object(name: str = "x", value: Any = sys) -> Still:

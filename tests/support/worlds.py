@@ -144,6 +144,7 @@ class Cheat:
     wants_history = True
     privileged = False
     every_frame = True
+    memory = None
 
     def reset(self, info: RolloutInfo) -> None:
         self.info = info

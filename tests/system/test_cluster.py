@@ -24,7 +24,7 @@ from support.worker_calls import Marked, behave, wait_until_gone
 from robomme_interference_data.build_dataset.dataset.build import build_dataset
 from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan, PlannedEpisode
 from robomme_interference_data.errors import WorkerError
-from robomme_interference_data.evaluate.run.log import read_record
+from robomme_interference_data.evaluate.run.row import read_record
 from robomme_interference_data.runtime.executor import Executor, Serial
 from robomme_interference_data.runtime.progress import WorkProgress
 

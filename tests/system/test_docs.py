@@ -178,6 +178,29 @@ def test_the_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert (tmp_path / "tutorial/score/report.html").is_file()
 
 
+def test_the_demo_ends_with_what_its_rollouts_show(tmp_path: Path) -> None:
+    def write(run: str, *rows: tuple[str, int, str]) -> Path:
+        (tmp_path / run).mkdir()
+        lines = (
+            json.dumps({"family": "MoveCube", "condition": under, "episode": at, "status": status})
+            for under, at, status in rows
+        )
+        (tmp_path / run / "rollouts.jsonl").write_text("\n".join(lines))
+        return tmp_path / run
+
+    framesamp = write(
+        "framesamp",
+        ("k0", 0, "error"),
+        ("k0", 1, "success"),
+        ("k0", 0, "success"),  # the error, tried again
+        ("raw-k7", 0, "timeout"),
+        ("raw-k7", 1, "fail"),
+    )
+    retrieval = write("retrieval", ("raw-k7", 0, "success"), ("raw-k7", 1, "fail"))
+    sentence = DEMO["summary"](framesamp, retrieval)
+    assert re.findall(r"\d+ of \d+", sentence) == ["2 of 2", "0 of 2", "1 of 2"]
+
+
 def example(page: Path, name: str) -> str:
     found = re.search(rf"<!-- example: {name} -->\n```python\n(.*?)```", text_of(page), flags=re.S)
     assert found is not None

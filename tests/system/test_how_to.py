@@ -33,8 +33,11 @@ PAGES = sorted(path.name for path in HOW_TO.glob("*.md"))
 
 NOT_RUN = {
     ("compare-systems.md", "score retrieval_rollouts.csv"): "a file that the paper's authors host",
-    ("lerobot-policy.md", "evaluate "): "a checkpoint; test_evaluate_lerobot.py makes and runs one",
-    ("lerobot-policy.md", "build my-training"): "hours of simulation",
+    (
+        "connect-a-policy.md",
+        "evaluate my-buffers --policy lerobot",
+    ): "a checkpoint; test_evaluate_lerobot.py makes and runs one",
+    ("connect-a-policy.md", "build my-training"): "hours of simulation",
     ("many-machines.md", "evaluate namespace/name --executor ray"): "a cluster; test_cluster.py",
     ("many-machines.md", "index my-buffers --encoder siglip"): "a cluster and 3.5 GB of weights",
     (
@@ -50,9 +53,12 @@ NOT_RUN = {
         "build my-buffers --only distractors",
     ): "RoboMME's recordings; test_source_h5.py",
     ("official-simulator.md", "evaluate my-buffers --simulator robomme"): "the same",
-    ("paper-systems.md", "evaluate "): "released checkpoints and RoboMME; test_systems.py",
-    ("paper-systems.md", "index my-buffers --encoder siglip"): "3.5 GB of weights",
-    ("publish-results.md", "score theirs/rollouts.jsonl"): "results that others published",
+    (
+        "official-simulator.md",
+        "evaluate my-buffers --policy websocket",
+    ): "released checkpoints and RoboMME; test_systems.py",
+    ("official-simulator.md", "index my-buffers --encoder siglip"): "3.5 GB of weights",
+    ("publish.md", "score theirs/rollouts.jsonl"): "results that others published",
     ("train-a-policy.md", "build my-"): "hours of simulation",
     ("train-a-policy.md", "from robomme_interference_data.training"): "test_history_dataset.py",
     ("train-a-policy.md", "score k0.csv"): "hours of training; test_memory_policy.py",
@@ -61,14 +67,14 @@ NOT_RUN = {
     ("train-a-policy.md", "evaluate my-buffers --policy python"): "hours of training",
     ("train-a-policy.md", "build demo/buffers --only executions"): "test_memory_policy.py",
     ("train-a-policy.md", "evaluate demo/buffers"): "test_memory_policy.py trains and evaluates",
-    ("vla-eval.md", "evaluate my-buffers --policy vla-eval"): "a server; test_vla_eval.py",
-    ("vla-eval.md", "score results/*_aggregate.json"): "vla-eval's results; its own test",
+    ("connect-a-policy.md", "evaluate my-buffers --policy vla-eval"): "a server; test_vla_eval.py",
+    ("connect-a-policy.md", "score results/*_aggregate.json"): "vla-eval's results; its own test",
     ("your-own-policy.md", "evaluate my-buffers --policy lerobot"): "a checkpoint",
     ("your-own-policy.md", "evaluate my-buffers --policy hold"): "executions; test_offline.py",
     ("your-own-policy.md", "evaluate my-buffers --policy mean"): "executions; test_offline.py",
     ("your-own-policy.md", "score runs/offline"): "rows of that checkpoint; test_offline.py",
     ("your-own-policy.md", "from pathlib import Path"): "starts processes; test_run.py",
-    ("publish-buffers.md", "from datasets import load_dataset"): "reads the Hub; test_cards.py",
+    ("publish.md", "from datasets import load_dataset"): "reads the Hub; test_cards.py",
     ("another-benchmark.md", "from robomme_interference_data.simulators"): "an outline, not code",
 }
 """What pages show and this test does not run: page, beginning of the step, and why. It must shrink:
@@ -121,7 +127,7 @@ def recorded(folder: Path) -> None:
 
 PREPARED: dict[str, Callable[[Path], None]] = {
     "another-benchmark.md": nothing,
-    "publish-buffers.md": recorded,
+    "publish.md": recorded,
     "retrieval.md": nothing,
     "train-a-policy.md": trained,
     "vision-language-model.md": asked,
@@ -132,7 +138,7 @@ PREPARED: dict[str, Callable[[Path], None]] = {
 
 BEFORE = {
     "many-machines.md": "evaluate my-buffers --policy replay --out runs/shard-1 --shard 1/8",
-    "publish-results.md": "evaluate my-buffers --policy replay --out my-run --episodes 0",
+    "publish.md": "evaluate my-buffers --policy replay --out my-run --episodes 0",
 }
 """Runs that a page starts from."""
 

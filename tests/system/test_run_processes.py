@@ -29,7 +29,7 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.evaluate import run_evaluation
 from robomme_interference_data.evaluate.policies.process import policy_processes
 from robomme_interference_data.evaluate.policies.shared import SharedPolicy
-from robomme_interference_data.evaluate.run.log import read_record
+from robomme_interference_data.evaluate.run.row import read_record
 from robomme_interference_data.runtime.process import Processes
 
 pytestmark = pytest.mark.usefixtures("world")

@@ -17,7 +17,7 @@ from robomme_interference_data import load_buffer_set
 from robomme_interference_data.evaluate import Observation, Policy, RolloutInfo
 from robomme_interference_data.evaluate.rollout.rollout import run_rollout
 from robomme_interference_data.evaluate.run.plan import WorkItem
-from robomme_interference_data.evaluate.run.runner import RunContext
+from robomme_interference_data.evaluate.run.worker import RunContext
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.retrieval.selector import Selector

@@ -26,7 +26,7 @@ from robomme_interference_data.storage.files import parse_json, read_bytes, read
 from .values import record_schema
 
 if TYPE_CHECKING:
-    from robomme_interference_data.evaluate.run.header import RunHeader
+    from robomme_interference_data.evaluate.run.log import RunHeader
 
 _REQUIRED = ("family", "condition", "episode", "status", "success")
 _RELEASED_NAMES = {"variant": "system", "retrieval_model": "retrieval"}
@@ -70,7 +70,7 @@ def find_sources(paths: Sequence[Path]) -> "dict[Path, RunHeader | None]":
 
 def _read_run_header(path: Path) -> "RunHeader":
     # Files of rows alone do without runs.
-    from robomme_interference_data.evaluate.run.header import RunHeader
+    from robomme_interference_data.evaluate.run.log import RunHeader
 
     return read_header(path, RunHeader)
 
@@ -151,7 +151,14 @@ def _read_parquet(path: Path, names: Sequence[str], has_system: bool) -> FileCol
 
 def _read_csv(path: Path, names: Sequence[str], has_system: bool) -> FileColumns:
     text = read_bytes(path, MAX_ROW_BYTES).removeprefix(codecs.BOM_UTF8).decode()
-    csv.field_size_limit(len(text) + 1)
+    before = csv.field_size_limit(len(text) + 1)  # of the whole process
+    try:
+        return _parse_csv(path, text, names, has_system)
+    finally:
+        csv.field_size_limit(before)
+
+
+def _parse_csv(path: Path, text: str, names: Sequence[str], has_system: bool) -> FileColumns:
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows: dict[int, list[str]] = {}
     malformed: dict[int, str] = {}
@@ -181,7 +188,7 @@ def _read_record(path: Path, names: Sequence[str], has_system: bool) -> FileColu
 
     The types are those of a rollout's row; a row object for each line would take ten times as long.
     """
-    from robomme_interference_data.evaluate.run.header import whole_lines
+    from robomme_interference_data.evaluate.run.row import whole_lines
 
     data = whole_lines(path)
     if not data:
@@ -258,7 +265,8 @@ def _read_vla_eval(path: Path, names: Sequence[str], has_system: bool) -> FileCo
     except (KeyError, TypeError, AttributeError, IndexError):
         raise FormatError(
             f"{path} holds no results of this benchmark in vla-eval",
-            "Expected a file of `vla-eval run` or `vla-eval export`: see docs/how-to/vla-eval.md.",
+            "Expected a file of `vla-eval run` or `vla-eval export`: "
+            "see docs/how-to/connect-a-policy.md.",
         ) from None
     columns = {name: [row[at] for row in rows.values()] for at, name in enumerate(names)}
     return FileColumns(columns, list(rows), malformed)

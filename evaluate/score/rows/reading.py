@@ -22,7 +22,7 @@ from .files import FileColumns, find_sources, read_file, system_of
 from .values import DEFAULTS, Row, parse, shifted
 
 if TYPE_CHECKING:
-    from robomme_interference_data.evaluate.run.header import RunHeader
+    from robomme_interference_data.evaluate.run.log import RunHeader
 
 _SHOWN = 10  # bad rows that are listed; the others are counted
 

@@ -73,7 +73,6 @@ class RoboMMESimulator(Simulator):
     action_names = VALUE_NAMES
     name = "robomme"
     about = "the official simulator, RoboMME"
-    remote = True
     settings = ("cameras", "python", "subgoals", "answer_s")
     own_episodes = True
     try_out = False

@@ -1,9 +1,11 @@
-"""The label of a run's rows: the default one, and whether a name fits what is run."""
+"""The settings of rollouts: completed, and checked as far as no policy or server is needed."""
 
+import dataclasses
 import re
 
-from robomme_interference_data.constants import ORACLE
+from robomme_interference_data.constants import ORACLE, RECORDINGS
 from robomme_interference_data.errors import InvalidOptionError, named
+from robomme_interference_data.evaluate import optional
 from robomme_interference_data.evaluate.policies.capabilities import PolicyKind, Role
 from robomme_interference_data.evaluate.policies.registry import (
     POLICIES,
@@ -11,10 +13,39 @@ from robomme_interference_data.evaluate.policies.registry import (
     policy_memory,
     policy_options,
 )
-from robomme_interference_data.evaluate.run.config import RunConfig, with_retrieval
-from robomme_interference_data.evaluate.systems import SYSTEMS, System
+from robomme_interference_data.evaluate.run.config import RunConfig, check_unused, with_retrieval
+from robomme_interference_data.evaluate.systems import SYSTEMS, System, name_system
 from robomme_interference_data.retrieval.select import Rule
 from robomme_interference_data.schema.sampling import Memory
+
+_OF_SIMULATORS = ("simulator", "shift", "check_lesson", "videos")
+"""Settings without effect along recordings."""
+
+
+def complete_settings(config: RunConfig) -> tuple[RunConfig, System]:
+    """Return the settings with what follows from them, and the system of the label of their rows.
+
+    Models on the Hub get their commit, which is the same for all workers; the writer of subgoals
+    gets the options of a published system; an offline run gets the simulator of recordings.
+
+    Raises:
+        InvalidOptionError: Settings contradict each other, or the system that the label means.
+    """
+    if config.offline:
+        check_unused(config, _OF_SIMULATORS, "an offline evaluation", "Leave it out.")
+        if config.subgoals == ORACLE:
+            raise InvalidOptionError(
+                f"subgoals of {ORACLE} need a simulator",
+                f"Set a model, or leave out {named('offline')}.",
+            )
+        config = dataclasses.replace(config, simulator=RECORDINGS)
+    label = config.system or default_system(config)
+    config = dataclasses.replace(config, policy=POLICIES.pin(config.policy))
+    if config.subgoals is not None:
+        subgoals = optional.pin_subgoals(config.subgoals)
+        config = optional.with_published(dataclasses.replace(config, subgoals=subgoals))
+    check_system(config, label)
+    return config, name_system(label)
 
 
 def default_system(config: RunConfig) -> str:
@@ -29,7 +60,7 @@ def default_system(config: RunConfig) -> str:
         raise InvalidOptionError(
             f"the rows of {unidentified} need a name: its text does not identify it",
             f"Set {named('system')}, such as perceptual-framesamp-modul, or a name of your own: "
-            "see docs/how-to/paper-systems.md.",
+            "see docs/how-to/official-simulator.md.",
         )
     memory = policy_memory(config.policy)
     parts = [spec.target if memory is None else Memory.parse(memory).label]
@@ -55,12 +86,19 @@ def _option_labels(config: RunConfig, kind: PolicyKind) -> list[str]:
     ]
 
 
-def check_name(config: RunConfig, system: System) -> None:
+def check_system(config: RunConfig, system: str) -> None:
+    """Check that policy and subgoals are those that a label of rows means, and fit each other."""
+    _check_name(config, name_system(system))
+    _check_subgoals(config)
+
+
+def _check_name(config: RunConfig, system: System) -> None:
     """Reject the name of a published system or control for a run of another one."""
     fault = _fault_of_name(config, system)
     if fault is not None:
         raise InvalidOptionError(
-            fault, f"Set {named('system')} to a name of your own: see docs/how-to/paper-systems.md."
+            fault,
+            f"Set {named('system')} to a name of your own: see docs/how-to/official-simulator.md.",
         )
 
 
@@ -97,3 +135,21 @@ def _fault_of_published_name(config: RunConfig, kind: PolicyKind, system: System
     if has_step and Rule.parse(config.retrieval_rule).method != "max":
         return f"the retrieval step of {system.name} has the rule max, not {config.retrieval_rule}"
     return None
+
+
+def _check_subgoals(config: RunConfig) -> None:
+    """Reject subgoals that no policy reads, and settings of them without effect."""
+    for name in ("subgoal_prompt", "subgoal_options"):
+        if getattr(config, name) and config.subgoals in (None, ORACLE):
+            raise InvalidOptionError(
+                f"{named(name)} has no effect without a model that writes subgoals",
+                'Set subgoals="openai:URL#MODEL", or leave it out.',
+            )
+    if config.subgoals is None:
+        return
+    if not policy_kind(config.policy).reads_subgoals:
+        able = [name for name, kind in POLICIES.kinds.items() if kind.reads_subgoals]
+        raise InvalidOptionError(
+            f"the policy {config.policy} reads no subgoals",
+            f"Set {named('policy')} to {', '.join(able)}, or leave out {named('subgoals')}.",
+        )

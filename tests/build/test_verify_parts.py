@@ -1,0 +1,57 @@
+"""`verify` of what is not yet, or not only, a buffer set: datasets without manifests."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.buffer_sets import build
+
+from robomme_interference_data.build_dataset.sources.sample import SampleSource
+
+
+@pytest.mark.parametrize(
+    ("gone", "following"),
+    [
+        (("manifests",), "--only manifests"),
+        (("manifests", "distractors"), "--only distractors --source KIND:PATH"),
+        (("manifests", "demonstrations"), "--only demonstrations --source KIND:PATH"),
+    ],
+)
+def test_what_is_there_is_verified(
+    gone: tuple[str, ...], following: str, own_buffers: Path, run: Any
+) -> None:
+    for name in gone:
+        shutil.rmtree(own_buffers / name)
+    code, out, err = run("verify", own_buffers, "--json")
+    error = json.loads(err.splitlines()[-1])
+    assert (code, json.loads(out)) == (1, {"violations": []})
+    assert error["type"] == "MissingFileError"
+    assert error["command"] == f"robomme-interference build {own_buffers} {following}"
+    kept = "demonstrations" if "distractors" in gone else "distractors"
+    path = next((own_buffers / kept).glob("data/*/*.parquet"))
+    path.write_bytes(path.read_bytes()[:-1])
+    code, out, _ = run("verify", own_buffers, "--no-decode", "--json")
+    found = {violation["where"] for violation in json.loads(out)["violations"]}
+    assert code == 1 and str(path.relative_to(own_buffers)) in found
+
+
+def test_damaged_metadata_and_files_of_nobody(own_buffers: Path, run: Any) -> None:
+    shutil.rmtree(own_buffers / "manifests")
+    (own_buffers / "notes.txt").write_text("mine")
+    (own_buffers / "distractors/meta/interference.json").write_text("{}")
+    code, out, _ = run("verify", own_buffers, "--no-decode", "--json")
+    found = {violation["where"] for violation in json.loads(out)["violations"]}
+    assert code == 1 and found == {"notes.txt", "distractors"}
+
+
+def test_a_dataset_without_buffers_is_one_violation(own_buffers: Path, run: Any) -> None:
+    source = SampleSource(size=32)
+    build(own_buffers, "executions", source, families=("MoveCube",), split="test", numbers=(0,))
+    code, out, _ = run("verify", own_buffers, "--no-decode", "--json")
+    [violation] = json.loads(out)["violations"]
+    assert code == 1 and violation["where"] == "executions"
+    assert f"build {own_buffers} --only manifests" in violation["what"]
+    assert run("build", own_buffers, "--only", "manifests")[0] == 0
+    assert run("verify", own_buffers, "--no-decode")[0] == 0
