@@ -226,6 +226,20 @@ def test_nobody_whose_rollouts_all_broke_has_a_rate(tmp_path: Path) -> None:
     assert "a in" not in rates.text and "1 broke" in lacking.text
 
 
+def test_a_fall_whose_interval_holds_0_is_not_called_below(tmp_path: Path) -> None:
+    """Of three tests, alpha's p of 0.031 is the largest, and its interval has a level of 98.3%."""
+    given = {
+        ("alpha", "k0"): "s" * 14 + "f" * 46,
+        ("alpha", "k7"): "f" * 14 + "s" * 4 + "f" * 42,
+        ("beta", "k0"): "s" * 60,
+        ("beta", "k7"): "f" * 60,
+    }
+    _, falls, *_ = sentences(tmp_path, given)
+    alpha, beta = falls.text.split("; ")
+    assert "alpha's k7 minus its own k0 is \N{MINUS SIGN}16.7 points" in alpha
+    assert " to +" in alpha and "p = 0.031" in alpha and "points below" in beta
+
+
 def test_no_more_sessions_than_k7_are_primary(tmp_path: Path) -> None:
     given = {("a", name): "sfsf" for name in ("k0", "k7", "k31")}
     rates, falls, _ = sentences(tmp_path, given)

@@ -56,6 +56,12 @@ def _finding(fall: Fall, compared: int) -> Sentence:
     """State what is concluded about one system, with its numbers."""
     row, name = fall.row, display_name(fall.system)
     match fall.finding:
+        # Holm's p can be below 0.05 where Bonferroni's interval, which is wider, holds 0.
+        case Finding.FALL | Finding.RISE if not _excludes_zero(row):
+            text = (
+                "{finding}: {name}'s {condition} minus its own {against_condition} is {difference} "
+                "points ({interval}{p})"
+            )
         case Finding.FALL:
             text = (
                 "a fall is shown: {name}'s {condition} is {joint_high:size} to {joint_low:size} "
@@ -87,7 +93,13 @@ def _finding(fall: Fall, compared: int) -> Sentence:
                 text += ", and up to {joint_low:size} points is not excluded"
             text += " ({interval}{p})"
     level = _level(compared)
-    return say(text, row, name=name, p=p_of(row), level=level, interval=_interval(row, level))
+    words = {"finding": fall.finding, "name": name, "level": level}
+    return say(text, row, p=p_of(row), interval=_interval(row, level), **words)
+
+
+def _excludes_zero(row: TableRow) -> bool:
+    low, high = row["joint_low"], row["joint_high"]
+    return low is not None and (low > 0 or high < 0)
 
 
 def _level(compared: int) -> str:
