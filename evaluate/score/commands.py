@@ -167,9 +167,9 @@ def power(
     flips: Annotated[
         float,
         typer.Option(
-            help="Share of the episodes that differs between two systems; between two learned "
-            "ones it is 22 to 46% (docs/results/training.md), between two runs of one system 6 to "
-            "8%."
+            help="Share of the episodes that differs between two systems of equal rates; of the "
+            "learned ones in docs/results/training.md 9 to 44% do at k0, between two runs of one "
+            "system 6 to 8%."
         ),
     ] = 0.25,
     difference: Annotated[

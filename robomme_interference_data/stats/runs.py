@@ -18,6 +18,9 @@ from .intervals import LEVEL
 MIN_RUNS = 3
 """Training runs from which intervals and tests hold for other runs of the same training."""
 
+_LEAST = 0.25
+"""Least share of the variance between runs that is theirs, not the noise of single rollouts."""
+
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 
 
@@ -88,9 +91,10 @@ def run_spread(values: Floats) -> RunSpread:
     """Return the spread over training runs of values, `(E, R) float64`, NaN where missing.
 
     With the variance s² of the runs' means over n episodes and the residual variance r of episodes
-    and runs, the runs add max(0, s² − r / n) / R, with R − 1 degrees of freedom: the noise of
-    single rollouts is in the interval over episodes already. Episodes that a run lacks are left
-    out.
+    and runs, the runs add max(s² / 4, s² − r / n) / R, with R − 1 degrees of freedom: the noise of
+    single rollouts is in the interval over episodes already. At least a quarter of s², because
+    three runs are often alike by chance: without it, tests of three runs reject too often, 7%.
+    Episodes that a run lacks are left out.
 
     Source: components of variance of two crossed random effects, Searle (1971), Linear Models,
     chapter 9.
@@ -107,7 +111,7 @@ def run_spread(values: Floats) -> RunSpread:
         return RunSpread(runs, deviation)
     residuals = values - means - values.mean(axis=1, keepdims=True) + values.mean()
     noise = float((residuals**2).sum()) / ((runs - 1) * (n - 1))
-    variance = max(0.0, spread - noise / n) / runs
+    variance = max(_LEAST * spread, spread - noise / n) / runs
     if variance < 1e-18:  # equal means can differ in the last digits
         return RunSpread(runs, deviation)
     return RunSpread(runs, deviation, variance, runs - 1)
