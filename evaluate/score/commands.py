@@ -70,7 +70,7 @@ def score(
     from robomme_interference_data.runtime.memory import memory_limit
     from robomme_interference_data.viz.tables import tables_text
 
-    from .report.page import headlines
+    from .report.headline import headlines
     from .scoring import score as compute
     from .writing import write_score
 

@@ -15,7 +15,7 @@ from .config import Against, Expected, Settings
 from .outcomes import Outcomes, offline_outcomes, outcomes_of
 from .partners import base_of, ceilings_of
 from .rows.reading import CheckedRows, read_rows
-from .tables import effects, families, ranks, slopes
+from .tables import effects, families, family_falls, ranks, slopes
 from .tables.cells import SuccessCell, cells_of, main_table, parts_table
 from .tables.contrast import Contrast
 from .tables.correction import correct, with_primary
@@ -35,6 +35,7 @@ TABLES = (
     "evidence_use",
     "decay",
     "families",
+    "family_falls",
     "matrix",
     "action_error",
     "action_error_effects",
@@ -109,7 +110,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     compared, unpaired = _compared(simulated, draws)
     contrasts = correct(with_primary(compared, simulated))
     notes = [*rows.notes, *unpaired]
-    notes += [sentence for each in simulated if (sentence := _repeat_noise(each))]
+    notes += [sentence for each in simulated if (sentence := repeat_noise(each))]
     tables = [
         main_table(cells),
         parts_table(cells),
@@ -117,6 +118,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         slopes.interaction_table(contrasts),
         slopes.decay_table(simulated, draws),
         families.families_table(simulated, contrasts),
+        family_falls.family_falls_table(simulated, contrasts),
         ranks.matrix_table(contrasts),
         cost_table(rows, cells),
     ]
@@ -212,7 +214,7 @@ def _compared(all_outcomes: Sequence[Outcomes], draws: int) -> tuple[list[Contra
     return contrasts, notes
 
 
-def _repeat_noise(outcomes: Outcomes) -> str:
+def repeat_noise(outcomes: Outcomes) -> str:
     """Return a sentence on how often two repeats of a rollout disagree; empty without repeats."""
     pairs, flips = outcomes.repeat_flips
     if not pairs:

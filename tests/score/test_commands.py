@@ -70,7 +70,7 @@ def test_score_and_export_on_the_command_line(
     beyond |= {"action_error", "action_error_effects"}  # nor offline
     assert {path.stem for path in (out / "tables").glob("*.csv")} == {*TABLES} - beyond
     drawn = sorted(path.name for path in (out / "figures").iterdir())
-    kinds = ("difficulty", "effects", "families", "heatmap", "retrieval", "success")
+    kinds = ("difficulty", "effects", "families", "family_falls", "heatmap", "retrieval", "success")
     assert drawn == [f"{kind}-robomme.svg" for kind in kinds]
     # The released rows come back byte for byte.
     (exported,) = (tmp_path / "export").iterdir()

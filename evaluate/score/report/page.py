@@ -30,13 +30,13 @@ from robomme_interference_data.storage.files import sha256_file, write_text
 from robomme_interference_data.viz.tables import Table
 from robomme_interference_data.viz.templates import fill
 
-from .headline import headline
-from .strongest import strongest
+from .primary import screens
 
 _LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
 """Libraries that numbers and figures depend on."""
 
 _SHOWN_IN = {
+    "family_falls": ("family_falls", "families"),
     "effects": ("effects",),
     "success": ("main", "paper"),
     "families": ("parts",),
@@ -54,6 +54,12 @@ _SHOWN_IN = {
 }
 """Figure to the tables with its numbers."""
 
+EXPLORATORY = (
+    "Everything below is exploratory: it is corrected within a table at most, not over all tables, "
+    "so that reports without any effect often hold a finding in some table. Take it as a question "
+    "for the next run."
+)
+
 _GRIDS = {
     Expected.BENCHMARK: "the benchmark's: nine families, test episodes 0 to 49 each",
     Expected.OBSERVED: "those that occur in any row",
@@ -66,10 +72,11 @@ def write_report(
     """Write the page: the same bytes for the same rows, options and command."""
     names = {name for outcomes in score.all_outcomes for name in outcomes.conditions}
     conditions = [condition.name for condition in in_order(names)] if names else []
+    shown = screens(score)
     values = {
-        "headlines": headlines(score),
-        "strongest": {name: strongest(score, name) for name in _simulators(score)},
-        "grids": score.grids,
+        "screens": shown,
+        "exploratory": EXPLORATORY,
+        "primary_figures": {name for screen in shown for name in screen.figures},
         "tables": score.tables.values(),
         "systems": _names(score),
         "known": {name: system.display for name, system in SYSTEMS.items()},
@@ -86,15 +93,6 @@ def write_report(
     }
     html = fill(__package__, "report.html.j2", values, what="the report", autoescape=True)
     write_text(out, html)
-
-
-def headlines(score: Score) -> dict[str, str]:
-    """Return the main finding of each simulator, and of recordings."""
-    return {name: headline(score, name) for name in _simulators(score)}
-
-
-def _simulators(score: Score) -> list[str]:
-    return [outcomes.simulator for outcomes in score.all_outcomes]
 
 
 def _number(text: str) -> str:
