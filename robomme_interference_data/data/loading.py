@@ -118,8 +118,11 @@ def built_datasets(root: Path) -> tuple[str, ...]:
 
 
 def next_build(root: Path) -> str:
-    """Return the command that builds what a buffer set in a folder lacks first."""
-    built = built_datasets(root)
+    """Return the command that builds what a buffer set in a folder lacks first.
+
+    If it has manifests, its demonstrations may be on the Hub, and the manifests are built again.
+    """
+    built = DATASETS if (root / MANIFEST_PATH).is_file() else built_datasets(root)
     for name in (DEMONSTRATIONS, DISTRACTORS):
         if name not in built:
             return shlex.join(["build", str(root), "--only", name, "--source", "KIND:PATH"])
