@@ -10,7 +10,7 @@ from robomme_interference_data.stats.significance import ALPHA, poisson_binomial
 from robomme_interference_data.viz.tables import Columns, Table
 
 from .cells import SuccessCell
-from .comparison import corrected
+from .correction import corrected
 
 _NOTE = (
     "For cells whose episodes are all questions with a known chance (1 / options), chance: the "
