@@ -237,6 +237,19 @@ def test_looks_spend_the_level() -> None:
     assert alone.power - 0.06 < often.power < alone.power + 0.02
     done = run("power", "--flips", "0.06", "--looks", "5")
     last = done.stdout.splitlines()[-1]
-    assert last.split() == "look 5 after 450 episodes: significant if p holm is below 0.042".split()
+    assert last.split() == [
+        "look",
+        "5",
+        "after",
+        "450",
+        "episodes:",
+        "significant",
+        "if",
+        "p",
+        "holm",
+        "is",
+        "below",
+        "0.042",
+    ]
     with raises(InvalidOptionError):
         plan(0.05, 450, 0.06, looks=21)
