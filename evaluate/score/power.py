@@ -30,8 +30,8 @@ POWER = 0.8
 FLIPS = 0.25
 """Share of the episodes that flips between two learned systems of equal rates.
 
-The trained systems of docs/results/training differ in 9 to 44% of the episodes under k0, half of
-the pairs in 27% or more; two runs of one released system in 6 to 8%.
+The trained systems of docs/results/training differ in 9 to 44% of the episodes under k0; two runs
+of one released system in 6 to 8%.
 """
 
 MAX_RUNS = 100

@@ -11,6 +11,8 @@ from robomme_interference_data.evaluate.run.worker import RunContext
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId
 
+pytestmark = pytest.mark.usefixtures("world")
+
 
 @pytest.mark.parametrize(
     ("given", "metadata", "recorded"),

@@ -214,7 +214,7 @@ def test_what_cannot_be_exported_is_refused_before_anything_is_written(tmp_path:
     given = ("score", path, "--lenient", "--out", tmp_path / "o", "--export", tmp_path / "e")
     done = run(*given)
     assert isinstance(done.exception, InvalidOptionError)
-    for reason in ("2 model seeds", "1 rows of train or val episodes", "1 bad rows"):
+    for reason in ("2 seeds of training or model", "1 rows of train or val episodes", "1 bad rows"):
         assert reason in str(done.exception)
     assert files(tmp_path) == {"a.csv"}
 

@@ -20,7 +20,7 @@ PRIMARY_CONDITION = "k7"
 
 PRIMARY_GROUP = "primary"
 
-NULL_FINDINGS = "26% (95% interval 20 to 32%) of 200 simulated reports of three systems"
+NULL_FINDINGS = "26% (95% interval 20 to 32%) of simulated reports of three systems"
 """Reports without any effect that hold a finding in some table: see benchmarks/null_scores.py."""
 
 
