@@ -36,9 +36,9 @@ from robomme_interference_data.build_dataset.sources import (
     open_source,
 )
 from robomme_interference_data.constants import CAMERA_PREFIX, DEMONSTRATIONS, FPS
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Executor, Serial, Worker
 from robomme_interference_data.runtime.process import Processes
-from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.storage.arrays import FeatureDigests
 from robomme_interference_data.storage.encode import Codec, VideoEncoder, get_codec
 

@@ -34,11 +34,11 @@ from manifests import write_dataset, written
 
 from robomme_interference_data import Dataset, load_buffer_set
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, INFO_PATH, RECORDS_PATH
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.retrieval.encoders import Encoder, make_encoder
 from robomme_interference_data.retrieval.grade import cells, grade
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.select import Rule, choose, measure
-from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.storage.files import LocalFiles, read_json, write_json
 
 QUIET = WorkProgress(quiet=True)

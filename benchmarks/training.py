@@ -45,9 +45,9 @@ def main() -> None:
     parser.add_argument("--rounds", type=positive, default=3)
     args = parser.parse_args()
     root = args.buffer_set or demo_buffers()
-    with tempfile.TemporaryDirectory() as store:
+    with tempfile.TemporaryDirectory() as cache:
         buffer_set = load_buffer_set(root)
-        options = {"chunk": 0, "store": store, "quiet": True}
+        options = {"chunk": 0, "cache": cache, "quiet": True}
         data = HistoryDataset(buffer_set, ["k7"], image_size=args.image_size, **options)
         large = HistoryDataset(buffer_set, ["k7"], **options)
         count = len(data)

@@ -122,7 +122,7 @@ def _build_datasets(plans: "Mapping[str, DatasetPlan]", config: BuildConfig) -> 
 
 
 def _build_dataset(plan: "DatasetPlan", out: Path, workers: WorkersConfig) -> dict[str, Any]:
-    from robomme_interference_data.runtime.progress import WorkProgress
+    from robomme_interference_data.progress import WorkProgress
 
     from .dataset.build import build_dataset
 
@@ -152,7 +152,7 @@ def _plan_buffers(
     root: Path, files: "Mapping[str, Files]", change: "NextBuffers"
 ) -> dict[str, Any]:
     from robomme_interference_data.data.loading import load_buffer_set
-    from robomme_interference_data.runtime.progress import WorkProgress
+    from robomme_interference_data.progress import WorkProgress
 
     from .manifests import plan_manifests, write_manifests
 
@@ -175,7 +175,7 @@ def _plan_buffers(
 
 def _make_questions(root: Path) -> dict[str, Any]:
     from robomme_interference_data.data.loading import load_buffer_set
-    from robomme_interference_data.runtime.progress import WorkProgress
+    from robomme_interference_data.progress import WorkProgress
 
     from .plan.planned import check_is_own
     from .questions import make_questions, write_questions

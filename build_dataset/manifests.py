@@ -29,8 +29,8 @@ from robomme_interference_data.constants import (
     UNITS,
 )
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.data.manifest_table import pending_rows
 from robomme_interference_data.data.query_sessions import QuerySessions, SessionSource
+from robomme_interference_data.data.set_files import pending_rows
 from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError, named
 from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, Condition, in_order

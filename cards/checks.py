@@ -8,7 +8,7 @@ from robomme_interference_data.build_dataset.verify.audit import audit_buffer_se
 from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import PublishError, counted
-from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.storage.files import LocalFiles, with_filename
 
 _EXTRAS = {"build": ("lerobot", "datasets"), "score": ("jinja2", "matplotlib")}

@@ -144,7 +144,7 @@ def publish(
     """
     from robomme_interference_data.constants import DEMONSTRATIONS, INDEX_DIR
     from robomme_interference_data.data.loading import load_buffer_set
-    from robomme_interference_data.runtime.progress import WorkProgress
+    from robomme_interference_data.progress import WorkProgress
 
     from .buffer_set_content import BufferSetContent, plan_buffer_set, publish_buffer_set
     from .checks import check_buffer_set, missing_extras

@@ -8,6 +8,7 @@ sys.path.insert(0, str(Path(__file__).parent / "_ext"))
 
 project = "robomme-interference-data"
 author = "The RoboMME-Interference authors"
+project_copyright = "2026, the RoboMME-Interference authors. Apache-2.0"
 version = release = metadata.version(project)
 
 extensions = [
@@ -37,7 +38,7 @@ napoleon_use_rtype = False
 
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 3
-nb_execution_mode = "off"  # tests/system/test_tutorial.py executes the tutorial
+nb_execution_mode = "off"  # tests/system/test_docs.py executes the tutorial
 copybutton_prompt_text = r">>> |\$ "
 copybutton_prompt_is_regexp = True
 suppress_warnings = ["mystnb.unknown_mime_type"]

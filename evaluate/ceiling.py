@@ -21,7 +21,8 @@ from robomme_interference_data.schema.shifts import NO_SHIFT, parse_shift
 from robomme_interference_data.simulators.registry import recorded_scene
 from robomme_interference_data.viz.tables import Table
 
-from .run.config import CeilingConfig, check_retrieval, nothing_to_retrieve, with_camera
+from .run.config import CeilingConfig, check_retrieval, with_camera
+from .run.plan import nothing_to_retrieve
 
 _Kept = tuple[float | None, float | None]
 """Share of the evidence that a memory keeps, and the ideal observer's chance."""

@@ -24,21 +24,14 @@ from robomme_interference_data.cli.options import (
     QueryName,
     with_settings,
 )
-from robomme_interference_data.constants import (
-    DEMONSTRATIONS,
-    EXECUTIONS,
-    IDENTITY_PATH,
-    MANIFEST_PATH,
-)
-from robomme_interference_data.errors import InvalidOptionError, MissingFileError, counted, named
+from robomme_interference_data.constants import DEMONSTRATIONS, MANIFEST_PATH
+from robomme_interference_data.errors import InvalidOptionError, counted, named
 from robomme_interference_data.runtime.executor import Serial, WorkersConfig, make_executor
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
 
 from .config import ENCODER_HELP, RETRIEVAL, IndexConfig
 
 if TYPE_CHECKING:
-    from robomme_interference_data.data.buffer_set import BufferSet
-
     from .select import Similarities
 
 _CALIBRATION = "Calibration"
@@ -74,23 +67,14 @@ def index(
     ```
     """
     from robomme_interference_data.data.loading import load_buffer_set
-    from robomme_interference_data.runtime.progress import WorkProgress
+    from robomme_interference_data.progress import WorkProgress
     from robomme_interference_data.schema.codec import to_dict
 
     from .encoders import make_encoder
-    from .index import build_index, look_on_hub
+    from .index import build_index, datasets_to_index, look_on_hub
 
-    folder = Path(buffer_set)
-    paths = [folder / IDENTITY_PATH, *sorted(folder.glob(f"*/{IDENTITY_PATH}"))]
-    roots = [path.parent.parent for path in paths if path.is_file()]
-    roots = [root for root in roots if root == folder or root.name != EXECUTIONS]
-    if not roots:
-        raise MissingFileError(
-            f"{buffer_set} is neither a buffer set nor a dataset of this package",
-            "Build one first:",
-            f"build {buffer_set} --source KIND:PATH",
-        )
-    planned = load_buffer_set(buffer_set) if (folder / MANIFEST_PATH).is_file() else None
+    roots = datasets_to_index(buffer_set)
+    planned = load_buffer_set(buffer_set) if (buffer_set / MANIFEST_PATH).is_file() else None
     if planned is not None:
         planned.check_is_whole()
     image_encoder = make_encoder(config.encoder, device=config.device, batch=config.batch)
@@ -230,10 +214,12 @@ def retrieval_score(
     ```
     """
     from robomme_interference_data.data.loading import load_buffer_set
+    from robomme_interference_data.progress import WorkProgress
     from robomme_interference_data.schema.codec import to_dict
     from robomme_interference_data.storage.files import write_text
 
     from . import charts, encoders, grade, select
+    from .measure import measure_all
 
     check_output(out)
     name = encoders.encoder_name(encoder)
@@ -241,7 +227,29 @@ def retrieval_score(
     parsed = select.parse_rules(rules, encoders.published_threshold(name))
     opened = load_buffer_set(buffer_set)
     camera = opened.datasets[DEMONSTRATIONS].camera(camera)
-    about, measured = _measured(opened, name, camera, shift, families, conditions, as_json)
+    with WorkProgress(unit="buffers", quiet=as_json) as progress:
+        measured, left_out = measure_all(
+            opened,
+            name,
+            camera,
+            parse_shift(shift),
+            families=families,
+            conditions=conditions,
+            progress=progress,
+        )
+    if left_out and not as_json:
+        print_status(
+            f"{left_out} of {left_out + len(measured)} buffers hold no lesson and are left out"
+        )
+    about: dict[str, Any] = {
+        "buffer_set": opened.name,
+        "revision": opened.revision,
+        "encoder": name,
+        "camera": camera,
+        "shift": shift,
+        "buffers": len(measured),
+        "left_out": left_out,
+    }
     if calibrate:
         _calibrate(name, measured, about, sweep, out, as_json=as_json)
         return
@@ -253,8 +261,8 @@ def retrieval_score(
     if len(parsed) == 1:
         title += f", rule {parsed[0]}"
     if out is not None:
-        write_text(out / "cells.csv", _csv(grade.Cell, cells))
-        write_text(out / "rows.csv", _csv(grade.Grade, grades))
+        write_text(out / "cells.csv", grade.as_csv(grade.Cell, cells))
+        write_text(out / "rows.csv", grade.as_csv(grade.Grade, grades))
         charts.draw_cells(cells, title, out / "retrieval.png")
         print_status(f"{out / 'cells.csv'}, rows.csv and retrieval.png written")
     if as_json:
@@ -262,17 +270,6 @@ def retrieval_score(
         print_json(about | {"cells": [to_dict(cell) for cell in cells]})
     else:
         echo(f"{grade.cell_table(cells, title).text()}\n\n{grade.verdict(cells)}.")
-
-
-def _csv(record: type, records: Sequence[Any]) -> str:
-    """Return records of one type as CSV."""
-    from robomme_interference_data.schema.codec import to_dict
-    from robomme_interference_data.viz.tables import Table, record_columns
-
-    columns = record_columns(record)
-    values = map(to_dict, records)  # in the order of the fields, the columns in that of the schema
-    rows = [[named_values.get(name) for name in columns] for named_values in values]
-    return Table("records", "", columns, rows).csv()
 
 
 def _check_calibration(
@@ -313,43 +310,3 @@ def _calibrate(
         print_json(about | to_dict(calibration))
     else:
         echo(calibration.text(title))
-
-
-def _measured(
-    opened: "BufferSet",
-    encoder: str,
-    camera: str,
-    shift: str,
-    families: Sequence[str],
-    conditions: Sequence[str],
-    quiet: bool,
-) -> tuple[dict[str, Any], list["Similarities"]]:
-    """Return what the buffers belong to, and the similarities of each with frames of the lesson."""
-    from robomme_interference_data.data.views import live_embedding
-    from robomme_interference_data.runtime.progress import WorkProgress
-
-    from .select import measure
-
-    under = parse_shift(shift)
-    selected: dict[str, Any] = {"family": families, "condition": conditions}
-    total = sum(1 for _ in opened.manifests(**selected))
-    opened.check_tables(conditions or opened.conditions)
-    measured = []
-    with WorkProgress(unit="buffers", quiet=quiet) as progress:
-        progress.start(encoder, total)
-        for buffer in opened.buffers(**selected):
-            if buffer.manifest.lesson_frames:
-                query = live_embedding(opened, buffer, under, encoder, camera)
-                measured.append(measure(buffer, encoder, camera, query))
-            progress.advance(1)
-    left_out = total - len(measured)
-    if not measured:
-        raise InvalidOptionError(
-            f"none of the {left_out} buffers of {opened.name} holds a lesson, which grading needs",
-            command=opened.planning("k0", "k3"),
-        )
-    if left_out and not quiet:
-        print_status(f"{left_out} of {total} buffers hold no lesson and are left out")
-    about = {"buffer_set": opened.name, "revision": opened.revision, "encoder": encoder}
-    about |= {"camera": camera, "shift": shift}
-    return about | {"buffers": len(measured), "left_out": left_out}, measured

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import in_order
 from robomme_interference_data.schema.sampling import evidence_kept
 from robomme_interference_data.stats.bootstrap import bootstrap
 from robomme_interference_data.stats.intervals import wilson
-from robomme_interference_data.viz.tables import Columns, Table, percent
+from robomme_interference_data.viz.tables import Columns, Table, percent, record_columns
 
 from .select import Rule, Similarities, choose
 
@@ -236,3 +237,11 @@ def _share(cell: Cell, name: str) -> str | None:
     if value is None:
         return None
     return percent(value) + ("" if low is None else f" [{100 * low:.0f}–{100 * high:.0f}]")
+
+
+def as_csv(record: type, records: Sequence[Any]) -> str:
+    """Return records of one type, such as grades, as CSV with the columns of their schema."""
+    columns = record_columns(record)
+    values = map(to_dict, records)  # in the order of the fields, the columns in that of the schema
+    rows = [[named_values.get(name) for name in columns] for named_values in values]
+    return Table("records", "", columns, rows).csv()

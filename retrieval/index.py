@@ -4,6 +4,7 @@ The index is built in a hidden folder, one episode at a time, so that an interru
 there. It is renamed when it is complete.
 """
 
+import shlex
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -21,6 +22,7 @@ from robomme_interference_data.constants import (
     DISTRACTORS,
     EXECUTIONS,
     FORMAT_VERSION,
+    IDENTITY_PATH,
     INDEX_HEADER,
 )
 from robomme_interference_data.data.buffer_set import BufferSet
@@ -40,11 +42,12 @@ from robomme_interference_data.errors import (
     HubError,
     InterferenceError,
     InvalidOptionError,
+    MissingFileError,
     first_line,
     named,
 )
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Executor, Serial, Worker
-from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.storage.arrays import write_array
 from robomme_interference_data.storage.files import (
@@ -77,6 +80,25 @@ class IndexReport:
     folder: str
     embedded: int
     header: IndexHeader
+
+
+def datasets_to_index(folder: Path) -> list[Path]:
+    """Return the datasets of a buffer set whose frames are embedded, or the one dataset itself.
+
+    Raises:
+        MissingFileError: The folder is neither.
+    """
+    paths = [folder / IDENTITY_PATH, *sorted(folder.glob(f"*/{IDENTITY_PATH}"))]
+    roots = [path.parent.parent for path in paths if path.is_file()]
+    # Executions belong to no history.
+    roots = [root for root in roots if root == folder or root.name != EXECUTIONS]
+    if not roots:
+        raise MissingFileError(
+            f"{folder} is neither a buffer set nor a dataset of this package",
+            "Build one first:",
+            shlex.join(["build", str(folder), "--source", "KIND:PATH"]),
+        )
+    return roots
 
 
 def build_index(

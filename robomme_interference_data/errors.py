@@ -2,7 +2,7 @@
 
 Each is also a fitting builtin, so that callers can catch either, and carries a `hint` on what to do
 next. Messages and hints name settings with `named`: as in Python, or as the options of the command
-that runs. Hints name pages of the documentation as in a checkout,
+that runs. Hints name pages of the documentation as in a checkout, such as
 `docs/how-to/connect-a-policy.md`, and show their address.
 """
 

@@ -31,8 +31,8 @@ from robomme_interference_data.errors import (
     first_line,
     named,
 )
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Executor, Outcome
-from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.encode import get_codec
 from robomme_interference_data.storage.files import canonical_json, read_json

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from robomme_interference_data.errors import counted
-from robomme_interference_data.runtime.progress import duration
+from robomme_interference_data.progress import duration
 from robomme_interference_data.storage.files import all_files
 
 logger = logging.getLogger(__name__)

@@ -139,8 +139,11 @@ class StageTask:
             for frame in select_frames(self.plan.kind, recording, self.plan.unit):
                 writer.add(frame)
         except NothingToStore as reason:
-            writer.close()
+            writer.abandon()
             return Staged(episode, str(reason))
+        except BaseException:
+            writer.abandon()
+            raise
         writer.close()
         start = writer.length - 1 if self.plan.kind in LESSONS else None
         spans = {} if start is None else lesson_spans(start)
@@ -187,7 +190,7 @@ def keep_staged(folder: Path, staged: Staged, files: Mapping[str, bytes]) -> Non
             (partial / name).write_bytes(data)
         write_json(partial / _RECORD, to_dict(staged))
         for path in partial.iterdir():  # the data must reach the disk before the name does
-            with path.open("rb") as file:
+            with path.open("rb+") as file:  # Windows flushes only what is open for writing
                 os.fsync(file.fileno())
         partial.rename(folder)
     finally:
@@ -242,9 +245,18 @@ class _Writer:
             self.digests.update(name, value)
         self.length += 1
 
-    def close(self) -> None:
+    def abandon(self) -> None:
+        """Close the unfinished files."""
         for encoder in self._encoders.values():
-            encoder.close()
+            encoder.abandon()
+
+    def close(self) -> None:
+        try:
+            for encoder in self._encoders.values():
+                encoder.close()
+        except BaseException:
+            self.abandon()
+            raise
         for name, values in self._vectors.items():
             write_array(self._folder / f"{name}.npy", np.stack(values))
 

@@ -30,6 +30,7 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import BuildError, InvalidOptionError, named
+from robomme_interference_data.runtime.executor import WorkersConfig
 from robomme_interference_data.schema.conditions import datasets_of
 from robomme_interference_data.schema.settings import SETTING
 from robomme_interference_data.storage.files import Files, LocalFiles
@@ -109,7 +110,8 @@ def plan_build(config: BuildConfig, request: BuffersConfig) -> BuildPlan:
 def _is_for_buffers_alone(config: BuildConfig, request: BuffersConfig) -> bool:
     """Return whether a request changes only which buffers of an existing set are planned."""
     planned = (config.buffer_set / MANIFEST_PATH).is_file()
-    return planned and bool(_changed(request)) and not _changed(config, ("buffer_set",))
+    used = ["buffer_set", *(setting.name for setting in fields(WorkersConfig))]
+    return planned and bool(_changed(request)) and not _changed(config, used)
 
 
 def _require_source(config: BuildConfig, what: str) -> None:

@@ -9,8 +9,12 @@ from robomme_interference_data.errors import SimulatorCrashError, SourceError
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.shifts import SHIFTS
 from robomme_interference_data.simulators.base import Simulator
-from robomme_interference_data.simulators.checks import check_drawn
-from robomme_interference_data.simulators.episode import Demonstration, Observation, choose_cameras
+from robomme_interference_data.simulators.episode import (
+    Demonstration,
+    Observation,
+    check_drawn,
+    choose_cameras,
+)
 from robomme_interference_data.simulators.registry import (
     accepted_settings,
     make_simulator,

@@ -28,11 +28,11 @@ from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.fetched_copy import FetchedCopy
 from robomme_interference_data.data.loading import built_datasets
-from robomme_interference_data.data.manifest_table import pending_rows
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.questions import Question, read_questions
+from robomme_interference_data.data.set_files import pending_rows
 from robomme_interference_data.errors import FormatError, InterferenceError
-from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.schema.codec import arrow_schema, to_dict
 from robomme_interference_data.schema.conditions import datasets_of, in_order
 from robomme_interference_data.schema.manifest import BufferManifest, ManifestHeader

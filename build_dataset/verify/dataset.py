@@ -34,8 +34,8 @@ from robomme_interference_data.data.embeddings import normalized, open_index
 from robomme_interference_data.data.fetched_copy import FetchedCopy
 from robomme_interference_data.data.index_layout import IndexHeader, index_folder
 from robomme_interference_data.errors import InterferenceError, visible
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.retrieval.segment import typical_cosine
-from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.manifest import ManifestHeader
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.schema.shifts import SHIFTS

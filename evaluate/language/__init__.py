@@ -2,10 +2,9 @@
 
 | files | content |
 | --- | --- |
-| `models`, `openai`, `bounded_http`, `transformers`, `images` | models, and their input |
+| `models`, `openai`, `transformers`, `images` | models, and their input |
 | `prompt_files`, `published_prompts` | prompts as files, and those of the paper's systems |
-| `question_run`, `question_prompt`, `responders` | runs of questions |
+| `question_run`, `questions` | runs of questions, and who answers: a model, or a control |
 | `subgoal_settings` | the writer of subgoals that the settings of a run name |
-| `subgoal_writer`, `model_writer`, `subgoal_prompt` | writers of subgoals |
-| `columns` | columns of rows about answers and models |
+| `subgoal_writers`, `subgoal_prompt` | writers of subgoals, and their prompts |
 """

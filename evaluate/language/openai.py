@@ -5,14 +5,17 @@ import os
 import time
 from collections.abc import Sequence
 from typing import Any
+from weakref import WeakSet
 
+import httpx
 import openai
 from openai import OpenAI
 
 from robomme_interference_data.errors import InvalidOptionError, ModelError, first_line
+from robomme_interference_data.evaluate.deadline import shutdown_after
+from robomme_interference_data.retry import growing, retry
 from robomme_interference_data.storage.encode import png
 
-from .bounded_http import AnswerTooLongError, BoundedClient
 from .images import data_url, mp4, within
 from .models import ChatModel, Message, Part, Reply, Video
 
@@ -94,8 +97,10 @@ class OpenAIModel(ChatModel):
             {"role": message.role, "content": _content(message.parts)}
             for message in within(messages, self.images)
         ]
-        began, calls, fault = time.perf_counter(), 0, ""
-        while calls <= self._repeats:
+        began, calls = time.perf_counter(), 0
+
+        def ask() -> Reply:
+            nonlocal calls
             try:
                 client = self._client.with_options(max_retries=self._repeats - calls)
                 response = client.chat.completions.with_raw_response.create(
@@ -107,16 +112,19 @@ class OpenAIModel(ChatModel):
             except openai.APIError as error:
                 raise self._error(error) from error
             calls += response.retries_taken + 1
-            try:
-                return _read(response.parse(), calls, time.perf_counter() - began)
-            except _UNREADABLE as error:
-                fault = f"{type(error).__name__}: {first_line(error)}"
-            if calls <= self._repeats:
-                time.sleep(min(_PAUSE_S * 2 ** (calls - 1), _LONGEST_PAUSE_S))
-        raise ModelError(
-            f"{self._url} answers {calls} calls without a chat completion ({fault})",
-            f"Is it the base of an OpenAI-compatible endpoint, mostly ending in /v1? {_WAITS}",
-        )
+            return _read(response.parse(), calls, time.perf_counter() - began)
+
+        def is_temporary(error: Exception) -> bool:
+            return isinstance(error, _UNREADABLE) and calls <= self._repeats
+
+        try:
+            return retry(ask, is_temporary, growing(_PAUSE_S, _LONGEST_PAUSE_S))
+        except _UNREADABLE as error:
+            fault = f"{type(error).__name__}: {first_line(error)}"
+            raise ModelError(
+                f"{self._url} answers {calls} calls without a chat completion ({fault})",
+                f"Is it the base of an OpenAI-compatible endpoint, mostly ending in /v1? {_WAITS}",
+            ) from error
 
     def metadata(self) -> dict[str, Any]:
         """Return the model's name, after checking that the endpoint serves it."""
@@ -199,3 +207,70 @@ def _read(answer: Any, calls: int, seconds: float) -> Reply:
     text = (text or "").encode(errors="replace").decode()
     tokens = getattr(answer.usage, "total_tokens", None)
     return Reply(text, tokens if type(tokens) is int else None, calls, seconds)
+
+
+# --- limits of an answer -------------------------------------------------------------------------
+
+MAX_BYTES = 16 << 20
+"""Maximum bytes of an answer; a usual one has a few thousand."""
+
+
+class AnswerTooLongError(httpx.RequestError):
+    """An answer has more bytes than `MAX_BYTES`."""
+
+
+class BoundedClient(httpx.Client):
+    """An HTTP client for one thread whose limits a server cannot extend.
+
+    Args:
+        answer_s: Maximum seconds from a request to the last byte of its answer.
+    """
+
+    def __init__(self, answer_s: float):
+        super().__init__(follow_redirects=True, headers={"Accept-Encoding": "identity"})
+        self._answer_s = answer_s
+        self._streams: WeakSet[Any] = WeakSet()
+
+    def send(self, request: httpx.Request, **options: Any) -> httpx.Response:  # type: ignore[override]
+        """Send a request and read its answer, uncompressed, within the limits."""
+        request.extensions = {**request.extensions, "trace": self._keep_stream}
+        with shutdown_after(self._answer_s, self._sockets) as expired:
+            try:
+                response = _read_stream(super().send(request, **options | {"stream": True}))
+            except httpx.TransportError:
+                if not expired.is_set():
+                    raise
+        if expired.is_set():  # a shut down connection may look like the end of the answer
+            raise httpx.ReadTimeout("no whole answer in time", request=request)
+        return response
+
+    def _sockets(self) -> list[Any]:
+        return [stream.get_extra_info("socket") for stream in self._streams]
+
+    def _keep_stream(self, event: str, info: dict[str, Any]) -> None:
+        """Remember connections as they open; see httpx's `trace` extension."""
+        if event.endswith((".connect_tcp.complete", ".start_tls.complete")):
+            self._streams.add(info["return_value"])
+
+
+def _read_stream(response: httpx.Response) -> httpx.Response:
+    """Read a streamed response."""
+    content = bytearray()
+    try:
+        for chunk in response.iter_raw():
+            content += chunk
+            if len(content) > MAX_BYTES:
+                raise AnswerTooLongError(f"an answer of more than {MAX_BYTES} bytes")
+    finally:
+        response.close()
+    # A server may compress all the same; without this header httpx does not decompress the answer,
+    # whose size would then be unlimited.
+    headers = [(k, v) for k, v in response.headers.multi_items() if k != "content-encoding"]
+    return httpx.Response(
+        response.status_code,
+        headers=headers,
+        content=bytes(content),
+        request=response.request,
+        extensions=response.extensions,
+        history=response.history,
+    )

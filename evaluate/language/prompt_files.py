@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 from robomme_interference_data.errors import FormatError, UnknownNameError, counted, nearest
 from robomme_interference_data.storage.files import digest_json
 
-from .models import Part, Video
+from .models import ChatModel, Part, Video, model_identity
 
 _MAX_BYTES = 1 << 16
 
@@ -121,3 +121,16 @@ class Prompt:
         if missing := [key for key in required if key not in values]:
             raise ValueError(f"it lacks {', '.join(missing)}")
         return cls(**values)
+
+
+def describe_prompted(model: ChatModel, prompt: Prompt) -> dict[str, Any]:
+    """Return what identifies a model with a prompt, for `run.json`."""
+    return {"model": model.metadata(), "prompt_sha256": prompt.sha256}
+
+
+def prompted_identity(
+    text: str, options: Sequence[str], described: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return what of a model with a prompt can change an answer, from `describe_prompted`."""
+    identity = model_identity(text, options, described["model"])
+    return identity | {"prompt_sha256": described["prompt_sha256"]}

@@ -52,8 +52,8 @@ class Published:
 
     def check(self, name: str, prompt: SubgoalPrompt, options: Mapping[str, Any]) -> None:
         """Raise an `InvalidOptionError` if a prompt, or one of all options, is another one."""
-        guide = "docs/how-to/official-simulator.md"
-        own = f"Or set {named('system')} to a name of your own: see {guide}."
+        page = "docs/how-to/official-simulator.md"
+        own = f"Or set {named('system')} to a name of your own: see {page}."
         command = (
             f"evaluate BUFFER_SET --system {name} --policy websocket://HOST:PORT --out RUN "
             f"--subgoals openai:URL#MODEL --set subgoal_prompt=CLONE/{FOLDER}/{self.file}"

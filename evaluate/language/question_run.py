@@ -17,7 +17,7 @@ from robomme_interference_data.evaluate.run.history import history_columns
 from robomme_interference_data.evaluate.run.identity import retrieval_text, short_digest
 from robomme_interference_data.evaluate.run.log import unfinished
 from robomme_interference_data.evaluate.run.plan import WorkItem, plan_run
-from robomme_interference_data.evaluate.run.row import Rollout
+from robomme_interference_data.evaluate.run.row import Rollout, model_columns
 from robomme_interference_data.evaluate.run.worker import Job, PlannedRun, RunContext, RunFunction
 from robomme_interference_data.evaluate.systems import SYSTEMS, SystemFacts, name_system
 from robomme_interference_data.ids import EpisodeId
@@ -27,10 +27,10 @@ from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.simulators.registry import recorded_scene
 
-from .columns import model_columns
 from .images import HistoryFrames
-from .models import MODELS, model_identity
-from .responders import CONTROLS, WITHOUT_MODEL, ModelResponder, Prompted
+from .models import MODELS
+from .prompt_files import prompted_identity
+from .questions import CONTROLS, WITHOUT_MODEL, ModelResponder, Prompted
 
 
 @contextmanager
@@ -83,8 +83,7 @@ def _describe_run(
     """Return what is known of a run from its settings, and from what its model reports."""
     has_model, model = config.model not in WITHOUT_MODEL, metadata
     if has_model:
-        model = model_identity(config.model, config.model_options, metadata["model"])
-        model |= {"prompt_sha256": metadata["prompt_sha256"]}
+        model = prompted_identity(config.model, config.model_options, metadata)
     facts = SystemFacts(
         policy=MODELS.parse(config.model).kind if has_model else config.model,
         policy_id=short_digest({"model": model, "control": config.control}),

@@ -16,11 +16,11 @@ from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.identity import short_digest
 from robomme_interference_data.runtime.specs import bind_options
 
-from .model_writer import ModelWriter
-from .models import MODELS, model_identity
+from .models import MODELS
+from .prompt_files import prompted_identity
 from .published_prompts import PUBLISHED, load_published
 from .subgoal_prompt import DEFAULT_PROMPT
-from .subgoal_writer import OracleWriter, SubgoalWriter
+from .subgoal_writers import ModelWriter, OracleWriter, SubgoalWriter
 
 _WRITER_OPTIONS = [
     parameter.name
@@ -80,9 +80,8 @@ def subgoals_identity(config: RunConfig, metadata: Mapping[str, Any]) -> Any:
     if config.subgoals == ORACLE:
         return ORACLE
     writer_options, model_options = _split(config)
-    writer = metadata["subgoals"]
-    model = model_identity(str(config.subgoals), model_options, writer["model"])
-    return model | {"prompt_sha256": writer["prompt_sha256"]} | writer_options
+    text = str(config.subgoals)
+    return prompted_identity(text, model_options, metadata["subgoals"]) | writer_options
 
 
 def subgoals_text(config: RunConfig, metadata: Mapping[str, Any]) -> str:

@@ -6,7 +6,7 @@ import os
 import socket
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from typing import Any
 
@@ -26,6 +26,7 @@ from robomme_interference_data.errors import (
     ServerKeepaliveError,
 )
 from robomme_interference_data.evaluate.deadline import shutdown_after
+from robomme_interference_data.retry import growing, retry
 
 from .wire import pack, unpack
 
@@ -48,6 +49,10 @@ _ATTEMPT_S = 10.0
 
 _PAUSES_S = (0.2, 5.0)
 """The first pause between two attempts, which doubles, and the longest."""
+
+
+class _NoAnswerError(Exception):
+    """A server that does not answer yet; the message is the reason."""
 
 
 def _is_keepalive(error: Exception) -> bool:
@@ -109,41 +114,39 @@ class ServerConnection(ABC):
     def open(self) -> None:
         """Connect anew; retry while the server does not answer, or answers 5xx."""
         self.close()
-        began, warned = time.monotonic(), False
-        pause, longest = _PAUSES_S
-        while True:
-            left = max(self._connect_s - (time.monotonic() - began), pause)
-            try:
-                self._connection = self._handshake(min(left, _ATTEMPT_S if warned else _QUIET_S))
-                break
-            except InvalidStatus as error:
-                status = error.response.status_code
-                reason = f"it answers {status}"
-                if status < http.HTTPStatus.INTERNAL_SERVER_ERROR:
-                    raise self._refusal(status) from error
-            except (OSError, EOFError, InvalidMessage) as error:
-                reason = str(error) or type(error).__name__
-                if isinstance(error, TimeoutError):
-                    reason = "it does not answer"
-                if isinstance(error, socket.gaierror):  # an unknown host name stays unknown
-                    raise self._unreachable(reason) from error
-            except (InvalidHandshake, InvalidURI, ValueError) as error:
-                # Of a redirect, its address may be none of a websocket, or none at all.
-                raise self._refusal(error) from error
+        began, warned, hint, left = time.monotonic(), False, None, self._connect_s
+
+        def handshake() -> ClientConnection:
+            nonlocal left
+            left = max(self._connect_s - (time.monotonic() - began), _PAUSES_S[0])
+            return self._handshake(min(left, _ATTEMPT_S if warned else _QUIET_S))
+
+        def may_answer(error: Exception) -> bool:
+            nonlocal warned, hint
+            if not isinstance(error, _NoAnswerError):
+                return False
             hint = self._check()
-            waited = time.monotonic() - began
-            if waited + pause > self._connect_s:
-                raise self._unreachable(f"{reason} (for {self._connect_s:g} s)", hint)
-            if waited >= _QUIET_S and not warned:
+            if time.monotonic() - began >= _QUIET_S and not warned:
                 warned = True
                 logger.warning(
                     "Waiting until policy server %s answers, for %g s at most: %s",
                     self.name,
                     self._connect_s,
-                    reason,
+                    error,
                 )
-            time.sleep(pause)
-            pause = min(2 * pause, longest)
+            return True
+
+        def pauses() -> Iterator[float]:
+            for pause in growing(*_PAUSES_S):
+                if time.monotonic() - began + pause > self._connect_s:
+                    return
+                yield pause
+
+        try:
+            self._connection = retry(handshake, may_answer, pauses())
+        except _NoAnswerError as error:
+            reason = f"{error} (for {self._connect_s:g} s)"
+            raise self._unreachable(reason, hint) from error.__cause__
         self.metadata = self._greet(left)
 
     @abstractmethod
@@ -157,18 +160,34 @@ class ServerConnection(ABC):
 
     def _handshake(self, seconds: float) -> ClientConnection:
         key = os.environ.get(API_KEY_VARIABLE)
-        connecting = connect(
-            f"ws://{self.name}",
-            additional_headers={"Authorization": f"Api-Key {key}"} if key else {},
-            open_timeout=seconds,
-            close_timeout=2.0,
-            compression=None,
-            max_size=MAX_BYTES,
-            proxy=None,
-            # A server that computes does not answer pings; `response_s` finds the dead ones.
-            ping_interval=None,
-        )
-        return self._stack.enter_context(connecting)
+        try:
+            connection = connect(
+                f"ws://{self.name}",
+                additional_headers={"Authorization": f"Api-Key {key}"} if key else {},
+                open_timeout=seconds,
+                close_timeout=2.0,
+                compression=None,
+                max_size=MAX_BYTES,
+                proxy=None,
+                # A server that computes does not answer pings; `response_s` finds the dead ones.
+                ping_interval=None,
+            )
+            return self._stack.enter_context(connection)
+        except InvalidStatus as error:
+            status = error.response.status_code
+            if status < http.HTTPStatus.INTERNAL_SERVER_ERROR:
+                raise self._refusal(status) from error
+            raise _NoAnswerError(f"it answers {status}") from error
+        except (OSError, EOFError, InvalidMessage) as error:
+            reason = str(error) or type(error).__name__
+            if isinstance(error, socket.gaierror):  # an unknown host name stays unknown
+                raise self._unreachable(reason) from error
+            if isinstance(error, TimeoutError):
+                reason = "it does not answer"
+            raise _NoAnswerError(reason) from error
+        except (InvalidHandshake, InvalidURI, ValueError) as error:
+            # Of a redirect, its address may be none of a websocket, or none at all.
+            raise self._refusal(error) from error
 
     def _unreachable(self, reason: str, hint: str | None = None) -> PolicyServerError:
         return PolicyServerError(

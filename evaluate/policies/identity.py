@@ -22,7 +22,7 @@ from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.sampling import MEMORY_FORM, Memory
 from robomme_interference_data.storage.files import indented_json
 
-from .capabilities import Role
+from .kinds import Role
 from .policy import Policy
 from .registry import (
     POLICIES,
@@ -182,9 +182,9 @@ def check_memory_kind(keeps: bool, server: str, system: System) -> None:
     raise PolicyServerError(
         f"the policy server {server} {actual}, and that of {system.name} {expected}: it serves "
         "another kind of model",
-        f"Start it with the checkpoint of {system.name} "
-        "(docs/how-to/official-simulator.md lists them) "
-        f"and the history_config.txt beside it, or set {named('system')} to a name of your own.",
+        f"Start it with the checkpoint of {system.name} (docs/how-to/official-simulator.md lists "
+        "them) and the history_config.txt beside it, or set "
+        f"{named('system')} to a name of your own.",
     )
 
 

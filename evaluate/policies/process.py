@@ -33,7 +33,7 @@ from robomme_interference_data.runtime.executor import (
 )
 from robomme_interference_data.runtime.process import CLOSE_S
 
-from .shared import Address, Channel, PolicyHost, SharedPolicy, ended
+from .shared import Address, Ask, PolicyHost, SharedPolicy, ended
 
 logger = logging.getLogger(__name__)
 
@@ -89,33 +89,25 @@ class SocketAddress:
     key: bytes = field(repr=False)
     number: int
 
-    def connect(self, worker: int) -> Channel:
+    def connect(self, worker: int) -> Ask:
         """Connect a worker; wait until the process listens."""
         while self.path.parent.exists():
             # Missing or refused: it has not begun, or died and is started again.
             with suppress(FileNotFoundError, ConnectionError, EOFError):
                 connection = Client(str(self.path), "AF_UNIX", self.key)
                 connection.send(worker)
-                return _Socket(connection)
+                return partial(_ask, connection)
             time.sleep(_PAUSE_S)
         raise ServerDiedError("the policy's process ended", "Its output is above.")
 
 
-class _Socket:
-    """A worker's connection to a process."""
-
-    def __init__(self, connection: Connection):
-        self._connection = connection
-
-    def ask(self, request: bytes) -> bytes:
-        try:
-            self._connection.send_bytes(request)
-            return self._connection.recv_bytes()
-        except (EOFError, OSError) as error:
-            raise ended(error) from error
-
-    def close(self) -> None:
-        self._connection.close()
+def _ask(connection: Connection, request: bytes) -> bytes:
+    """Return the answer of a process to a request."""
+    try:
+        connection.send_bytes(request)
+        return connection.recv_bytes()
+    except (EOFError, OSError) as error:
+        raise ended(error) from error
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ from robomme_interference_data.runtime.specs import (
 )
 from robomme_interference_data.schema.sampling import MEMORY_FORM, Memory
 
-from .capabilities import PolicyKind, Role
-from .kinds import KINDS, addresses
+from .kinds import KINDS, PolicyKind, Role, addresses
 from .policy import Policy
 
 POLICIES = Registry("policy", KINDS)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 
 from robomme_interference_data.errors import PolicyServerError
-from robomme_interference_data.storage.cache import default_cache_folder
+from robomme_interference_data.storage.cache import cache_folder
 from robomme_interference_data.storage.staging import file_lock
 
 logger = logging.getLogger(__name__)
@@ -27,7 +27,7 @@ def lock_server(host: str, port: int, holder: str) -> Iterator[None]:
     be written, the run continues with a warning.
     """
     machine = socket.gethostname() if host in _THIS_MACHINE else host
-    folder = default_cache_folder().parent / "servers"
+    folder = cache_folder("servers")
     lock = folder / f"{machine.replace(':', '_')}_{port}.lock"
     about = lock.with_suffix(".holder")  # Windows lets nobody else read a locked file
     try:

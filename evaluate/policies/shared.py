@@ -34,21 +34,17 @@ _LOOK_S = 0.2
 """Seconds between two looks whether the run has ended."""
 
 
-class Channel(Protocol):
-    """A worker's connection to a policy's process."""
+Ask = Callable[[bytes], bytes]
+"""A worker's connection to a policy's process: it returns the answer to a request.
 
-    def ask(self, request: bytes) -> bytes:
-        """Return the answer to a request; raise `ServerDiedError` if the process ended."""
-        ...
-
-    def close(self) -> None:
-        """Close the connection."""
+It raises `ServerDiedError` if the process ended, and is closed with its last reference.
+"""
 
 
 class Address(Protocol):
     """Where a policy's process is, also after it was started again."""
 
-    def connect(self, worker: int) -> Channel:
+    def connect(self, worker: int) -> Ask:
         """Connect a worker, by its number; wait until the process listens.
 
         Raises:
@@ -63,26 +59,20 @@ class SharedPolicy(Policy):
     Every call raises what the policy's method raises, or `ServerDiedError` if the process ends.
     """
 
-    def __init__(self, channel: Channel):
-        self._channel = channel
-        try:
-            vars(self).update(self._call(_OPEN))  # the attributes of a policy
-        except BaseException:
-            channel.close()
-            raise
+    def __init__(self, ask: Ask):
+        self._ask = ask
+        vars(self).update(self._call(_OPEN))  # the attributes of a policy
 
     @classmethod
     def open(cls, address: Address, worker: int) -> Self:
         """Open the session of a worker, by its number; wait for a process that is started again."""
         while True:
-            channel = address.connect(worker)
-            try:
-                channel.ask(pickle.dumps((_PING, ())))
-            except ServerDiedError:
-                # It hung or died in the call of another worker, and is started again.
-                channel.close()
-            else:
-                return cls(channel)
+            ask = address.connect(worker)
+            # It may have hung or died in the call of another worker: then it is started again.
+            with suppress(ServerDiedError):
+                ask(pickle.dumps((_PING, ())))
+                break
+        return cls(ask)
 
     def reset(self, info: RolloutInfo) -> None:
         """Prepare the session for a rollout."""
@@ -106,11 +96,11 @@ class SharedPolicy(Policy):
 
     def close(self) -> None:
         """Close the session."""
-        with closing(self._channel), suppress(ServerDiedError):
+        with suppress(ServerDiedError):
             self._call(_CLOSE)
 
     def _call(self, method: str, *arguments: Any) -> Any:
-        value, error = pickle.loads(self._channel.ask(pickle.dumps((method, arguments))))
+        value, error = pickle.loads(self._ask(pickle.dumps((method, arguments))))
         if error is not None:
             raise error
         return value

@@ -16,12 +16,11 @@ from robomme_interference_data.data.buffer import Buffer, Chunk
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import InvalidOptionError, PolicyError, RunError
 from robomme_interference_data.evaluate import optional
-from robomme_interference_data.evaluate.language.columns import model_columns
 from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.history import HistoryReader, history_columns
 from robomme_interference_data.evaluate.run.plan import WorkItem
-from robomme_interference_data.evaluate.run.row import Rollout
+from robomme_interference_data.evaluate.run.row import Rollout, model_columns
 from robomme_interference_data.evaluate.run.worker import RunContext
 from robomme_interference_data.evaluate.systems import check_history, name_system
 from robomme_interference_data.runtime.executor import Worker
@@ -33,10 +32,10 @@ from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.episode import ACTION_SIZE, Observation, action_array
 
-from .recording_check import check_episode, check_lesson
+from .checks import check_episode, check_lesson
 
 if TYPE_CHECKING:
-    from robomme_interference_data.evaluate.language.subgoal_writer import SubgoalWriter
+    from robomme_interference_data.evaluate.language.subgoal_writers import SubgoalWriter
     from robomme_interference_data.retrieval.selector import Selector
 
     from .clips import Clip

@@ -15,7 +15,6 @@ from robomme_interference_data.errors import (
     SimulatorCrashError,
 )
 from robomme_interference_data.evaluate import optional
-from robomme_interference_data.evaluate.policies.capabilities import Role
 from robomme_interference_data.evaluate.policies.identity import (
     check_memory_kind,
     check_metadata,
@@ -25,6 +24,7 @@ from robomme_interference_data.evaluate.policies.identity import (
     lock_servers,
     policy_identity,
 )
+from robomme_interference_data.evaluate.policies.kinds import Role
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import (
     POLICIES,

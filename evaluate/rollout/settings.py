@@ -2,11 +2,14 @@
 
 import dataclasses
 import re
+from collections.abc import Iterable
+from typing import Any
 
 from robomme_interference_data.constants import ORACLE, RECORDINGS
+from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import InvalidOptionError, named
 from robomme_interference_data.evaluate import optional
-from robomme_interference_data.evaluate.policies.capabilities import PolicyKind, Role
+from robomme_interference_data.evaluate.policies.kinds import PolicyKind, Role
 from robomme_interference_data.evaluate.policies.registry import (
     POLICIES,
     policy_kind,
@@ -17,6 +20,7 @@ from robomme_interference_data.evaluate.run.config import RunConfig, check_unuse
 from robomme_interference_data.evaluate.systems import SYSTEMS, System, name_system
 from robomme_interference_data.retrieval.select import Rule
 from robomme_interference_data.schema.sampling import Memory
+from robomme_interference_data.simulators.registry import accepted_settings, simulator_class
 
 _OF_SIMULATORS = ("simulator", "shift", "check_lesson", "videos")
 """Settings without effect along recordings."""
@@ -153,3 +157,34 @@ def _check_subgoals(config: RunConfig) -> None:
             f"the policy {config.policy} reads no subgoals",
             f"Set {named('policy')} to {', '.join(able)}, or leave out {named('subgoals')}.",
         )
+
+
+def used_cameras(
+    config: RunConfig, policy_cameras: Iterable[str], demonstrations: Dataset
+) -> set[str]:
+    """Return the cameras whose live images a run reads."""
+    used = {*policy_cameras}
+    if config.subgoals not in (None, ORACLE):
+        used.add(demonstrations.camera())
+    if config.retrieval is not None:
+        used.add(demonstrations.camera(config.retrieval_camera, "retrieval_camera"))
+    return used
+
+
+def simulator_options(
+    config: RunConfig, policy_cameras: Iterable[str], demonstrations: Dataset
+) -> dict[str, Any]:
+    """Return the options of a run's simulator, which draws only the cameras that are used."""
+    used = used_cameras(config, policy_cameras, demonstrations)
+    if config.videos or config.check_lesson:
+        used |= {*simulator_class(config.simulator).cameras}
+    settings = {
+        "cameras": tuple(sorted(used)),
+        "shift": config.shift,
+        "python": config.robomme_python,
+        "subgoals": config.subgoals == ORACLE,
+        "buffer_set": config.buffer_set,
+        # Its own limit ends a little before the worker's: its error shows its output.
+        "answer_s": 0.9 * config.simulator_timeout_s,
+    }
+    return accepted_settings(config.simulator, settings)

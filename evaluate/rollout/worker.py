@@ -1,12 +1,12 @@
 """What a worker of a run does: one rollout after the other."""
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from robomme_interference_data.constants import DEMONSTRATIONS, ORACLE
+from robomme_interference_data.constants import DEMONSTRATIONS
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import (
     PolicyError,
@@ -28,19 +28,15 @@ from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.base import Simulator
-from robomme_interference_data.simulators.checks import check_drawn
-from robomme_interference_data.simulators.registry import (
-    accepted_settings,
-    make_simulator,
-    simulator_class,
-    simulator_versions,
-)
+from robomme_interference_data.simulators.episode import check_drawn
+from robomme_interference_data.simulators.registry import make_simulator, simulator_versions
 
-from .recording_check import check_episode
+from .checks import check_episode
 from .rollout import run_rollout
+from .settings import simulator_options, used_cameras
 
 if TYPE_CHECKING:
-    from robomme_interference_data.evaluate.language.subgoal_writer import SubgoalWriter
+    from robomme_interference_data.evaluate.language.subgoal_writers import SubgoalWriter
     from robomme_interference_data.evaluate.policies.answers import Answers
     from robomme_interference_data.evaluate.policies.shared import Address
 
@@ -273,34 +269,3 @@ class RolloutFunction(RunFunction[RunConfig]):
                 policy.metadata()  # connects
         except PolicyServerError as error:
             raise WorkerRetiredError(error.message, error.hint) from error
-
-
-def used_cameras(
-    config: RunConfig, policy_cameras: Iterable[str], demonstrations: Dataset
-) -> set[str]:
-    """Return the cameras whose live images a run reads."""
-    used = {*policy_cameras}
-    if config.subgoals not in (None, ORACLE):
-        used.add(demonstrations.camera())
-    if config.retrieval is not None:
-        used.add(demonstrations.camera(config.retrieval_camera, "retrieval_camera"))
-    return used
-
-
-def simulator_options(
-    config: RunConfig, policy_cameras: Iterable[str], demonstrations: Dataset
-) -> dict[str, Any]:
-    """Return the options of a run's simulator, which draws only the cameras that are used."""
-    used = used_cameras(config, policy_cameras, demonstrations)
-    if config.videos or config.check_lesson:
-        used |= {*simulator_class(config.simulator).cameras}
-    settings = {
-        "cameras": tuple(sorted(used)),
-        "shift": config.shift,
-        "python": config.robomme_python,
-        "subgoals": config.subgoals == ORACLE,
-        "buffer_set": config.buffer_set,
-        # Its own limit ends a little before the worker's: its error shows its output.
-        "answer_s": 0.9 * config.simulator_timeout_s,
-    }
-    return accepted_settings(config.simulator, settings)

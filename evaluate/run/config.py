@@ -10,7 +10,6 @@ from robomme_interference_data.constants import DEMONSTRATIONS, SPLITS
 from robomme_interference_data.errors import InvalidOptionError, named
 from robomme_interference_data.evaluate import optional
 from robomme_interference_data.runtime.executor import WorkersConfig
-from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.sampling import MEMORY_FORM
 from robomme_interference_data.schema.settings import setting
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP
@@ -300,10 +299,3 @@ def with_retrieval(name: str, config: RetrievalConfig) -> str:
     if config.retrieval is None:
         return name
     return "-".join(("retrieval", name, *non_default_retrieval(config).values())).replace("/", "-")
-
-
-def nothing_to_retrieve(hint: str) -> InvalidOptionError:
-    """Return the error for a retrieval step without a history."""
-    return InvalidOptionError(
-        f"a retrieval step has nothing to retrieve from under {NO_HISTORY}", hint
-    )

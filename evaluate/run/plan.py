@@ -4,9 +4,8 @@ import hashlib
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
-from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, named
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId, count_numbers, format_numbers, parse_numbers
@@ -14,7 +13,10 @@ from robomme_interference_data.schema.conditions import NO_HISTORY, in_order, pa
 from robomme_interference_data.schema.rollouts import RolloutKey
 from robomme_interference_data.storage.files import canonical_json
 
-from .config import WorkConfig, nothing_to_retrieve
+if TYPE_CHECKING:  # readers of rows need neither
+    from robomme_interference_data.data.buffer_set import BufferSet
+
+    from .config import WorkConfig
 
 _SHARD = re.compile(r"(\d{1,6})/(\d{1,6})")
 
@@ -114,7 +116,7 @@ def _read_shard(text: str) -> tuple[int, int]:
     return int(shard[1]), int(shard[2])
 
 
-def plan_run(config: WorkConfig, facts: SystemFacts, buffer_set: BufferSet) -> RunPlan:
+def plan_run(config: "WorkConfig", facts: SystemFacts, buffer_set: "BufferSet") -> RunPlan:
     """Return the plan of a run of a system, and check the tables of its conditions.
 
     Raises:
@@ -141,7 +143,14 @@ def plan_run(config: WorkConfig, facts: SystemFacts, buffer_set: BufferSet) -> R
     return plan
 
 
-def _check_condition(facts: SystemFacts, condition: str, buffer_set: BufferSet) -> None:
+def nothing_to_retrieve(hint: str) -> InvalidOptionError:
+    """Return the error for a retrieval step without a history."""
+    return InvalidOptionError(
+        f"a retrieval step has nothing to retrieve from under {NO_HISTORY}", hint
+    )
+
+
+def _check_condition(facts: SystemFacts, condition: str, buffer_set: "BufferSet") -> None:
     """Reject a condition that does not apply to a system."""
     if facts.applies(condition):
         return
@@ -150,13 +159,13 @@ def _check_condition(facts: SystemFacts, condition: str, buffer_set: BufferSet) 
             f"Leave {NO_HISTORY} out of {named('conditions')}: without history, the system is the "
             "one without a retrieval step."
         )
-    planned = NO_HISTORY in buffer_set.conditions
+    fault = f"the system takes no history, so {condition} has no effect"
+    if NO_HISTORY in buffer_set.conditions:
+        raise InvalidOptionError(fault, f"Set {named('conditions')} to {NO_HISTORY}.")
     raise InvalidOptionError(
-        f"the system takes no history, so {condition} has no effect",
-        f"Set {named('conditions')} to {NO_HISTORY}."
-        if planned
-        else f"It runs under {NO_HISTORY}, which is not planned yet.",
-        None if planned else buffer_set.planning(NO_HISTORY),
+        fault,
+        f"It runs under {NO_HISTORY}, which is not planned yet.",
+        buffer_set.planning(NO_HISTORY),
         "conditions",
     )
 

@@ -9,7 +9,7 @@ from typing import Any, Self
 from robomme_interference_data.constants import RECORDINGS
 from robomme_interference_data.errors import visible
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.runtime.progress import WorkProgress, duration
+from robomme_interference_data.progress import WorkProgress, duration
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.viz.tables import Table

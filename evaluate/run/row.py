@@ -1,24 +1,61 @@
 """The row of a rollout, its line in the record of a run, and the reader of a record."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any
 
 from robomme_interference_data.constants import MAX_ROW_BYTES, RUN_RECORD
 from robomme_interference_data.errors import FormatError, first_line
-from robomme_interference_data.evaluate.language.columns import AnswerColumns, ModelColumns
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.retrieval.columns import RetrievalColumns
 from robomme_interference_data.schema.codec import from_dict, to_dict
 from robomme_interference_data.schema.rollouts import OutcomeColumns, RolloutKey, Status, Timing
 from robomme_interference_data.schema.sampling import HistoryColumns
-from robomme_interference_data.simulators.measured import ActionErrorColumns
 from robomme_interference_data.storage.files import canonical_json, parse_json, read_bytes
 
 from .plan import WorkItem
 
 
-# A feature declares its columns in its own module and is one line here. A dataclass takes the
-# fields of its last base first, so files have the columns of these lines from the last to first.
+@dataclass(frozen=True, kw_only=True)
+class AnswerColumns:
+    """An answer to a question; all None for a rollout."""
+
+    answer: Annotated[
+        str | None, "Letter of the chosen option; None for a rollout or without a choice."
+    ] = None
+    chance: Annotated[
+        float | None, "Expected share of right answers from random guesses; None for a rollout."
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelColumns:
+    """The calls of a vision-language model; all None without one. Their time is `model_s`."""
+
+    model_calls: Annotated[
+        int | None, "Calls of the vision-language model, with retries; None without a model."
+    ] = None
+    model_tokens: Annotated[int | None, "Tokens of all prompts and answers, if reported."] = None
+    model_faults: Annotated[int | None, "Unusable answers of the model."] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActionErrorColumns:
+    """The difference of a policy's actions to those of a recording; all None in a simulator."""
+
+    action_l1: Annotated[
+        float | None,
+        "Offline: mean absolute difference of the actions to the recorded ones, over all steps and "
+        "values, in the actions' units.",
+    ] = None
+    action_l1_values: Annotated[
+        str | None, "The same for each value of the action, in their order, separated by spaces."
+    ] = None
+
+
+# Each feature is one line here. A dataclass takes the fields of its last base first, so files have
+# the columns of these lines from the last to first.
 @dataclass(frozen=True, kw_only=True)
 class Rollout(
     Timing,
@@ -36,6 +73,21 @@ class Rollout(
     def __post_init__(self) -> None:
         RolloutKey.__post_init__(self)
         OutcomeColumns.__post_init__(self)
+
+
+def model_columns(calls: int, tokens: Sequence[int | None], faults: int) -> dict[str, Any]:
+    """Return the columns about a vision-language model, given the tokens of each answer.
+
+    A total that the files of a run cannot hold becomes None, and counts as a fault.
+    """
+    counts = [count for count in tokens if count is not None]
+    total = sum(counts)
+    stored = all(count >= 0 for count in counts) and total < 1 << 63
+    return {
+        "model_calls": calls,
+        "model_tokens": total if counts and stored else None,
+        "model_faults": faults + (not stored),
+    }
 
 
 def is_done(row: Rollout) -> bool:

@@ -64,8 +64,8 @@ def score(
       --against paper --out my-score
     ```
     """
+    from robomme_interference_data.progress import WorkProgress
     from robomme_interference_data.runtime.memory import memory_limit
-    from robomme_interference_data.runtime.progress import WorkProgress
     from robomme_interference_data.viz.tables import tables_text
 
     from .report.headline import headlines

@@ -23,8 +23,8 @@ def check_label(system: str) -> None:
     if name_system(system).paper:
         raise InvalidOptionError(
             f"a server of vla-eval is not the paper's system {system}",
-            f"Set {named('system')} to a name of your own; docs/how-to/connect-a-policy.md "
-            "lists what differs.",
+            f"Set {named('system')} to a name of your own; docs/how-to/connect-a-policy.md lists "
+            "what differs.",
         )
 
 

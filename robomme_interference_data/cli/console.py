@@ -1,5 +1,6 @@
 """Output of commands (results on stdout, messages on stderr) and their interruption."""
 
+import io
 import json
 import logging
 import shlex
@@ -14,6 +15,13 @@ import typer
 
 from robomme_interference_data.constants import IDENTITY_PATH, MANIFEST_HEADER, MANIFEST_ROWS
 from robomme_interference_data.errors import InvalidOptionError, visible
+
+
+def write_utf8() -> None:
+    """Write UTF-8 into files and pipes: the code page of Windows lacks characters of tables."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and not stream.isatty():
+            stream.reconfigure(encoding="utf-8", errors=stream.errors)
 
 
 def echo(text: str, *, nl: bool = True) -> None:

@@ -29,7 +29,7 @@ from robomme_interference_data.retrieval import commands as retrieving
 from robomme_interference_data.storage.hub import check_endpoint
 
 from . import commands, show_command, simulate_command, verify_command
-from .console import echo, log_to_stderr, print_status
+from .console import echo, log_to_stderr, print_status, write_utf8
 
 PROGRAM = "robomme-interference"
 
@@ -178,6 +178,7 @@ def main() -> None:
 
     With `--json`, an error is one line of JSON, the last one on stderr: see `ShownError`.
     """
+    write_utf8()
     log_to_stderr()
     as_json = "--json" in sys.argv[1:]
     try:

@@ -46,7 +46,7 @@ def verify(
         verify_buffer_set,
         verify_datasets,
     )
-    from robomme_interference_data.runtime.progress import WorkProgress
+    from robomme_interference_data.progress import WorkProgress
 
     opened, incomplete = _open(buffer_set)
     progress = WorkProgress()

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import DISTRACTORS, STATE
-from robomme_interference_data.errors import HashMismatchError, InvalidOptionError, UnknownNameError
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId, whole_number
 from robomme_interference_data.schema.manifest import BufferManifest, SessionEntry, layout_sessions
-from robomme_interference_data.storage.arrays import combine
 
 from .dataset import Dataset
 from .frame_reader import FrameReader, allocate_frames
@@ -110,6 +109,7 @@ class Buffer:
     @property
     def states(self) -> NDArray[np.float32]:
         """Robot states, `(T, 8) float32`: 7 joint positions in rad, the gripper; a new array."""
+        # A copy: later chunks of `stream` are cut from this array.
         return self._states.copy()
 
     @cached_property
@@ -134,6 +134,7 @@ class Buffer:
             `(T, …)`, in the buffer's order; a new array.
         """
         sessions = self.manifest.sessions
+        # A held frame is stored once, and counts `repeat` times.
         values = (np.repeat(read(entry), entry.repeat, 0) for entry in sessions)
         return np.concatenate([empty, *values])
 
@@ -166,6 +167,7 @@ class Buffer:
 
     def _names(self, cameras: Sequence[str] | None) -> tuple[str, ...]:
         """Return these cameras, None for all; an unknown one is an error, also in a folder."""
+        # A text would be taken as a list of names of one letter each.
         if isinstance(cameras, str) or not isinstance(cameras, Iterable | None):
             raise InvalidOptionError.expected("cameras", cameras, "their names: ['front', 'wrist']")
         names = self.cameras if cameras is None else tuple(cameras)
@@ -197,9 +199,11 @@ class Buffer:
         Raises:
             UnknownNameError: There is no such camera.
             MissingFileError, FormatError: A video cannot be read.
+            HashMismatchError: With a cache: frames do not have the recorded SHA-256.
         """
         name = self.query.dataset.camera(camera)
         out = allocate_frames(len(self), self.query.dataset.shape(name))
+        # Before anything is decoded: the Hub's files come several at a time, not one by one.
         self._fetch([[name]] * len(self.sessions))
         self._reader.read(name, out)
         return out
@@ -257,6 +261,7 @@ class Buffer:
         decoders = {name: self._reader.iter(name, chosen.tolist()) for name in names}
         try:
             for first in range(0, len(chosen), chunk):
+                # A copy, since the caller owns the chunk.
                 indices_now = chosen[first : first + chunk].copy()
                 frames = {}
                 for name, shape in shapes.items():
@@ -267,6 +272,7 @@ class Buffer:
                     indices_now, frames, self._states[indices_now], session_index[indices_now]
                 )
         finally:
+            # Also if the caller stops early: each holds an open file and its decoder.
             for decoder in decoders.values():
                 decoder.close()
 
@@ -284,6 +290,7 @@ class Buffer:
         """
         from .embeddings import BufferSetIndex
 
+        # The index of the units has what makes all embeddings comparable: center, typical cosine.
         needed = {DISTRACTORS, self.query.dataset.kind} & {*self._datasets}
         needed |= {entry.dataset for entry in self.manifest.sessions}
         datasets = {name: self._datasets[name] for name in sorted(needed)}
@@ -316,42 +323,13 @@ class Buffer:
     def verify(self) -> None:
         """Check the manifest, decode everything, and compare it with the recorded SHA-256.
 
-        Later reads from a cache are compared as well.
-
         Raises:
             HashMismatchError: The manifest is not the one that the rules give, a dataset does not
                 have its revision, or frames or states differ from the recorded ones.
         """
-        self._reader.verified = True
-        query, manifest = self.query, self.manifest
-        sources = [self._datasets[entry.dataset] for entry in manifest.sessions]
-        for dataset in dict.fromkeys([query.dataset, *sources]):
-            dataset.check_records()
-        if self._check_rules is not None:  # else no rule made the buffer
-            self._check_rules(manifest)
-        for entry in manifest.sessions:
-            span = entry.start, entry.stop
-            what = f"{entry.role} {entry.source}"
-            self._check_span(what, entry.dataset, entry.episode_index, span, entry.sha256)
-        stored, recorded = query.first_frame, query.record.span_sha256
-        span = stored.frame, stored.frame + 1
-        sha256 = recorded.query if recorded else ""
-        self._check_span("first live view", stored.dataset, stored.episode_index, span, sha256)
+        from .verified import verify_buffer  # most buffers are not verified
 
-    def _check_span(
-        self, what: str, name: str, index: int, span: tuple[int, int], sha256: str
-    ) -> None:
-        dataset = self._datasets[name]
-        [digests] = dataset.digests(index, [span])
-        if combine(digests) == sha256:
-            return
-        recorded = dataset.record(index).digests(*span)
-        differing = [name for name in digests if recorded and digests[name] != recorded.get(name)]
-        columns = f": {', '.join(differing)}" if differing else ""
-        raise HashMismatchError.damaged(
-            f"{self.manifest}: {what} ({name} episode {index}, frames {span[0]} to {span[1] - 1}) "
-            f"does not have the recorded SHA-256{columns}"
-        )
+        verify_buffer(self.manifest, self.query, self._datasets, self._check_rules)
 
     def _chosen(self, indices: Sequence[int] | None) -> NDArray[np.int64]:
         """Return the indices of the frames to stream, `(n,) int64`."""

@@ -2,17 +2,22 @@
 
 import math
 import os
+import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import groupby, repeat
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import KEY_FRAMES
-from robomme_interference_data.errors import FormatError
+from robomme_interference_data.errors import FormatError, HashMismatchError, InterferenceError
 from robomme_interference_data.schema.manifest import Session, SessionEntry
+from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.storage.arrays import FeatureDigests
+from robomme_interference_data.storage.files import digest_json
 
 from .dataset import Dataset, camera_feature
 
@@ -25,12 +30,12 @@ _PIECE = 8 * KEY_FRAMES
 _MAX_BYTES = 16 << 30
 """Most bytes of frames in memory at once: a small video file may hold many large frames."""
 
+_warned: set[Path] = set()
+"""Folders of caches that could not be written to, and were warned about."""
+
 
 class FrameReader:
-    """Reads frames of sessions, from the cache if possible, on `threads` (None: one per CPU).
-
-    If `verified`, frames from the cache are compared with their digest.
-    """
+    """Reads frames of sessions, from the cache if possible, on `threads` (None: one per CPU)."""
 
     def __init__(
         self,
@@ -43,60 +48,56 @@ class FrameReader:
         self._datasets = datasets
         self._cache = cache
         self._threads = threads or os.cpu_count() or 1
-        self.verified = False
 
     def read(self, camera: str, out: NDArray[np.uint8]) -> None:
         """Read all frames of a camera into `out`, `(T, H, W, 3) uint8`."""
         with ThreadPoolExecutor(self._threads) as pool:
+            reading = [r for s in self._sessions for r in self._start_reading(s, camera, out, pool)]
             try:
-                for finish in [self._start_reading(s, camera, out, pool) for s in self._sessions]:
-                    finish()
+                for piece_read in reading:
+                    piece_read.result()
             except BaseException:
+                # Else the pool would finish all that is queued before the error arrives.
                 pool.shutdown(cancel_futures=True)
                 raise
 
     def iter(self, camera: str, chosen: Sequence[int]) -> Generator[NDArray[np.uint8]]:
         """Yield frames of a camera, `(H, W, 3) uint8`, by their ascending indices."""
         indices = np.asarray(chosen, np.int64)
+        # Runs of consecutive frames: a video is decoded in order, and each run begins with a seek.
         for run in np.split(indices, np.flatnonzero(np.diff(indices) > 1) + 1):
             if len(run):
                 yield from self._iter_frames(camera, int(run[0]), int(run[-1]) + 1)
 
-    def _cached(
-        self, entry: SessionEntry, camera: str
-    ) -> tuple[str | None, NDArray[np.uint8] | None]:
-        """Return a session's key in the cache, None if it cannot be cached, and its frames."""
-        dataset = self._datasets[entry.dataset]
+    def _cached(self, entry: SessionEntry, camera: str) -> NDArray[np.uint8] | None:
+        """Return an entry's frames from the cache; None if there is none, or it is unusable."""
         if self._cache is None:
-            return None, None
-        digests = dataset.record(entry.episode_index).digests(entry.start, entry.stop)
-        if digests is None:
-            return None, None
-        key = digests.get(camera_feature(camera), "")
-        shape = (entry.stop - entry.start, *dataset.shape(camera))
-        return key, self._cache.get(key, shape, verify=self.verified)
-
-    def _keep(self, key: str | None, frames: NDArray[np.uint8]) -> None:
-        if self._cache is None or key is None:
-            return
-        from robomme_interference_data.storage.cache import frames_sha256
-
-        # Only under their true digest: another buffer set may hold the frames with that digest.
-        if frames_sha256(frames) == key:
-            self._cache.put(key, frames)
+            return None
+        dataset = self._datasets[entry.dataset]
+        session = dataset.record(entry.episode_index).session[1]
+        size = session * math.prod(dataset.shape(camera))
+        # A manifest may claim frames after the session, and a small video may hold many large ones.
+        if entry.stop > session or size > self._cache.max_bytes:
+            return None
+        try:
+            frames = cached_session(self._cache, dataset, entry.episode_index, camera)
+        except OSError as error:
+            if isinstance(error, InterferenceError):  # the video itself
+                raise
+            _warn_once(self._cache.folder, error)
+            return None
+        return frames[entry.start : entry.stop]
 
     def _start_reading(
         self, session: Session, camera: str, out: NDArray[np.uint8], pool: ThreadPoolExecutor
-    ) -> Callable[[], None]:
-        """Start to read a session into its part of `out`; call the result to wait for the end."""
+    ) -> list[Future[None]]:
+        """Start to read a session into its part of `out`."""
         entry, target = session.entry, out[session.start : session.stop]
         dataset, length = self._datasets[entry.dataset], entry.stop - entry.start
-        key, cached = self._cached(entry, camera)
-        piece = _PIECE if self._threads > 1 else length
         shown = target.reshape(length, entry.repeat, *target.shape[1:])  # a view
 
-        def read(first: int) -> None:
-            last = min(first + piece, length)
+        def read(first: int, last: int) -> None:
+            cached = self._cached(entry, camera)
             if cached is not None:
                 shown[first:last] = cached[first:last, None]
                 return
@@ -105,15 +106,10 @@ class FrameReader:
             for number, frame in enumerate(frames, first):
                 shown[number] = frame
 
-        reading = [pool.submit(read, first) for first in range(0, length, piece)]
-
-        def finish() -> None:
-            for piece_read in reading:
-                piece_read.result()
-            if cached is None:
-                self._keep(key, shown[:, 0])
-
-        return finish
+        # The cache holds whole sessions, so pieces would wait for each other.
+        piece = _PIECE if self._threads > 1 and self._cache is None else length
+        firsts = range(0, length, piece)
+        return [pool.submit(read, first, min(first + piece, length)) for first in firsts]
 
     def _iter_frames(self, camera: str, start: int, stop: int) -> Generator[NDArray[np.uint8]]:
         """Yield frames `start` to `stop` (excluded), `(H, W, 3) uint8`, in order."""
@@ -123,19 +119,83 @@ class FrameReader:
                 continue
             entry, dataset = session.entry, self._datasets[session.entry.dataset]
             stored = [(index - session.start) // entry.repeat for index in indices]
-            key, whole = self._cached(entry, camera)
+            cached = self._cached(entry, camera)
             frames: Iterator[NDArray[np.uint8]]
-            if key is None:
+            if cached is None:
                 first, last = entry.start + stored[0], entry.start + stored[-1] + 1
                 frames = dataset.iter_frames(entry.episode_index, camera, first, last)
             else:
-                if whole is None:
-                    whole = allocate_frames(entry.stop - entry.start, dataset.shape(camera))
-                    dataset.read_frames(entry.episode_index, camera, entry.start, whole)
-                    self._keep(key, whole)
-                frames = iter(whole[stored[0] : stored[-1] + 1])
+                frames = iter(cached[stored[0] : stored[-1] + 1])
+            # A held frame is decoded once and shown several times.
             for frame, (_, shown) in zip(frames, groupby(stored), strict=True):
                 yield from repeat(frame, len(list(shown)))
+
+
+def cached_session(
+    cache: "DecodedCache",
+    dataset: Dataset,
+    episode_index: int,
+    camera: str,
+    shape: tuple[int, ...] | None = None,
+    convert: Callable[[NDArray[np.uint8]], NDArray[np.uint8]] | None = None,
+) -> NDArray[np.uint8]:
+    """Return the frames of an episode's session, a lesson or unit, from the cache.
+
+    Args:
+        cache: The cache, which stores them if it lacks them.
+        dataset: Dataset of the episode.
+        episode_index: Number of the episode.
+        camera: Name of the camera, with or without `observation.images.`.
+        shape: Shape of a converted frame, from which the conversion follows: `(3, S, S)`.
+        convert: Makes it of a decoded one, `(H, W, 3) uint8`; None for no conversion.
+
+    Returns:
+        `(T, H, W, 3) uint8` RGB, or `(T, *shape) uint8`; read-only.
+
+    Raises:
+        HashMismatchError: The decoded frames do not have the recorded digest.
+        OSError: The cache cannot be written to.
+    """
+    record, feature = dataset.record(episode_index), camera_feature(camera)
+    start, stop = record.session
+    recorded = record.feature_sha256.get(feature)
+
+    def decode() -> Iterator[NDArray[np.uint8]]:
+        digests = FeatureDigests()
+        for frame in dataset.iter_frames(episode_index, camera, start, stop):
+            digests.update(feature, frame)
+            yield frame if convert is None else convert(frame)
+        # Nothing is stored under a digest that an untrusted dataset only claims.
+        check_session(dataset, record, feature, digests)
+
+    whole = (stop - start, *(shape or dataset.shape(camera)))
+    layout = "HWC" if convert is None else "CHW"
+    return cache.frames(digest_json([recorded, layout, whole]), whole, decode)
+
+
+def check_session(
+    dataset: Dataset, record: EpisodeRecord, feature: str, digests: FeatureDigests
+) -> None:
+    """Compare the digest of a feature of an episode's session with the recorded one.
+
+    Raises:
+        HashMismatchError: They differ.
+    """
+    if digests.current()[feature] != record.feature_sha256.get(feature):
+        raise HashMismatchError.damaged(
+            f"{dataset.files.describe()}: {feature} of {record.episode_id} does not have the "
+            "recorded SHA-256"
+        )
+
+
+def _warn_once(folder: Path, error: OSError) -> None:
+    if folder not in _warned:
+        _warned.add(folder)
+        warnings.warn(
+            f"decoded frames cannot be cached in {folder}: {error.strerror or error}",
+            RuntimeWarning,
+            stacklevel=2,
+        )
 
 
 def allocate_frames(frames: int, shape: tuple[int, ...]) -> NDArray[np.uint8]:

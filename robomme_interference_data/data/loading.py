@@ -13,6 +13,7 @@ from robomme_interference_data.constants import (
     EXECUTIONS,
     FETCH_RECORD,
     IDENTITY_PATH,
+    INFO_PATH,
     MANIFEST_PATH,
     MANIFESTS,
 )
@@ -56,6 +57,7 @@ def load_buffer_set(
     _check_location("buffer_set", buffer_set, "a folder, or namespace/name")
     files: LocalFiles | HubFiles
     folder = Path(buffer_set).expanduser()
+    # With a revision, `locate` has the error that a folder has none.
     if folder.is_dir() and revision is None:
         files = LocalFiles(folder)
     else:
@@ -65,7 +67,7 @@ def load_buffer_set(
     if threads is not None:
         threads = whole_number("threads", threads, "an integer from 1, or None", 1)
     try:
-        return BufferSet(files, _cache(cache), threads)
+        return BufferSet(files, open_cache(cache), threads)
     except MissingFileError as error:
         raise _no_buffer_set(files) from error
 
@@ -96,6 +98,13 @@ def _no_buffer_set(files: "LocalFiles | HubFiles") -> MissingFileError:
                 "Build what it lacks.",
                 next_build(files.root),
             )
+        if (files.root / IDENTITY_PATH).is_file():
+            return MissingFileError(message, "It is one dataset: give the folder that holds it.")
+        if (files.root / INFO_PATH).is_file():
+            command = ["build", "BUFFER_SET", "--source", f"lerobot:{files.root}"]
+            return MissingFileError(
+                message, "Build one from these recordings.", shlex.join(command)
+            )
     return MissingFileError(
         message,
         "Give a folder with demonstrations/, distractors/ and manifests/, or build one.",
@@ -109,8 +118,11 @@ def built_datasets(root: Path) -> tuple[str, ...]:
 
 
 def next_build(root: Path) -> str:
-    """Return the command that builds what a buffer set in a folder lacks first."""
-    built = built_datasets(root)
+    """Return the command that builds what a buffer set in a folder lacks first.
+
+    If it has manifests, its demonstrations may be on the Hub, and the manifests are built again.
+    """
+    built = DATASETS if (root / MANIFEST_PATH).is_file() else built_datasets(root)
     for name in (DEMONSTRATIONS, DISTRACTORS):
         if name not in built:
             return shlex.join(["build", str(root), "--only", name, "--source", "KIND:PATH"])
@@ -141,8 +153,7 @@ def load_buffer(
             by `load_buffer_set` (then `revision`, `cache` and `threads` are ignored).
         revision: As for `load_buffer_set`.
         k: Short for the condition `k<k>`, instead of `condition`.
-        verify: Decode everything now and compare it with the recorded SHA-256, and later also
-            compare what is read from the cache.
+        verify: Decode everything now and compare it with the recorded SHA-256.
         cameras: Cameras whose videos are downloaded now, such as `["front"]`; None for all. Other
             videos are downloaded when they are used.
         cache: As for `load_buffer_set`.
@@ -195,13 +206,14 @@ def open_dataset(buffer_set: BufferSet, name: str, more: str = "") -> Dataset:
     )
 
 
-def _cache(cache: "bool | str | os.PathLike[str] | DecodedCache") -> "DecodedCache | None":
+def open_cache(cache: "bool | str | os.PathLike[str] | DecodedCache") -> "DecodedCache | None":
+    """Return the cache that an argument `cache` means, None for none; see `load_buffer_set`."""
     if cache is False or cache is None:
         return None
-    from robomme_interference_data.storage.cache import DecodedCache, default_cache_folder
+    from robomme_interference_data.storage.cache import DecodedCache
 
     if cache is True:
-        return DecodedCache(default_cache_folder())
+        return DecodedCache()
     if isinstance(cache, DecodedCache):
         return cache
     _check_location("cache", cache, "True, False, a folder or a DecodedCache")

@@ -10,6 +10,7 @@ import secrets
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,36 +55,31 @@ class ActorAddress:
 
     name: str
 
-    def connect(self, worker: int) -> "ActorChannel":
-        """Connect a worker, by its number."""
-        return ActorChannel(self.name, worker)
+    def connect(self, worker: int) -> Callable[[bytes], bytes]:
+        """Return what sends the requests of a worker, by its number.
 
-
-class ActorChannel:
-    """A worker's connection to an actor."""
-
-    def __init__(self, name: str, worker: int):
+        Raises:
+            ServerDiedError: The actor was ended. What is returned raises it if the actor dies.
+        """
         try:
-            self._actor: Any = ray.get_actor(name)
-        except ValueError as error:  # it was ended, and is not started again
+            actor: Any = ray.get_actor(self.name)
+        except ValueError as error:  # it is not started again
             raise ServerDiedError(f"no actor of a shared policy: {first_line(error)}") from error
-        self._worker = worker
+        return partial(_ask, actor, worker)
 
-    def ask(self, request: bytes) -> bytes:
-        """Return the answer to a request; raise `ServerDiedError` if the actor died."""
-        try:
-            answer: bytes = ray.get(self._actor.answer.remote(self._worker, request))
-        except RayTaskError:
-            raise
-        except RayError as error:
-            raise ServerDiedError(
-                f"the actor of a shared policy died: {first_line(error)}",
-                "Ray's log on its node has its output.",
-            ) from error
-        return answer
 
-    def close(self) -> None:
-        """There is nothing to close."""
+def _ask(actor: Any, worker: int, request: bytes) -> bytes:
+    """Return an actor's answer to a request."""
+    try:
+        answer: bytes = ray.get(actor.answer.remote(worker, request))
+    except RayTaskError:
+        raise
+    except RayError as error:
+        raise ServerDiedError(
+            f"the actor of a shared policy died: {first_line(error)}",
+            "Ray's log on its node has its output.",
+        ) from error
+    return answer
 
 
 @contextmanager

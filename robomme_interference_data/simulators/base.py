@@ -18,8 +18,7 @@ from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.shifts import Shift
 from robomme_interference_data.schema.subgoal import Subgoal
 
-from .checks import check_begun
-from .episode import ACTION_SIZE, CAMERAS, EpisodeStart, Observation, action_array
+from .episode import ACTION_SIZE, CAMERAS, EpisodeStart, Observation, action_array, check_begun
 from .scene import Scene
 
 SCRIPTED = ("oracle", "guess", "recall", "answer")

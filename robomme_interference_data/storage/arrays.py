@@ -8,11 +8,10 @@ of the actions. Both can be recomputed from decoded arrays with hashlib alone.
 
 import hashlib
 import math
-import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,31 +42,8 @@ def write_array(path: Path, array: NDArray[Any]) -> None:
         file.write(array.data)
 
 
-def allocate_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:
-    """Create an array for `map_array` on disk, and return it as a writable memory map.
-
-    All its space is allocated at once: on a full disk this raises `OSError`, whereas writing to a
-    sparse map would end the process.
-    """
-    header = {"descr": np.dtype(dtype).str, "fortran_order": False, "shape": shape}
-    with path.open("wb") as file:
-        np.lib.format.write_array_header_1_0(file, header)  # type: ignore[no-untyped-call]
-        start, size = file.tell(), math.prod(shape) * np.dtype(dtype).itemsize
-        if hasattr(os, "posix_fallocate"):
-            os.posix_fallocate(file.fileno(), 0, start + size)
-        else:  # macOS and Windows
-            _write_zeros(file, size)
-    return np.memmap(path, dtype, "r+", start, shape)
-
-
-def _write_zeros(file: BinaryIO, size: int) -> None:
-    block = bytes(1 << 20)
-    for written in range(0, size, len(block)):
-        file.write(block[: size - written])
-
-
-def map_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:
-    """Return an array that `write_array` wrote as a read-only memory map.
+def read_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:
+    """Read an array that `write_array` wrote.
 
     Type and shape must be the given ones (-1 for any length), and fit the file's size, before
     anything is allocated. `np.load` would also open archives.
@@ -86,12 +62,7 @@ def map_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:
     size = path.stat().st_size
     if header.end() + math.prod(sides) * np.dtype(dtype).itemsize != size:
         raise FormatError.damaged(path, f"{size} bytes do not fit an array of shape {sides}")
-    return np.memmap(path, dtype, "r", header.end(), sides)
-
-
-def read_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:
-    """Read an array into memory; see `map_array`."""
-    return np.array(map_array(path, dtype, shape))
+    return np.fromfile(path, dtype, offset=header.end()).reshape(sides)
 
 
 def combine(digests: Mapping[str, str]) -> str:
@@ -111,6 +82,7 @@ class FeatureDigests:
 
     def update(self, feature: str, values: NDArray[Any]) -> None:
         """Add the next value, or several stacked along a first axis, of a feature."""
+        # The same bytes on machines of either byte order.
         if values.dtype == np.float32:
             values = values.astype("<f4", copy=False)
         elif values.dtype != np.uint8:

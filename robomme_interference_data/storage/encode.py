@@ -40,6 +40,7 @@ class Codec:
     interpolation: str | None = None
 
 
+# The encoder's fastest mode: without loss, more effort saves bytes but changes no pixel.
 _AOM_LOSSLESS = {"usage": 1, "cpu-used": 8, "row-mt": 1, "aom-params": "lossless=1"}
 
 CODECS = {
@@ -156,16 +157,21 @@ class VideoEncoder:
             self._container.mux(self._stream.encode(None))
             self._container.close()
 
+    def abandon(self) -> None:
+        """Close the unfinished file; what goes wrong then does not matter."""
+        # Otherwise PyAV closes it during garbage collection, and prints the error there.
+        with suppress(av.error.FFmpegError):
+            self._container.close()
+
     @contextmanager
     def _errors(self) -> Iterator[None]:
         try:
             yield
         except (av.error.FFmpegError, UnknownCodecError) as error:
             if self._container is not None:
-                # Otherwise PyAV closes it during garbage collection, and prints the error again.
-                with suppress(av.error.FFmpegError):
-                    self._container.close()
-            raise BuildError(f"{self._path}: the video cannot be written: {error}") from error
+                self.abandon()
+            hint = "Check the free disk space." if isinstance(error, OSError) else None
+            raise BuildError(f"{self._path}: the video cannot be written: {error}", hint) from error
 
 
 def png(image: NDArray[np.uint8]) -> bytes:
@@ -173,6 +179,7 @@ def png(image: NDArray[np.uint8]) -> bytes:
     height, width, _ = image.shape
     encoder = av.CodecContext.create("png", "w")
     encoder.width, encoder.height, encoder.pix_fmt = width, height, "rgb24"
+    # None flushes the encoder, which may hold the picture back.
     packets = [*encoder.encode(av.VideoFrame.from_ndarray(image, "rgb24")), *encoder.encode(None)]
     return b"".join(map(bytes, packets))
 

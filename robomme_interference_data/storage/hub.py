@@ -23,6 +23,7 @@ _LOCATION = re.compile(rf"({_NAME}/{_NAME})((?:/{_NAME})*)(?:@(.+))?")
 _VERSION = re.compile(r"data-\d+\.\d+\.\d+")
 _ENDPOINT = re.compile(r"https?://([\w.-]+|\[[\da-fA-F:.]+\])(:[1-9]\d{0,4})?(/\S*)?")
 _PUBLIC = "https://huggingface.co"
+# As many as the client's own `snapshot_download` has.
 _PARALLEL_DOWNLOADS = 8
 
 
@@ -145,17 +146,20 @@ class HubFiles(Files):
         `snapshot_download` would first list the whole repository: for one buffer of a large
         dataset, more bytes and requests than the buffer's metadata.
         """
-        from huggingface_hub.utils import tqdm
+        from huggingface_hub.utils import are_progress_bars_disabled
+
+        from robomme_interference_data.progress import WorkProgress
 
         missing = self.missing(paths)
         if not missing:
             return
         with (
-            tqdm(total=len(missing), desc=f"Fetching from {self.repo_id}", unit=" files") as bar,
+            WorkProgress(unit="files", quiet=are_progress_bars_disabled()) as progress,
             ThreadPoolExecutor(_PARALLEL_DOWNLOADS) as pool,
         ):
+            progress.start(f"Fetching from {self.repo_id}", len(missing))
             for _ in pool.map(self.path, missing):  # an error cancels the downloads in the queue
-                bar.update()
+                progress.advance(1)
 
     def missing(self, paths: Iterable[str]) -> list[str]:
         """Return the files that are not in the cache, each once."""

@@ -1,11 +1,12 @@
 """Call the Hugging Face Hub's client: its errors become this package's errors."""
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from robomme_interference_data.errors import HubError, MissingFileError
+from robomme_interference_data.retry import retry
 
 from .files import with_filename
 
@@ -72,13 +73,11 @@ class HubCall:
 
     def run(self, call: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
         """Call a function of the client; again, once, if a download meets a fault of the Hub."""
-        try:
-            return self._once(call, *arguments, **options)
-        except HubError as error:
-            if self.revision is None or _status(error.__cause__) not in _FAULTS:
-                raise
-        time.sleep(_PAUSE_S)
-        return self._once(call, *arguments, **options)
+        return retry(
+            partial(self._once, call, *arguments, **options),
+            lambda error: self.revision is not None and _status(error.__cause__) in _FAULTS,
+            [_PAUSE_S],
+        )
 
     def _once(self, call: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
         from huggingface_hub import constants, errors
@@ -97,8 +96,10 @@ class HubCall:
         ) as error:
             cause: BaseException = error
             vague = (RuntimeError, errors.LocalEntryNotFoundError, errors.RevisionResolutionError)
+            # These only say that a call failed; what they were raised from says why.
             while isinstance(cause, vague) and cause.__cause__ is not None:
                 cause = cause.__cause__
+            # An error of this machine, such as a full disk, not of the Hub.
             if isinstance(cause, OSError) and cause.errno is not None:
                 with with_filename(constants.HF_HUB_CACHE if self.revision else self.repo_id):
                     raise cause from None

@@ -3,32 +3,38 @@
 import operator
 import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, EXECUTIONS, SHIFTED, STATE
+from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, SHIFTED, STATE
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import camera_feature
-from robomme_interference_data.data.loading import load_buffer_set
+from robomme_interference_data.data.loading import load_buffer_set, open_cache
 from robomme_interference_data.data.views import shifted_view
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import (
+    HashMismatchError,
+    InterferenceError,
+    InvalidOptionError,
+)
 from robomme_interference_data.ids import EpisodeId, parse_numbers, whole_number
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.retrieval.stored_selector import StoredSelector
-from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.schema.manifest import ManifestHeader
 from robomme_interference_data.schema.sampling import Memory
-from robomme_interference_data.schema.shifts import NO_SHIFT, parse_shift
-from robomme_interference_data.storage.cache import default_cache_folder
+from robomme_interference_data.schema.shifts import NO_SHIFT, Shift, parse_shift
 
 from .draws import Weights
 from .histories import DrawnHistory, Histories
-from .moments import check_arguments, check_size, choose_moments, needed_datasets
+from .moments import check_arguments, check_size, choose_moments, drawable_rows, needed_datasets
 from .question_tensors import QuestionTensors
 from .rows import PADDING, StoredRows
 
 if TYPE_CHECKING:
     import torch
+
+    from robomme_interference_data.storage.cache import DecodedCache
 
 
 class _Drawn(NamedTuple):
@@ -49,7 +55,7 @@ class HistoryDataset:
     the buffer of the episode under a condition that is drawn from `conditions`; its memory is what
     the rule `memory` keeps of the history and the live frames before t. Everything that is drawn
     follows from `seed`, the epoch and the index: items are the same for any number of workers and
-    ranks, in any order. Frames come from a store of decoded frames, which the first use fills.
+    ranks, in any order. Frames come from the cache of decoded frames, which the first use fills.
 
     An item has, with M memory frames, S the image size and P the most parts of an answer:
 
@@ -95,7 +101,8 @@ class HistoryDataset:
         unit_episodes: With `redraw`, indices of the train episodes whose units may be drawn, such
             as `0-5`, so that others can be kept for testing; None for all.
         seed: Seed of everything that is drawn.
-        store: Folder of the decoded frames; None for `~/.cache/robomme-interference/frames`.
+        cache: Where decoded frames are kept: a `DecodedCache`, a folder for one of 20 GiB, or True
+            for the folder `~/.cache/robomme-interference`.
         quiet: Show no progress.
 
     Raises:
@@ -125,7 +132,7 @@ class HistoryDataset:
         redraw: bool = False,
         unit_episodes: str | None = None,
         seed: int = 0,
-        store: str | os.PathLike[str] | None = None,
+        cache: "bool | str | os.PathLike[str] | DecodedCache" = True,
         quiet: bool = False,
     ):
         for option, given in (("cameras", cameras), ("families", families)):
@@ -139,7 +146,7 @@ class HistoryDataset:
             conditions=conditions, memory=memory, cameras=cameras, image_size=image_size,
             chunk=chunk, families=tuple(families), episodes=episodes, retrieval=retrieval,
             retrieval_rule=retrieval_rule, retrieval_camera=retrieval_camera, shifts=shifts,
-            questions=questions, redraw=redraw, unit_episodes=unit_episodes, seed=seed, store=store,
+            questions=questions, redraw=redraw, unit_episodes=unit_episodes, seed=seed, cache=cache,
         )  # fmt: skip
         self.memory, self.seed = Memory.parse(memory), seed
         self.chunk = whole_number("chunk", chunk, "an integer from 0", 0)
@@ -165,26 +172,31 @@ class HistoryDataset:
         self.buffer_set.check_tables(self._conditions.names, planned=not redraw)
         for dataset in datasets.values():
             dataset.check_records()
+        kept = open_cache(cache)
+        if kept is None:
+            raise InvalidOptionError.expected("cache", cache, "True, a folder or a DecodedCache")
         size = check_size(self.buffer_set, self.cameras, image_size)
-        self._rows = StoredRows(datasets)
+        self._rows = StoredRows(datasets, kept, size)
         self._moments = choose_moments(
             self.buffer_set, self._rows, families, episodes, actions=actions
         )
         draws = (seed, units) if redraw else None
         self._histories = Histories(self.buffer_set, self._rows, step, draws)
         self._questions = QuestionTensors(self.buffer_set, self.episode_ids) if questions else None
-        folder = default_cache_folder().parent / "frames" if store is None else Path(store)
-        with WorkProgress(unit="episodes", quiet=quiet) as progress:
-            for camera in self.cameras:
-                self._rows.load(camera, folder, size, progress)
-            self._rows.load(STATE, folder, None, progress)
-            if actions:
-                self._rows.load(ACTION, folder, None, progress, (EXECUTIONS,))
-            if not redraw:
-                with progress.status("Laying out histories"):
-                    self._histories.plan(
-                        self._conditions.names, self.episode_ids, self._shift_of.values()
-                    )
+        now = self._live_rows()
+        if redraw:
+            history = drawable_rows(datasets, self._rows, self.episode_ids, units)
+        else:
+            with WorkProgress(quiet=quiet) as progress, progress.status("Laying out histories"):
+                self._histories.plan(
+                    self._conditions.names, self.episode_ids, self._shift_of.values()
+                )
+            history = self._histories.rows
+        # Here, not when they are first used: a loader's forked workers share what is open now.
+        self._rows.prepare((*self.cameras, STATE), np.concatenate([now, history]), quiet=quiet)
+        if actions:
+            self._rows.prepare((ACTION,), now, quiet=quiet)
+        # All items have as many places, so that they can be batched.
         self._size = self.memory_frames
         import torch
 
@@ -192,7 +204,13 @@ class HistoryDataset:
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # type: ignore[no-untyped-call]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _open_again, (self.buffer_set.location, self._arguments, self._epoch)
+        return _open_again, (
+            self.buffer_set.location,
+            self._arguments,
+            self._epoch,
+            self.buffer_set.header,
+            self.episode_ids,
+        )
 
     def __len__(self) -> int:
         """Return the number of items."""
@@ -270,6 +288,7 @@ class HistoryDataset:
             kept = np.asarray(self.memory.earlier(len(past) + drawn.moment), np.int64)
             count, ended = len(kept), int(kept.searchsorted(len(past)))
             rows[place, :ended] = past[kept[:ended]]
+            # Frames after the history are of the execution, which begins at its own row.
             rows[place, ended:count] = kept[ended:] + (
                 self._moments.first[drawn.number] - len(past)
             )
@@ -291,6 +310,7 @@ class HistoryDataset:
         if self.chunk:
             steps = moment[:, None] + np.arange(self.chunk)
             last = self._moments.actions[numbers][:, None] - 1
+            # After the end the last action repeats, as LeRobot pads its chunks.
             batch[ACTION] = self._rows.take(ACTION, first[:, None] + np.minimum(steps, last))
             batch["action_is_pad"] = steps > last
         batch["frame_index"] = moment
@@ -308,15 +328,52 @@ class HistoryDataset:
         return {name: torch.from_numpy(values) for name, values in batch.items()} | texts
 
     def _current_row(self, drawn: _Drawn) -> int:
-        shift = self._shift_of[drawn.shift]
+        return self._view_row(drawn.number, self._shift_of[drawn.shift]) + drawn.moment
+
+    def _view_row(self, number: int, shift: Shift | None) -> int:
+        """Return the row of the first live view of an episode, given by its number."""
         if shift is None:
-            return int(self._moments.first[drawn.number]) + drawn.moment
-        _, stored, frame = shifted_view(self.buffer_set, self.episode_ids[drawn.number], shift)
+            return int(self._moments.first[number])
+        _, stored, frame = shifted_view(self.buffer_set, self.episode_ids[number], shift)
         return self._rows.first(SHIFTED, stored) + frame
 
+    def _live_rows(self) -> NDArray[np.int64]:
+        """Return the rows of the first live views; those of later ones belong to the same spans."""
+        numbers, shifts = range(len(self.episode_ids)), self._shift_of.values()
+        return np.array([self._view_row(number, shift) for shift in shifts for number in numbers])
 
-def _open_again(location: str, arguments: dict[str, Any], epoch: "torch.Tensor") -> HistoryDataset:
+
+class _Unusable:
+    """A dataset that another process cannot open again.
+
+    A loader reports errors of items in the process that trains, but an error while a dataset is
+    unpickled only ends its worker.
+    """
+
+    def __init__(self, error: InterferenceError):
+        self._error = error
+
+    def __getitem__(self, index: object) -> Any:
+        raise self._error
+
+
+def _open_again(
+    location: str,
+    arguments: dict[str, Any],
+    epoch: "torch.Tensor",
+    header: ManifestHeader,
+    episodes: tuple[EpisodeId, ...],
+) -> HistoryDataset | _Unusable:
     """Return a dataset in another process; memory maps and tables cannot be pickled."""
-    made = HistoryDataset(location, **arguments, quiet=True)
+    try:
+        made = HistoryDataset(location, **arguments, quiet=True)
+        # Items are numbered over all episodes: in a set that grew, an index means another moment.
+        if (made.buffer_set.header, made.episode_ids) != (header, episodes):
+            raise HashMismatchError(
+                f"{location} was changed since the training began: a worker finds other buffers",
+                "Start the training again; do not change a buffer set that is in use.",
+            )
+    except InterferenceError as error:
+        return _Unusable(error)
     made._epoch = epoch
     return made

@@ -1,74 +1,185 @@
 """The stored values of several datasets, one after another.
 
-A *row* is a frame of any dataset of the buffer set: rows of the datasets follow one another.
+A *row* is a frame of any dataset of the buffer set: rows of the datasets follow one another. Rows
+of one session are read together, from one file of the cache of decoded frames.
 """
 
-from collections.abc import Collection, Mapping
+import os
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from itertools import pairwise
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.constants import CAMERA_PREFIX
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.data.frame_reader import cached_session, check_session
+from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.progress import WorkProgress
+from robomme_interference_data.storage.arrays import FeatureDigests
+from robomme_interference_data.storage.cache import DecodedCache
 
-from .frame_store import first_rows, stored_values
+from .images import resize
 
 PADDING = -1
 """The row of a place without a frame."""
 
 
-class StoredRows:
-    """The stored values of several datasets, by row."""
+class _Span(NamedTuple):
+    """Rows that are read together: a session, or the query frame after it."""
 
-    def __init__(self, datasets: Mapping[str, Dataset]):
-        self._datasets = dict(datasets)
-        self._first: dict[str, NDArray[np.int64]] = {}
+    dataset: str
+    episode: int
+    start: int
+    stop: int
+
+
+class StoredRows:
+    """The stored values of several datasets, by row; opened, and stored, when first used.
+
+    Args:
+        datasets: The datasets by name.
+        cache: Where decoded and resized frames are.
+        size: Side of resized images in pixels; None for no change of size.
+    """
+
+    def __init__(self, datasets: Mapping[str, Dataset], cache: DecodedCache, size: int | None):
+        self._datasets, self._cache, self._size = dict(datasets), cache, size
+        self._first: dict[str, list[int]] = {}
+        self._spans: list[_Span] = []
         starts, total = [], 0
         for name, dataset in self._datasets.items():
-            self._first[name] = total + first_rows(dataset)
-            starts.append(total)
-            total = int(self._first[name][-1])
+            self._first[name] = []
+            for record in dataset.records():
+                self._first[name].append(total)
+                stop = record.session[1]
+                for span in ((0, stop), (stop, record.length)):
+                    if span[0] < span[1]:
+                        self._spans.append(_Span(name, record.episode_index, *span))
+                        starts.append(total + span[0])
+                total += record.length
         self._starts = np.array(starts)
-        self._values: dict[str, list[NDArray[Any] | None]] = {}
+        self._values: defaultdict[str, list[NDArray[Any] | None]]
+        self._values = defaultdict(lambda: [None] * len(self._spans))
 
     def first(self, dataset: str, episode: int) -> int:
         """Return the row of an episode's first frame."""
-        return int(self._first[dataset][episode])
+        return self._first[dataset][episode]
 
-    def load(
-        self,
-        feature: str,
-        folder: Path,
-        size: int | None,
-        progress: WorkProgress,
-        names: Collection[str] | None = None,
-    ) -> None:
-        """Open a feature of all datasets, or of those with these names; see `stored_values`."""
-        self._values[feature] = [
-            np.asarray(stored_values(dataset, feature, folder, size, progress))
-            if names is None or name in names
-            else None
-            for name, dataset in self._datasets.items()
-        ]
+    def prepare(self, features: Iterable[str], rows: NDArray[np.int64], *, quiet: bool) -> None:
+        """Open features of the sessions of some rows, on several threads, with a progress bar.
+
+        Raises:
+            InvalidOptionError: They do not fit into the cache.
+            HashMismatchError: Frames or vectors differ from the recorded ones.
+            OSError: The disk is full.
+        """
+        features, used = list(features), np.unique(self._owner(rows)).tolist()
+        cameras = [feature for feature in features if _is_camera(feature)]
+        self._check_fits(cameras, used)
+        episodes: dict[str, list[int]] = {}
+        for number in used:
+            episodes.setdefault(self._spans[number].dataset, []).append(self._spans[number].episode)
+        for name, dataset in self._datasets.items():
+            files = (dataset.files_of(episode, cameras) for episode in episodes.get(name, ()))
+            dataset.files.fetch(path for paths in files for path in paths)
+        with (
+            WorkProgress(unit="sessions", quiet=quiet) as progress,
+            ThreadPoolExecutor(os.cpu_count()) as pool,
+        ):
+            try:
+                for feature in features:
+                    progress.start(feature.rpartition(".")[2], len(used))
+                    opening = [pool.submit(self._open, feature, number) for number in used]
+                    for opened in as_completed(opening):
+                        opened.result()
+                        progress.advance(1)
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
 
     def take(self, feature: str, rows: NDArray[np.int64]) -> NDArray[Any]:
-        """Return the values of rows, `(*rows.shape, …)`; 0 for `PADDING`."""
-        arrays, flat = self._values[feature], rows.ravel()
-        some = next(array for array in arrays if array is not None)
-        out = np.empty((len(flat), *some.shape[1:]), some.dtype)
-        # Run by run of rows of the same dataset; PADDING belongs to none, number -1.
-        owner = self._starts.searchsorted(flat, "right") - 1
-        local = flat - self._starts[owner]
-        bounds = [*np.diff(owner, prepend=len(arrays)).nonzero()[0].tolist(), len(flat)]
-        for start, stop in pairwise(bounds):
-            if (number := owner[start]) < 0:
+        """Return the values of rows, `(*rows.shape, …)`; 0 for `PADDING`.
+
+        Images are `(3, H, W) uint8`, vectors `(D,) float32`.
+        """
+        flat = rows.ravel()
+        owner = self._owner(flat)
+        # Run by run of rows of the same span; PADDING belongs to none, number -1.
+        bounds = [*np.diff(owner, prepend=len(self._spans)).nonzero()[0].tolist(), len(flat)]
+        numbers = owner[bounds[:-1]].tolist()
+        shape = self._shape(self._datasets[self._spans[max(numbers)].dataset], feature)
+        out = np.empty((len(flat), *shape), np.uint8 if _is_camera(feature) else np.float32)
+        for number, (start, stop) in zip(numbers, pairwise(bounds), strict=True):
+            if number < 0:
                 out[start:stop] = 0
                 continue
-            values = arrays[number]
-            assert values is not None
+            local = flat[start:stop] - self._starts[number]
             # The mode lets numpy write into `out` without a copy in between.
-            values.take(local[start:stop], axis=0, out=out[start:stop], mode="clip")
+            self._open(feature, number).take(local, axis=0, out=out[start:stop], mode="clip")
         return out.reshape(*rows.shape, *out.shape[1:])
+
+    def _owner(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the numbers of the spans that rows belong to; -1 for `PADDING`."""
+        return self._starts.searchsorted(rows, "right") - 1
+
+    def _open(self, feature: str, number: int) -> NDArray[Any]:
+        """Return the values of a span."""
+        values = self._values[feature][number]
+        if values is None:
+            span = self._spans[number]
+            read = self._images if _is_camera(feature) else self._vectors
+            values = self._values[feature][number] = read(feature, span)
+        return values
+
+    def _images(self, feature: str, span: _Span) -> NDArray[np.uint8]:
+        dataset = self._datasets[span.dataset]
+        if span.start == 0:
+            shape = self._shape(dataset, feature)
+            return cached_session(
+                self._cache, dataset, span.episode, feature, shape, self._converted
+            )
+        # One frame, of which no digest of its own is recorded: not worth a file.
+        frames = dataset.iter_frames(span.episode, feature, span.start, span.stop)
+        return np.stack([self._converted(frame) for frame in frames])
+
+    def _vectors(self, feature: str, span: _Span) -> NDArray[np.float32]:
+        dataset, digests = self._datasets[span.dataset], FeatureDigests()
+        record = dataset.record(span.episode)
+        values = dataset.read_vectors(span.episode, feature, 0, record.length)
+        digests.update(feature, values[slice(*record.session)])
+        check_session(dataset, record, feature, digests)
+        return values[span.start : span.stop]
+
+    def _converted(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return resize(frame[None], self._size)[0]
+
+    def _shape(self, dataset: Dataset, feature: str) -> tuple[int, ...]:
+        if not _is_camera(feature):
+            return dataset.features[feature]
+        height, width, _ = dataset.shape(feature)
+        return 3, self._size or height, self._size or width
+
+    def _check_fits(self, cameras: list[str], used: list[int]) -> None:
+        """Check that the cache can hold everything at once: else each start would decode again."""
+        size = 0
+        for number in used:
+            span = self._spans[number]
+            for camera in cameras:
+                frame = self._shape(self._datasets[span.dataset], camera)
+                size += (span.stop - span.start) * int(np.prod(frame))
+        if size > self._cache.max_bytes:
+            bound = self._cache.max_bytes
+            raise InvalidOptionError(
+                f"the used frames have {size / 1e9:,.1f} GB, the cache {bound / 1e9:,.1f} GB",
+                "Use smaller images, fewer episodes or conditions, or a larger cache: "
+                f"cache=DecodedCache(max_bytes={size * 11 // 10})",
+                option="cache",
+            )
+
+
+def _is_camera(feature: str) -> bool:
+    return feature.startswith(CAMERA_PREFIX)

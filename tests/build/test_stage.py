@@ -1,8 +1,11 @@
 """Staging an episode: frame selection, encoding, hashes, and frames that cannot be stored."""
 
 import dataclasses
+import gc
 import hashlib
+import sys
 from collections.abc import Generator, Iterator
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,6 +41,7 @@ from robomme_interference_data.errors import BuildError, SourceError
 from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.schema.records import EvidenceSpan, SpanDigests
 from robomme_interference_data.storage.arrays import combine
+from robomme_interference_data.storage.encode import CODECS, VideoEncoder
 from robomme_interference_data.storage.video import iter_frames
 
 NAME = "MoveCube/test/0"
@@ -242,3 +246,21 @@ def test_nothing_to_store(select: Any, lesson: int | None, length: int) -> None:
         list(select(marks(lesson, length)))
     with raises(SourceError):
         list(select_demonstration(marks(None, 10)))
+
+
+def test_an_unfinished_video_that_cannot_be_written_ends_quietly(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """PyAV would close it during garbage collection, and print a traceback."""
+    full, printed = Path("/dev/full"), list[object]()
+    if not full.exists():
+        pytest.skip("no device that is always full")
+    monkeypatch.setattr(sys, "unraisablehook", printed.append)
+    encoder = VideoEncoder(full, CODECS["av1-lossless"], 10, 64, 64, container="matroska")
+    with suppress(BuildError):
+        for _ in range(40):
+            encoder.add(np.zeros((64, 64, 3), np.uint8))
+    encoder.abandon()
+    del encoder
+    gc.collect()
+    assert not printed

@@ -34,8 +34,8 @@ from robomme_interference_data.constants import (
     Unit,
 )
 from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Serial
-from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.storage.files import read_json, write_json
 
 QUERIES = {f"{family}/test/0": (12, 5) for family in ("Lift", "Stack")}

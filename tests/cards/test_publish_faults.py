@@ -12,20 +12,14 @@ from support.hub import kill_at
 from support.hub_server import HubServer
 from support.machine import full_disk
 from support.messages import raises
-from support.publishing import LESSONS, UNITS, files, plain_cards, publish, tags
+from support.publishing import LESSONS, UNITS, files, publish, tags
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.cards import checks
 from robomme_interference_data.cards.checks import open_with_lerobot
 from robomme_interference_data.errors import HubError, PublishError
 
-pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(autouse=True)
-def _somebody(login: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
-    login("someone")
-    plain_cards(monkeypatch)
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("_somebody")]
 
 
 PUBLISH = """

@@ -1,8 +1,10 @@
 """The cache of decoded frames: bounded, shared, and never trusted when damaged."""
 
+import logging
 import os
+import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +14,10 @@ from support.messages import raises
 
 from robomme_interference_data import DecodedCache
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.storage.cache import default_cache_folder
+from robomme_interference_data.storage.cache import cache_folder
 
 SHAPE = (4, 8, 8, 3)
-FILE_BYTES = 4 * 8 * 8 * 3 + 128
+FILE_BYTES = 4 * 8 * 8 * 3 + 32
 
 
 def frames(seed: int) -> NDArray[np.uint8]:
@@ -26,87 +28,120 @@ def name(seed: int) -> str:
     return f"{seed:064x}"
 
 
+def get(cache: DecodedCache, seed: int) -> tuple[NDArray[np.uint8], bool]:
+    """Return the frames of a seed, and whether they were decoded now."""
+    decoded = []
+
+    def decode() -> Iterator[NDArray[np.uint8]]:
+        decoded.append(seed)
+        return iter(frames(seed))
+
+    found = cache.frames(name(seed), SHAPE, decode)
+    np.testing.assert_array_equal(found, frames(seed))
+    return found, bool(decoded)
+
+
 def used_at(cache: DecodedCache, seed: int, second: int) -> None:
-    """Set when a file was last used: clocks may be too coarse to order two writes."""
-    os.utime(cache.folder / f"{name(seed)}.npy", (second, second))
+    """Set when a file was last used: clocks may be too coarse to order two uses."""
+    path = cache.folder / name(seed)
+    os.utime(path, ns=(second * 10**9, path.stat().st_mtime_ns))
 
 
-def test_put_and_get(tmp_path: Path) -> None:
+def test_what_is_stored_is_not_decoded_again(tmp_path: Path) -> None:
     cache = DecodedCache(tmp_path / "cache")
-    assert cache.get(name(1), SHAPE) is None
-    assert not cache.folder.exists()  # asking makes nothing
-    cache.put(name(1), frames(1))
-    found = cache.get(name(1), SHAPE)
-    assert found is not None
-    np.testing.assert_array_equal(found, frames(1))
-    assert isinstance(found, np.memmap)
+    assert get(cache, 1)[1]
+    found, decoded = get(cache, 1)
+    assert not decoded
     with raises(ValueError):
         found[0] = 0
-    assert [path.name for path in cache.folder.iterdir()] == [f"{name(1)}.npy"]
+    assert [path.name for path in cache.folder.iterdir()] == [name(1)]
+    assert not get(DecodedCache(tmp_path / "cache"), 1)[1]
 
 
-def test_put_replaces_and_another_shape_or_type_counts_as_absent(tmp_path: Path) -> None:
+def overwrite_by_zeros(path: Path) -> None:
+    path.write_bytes(bytes(FILE_BYTES - 32) + path.read_bytes()[-32:])
+
+
+def shorten(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-1])
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+@pytest.mark.parametrize("damage", [overwrite_by_zeros, shorten, empty])
+def test_damaged_frames_are_decoded_again(
+    damage: object, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Also in a process that opened the file before it was damaged."""
     cache = DecodedCache(tmp_path)
-    cache.put(name(1), frames(1))
-    held = cache.get(name(1), SHAPE)
-    cache.put(name(1), frames(2))
-    np.testing.assert_array_equal(held, frames(1))  # a map that is in use keeps its file
-    np.testing.assert_array_equal(cache.get(name(1), SHAPE), frames(2))
-    assert cache.get(name(1), (5, 8, 8, 3)) is None
-    np.save(tmp_path / f"{name(2)}.npy", frames(2).astype(np.int8))
-    assert cache.get(name(2), SHAPE) is None
-    (tmp_path / f"{name(3)}.npy").mkdir()
-    assert cache.get(name(3), SHAPE) is None
-    path = tmp_path / f"{name(1)}.npy"
-    path.write_bytes(path.read_bytes()[:-1])  # damaged
-    assert cache.get(name(1), SHAPE) is None
-    cache.put(name(1), frames(1))  # and written anew
-    np.testing.assert_array_equal(cache.get(name(1), SHAPE), frames(1))
+    get(cache, 1)
+    damage(tmp_path / name(1))  # type: ignore[operator]
+    with caplog.at_level(logging.WARNING):
+        assert get(cache, 1)[1]
+    assert name(1) in caplog.text
+    assert not get(cache, 1)[1]
+
+
+def test_a_digest_is_compared_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cache = DecodedCache(tmp_path)
+    get(cache, 1)
+    monkeypatch.setattr("hashlib.sha256", None)
+    assert not get(cache, 1)[1]
+
+
+def test_a_map_that_is_in_use_keeps_its_file(tmp_path: Path) -> None:
+    cache = DecodedCache(tmp_path)
+    held, _ = get(cache, 1)
+    (tmp_path / name(1)).unlink()
+    assert get(cache, 1)[1]
+    np.testing.assert_array_equal(held, frames(1))
 
 
 def test_least_used_go_first(tmp_path: Path) -> None:
     cache = DecodedCache(tmp_path, max_bytes=3 * FILE_BYTES)
     for seed in (1, 2, 3):
-        cache.put(name(seed), frames(seed))
+        get(cache, seed)
         used_at(cache, seed, second=seed)
-    assert cache.get(name(1), SHAPE) is not None  # used now, so 2 is the least used
-    cache.put(name(4), frames(4))
-    assert cache.get(name(2), SHAPE) is None
-    for seed in (1, 3, 4):
-        np.testing.assert_array_equal(cache.get(name(seed), SHAPE), frames(seed))
+    get(cache, 1)  # used now, so 2 is the least used
+    get(cache, 4)
+    assert not any(get(cache, seed)[1] for seed in (1, 3, 4))
+    assert get(cache, 2)[1]
 
 
 @pytest.mark.parametrize("bound", [FILE_BYTES, 2 * FILE_BYTES - 1, 5 * FILE_BYTES, 10**9])
-def test_the_bound_holds_after_every_put(tmp_path: Path, bound: int) -> None:
+def test_the_bound_holds_after_every_use(tmp_path: Path, bound: int) -> None:
     cache = DecodedCache(tmp_path, max_bytes=bound)
     for seed in range(8):
-        cache.put(name(seed), frames(seed))
+        get(cache, seed)
         used_at(cache, seed, second=seed)
         sizes = [path.stat().st_size for path in tmp_path.iterdir()]
         assert sum(sizes) <= bound
         assert sizes == [FILE_BYTES] * min(seed + 1, bound // FILE_BYTES)
-    DecodedCache(tmp_path / "smaller", FILE_BYTES - 1).put(name(1), frames(1))
-    assert not (tmp_path / "smaller").exists()
     with raises(InvalidOptionError):
         DecodedCache(tmp_path, max_bytes=0)
 
 
-def test_other_files_stay(tmp_path: Path) -> None:
+def test_other_files_stay_and_what_a_kill_left_goes(tmp_path: Path) -> None:
     cache = DecodedCache(tmp_path, max_bytes=FILE_BYTES)
-    others = [tmp_path / "mine.npy", tmp_path / f"{name(1)}.npz", tmp_path / f"{name(1)[:-1]}.npy"]
-    for path in others:
+    others = [tmp_path / "mine", tmp_path / f"{name(1)}.npz", tmp_path / name(1)[:-1]]
+    left = tmp_path / f".{name(2)}.1234.partial"
+    for path in (*others, left):
         path.write_bytes(bytes(2 * FILE_BYTES))
         os.utime(path, (0, 0))
-    cache.put(name(1), frames(1))
-    assert sorted(tmp_path.iterdir()) == sorted([*others, tmp_path / f"{name(1)}.npy"])
+    get(cache, 1)
+    assert sorted(tmp_path.iterdir()) == sorted([*others, tmp_path / name(1)])
 
 
-def test_with_verify_other_frames_count_as_absent(tmp_path: Path) -> None:
-    cache, right = DecodedCache(tmp_path), sha256(frames(1).tobytes()).hexdigest()
-    for seed, found in ((1, True), (2, False), (1, True)):
-        cache.put(right, frames(seed))
-        assert cache.get(right, SHAPE) is not None
-        assert (cache.get(right, SHAPE, verify=True) is not None) == found
+def test_what_cannot_be_decoded_leaves_nothing(tmp_path: Path) -> None:
+    def decode() -> Iterator[NDArray[np.uint8]]:
+        yield frames(1)[0]
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        DecodedCache(tmp_path).frames(name(1), SHAPE, decode)
+    assert not [*tmp_path.iterdir()]
 
 
 def test_many_at_once(tmp_path: Path) -> None:
@@ -115,35 +150,51 @@ def test_many_at_once(tmp_path: Path) -> None:
 
     def use(worker: int) -> None:
         for turn in range(60):
-            seed = (turn * (worker + 1)) % 7
-            found = cache.get(name(seed), SHAPE)
-            if found is None:
-                cache.put(name(seed), frames(seed))
-            else:
-                np.testing.assert_array_equal(found, frames(seed))
+            get(cache, (turn * (worker + 1)) % 7)
 
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(use, range(4)))
-    cache.put(name(99), frames(99))
+    get(cache, 99)
     assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= 3 * FILE_BYTES
+
+
+def _slowly(folder: Path, seed: int) -> bool:
+    """Return whether the frames were decoded by this call."""
+    decoded = []
+
+    def decode() -> Iterator[NDArray[np.uint8]]:
+        decoded.append(seed)
+        for frame in frames(seed):
+            time.sleep(0.05)
+            yield frame
+
+    DecodedCache(folder).frames(name(seed), SHAPE, decode)
+    return bool(decoded)
+
+
+def test_of_two_processes_one_waits_for_the_other(tmp_path: Path) -> None:
+    """As the ranks of a training; threads have locks of their own, as processes do."""
+    with ThreadPoolExecutor(2) as pool:
+        decoded = pool.map(_slowly, [tmp_path] * 2, [1] * 2)
+    assert sum(decoded) == 1
 
 
 def test_default_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert default_cache_folder() == tmp_path / "robomme-interference" / "decoded"
+    assert DecodedCache().folder == tmp_path / "robomme-interference" / "decoded"
     monkeypatch.setenv("XDG_CACHE_HOME", "")
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert default_cache_folder() == tmp_path / ".cache" / "robomme-interference" / "decoded"
+    assert cache_folder("weights") == tmp_path / ".cache" / "robomme-interference" / "weights"
 
 
 def test_a_cache_that_only_others_may_write_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cache = DecodedCache(tmp_path)
-    cache.put(name(1), frames(1))
+    get(cache, 1)
 
-    def refuse(*_: object) -> None:
+    def refuse(*_: object, **__: object) -> None:
         raise PermissionError
 
     monkeypatch.setattr(os, "utime", refuse)
-    np.testing.assert_array_equal(cache.get(name(1), SHAPE), frames(1))
+    assert not get(cache, 1)[1]

@@ -32,8 +32,11 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.evaluate import systems
 from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.rollout.checks import check_plan, check_settings
-from robomme_interference_data.evaluate.rollout.settings import check_system, default_system
-from robomme_interference_data.evaluate.rollout.worker import simulator_options
+from robomme_interference_data.evaluate.rollout.settings import (
+    check_system,
+    default_system,
+    simulator_options,
+)
 from robomme_interference_data.evaluate.run.plan import plan_work
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.runtime.executor import Serial

@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 from support.messages import raises
 
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.evaluate.language.columns import model_columns
 from robomme_interference_data.evaluate.run.identity import plain
 from robomme_interference_data.evaluate.run.log import open_log, read_run
-from robomme_interference_data.evaluate.run.row import read_record
+from robomme_interference_data.evaluate.run.row import model_columns, read_record
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.storage.parquet import open_parquet
 

@@ -31,7 +31,7 @@ from support.chat_server import (
 from support.messages import raises
 
 from robomme_interference_data.errors import InvalidOptionError, ModelError
-from robomme_interference_data.evaluate.language import bounded_http
+from robomme_interference_data.evaluate.language import openai as openai_module
 from robomme_interference_data.evaluate.language.images import within
 from robomme_interference_data.evaluate.language.models import (
     MODELS,
@@ -134,7 +134,7 @@ def test_no_whole_answer_in_time(server: ChatServer, fault: str) -> None:
 
 
 def test_an_answer_without_end(server: ChatServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bounded_http, "MAX_BYTES", 1 << 20)
+    monkeypatch.setattr(openai_module, "MAX_BYTES", 1 << 20)
     server.faults = [ENDLESS] * 2
     with raises(ModelError):
         model_of(server, "repeats=1").reply(ASKED)

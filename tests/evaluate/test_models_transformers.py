@@ -94,7 +94,7 @@ def test_digests_follow_the_files(tmp_path: Path) -> None:
         digests.add(weights.digest_weights(file.parent, ["*.safetensors"]))
         assert weights.digest_weights(file.parent, ["*.json"]) not in digests
     assert len(digests) == 3
-    kept = [*(weights.default_cache_folder().parent / "weights").iterdir()]
+    kept = [*(weights.cache_folder("weights")).iterdir()]
     for one in kept:
         one.write_text("damaged")
     assert weights.digest_weights(file.parent, ["*.safetensors"]) in digests

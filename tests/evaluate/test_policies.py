@@ -18,8 +18,8 @@ from robomme_interference_data.errors import (
     PolicyError,
     UnknownNameError,
 )
-from robomme_interference_data.evaluate.policies.capabilities import PolicyKind, Role
 from robomme_interference_data.evaluate.policies.identity import policy_identity
+from robomme_interference_data.evaluate.policies.kinds import PolicyKind, Role
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import (
     POLICIES,

@@ -16,7 +16,7 @@ from robomme_interference_data.data.questions import LETTERS, Question
 from robomme_interference_data.errors import FormatError, InvalidOptionError, UnknownNameError
 from robomme_interference_data.evaluate.language.models import Video
 from robomme_interference_data.evaluate.language.prompt_files import as_text
-from robomme_interference_data.evaluate.language.question_prompt import QuestionPrompt, read_letter
+from robomme_interference_data.evaluate.language.questions import QuestionPrompt, read_letter
 from robomme_interference_data.evaluate.language.subgoal_prompt import SubgoalPrompt, merge_near
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.subgoal import Subgoal

@@ -19,7 +19,7 @@ from robomme_interference_data.build_dataset.questions import write_questions
 from robomme_interference_data.constants import DEMONSTRATIONS, FAMILIES
 from robomme_interference_data.data.questions import Question
 from robomme_interference_data.errors import InterferenceError, InvalidOptionError
-from robomme_interference_data.evaluate.language.responders import Prompted, guess
+from robomme_interference_data.evaluate.language.questions import Prompted, guess
 from robomme_interference_data.evaluate.run import evaluation
 from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.storage.encode import decode_image

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from multiprocessing import AuthenticationError
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -266,19 +267,6 @@ def test_the_end_of_the_run_reaches_everybody(address: SocketAddress) -> None:
 # --- the host ------------------------------------------------------------------------------------
 
 
-class Direct:
-    """A channel to a host in this process."""
-
-    def __init__(self, host: PolicyHost, worker: int):
-        self.host, self.worker = host, worker
-
-    def ask(self, request: bytes) -> bytes:
-        return self.host.answer(self.worker, request)
-
-    def close(self) -> None:
-        pass
-
-
 @contextmanager
 def hosted(policy: str, **settings: Any) -> Iterator[PolicyHost]:
     host, done = PolicyHost(config(policy, **settings), 0), threading.Event()
@@ -292,10 +280,10 @@ def hosted(policy: str, **settings: Any) -> Iterator[PolicyHost]:
 def test_a_worker_that_opens_again_gets_a_new_session() -> None:
     view = Observation({}, np.arange(8, dtype=np.float32))
     with hosted("Remembering") as host:
-        first, other = SharedPolicy(Direct(host, 0)), SharedPolicy(Direct(host, 1))
+        first, other = SharedPolicy(partial(host.answer, 0)), SharedPolicy(partial(host.answer, 1))
         for policy in (first, other):
             policy.reset(RolloutInfo("a goal", 0, 0))
-        SharedPolicy(Direct(host, 0)).reset(RolloutInfo("another goal", 0, 0))
+        SharedPolicy(partial(host.answer, 0)).reset(RolloutInfo("another goal", 0, 0))
         with pytest.raises(AssertionError):
             first.act(view, "a goal")  # its session is the new one
         assert other.act(view, "a goal").shape == (1, 8)
@@ -306,10 +294,10 @@ def test_a_worker_that_opens_again_gets_a_new_session() -> None:
 
 def test_errors_arrive_with_their_traceback() -> None:
     with hosted("Unloadable") as host, pytest.raises(PolicyError) as raised:
-        SharedPolicy(Direct(host, 0))
+        SharedPolicy(partial(host.answer, 0))
     assert "no weights here" in str(raised.value)
     with hosted("Remembering", policy_options=("fault=goal",)) as host:
-        policy = SharedPolicy(Direct(host, 0))
+        policy = SharedPolicy(partial(host.answer, 0))
         policy.reset(RolloutInfo("a cube", 0, 0))
         with pytest.raises(RuntimeError) as odd:  # it cannot be pickled
             policy.act(Observation({}, np.zeros(8, np.float32)), "a cube")

@@ -24,7 +24,6 @@ from robomme_interference_data.errors import (
     RunError,
 )
 from robomme_interference_data.evaluate.language.images import HistoryFrames
-from robomme_interference_data.evaluate.language.model_writer import ModelWriter
 from robomme_interference_data.evaluate.language.models import (
     ChatModel,
     Message,
@@ -34,7 +33,7 @@ from robomme_interference_data.evaluate.language.models import (
 )
 from robomme_interference_data.evaluate.language.subgoal_prompt import SubgoalPrompt
 from robomme_interference_data.evaluate.language.subgoal_settings import make_writer
-from robomme_interference_data.evaluate.language.subgoal_writer import OracleWriter
+from robomme_interference_data.evaluate.language.subgoal_writers import ModelWriter, OracleWriter
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.rollout.checks import check_settings

@@ -27,7 +27,7 @@ from robomme_interference_data.simulators.tabletop.episodes import (
 )
 from robomme_interference_data.simulators.tabletop.families import draw_episode
 from robomme_interference_data.simulators.tabletop.families.video_place import RADIUS
-from robomme_interference_data.simulators.tabletop.layout import Spot
+from robomme_interference_data.simulators.tabletop.family import Spot
 from robomme_interference_data.simulators.tabletop.swaps import lanes
 
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "tabletop.md"

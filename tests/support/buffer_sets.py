@@ -22,8 +22,8 @@ from robomme_interference_data.build_dataset.verify.buffer_set import verify_buf
 from robomme_interference_data.constants import SUMS_PATH
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Serial
-from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.manifest import BufferManifest, SessionEntry
 from robomme_interference_data.storage.files import LocalFiles, format_sums, sha256_file
 

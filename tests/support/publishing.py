@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.buffer_sets import plan_again  # noqa: F401
 from support.hub_server import HubServer
 
 from robomme_interference_data import load_buffer_set
@@ -63,3 +62,8 @@ def files(hub: HubServer, repo_id: str, revision: str = "main") -> dict[str, byt
     """Return the files of a repository but the Hub's own."""
     found = hub.repositories[f"datasets/{repo_id}"].find(revision).files
     return {path: one.data for path, one in sorted(found.items()) if path != ".gitattributes"}
+
+
+def writes(hub: HubServer) -> list[str]:
+    """Return the requests that change the Hub."""
+    return [one for one in hub.requests if not one.startswith(("GET", "HEAD"))]

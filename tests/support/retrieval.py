@@ -13,6 +13,7 @@ from support.buffer_sets import QUERIES, with_sessions
 from robomme_interference_data import Buffer, EpisodeId, Session, SessionEntry, load_buffer_set
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS
 from robomme_interference_data.data.index_layout import IndexHeader
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.segment import (
@@ -22,7 +23,6 @@ from robomme_interference_data.retrieval.segment import (
     cosines,
 )
 from robomme_interference_data.retrieval.select import Similarities
-from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.manifest import layout_sessions
 from robomme_interference_data.storage.files import read_header, write_json

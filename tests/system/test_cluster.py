@@ -25,8 +25,8 @@ from robomme_interference_data.build_dataset.dataset.build import build_dataset
 from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan, PlannedEpisode
 from robomme_interference_data.errors import WorkerError
 from robomme_interference_data.evaluate.run.row import read_record
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Executor, Serial
-from robomme_interference_data.runtime.progress import WorkProgress
 
 ray_cluster = lazy("support.ray_cluster")
 ray_workers = lazy("robomme_interference_data.runtime.ray_cluster")

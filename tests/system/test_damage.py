@@ -30,7 +30,8 @@ from robomme_interference_data.build_dataset.verify.buffer_set import verify_buf
 from robomme_interference_data.errors import HashMismatchError, InterferenceError
 from robomme_interference_data.evaluate.ceiling import ceiling
 from robomme_interference_data.evaluate.run.config import CeilingConfig
-from robomme_interference_data.retrieval.commands import _measured
+from robomme_interference_data.progress import WorkProgress
+from robomme_interference_data.retrieval.measure import measure_all
 from robomme_interference_data.storage.files import read_json, sha256_file, write_json
 
 pytestmark = pytest.mark.slow
@@ -299,8 +300,13 @@ def test_no_reader_takes_rows_that_the_rules_do_not_give(
         "ask": lambda: ask(tmp_path / "run", buffer_set=root, conditions=("k1",)),
         "ceiling": lambda: ceiling(load_buffer_set(root), CeilingConfig(conditions=("k1",))),
         "train": train,
-        "grade": lambda: _measured(
-            load_buffer_set(root), "thumbnail", "front", "none", (), ("k1",), quiet=True
+        "grade": lambda: measure_all(
+            load_buffer_set(root),
+            "thumbnail",
+            "front",
+            None,
+            conditions=("k1",),
+            progress=WorkProgress(quiet=True),
         ),
     }
     with raises(HashMismatchError):

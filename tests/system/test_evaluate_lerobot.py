@@ -24,8 +24,8 @@ def test_a_policy_trained_on_built_executions_acts(tmp_path: Path) -> None:
     from robomme_interference_data.build_dataset.plan.datasets import plan_dataset
     from robomme_interference_data.constants import ACTION
     from robomme_interference_data.evaluate.policies.registry import make_policy
+    from robomme_interference_data.progress import WorkProgress
     from robomme_interference_data.runtime.executor import Serial
-    from robomme_interference_data.runtime.progress import WorkProgress
 
     out = tmp_path / "executions"
     config = BuildConfig(source=("sample:MoveCube,PatternLock",), buffer_set=out, split="test")

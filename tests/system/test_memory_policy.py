@@ -186,7 +186,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "train-a-policy.md"
 def test_the_pages_commands_and_its_example(
     executed_buffers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = PAGE.read_text()
+    text = re.sub(r" *\\\n *", " ", PAGE.read_text())
     lines = re.findall(r"^python examples/memory_policy/(\w+)\.py (.*)$", text, flags=re.M)
     assert {name for name, _ in lines} == {"train", "answer"}
     for name, line in lines:

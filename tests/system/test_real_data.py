@@ -19,8 +19,8 @@ from robomme_interference_data.build_dataset.plan.episodes import choose_episode
 from robomme_interference_data.build_dataset.plan.planned import datasets_in
 from robomme_interference_data.build_dataset.sources import open_source
 from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Serial
-from robomme_interference_data.runtime.progress import WorkProgress
 
 h5py = pytest.importorskip("h5py")
 

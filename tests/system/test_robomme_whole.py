@@ -12,8 +12,8 @@ from robomme_interference_data.build_dataset.plan.datasets import plan_dataset
 from robomme_interference_data.build_dataset.plan.planned import datasets_in
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS
 from robomme_interference_data.errors import BuildError
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Serial
-from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.simulators.robomme.simulator import EPISODES
 
 

@@ -1,8 +1,6 @@
 """Items of `HistoryDataset`: frames of the right history, draws, and what it refuses."""
 
-import pickle
 import shutil
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,12 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from support.buffer_sets import GOLDEN, QUERIES, copy_buffer_set, plan_again
 from support.messages import raises
-from support.retrieval import make_index
-from support.shifted import add_shifted
 from support.tabletop import TABLETOP
 from torch.utils.data import default_collate
 
@@ -28,33 +22,11 @@ from robomme_interference_data.retrieval.selector import Selector
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.schema.shifts import SHIFTS
 from robomme_interference_data.training import HistoryDataset, resize
-from robomme_interference_data.training.draws import Weights
 
 LIVE = 260 - 48
 """Frames of a sample episode after its lesson."""
 
 Make = Callable[..., HistoryDataset]
-
-
-@pytest.fixture(scope="session")
-def buffers(executed_buffers: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The golden buffer set with executions, shifted views, and an index."""
-    root = copy_buffer_set(tmp_path_factory.mktemp("training") / "buffers", executed_buffers)
-    add_shifted(root)
-    make_index(root)
-    return root
-
-
-@pytest.fixture(scope="session")
-def make(buffers: Path, tmp_path_factory: pytest.TempPathFactory) -> Make:
-    """Make a dataset of that buffer set; the store of frames is shared."""
-    store = tmp_path_factory.mktemp("store")
-
-    def call(conditions: Any = ("k3",), **options: Any) -> HistoryDataset:
-        usual: dict[str, Any] = {"store": store, "quiet": True, "image_size": 16}
-        return HistoryDataset(buffers, conditions, **usual | options)
-
-    return call
 
 
 # --- what an item holds ------------------------------------------------------------------------
@@ -146,7 +118,7 @@ def test_views_under_shifts(make: Make, buffers: Path) -> None:
 
 @pytest.mark.slow
 def test_questions_as_tensors(tmp_path: Path) -> None:
-    options: dict[str, Any] = {"chunk": 0, "questions": True, "store": tmp_path, "quiet": True}
+    options: dict[str, Any] = {"chunk": 0, "questions": True, "cache": tmp_path, "quiet": True}
     data = HistoryDataset(TABLETOP, ["k0"], image_size=8, **options)
     questions = read_questions(load_buffer_set(TABLETOP))
     for number, episode in enumerate(data.episode_ids):
@@ -193,77 +165,13 @@ def test_a_batch_is_the_collated_items(memory: str, make: Make) -> None:
 
 @pytest.mark.slow
 def test_a_batch_of_questions_and_shifts(make: Make, tmp_path: Path) -> None:
-    options: dict[str, Any] = {"chunk": 0, "questions": True, "store": tmp_path, "quiet": True}
+    options: dict[str, Any] = {"chunk": 0, "questions": True, "cache": tmp_path, "quiet": True}
     asked = HistoryDataset(TABLETOP, ["k0"], image_size=8, **options)
     shifted = make(["k0"], chunk=0, shifts={"none": 1, str(SHIFTS[2]): 1}, seed=3)
     assert len({shifted[index]["shift"] for index in range(3)}) == 2
     for data in (asked, shifted):
         every = [*range(len(data))]
         same(data[every], default_collate([data[index] for index in every]))
-
-
-# --- draws -------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_items_are_a_function_of_seed_epoch_and_index(make: Make) -> None:
-    def drawn(data: HistoryDataset, workers: int = 0) -> list[str]:
-        loader = torch.utils.data.DataLoader(data, 64, num_workers=workers)
-        return [name for batch in loader for name in batch["condition"]]
-
-    data = make({"k0": 1, "k3": 1})
-    first = drawn(data)
-    assert {*first} == {"k0", "k3"} and first == drawn(data, 2) == drawn(make({"k0": 1, "k3": 1}))
-    assert [data[index]["condition"] for index in (5, 0, 5)] == [first[5], first[0], first[5]]
-    assert drawn(make({"k0": 1, "k3": 1}, seed=1)) != first
-    shuffled = torch.randperm(20)
-    assert data[[*shuffled]]["condition"] == [first[index] for index in shuffled]
-    data.set_epoch(1)
-    second = drawn(data)
-    assert second != first and second == drawn(data, 2)
-    assert pickle.loads(pickle.dumps(data))[7]["condition"] == second[7]
-
-
-def test_a_running_loader_sees_the_epoch(make: Make) -> None:
-    data = make({"k0": 1, "k3": 1}, chunk=0)
-    loader = torch.utils.data.DataLoader(data, num_workers=1, persistent_workers=True)
-    seen = []
-    for epoch in range(8):
-        data.set_epoch(epoch)
-        seen.append([batch["condition"][0] for batch in loader])
-        assert seen[-1] == [data[number]["condition"] for number in range(3)]
-    assert len({*map(tuple, seen)}) > 1
-
-
-@given(st.lists(st.sampled_from([1, 2, 5]), min_size=1, max_size=4), st.integers(0, 9))
-def test_weights_are_probabilities(weights: list[int], seed: int) -> None:
-    names = [f"k{number}" for number in range(len(weights))]
-    drawing = Weights.parse("conditions", dict(zip(names, weights, strict=True)))
-    counts = Counter(drawing.draw(seed, number) for number in range(2000))
-    for name, weight in zip(names, weights, strict=True):
-        share = weight / sum(weights)
-        assert abs(counts[name] / 2000 - share) < 6 * (share * (1 - share) / 2000) ** 0.5 + 1e-9
-
-
-def test_sessions_drawn_anew_keep_the_rules(make: Make, buffers: Path) -> None:
-    """Conditions need not be planned; units are of other families and of the allowed episodes."""
-    data = make(["k5"], redraw=True, unit_episodes="0", chunk=0, memory="window:400")
-    lesson, drawn = 48, set()
-    units = load_buffer_set(buffers).datasets["distractors"]
-    by_frame = {}
-    for record in units.records():
-        [frame] = units.iter_frames(record.episode_index, "front", 0, 1)
-        by_frame[resize(frame[None].copy(), 16).tobytes()] = record.episode_id
-    for epoch in range(3):
-        data.set_epoch(epoch)
-        for number, query in enumerate(data.episode_ids):
-            images = data[number]["memory.images.front"]
-            starts = [images[lesson + 32 * place].numpy().tobytes() for place in range(5)]
-            sources = [by_frame[start] for start in starts]
-            assert len({*sources}) == 5 and {one.index for one in sources} == {0}
-            assert query.family not in {one.family for one in sources}
-            drawn.add((number, tuple(sources)))
-    assert len(drawn) > 3  # other draws in other epochs
 
 
 # --- what it refuses ---------------------------------------------------------------------------
@@ -295,6 +203,7 @@ def test_sessions_drawn_anew_keep_the_rules(make: Make, buffers: Path) -> None:
         ({"questions": True}, MissingFileError),
         ({"conditions": ["raw-k1"], "redraw": True}, MissingFileError),
         ({"memory": "full", "redraw": True}, InvalidOptionError),
+        ({"cache": False}, InvalidOptionError),
     ],
 )
 def test_bad_input(options: dict[str, Any], error: type[Exception], make: Make) -> None:
@@ -304,9 +213,9 @@ def test_bad_input(options: dict[str, Any], error: type[Exception], make: Make) 
 
 def test_a_buffer_set_without_executions(tiny_buffers: Path, tmp_path: Path) -> None:
     with raises(MissingFileError) as raised:
-        HistoryDataset(tiny_buffers, ["k0"], store=tmp_path)
+        HistoryDataset(tiny_buffers, ["k0"], cache=tmp_path)
     assert raised.value.command == f"build {tiny_buffers} --only executions --source KIND:PATH"
-    assert HistoryDataset(tiny_buffers, ["k0"], chunk=0, store=tmp_path, quiet=True)[0]
+    assert HistoryDataset(tiny_buffers, ["k0"], chunk=0, cache=tmp_path, quiet=True)[0]
 
 
 @pytest.mark.slow
@@ -314,7 +223,7 @@ def test_manifests_planned_before_the_executions(executed_buffers: Path, tmp_pat
     root = copy_buffer_set(tmp_path / "buffers", executed_buffers)
     shutil.copytree(GOLDEN / MANIFESTS, root / MANIFESTS, dirs_exist_ok=True)
     with pytest.raises(MissingFileError) as caught:
-        HistoryDataset(root, ["k0"], store=tmp_path)
+        HistoryDataset(root, ["k0"], cache=tmp_path)
     assert str(caught.value.command).endswith("--only manifests")
     plan_again(root)
-    assert len(HistoryDataset(root, ["k0"], store=tmp_path, quiet=True)) == 3 * LIVE
+    assert len(HistoryDataset(root, ["k0"], cache=tmp_path, quiet=True)) == 3 * LIVE

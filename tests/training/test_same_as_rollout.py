@@ -103,7 +103,7 @@ def test_same_frames_states_and_positions(
         cameras=CAMERAS,
         image_size=24,
         retrieval=retrieval,
-        store=tmp_path_factory.getbasetemp() / "store",
+        cache=tmp_path_factory.getbasetemp() / "store",
         quiet=True,
     )
     assert len(policy.moments) == 14 and max(policy.moments) == 208

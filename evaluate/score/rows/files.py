@@ -265,8 +265,8 @@ def _read_vla_eval(path: Path, names: Sequence[str], has_system: bool) -> FileCo
     except (KeyError, TypeError, AttributeError, IndexError):
         raise FormatError(
             f"{path} holds no results of this benchmark in vla-eval",
-            "Expected a file of `vla-eval run` or `vla-eval export`: "
-            "see docs/how-to/connect-a-policy.md.",
+            "Expected a file of `vla-eval run` or `vla-eval export`: see "
+            "docs/how-to/connect-a-policy.md.",
         ) from None
     columns = {name: [row[at] for row in rows.values()] for at, name in enumerate(names)}
     return FileColumns(columns, list(rows), malformed)

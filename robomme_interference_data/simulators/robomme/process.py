@@ -23,7 +23,7 @@ from robomme_interference_data.errors import (
     printed_last,
 )
 from robomme_interference_data.runtime.safe_path import SAFE_PATH
-from robomme_interference_data.storage.cache import default_cache_folder
+from robomme_interference_data.storage.cache import cache_folder
 
 from . import versions as robomme_versions
 from . import worker as robomme_worker
@@ -59,7 +59,7 @@ class Process:
         self._python, self._answer_s = python, answer_s
         self._log: deque[bytes] = deque(maxlen=PRINTED_LINES)
         self._channel, theirs = Pipe()
-        folder = default_cache_folder().parent / "robomme"
+        folder = cache_folder("robomme")
         try:
             with theirs:
                 self._process = subprocess.Popen(

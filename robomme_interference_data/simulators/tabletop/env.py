@@ -1,7 +1,7 @@
 """The ManiSkill environment behind all nine families."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import sapien
@@ -27,8 +27,10 @@ from .episodes import difficulty_of, turn_of
 from .families import draw_episode
 from .motion import BASE, Arm, Point, Script
 from .renderer import make_renderer
-from .scene_shift import SceneShift
-from .subgoal_follower import SubgoalFollower
+
+if TYPE_CHECKING:
+    from .scene_shift import SceneShift
+    from .subgoal_follower import SubgoalFollower
 
 _POSSIBLE: dict[str, tuple[Any, ...]] = {
     "num_envs": (1,),
@@ -74,6 +76,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         self.frame_step = 1
         self.demonstrating = False
         self.shift: Shift | None = None
+        self._scene_shift: SceneShift | None = None  # of the running episode, once it has a shift
         for name, values in (_POSSIBLE if render else _POSSIBLE_BLIND).items():
             if options.setdefault(name, values[0]) not in values:
                 expected = " or ".join(map(repr, values))
@@ -146,9 +149,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         self.number, self.episode, self.answer = number, episode, answers[answer]
         self.guess = answers[turn_of(number, count, stream=1)]
         observed, info = super().reset(seed=number, options=options)
-        if self.drawing:
-            cameras = {name: self._camera(name) for name in CAMERAS}
-            self._scene_shift = SceneShift(self.scene.sub_scenes[0], cameras, number)
+        self._scene_shift = None
         if self.demonstrating:
             info["demonstration"] = self._demonstrate()
             if self.shift is not None:
@@ -193,6 +194,9 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
             if subgoal is None:
                 return self.act("guess")
             self.arm.reset()
+            # Here, because few policies follow subgoals.
+            from .subgoal_follower import SubgoalFollower
+
             answers = self.episode.shuffled(self.number)
             self._follower = SubgoalFollower(self.episode, self.arm, answers, self.to_pixels)
         self._follower.act(subgoal)
@@ -216,8 +220,15 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
 
     def show(self, shift: Shift | None) -> None:
         """Apply a shift to the live scene from now on; None for no shift."""
-        if self.drawing:
-            self._scene_shift.show(shift)
+        if not self.drawing or (shift is None and self._scene_shift is None):
+            return
+        if self._scene_shift is None:
+            # Here, because most runs have no shift; the scene is still as it was built.
+            from .scene_shift import SceneShift
+
+            cameras = {name: self._camera(name) for name in CAMERAS}
+            self._scene_shift = SceneShift(self.scene.sub_scenes[0], cameras, self.number)
+        self._scene_shift.show(shift)
 
     def render_rgb_array(self, camera_name: str | None = None) -> torch.Tensor:
         """Return a camera's image, front by default, `(1, 256, 256, 3) uint8` RGB."""

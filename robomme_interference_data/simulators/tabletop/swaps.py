@@ -12,8 +12,7 @@ from numpy.random import RandomState
 from robomme_interference_data.simulators.scene import Pair, SwapScene, swap_texts, swapped_places
 
 from .bodies import Body, Placement
-from .family import Family
-from .layout import Spot, shuffled
+from .family import Family, Spot, shuffled
 from .motion import Arm, Script, eased
 
 STEPS = 30  # time steps of a swap

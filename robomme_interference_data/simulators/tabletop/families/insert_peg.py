@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.scene import Option
 from robomme_interference_data.simulators.tabletop.bodies import COLORS, SceneBuilder
-from robomme_interference_data.simulators.tabletop.family import Family, Step
-from robomme_interference_data.simulators.tabletop.layout import row
+from robomme_interference_data.simulators.tabletop.family import Family, Step, row
 from robomme_interference_data.simulators.tabletop.motion import SLOW, Arm, Script
 
 LENGTH, GRIP = 0.14, 0.04  # m: a peg, and from its middle to where it is grasped

@@ -10,8 +10,12 @@ from numpy.typing import NDArray
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.family_scenes import MoveScene
 from robomme_interference_data.simulators.tabletop.bodies import CUBE, SceneBuilder
-from robomme_interference_data.simulators.tabletop.family import Family, Step
-from robomme_interference_data.simulators.tabletop.layout import distance_to_segment, is_near
+from robomme_interference_data.simulators.tabletop.family import (
+    Family,
+    Step,
+    distance_to_segment,
+    is_near,
+)
 from robomme_interference_data.simulators.tabletop.motion import SLOW, Arm, Script
 
 Vector = NDArray[np.float64]

@@ -13,8 +13,13 @@ from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.family_scenes import grid_paths, row_paths
 from robomme_interference_data.simulators.scene import Option
 from robomme_interference_data.simulators.tabletop.bodies import Body, SceneBuilder
-from robomme_interference_data.simulators.tabletop.family import Family, Step
-from robomme_interference_data.simulators.tabletop.layout import ABOVE, Spot, distance_to_segment
+from robomme_interference_data.simulators.tabletop.family import (
+    ABOVE,
+    Family,
+    Spot,
+    Step,
+    distance_to_segment,
+)
 from robomme_interference_data.simulators.tabletop.motion import ROD, Arm, Point, Script
 
 Path = tuple[int, ...]

@@ -6,8 +6,13 @@ from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.family_scenes import PlaceScene
 from robomme_interference_data.simulators.scene import Option
 from robomme_interference_data.simulators.tabletop.bodies import CUBE, SceneBuilder
-from robomme_interference_data.simulators.tabletop.family import Step
-from robomme_interference_data.simulators.tabletop.layout import is_near, push_down, row, shuffled
+from robomme_interference_data.simulators.tabletop.family import (
+    Step,
+    is_near,
+    push_down,
+    row,
+    shuffled,
+)
 from robomme_interference_data.simulators.tabletop.motion import HELD, Arm, Point, Script
 from robomme_interference_data.simulators.tabletop.swaps import SwapFamily
 

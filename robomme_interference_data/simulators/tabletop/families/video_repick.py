@@ -6,8 +6,7 @@ from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.family_scenes import RepickScene
 from robomme_interference_data.simulators.scene import Option
 from robomme_interference_data.simulators.tabletop.bodies import CUBE, SceneBuilder
-from robomme_interference_data.simulators.tabletop.family import Step
-from robomme_interference_data.simulators.tabletop.layout import push_down, row
+from robomme_interference_data.simulators.tabletop.family import Step, push_down, row
 from robomme_interference_data.simulators.tabletop.motion import HELD, Arm, Script
 from robomme_interference_data.simulators.tabletop.swaps import SwapFamily
 

@@ -15,8 +15,7 @@ from robomme_interference_data.simulators.tabletop.bodies import (
     Placement,
     SceneBuilder,
 )
-from robomme_interference_data.simulators.tabletop.family import Family, Step
-from robomme_interference_data.simulators.tabletop.layout import along, row, shuffled
+from robomme_interference_data.simulators.tabletop.family import Family, Step, along, row, shuffled
 from robomme_interference_data.simulators.tabletop.motion import HELD, Arm, Script
 from robomme_interference_data.simulators.tabletop.swaps import SwapFamily
 

@@ -1,7 +1,7 @@
-"""The table of a buffer set's manifests: a row for each buffer."""
+"""What a buffer set consists of: the table of its manifests, and its datasets, opened on use."""
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cached_property
 from itertools import chain, compress
 from pathlib import Path
@@ -15,18 +15,27 @@ from robomme_interference_data.constants import (
     MANIFEST_HEADER,
     MANIFEST_ROWS,
     MANIFESTS,
+    OPTIONAL_DATASETS,
     RULE_VERSION,
 )
-from robomme_interference_data.errors import FormatError, HashMismatchError, UnknownNameError
+from robomme_interference_data.errors import (
+    FormatError,
+    HashMismatchError,
+    MissingFileError,
+    UnknownNameError,
+)
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import arrow_schema, from_table, to_pandas
 from robomme_interference_data.schema.manifest import BufferManifest, ManifestHeader
 from robomme_interference_data.storage.files import Files, LocalFiles, sha256_file
 from robomme_interference_data.storage.parquet import RowSpan
 
+from .dataset import Dataset
+
 if TYPE_CHECKING:
     import pandas
 
+# As Python objects, rows take many times the memory of the table.
 _BATCH_ROWS = 1024
 _KEYS = ("episode_id", "condition", "difficulty")
 
@@ -45,6 +54,8 @@ class ManifestTable:
 
     def __init__(self, files: Files, header: ManifestHeader):
         pending = pending_rows(header)
+        # A build that is killed while it replaces both files has written the header, and the rows
+        # under this name.
         replaced = isinstance(files, LocalFiles) and (files.root / pending).is_file()
         self.path: Path = files.path(pending if replaced else f"{MANIFESTS}/{MANIFEST_ROWS}")
         self._header, self._where = header, files.describe()
@@ -151,3 +162,88 @@ class ManifestTable:
     @cached_property
     def _rows(self) -> RowSpan:
         return RowSpan(self.path)
+
+
+def dataset_files(files: Files, header: ManifestHeader, name: str) -> Files:
+    """Return access to a dataset's files.
+
+    A folder with the dataset's name in a local buffer set takes precedence over the location
+    that the manifests record.
+
+    Args:
+        files: The buffer set's files.
+        header: Its header.
+        name: The dataset's name.
+
+    Raises:
+        FormatError: The folder is a link that leads out of the buffer set.
+        MissingFileError: There is no folder, and no location is recorded.
+    """
+    location = header.datasets[name].location
+    if isinstance(files, LocalFiles) and (location is None or (files.root / name).is_dir()):
+        folder = files.root / name
+        if not folder.resolve().is_relative_to(files.root.resolve()):
+            raise FormatError(
+                f"{folder} is a link that leads out of the buffer set",
+                "Replace the link by the folder.",
+            )
+        return LocalFiles(folder, files.refetch)
+    # A published buffer set lies in the repository of its demonstrations.
+    if location == ".":
+        return files
+    from robomme_interference_data.storage.hub import HubFiles
+
+    if location is not None:
+        return HubFiles.parse(location)
+    # Optional datasets are folders of that repository.
+    if not isinstance(files, HubFiles) or name not in OPTIONAL_DATASETS:
+        raise MissingFileError(
+            f"the manifests of {files.location} do not record the location of its {name}",
+            "Those of a published buffer set do.",
+            "publish BUFFER_SET --repo-id NAMESPACE/NAME",
+        )
+    return files.inside(name)
+
+
+class SetDatasets(Mapping[str, Dataset]):
+    """The datasets of a buffer set, each opened on first access.
+
+    Args:
+        names: The planned ones; in a partial copy, those that are there.
+        files_of: Returns access to the files of one.
+        header: The buffer set's header.
+        fix: Hint and command of the error about a dataset of another revision.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        files_of: Callable[[str], Files],
+        header: ManifestHeader,
+        fix: tuple[str, str | None],
+    ):
+        self._names, self._files_of, self._header, self._fix = names, files_of, header, fix
+        self._opened: dict[str, Dataset] = {}
+
+    def __getitem__(self, name: str) -> Dataset:
+        if name not in self._opened:
+            recorded = self._header.datasets[name]
+            dataset = Dataset(self._files_of(name))
+            if dataset.revision != recorded.revision:
+                raise HashMismatchError(
+                    f"{dataset.files.describe()} has revision {dataset.revision[:12]}…; the "
+                    f"manifests were made for {recorded.revision[:12]}…",
+                    *self._fix,
+                )
+            self._opened[name] = dataset
+        return self._opened[name]
+
+    def __contains__(self, name: object) -> bool:
+        # The method of `Mapping` would open the dataset to find out.
+        return name in self._names
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
