@@ -23,6 +23,7 @@ from robomme_interference_data.evaluate.score.plots.figures import FIGURES
 from robomme_interference_data.evaluate.score.rows.reading import CheckedRows
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.contrast import START
+from robomme_interference_data.evaluate.score.tables.correction import NULL_FINDINGS
 from robomme_interference_data.evaluate.systems import SYSTEMS, display_name
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import in_order, parse_condition
@@ -55,10 +56,11 @@ _SHOWN_IN = {
 """Figure to the tables with its numbers."""
 
 EXPLORATORY = (
-    "Everything below is exploratory: it is corrected within a table at most, not over all tables, "
-    "so that reports without any effect often hold a finding in some table. Take it as a question "
-    "for the next run."
+    "Everything below is exploratory: it is corrected within a table or a part of one, not over "
+    f"all tables. Without any effect, {NULL_FINDINGS} hold a finding in some table. Take one as a "
+    "question for the next run."
 )
+"""What to make of findings outside the primary analysis."""
 
 _GRIDS = {
     Expected.BENCHMARK: "the benchmark's: nine families, test episodes 0 to 49 each",
