@@ -38,6 +38,7 @@ def methods(score: Score) -> tuple[str, str]:
                 if contrast.primary and contrast.effect is Effect.SESSIONS
             )
         ),
+        "chance": any(cell.chance >= 0 for cell in score.cells),
         "tables": set(score.tables),
         "intervals": {contrast.pairs.method for contrast in successes},
         "retention": any(not math.isnan(each.retention.value) for each in successes),
