@@ -76,9 +76,11 @@ def write_questions(questions: Sequence[Question], folder: Path) -> Path:
 def _planned(query: Query, revision: str) -> tuple[Question, Marks]:
     scene, seed, name = recorded_scene(query), query.seed, str(query.episode_id)
     if scene is None or seed is None:
+        recorded = f"with the simulator {query.simulator!r}"
+        if query.simulator is None:
+            recorded = "without a simulator"
         raise BuildError(
-            f"{name} was recorded with the simulator {query.simulator!r}, which does not list the "
-            "possible answers",
+            f"{name} was recorded {recorded}, which does not list the possible answers",
             "Questions need demonstrations of a simulator that does, such as tabletop.",
         )
     numbers: dict[Any, int] = {}  # choice to its first answer

@@ -23,13 +23,14 @@ from .publication import OTHER, Publication
 from .tables import column_table
 
 README = "README.md"
+DISTRIBUTION = "robomme-interference-data"
 
-PAPER = "https://robotmemorybench.com"
+PAPER = "https://arxiv.org/abs/2606.22338"
 BIBTEX = f"""@article{{rathi2026robommeinterference,
   title  = {{RoboMME-Interference: Benchmarking Robot Memory Under Interference}},
   author = {{Rathi, Soumil}},
   year   = {{2026}},
-  month  = {{8}},
+  note   = {{arXiv:2606.22338}},
   url    = {{{PAPER}}}
 }}"""
 """The paper; `CITATION.cff` of the project says the same."""
@@ -49,6 +50,13 @@ _FILTERS = {
     "raw": Raw,
     "number": "{:,}".format,
 }
+
+
+def _install() -> str:
+    """Return the command that installs this package: from its repository, as no index has it."""
+    urls = metadata.metadata(DISTRIBUTION).get_all("Project-URL", [])
+    pairs = (url.split(", ") for url in urls)
+    return f"pip install git+{dict(pairs)['Repository']}"
 
 
 def card_files(facts: Facts, publication: Publication) -> dict[str, bytes]:
@@ -77,10 +85,7 @@ def card_text(facts: Facts, publication: Publication) -> str:
         ("version", code(publication.tag)),
         *base_rows,
         *facts.provenance,
-        (
-            "made with",
-            code(f"robomme-interference-data {metadata.version('robomme-interference-data')}"),
-        ),
+        ("made with", code(f"{DISTRIBUTION} {metadata.version(DISTRIBUTION)}")),
         ("version of the format", code(FORMAT_VERSION)),
     )
     values = {
@@ -90,6 +95,7 @@ def card_text(facts: Facts, publication: Publication) -> str:
         "repositories": facts.repositories,
         "paper": PAPER,
         "bibtex": BIBTEX,
+        "install": _install(),
         "other": OTHER,
         "frames": facts.examples,
         "split_name": facts.tables[0].split,

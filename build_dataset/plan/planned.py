@@ -1,5 +1,6 @@
 """What the buffer set in a folder holds and plans now."""
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,6 +59,13 @@ def check_is_own(buffer_set: BufferSet) -> None:
             "published buffer set never changes",
             "Build one of your own with the same demonstrations:",
             buffer_set.planning(),
+        )
+    if buffer_set.header.datasets[DISTRACTORS].location == ".":
+        lessons = buffer_set.dataset_files(DEMONSTRATIONS).location
+        raise BuildError(
+            f"{buffer_set.location} has the layout of a repository, which never changes",
+            "Build one of your own with the same demonstrations:",
+            f"build BUFFER_SET --demonstrations {shlex.quote(lessons)} --source KIND:PATH",
         )
 
 

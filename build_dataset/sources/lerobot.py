@@ -149,7 +149,13 @@ class LeRobotSource(Source):
     def _families(self) -> list[dict[str, Any]]:
         if self._families_file is None:
             return [{}] * len(self._lerobot)
-        return read_families(self._families_file, self._tasks)
+        try:
+            return read_families(self._families_file, self._tasks)
+        except SourceError as error:
+            if self._given_families is None:
+                more = f"It is of an earlier build: give another with {named('families_file')}."
+                raise SourceError(error.message, f"{error.hint}\n{more}") from None
+            raise
 
     @property
     def _tasks(self) -> list[list[str]]:

@@ -109,6 +109,7 @@ class Buffer:
     @property
     def states(self) -> NDArray[np.float32]:
         """Robot states, `(T, 8) float32`: 7 joint positions in rad, the gripper; a new array."""
+        # A copy: later chunks of `stream` are cut from this array.
         return self._states.copy()
 
     @cached_property
@@ -133,6 +134,7 @@ class Buffer:
             `(T, …)`, in the buffer's order; a new array.
         """
         sessions = self.manifest.sessions
+        # A held frame is stored once, and counts `repeat` times.
         values = (np.repeat(read(entry), entry.repeat, 0) for entry in sessions)
         return np.concatenate([empty, *values])
 
@@ -165,6 +167,7 @@ class Buffer:
 
     def _names(self, cameras: Sequence[str] | None) -> tuple[str, ...]:
         """Return these cameras, None for all; an unknown one is an error, also in a folder."""
+        # A text would be taken as a list of names of one letter each.
         if isinstance(cameras, str) or not isinstance(cameras, Iterable | None):
             raise InvalidOptionError.expected("cameras", cameras, "their names: ['front', 'wrist']")
         names = self.cameras if cameras is None else tuple(cameras)
@@ -196,9 +199,11 @@ class Buffer:
         Raises:
             UnknownNameError: There is no such camera.
             MissingFileError, FormatError: A video cannot be read.
+            HashMismatchError: With a cache: frames do not have the recorded SHA-256.
         """
         name = self.query.dataset.camera(camera)
         out = allocate_frames(len(self), self.query.dataset.shape(name))
+        # Before anything is decoded: the Hub's files come several at a time, not one by one.
         self._fetch([[name]] * len(self.sessions))
         self._reader.read(name, out)
         return out
@@ -256,6 +261,7 @@ class Buffer:
         decoders = {name: self._reader.iter(name, chosen.tolist()) for name in names}
         try:
             for first in range(0, len(chosen), chunk):
+                # A copy, since the caller owns the chunk.
                 indices_now = chosen[first : first + chunk].copy()
                 frames = {}
                 for name, shape in shapes.items():
@@ -266,6 +272,7 @@ class Buffer:
                     indices_now, frames, self._states[indices_now], session_index[indices_now]
                 )
         finally:
+            # Also if the caller stops early: each holds an open file and its decoder.
             for decoder in decoders.values():
                 decoder.close()
 
@@ -283,6 +290,7 @@ class Buffer:
         """
         from .embeddings import BufferSetIndex
 
+        # The index of the units has what makes all embeddings comparable: center, typical cosine.
         needed = {DISTRACTORS, self.query.dataset.kind} & {*self._datasets}
         needed |= {entry.dataset for entry in self.manifest.sessions}
         datasets = {name: self._datasets[name] for name in sorted(needed)}

@@ -45,7 +45,9 @@ if TYPE_CHECKING:
     from .query_sessions import SessionSource
 
 logger = logging.getLogger(__name__)
+# Where a header may send a reader: to its own root or to a commit, never to another folder.
 _LOCATION = re.compile(r"\.|[\w.-]+(?:/[\w.-]+)+@[0-9a-f]{40}")
+# The digest of the rows is also a part of a file's name; see `pending_rows`.
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
@@ -273,6 +275,7 @@ class BufferSet:
         episode, name = EpisodeId.parse(episode_id), self.planned(condition, k).name
         row = self._table.row_of.get((str(episode), name))
         if row is None:
+            # A known episode has a row under each planned condition.
             self._check_episode(episode)
             raise FormatError.damaged(self._table.path, f"no row of {episode} under {name}")
         if self.copy is not None and not self._is_present[row]:
@@ -400,6 +403,7 @@ class BufferSet:
         return map(self._buffer, self.manifests(**properties))
 
     def _buffer(self, manifest: BufferManifest) -> Buffer:
+        # The table may be anybody's: a name in it need not be one of the header's datasets.
         for entry in manifest.sessions:
             if entry.dataset not in self.datasets:
                 what = f"{manifest} has a session of the unknown dataset {entry.dataset!r}"
@@ -416,6 +420,7 @@ class BufferSet:
     def _check_episode(self, episode: EpisodeId) -> None:
         if episode in self._episodes:
             return
+        # First what a wider copy would have: that error has the command that fetches it.
         if self.copy is not None and str(episode) in {*self._table.keys["episode_id"]}:
             options = f"--families {episode.family} --episodes {episode.index}"
             raise self.copy.not_fetched(f"the buffers of {episode}", options)

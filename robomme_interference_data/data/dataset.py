@@ -92,7 +92,9 @@ class Dataset:
     def __init__(self, files: Files):
         self.files = files
         with suppress(MissingFileError):  # reported below
+            # All at once, if they are on the Hub.
             files.fetch((INFO_PATH, IDENTITY_PATH, RECORDS_PATH))
+        # The small copy of the episode table: LeRobot's own also has statistics of every feature.
         self.lerobot = LeRobotFiles(files, [RECORDS_PATH])
         try:
             path = files.path(IDENTITY_PATH)
@@ -214,6 +216,7 @@ class Dataset:
     def records(self) -> Iterator[EpisodeRecord]:
         """Yield the records of all episodes, by episode index."""
         if len(self._records) < len(self):
+            # Converting the whole table at once is faster than row by row.
             for index, row in enumerate(self.lerobot.table.to_pylist()):
                 self._records[index] = from_dict(EpisodeRecord, row, self._name)
         return (self._records[index] for index in range(len(self)))
@@ -224,6 +227,7 @@ class Dataset:
         Raises:
             HashMismatchError: They differ.
         """
+        # Every verified buffer and every run asks for it.
         if self._checked:
             return
         if revision_of(self.identity, self.lerobot.info, self.records()) != self.revision:
@@ -312,6 +316,7 @@ class Dataset:
 
     def digests(self, episode_index: int, spans: Sequence[tuple[int, int]]) -> list[dict[str, str]]:
         """Decode an episode once and return the digests by feature of its spans, ends excluded."""
+        # Each feature is read once for all spans: decoding takes far longer than hashing.
         first, last = min(start for start, _ in spans), max(stop for _, stop in spans)
 
         def values(name: str) -> Iterable[NDArray[Any]]:

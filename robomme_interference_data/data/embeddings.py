@@ -43,6 +43,7 @@ from .index_layout import (
 
 def center_of(episodes: Iterable[NDArray[np.float16]]) -> NDArray[np.float32]:
     """Return the mean of each episode's mean, `(D,) float32`, of features `(T, D) float16`."""
+    # Sums of float16 would lose most digits, and depend on the order of the values.
     means = [features.mean(axis=0, dtype=np.float64) for features in episodes if len(features)]
     return np.asarray(sum(means) / max(len(means), 1), np.float32)
 
@@ -180,6 +181,7 @@ class EmbeddingIndex:
             array = read_array(path, dtype, shape)
         except FormatError as error:
             raise self._damaged(error.message) from None
+        # One value that is no number would make every cosine with it none.
         if first and not np.isfinite(array).all():
             raise self._damaged(f"{name} holds numbers that are not finite")
         self._checked.add(name)

@@ -47,6 +47,7 @@ def fetch(parts: Sequence[FetchPart], to: Path | None = None) -> None:
             part.files.fetch(part.sizes)
         return
     to = to.resolve()
+    # The first part is the buffer set itself; the others are repositories that it refers to.
     location = parts[0].files.location
     earlier = earlier_files(to, location, parts[0].files.path(MANIFEST_PATH))
     record = FetchRecord(FORMAT_VERSION, location, earlier)
@@ -62,6 +63,7 @@ def _copy(part: FetchPart, staged: Path, to: Path) -> None:
 
     def is_there(path: str) -> bool:
         places = (to / path, staged / path)
+        # What has no digest in the buffer set, such as the card, is copied again each time.
         return path in part.sums and any(
             place.is_file() and sha256_file(place) == part.sums[path] for place in places
         )

@@ -157,6 +157,7 @@ def plan_fetch(
             hint = "Without the index, the frames can be fetched." if config.index else None
             raise MissingFileError(f"{files.describe()} lacks {lacking[0]}{more}", hint)
         chosen = {path: sizes[path] for path in sorted(paths)}
+        # A part leaves listed files out, so nothing can be said about the rest.
         unlisted = sizes.keys() - paths - sums.keys() if whole else ()
         parts.append(
             FetchPart(
@@ -175,6 +176,7 @@ def _listed(dataset: "Dataset") -> dict[str, str]:
     """Return the files that a dataset lists, with their SHA-256."""
     sums = dataset.sums()
     for path in sums:
+        # The list comes from the repository: it could name files that other programs would run.
         if path.split("/")[0] not in DATASET_FOLDERS:
             raise FormatError.damaged(
                 dataset.files.describe(),
@@ -208,6 +210,7 @@ def _needed(
     datasets = {
         name: buffer_set.datasets[name]
         for name, some in episodes.items()
+        # No session lies in these two: they go by query, below.
         if name not in (SHIFTED, EXECUTIONS)
         and (whole or some or name in (DEMONSTRATIONS, DISTRACTORS))
     }

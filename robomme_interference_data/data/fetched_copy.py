@@ -50,6 +50,7 @@ def earlier_files(to: Path, location: str, header: Path) -> tuple[str, ...]:
         )
     existing = to / MANIFEST_PATH
     if existing.is_file():
+        # By content: a later commit that changes only the card has the same header.
         is_same = existing.read_bytes() == header.read_bytes()
     else:  # an interrupted copy: the header is moved last
         is_same = record.location == location
@@ -118,6 +119,7 @@ class FetchedCopy:
 
     def holds_buffer(self, datasets: Mapping[str, Dataset], manifest: BufferManifest) -> bool:
         """Whether the query and all sessions of a buffer are here."""
+        # The query's own episode, too, of which no session is in the buffer under `no-history`.
         episodes = {(manifest.query.dataset, manifest.query.episode_index)}
         episodes |= {(entry.dataset, entry.episode_index) for entry in manifest.sessions}
         return all(

@@ -57,12 +57,14 @@ class FrameReader:
                 for piece_read in reading:
                     piece_read.result()
             except BaseException:
+                # Else the pool would finish all that is queued before the error arrives.
                 pool.shutdown(cancel_futures=True)
                 raise
 
     def iter(self, camera: str, chosen: Sequence[int]) -> Generator[NDArray[np.uint8]]:
         """Yield frames of a camera, `(H, W, 3) uint8`, by their ascending indices."""
         indices = np.asarray(chosen, np.int64)
+        # Runs of consecutive frames: a video is decoded in order, and each run begins with a seek.
         for run in np.split(indices, np.flatnonzero(np.diff(indices) > 1) + 1):
             if len(run):
                 yield from self._iter_frames(camera, int(run[0]), int(run[-1]) + 1)
@@ -124,6 +126,7 @@ class FrameReader:
                 frames = dataset.iter_frames(entry.episode_index, camera, first, last)
             else:
                 frames = iter(cached[stored[0] : stored[-1] + 1])
+            # A held frame is decoded once and shown several times.
             for frame, (_, shown) in zip(frames, groupby(stored), strict=True):
                 yield from repeat(frame, len(list(shown)))
 

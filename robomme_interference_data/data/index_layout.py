@@ -98,6 +98,7 @@ def encoder_id(encoder: str) -> str:
         return kind
     if Path(model).is_dir():
         return f"{kind}:{Path(model).resolve().name}"
+    # A revision names a version of the weights, whose digest the header records.
     model = model.partition("@")[0]
     return kind if model == PAPER_ENCODER else f"{kind}:{model}"
 
@@ -110,6 +111,7 @@ def index_folder(encoder: str, camera: str) -> str:
     kind, colon, model = encoder_id(encoder).partition(":")
     name = f"{kind}-{PurePath(model).name}" if colon else kind
     camera = camera.removeprefix(CAMERA_PREFIX)
+    # The benchmark's own camera needs no name.
     parts = [name] if camera == "front" else [name, camera]
     return f"{INDEX_DIR}/{'@'.join(re.sub(r'[^A-Za-z0-9._-]+', '-', part) for part in parts)}"
 

@@ -13,6 +13,7 @@ from robomme_interference_data.constants import (
     EXECUTIONS,
     FETCH_RECORD,
     IDENTITY_PATH,
+    INFO_PATH,
     MANIFEST_PATH,
     MANIFESTS,
 )
@@ -56,6 +57,7 @@ def load_buffer_set(
     _check_location("buffer_set", buffer_set, "a folder, or namespace/name")
     files: LocalFiles | HubFiles
     folder = Path(buffer_set).expanduser()
+    # With a revision, `locate` has the error that a folder has none.
     if folder.is_dir() and revision is None:
         files = LocalFiles(folder)
     else:
@@ -96,6 +98,13 @@ def _no_buffer_set(files: "LocalFiles | HubFiles") -> MissingFileError:
                 "Build what it lacks.",
                 next_build(files.root),
             )
+        if (files.root / IDENTITY_PATH).is_file():
+            return MissingFileError(message, "It is one dataset: give the folder that holds it.")
+        if (files.root / INFO_PATH).is_file():
+            command = ["build", "BUFFER_SET", "--source", f"lerobot:{files.root}"]
+            return MissingFileError(
+                message, "Build one from these recordings.", shlex.join(command)
+            )
     return MissingFileError(
         message,
         "Give a folder with demonstrations/, distractors/ and manifests/, or build one.",
@@ -109,8 +118,11 @@ def built_datasets(root: Path) -> tuple[str, ...]:
 
 
 def next_build(root: Path) -> str:
-    """Return the command that builds what a buffer set in a folder lacks first."""
-    built = built_datasets(root)
+    """Return the command that builds what a buffer set in a folder lacks first.
+
+    If it has manifests, its demonstrations may be on the Hub, and the manifests are built again.
+    """
+    built = DATASETS if (root / MANIFEST_PATH).is_file() else built_datasets(root)
     for name in (DEMONSTRATIONS, DISTRACTORS):
         if name not in built:
             return shlex.join(["build", str(root), "--only", name, "--source", "KIND:PATH"])

@@ -62,6 +62,7 @@ class SessionSource:
             SourceError, BuildError: The datasets lack what its condition needs.
         """
         planned = self.planned(manifest.episode_id, parse_condition(manifest.condition))
+        # Field by field, so that the error names what differs.
         for name, value in vars(planned).items():
             if getattr(manifest, name) != value:
                 raise HashMismatchError.damaged(
@@ -81,6 +82,7 @@ class SessionSource:
         dataset = self.datasets[name]
         if name not in self._sessions:
             self._sessions[name] = {
+                # A contradiction's own id has another answer; its scene is that of its query.
                 record.episode_id.scene: dataset.session(_ROLES[name], record)
                 for record in dataset.records()
             }

@@ -21,6 +21,7 @@ LETTERS = string.ascii_uppercase[:8]
 """Letters of options, in order."""
 
 
+# Five digits: no image that can be read has as many pixels on a side.
 _POINTS = re.compile(r"(?:-?\d{1,5},-?\d{1,5}(?: -?\d{1,5},-?\d{1,5})*)?")
 
 
@@ -86,6 +87,7 @@ def digest_questions(questions: Iterable[Question]) -> str:
     """Return the SHA-256 over all questions, answers and pictures."""
     ordered = sorted(questions, key=lambda question: question.episode_id)
     return digest_json(
+        # JSON has no bytes, so the picture's digest stands for it.
         to_dict(question) | {"picture": sha256(question.picture).hexdigest()}
         for question in ordered
     )

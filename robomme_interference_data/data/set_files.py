@@ -35,6 +35,7 @@ from .dataset import Dataset
 if TYPE_CHECKING:
     import pandas
 
+# As Python objects, rows take many times the memory of the table.
 _BATCH_ROWS = 1024
 _KEYS = ("episode_id", "condition", "difficulty")
 
@@ -53,6 +54,8 @@ class ManifestTable:
 
     def __init__(self, files: Files, header: ManifestHeader):
         pending = pending_rows(header)
+        # A build that is killed while it replaces both files has written the header, and the rows
+        # under this name.
         replaced = isinstance(files, LocalFiles) and (files.root / pending).is_file()
         self.path: Path = files.path(pending if replaced else f"{MANIFESTS}/{MANIFEST_ROWS}")
         self._header, self._where = header, files.describe()
@@ -185,12 +188,14 @@ def dataset_files(files: Files, header: ManifestHeader, name: str) -> Files:
                 "Replace the link by the folder.",
             )
         return LocalFiles(folder, files.refetch)
+    # A published buffer set lies in the repository of its demonstrations.
     if location == ".":
         return files
     from robomme_interference_data.storage.hub import HubFiles
 
     if location is not None:
         return HubFiles.parse(location)
+    # Optional datasets are folders of that repository.
     if not isinstance(files, HubFiles) or name not in OPTIONAL_DATASETS:
         raise MissingFileError(
             f"the manifests of {files.location} do not record the location of its {name}",
@@ -234,6 +239,7 @@ class SetDatasets(Mapping[str, Dataset]):
         return self._opened[name]
 
     def __contains__(self, name: object) -> bool:
+        # The method of `Mapping` would open the dataset to find out.
         return name in self._names
 
     def __iter__(self) -> Iterator[str]:

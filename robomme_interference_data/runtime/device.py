@@ -20,6 +20,7 @@ def choose_device(name: str | None) -> "torch.device":
     import torch
 
     try:
+        # None means the best of this machine; a device that is named must work.
         device = torch.device(name or ("cuda" if torch.cuda.is_available() else "cpu"))
         torch.empty(0, device=device)  # a device that is only named may be missing
     except (RuntimeError, AssertionError) as error:

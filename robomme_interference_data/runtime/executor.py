@@ -171,6 +171,7 @@ class Executor(ABC):
                 default.
         """
         end_if_starting()
+        # No worker is started for nothing.
         todo = list(tasks)
         if todo:
             with self.pool(function) as pool:

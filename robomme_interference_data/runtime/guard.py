@@ -27,6 +27,7 @@ _REMOVE_LATER = ["sh", "-c", 'sleep 60; rm -rf -- "$0"']
 
 def _watch_worker(worker: int, parent: int, home: str) -> None:
     watched = [parent] if parent >= 0 else []
+    # A change of the parent process wakes nobody, so it is looked at five times a second.
     while os.getppid() == worker and not select.select(watched, [], [], 0.2)[0]:
         pass
     if not watched:

@@ -48,6 +48,7 @@ class WorkerProcess:
         self._process = context.Process(target=_serve, args=arguments, daemon=True)
         with safe_path():
             self._process.start()
+        # With two ends open here, the death of the process would go unnoticed.
         theirs.close()
 
     def send(self, task: Any, time_limit: float | None) -> None:

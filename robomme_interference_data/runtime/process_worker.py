@@ -35,9 +35,11 @@ class ProcessWorker(Worker):
             (home / name).mkdir()
         self._late = (home / _LIMIT).open("wb", buffering=0)
         if os.getpgrp() != os.getpid():
+            # A group of its own, with which its guard ends all that it starts.
             os.setpgid(0, 0)
         arguments = ["--worker", str(os.getpid()), str(parent), str(home)]
         subprocess.Popen(
+            # Without site-packages it starts at once, and imports no module of the user.
             [sys.executable, "-I", "-S", guard.__file__, *arguments],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
@@ -49,6 +51,7 @@ class ProcessWorker(Worker):
         """Keep a file where it outlives this process."""
         partial = self._home / "partial"
         partial.write_bytes(data)
+        # A rename, since this process may be killed while it writes.
         partial.replace(self._home / _FILES / quote(path, safe=""))
 
     def take_files(self) -> dict[str, bytes]:

@@ -145,6 +145,7 @@ class _RayWorker:
         try:
             self._node, self._home, versions = ray.get(self.call)
         except RayError as error:
+            # A node may be lost while a worker starts on it.
             self._failures += 1
             if self._failures == _FAILURES:
                 raise WorkerError(f"a worker cannot start: {_cause(error)}") from None
@@ -173,6 +174,7 @@ class _RayWorker:
             if isinstance(error, OutOfMemoryError):
                 raise error
             strategy = NodeAffinitySchedulingStrategy(self._node, soft=False)
+            # No CPU, since the node may have none free.
             read = _read_remains.options(num_cpus=0, scheduling_strategy=strategy)
             outcome = ray.get(read.remote(self._home), timeout=_COLLECT_S)
         except RayError:
@@ -196,6 +198,7 @@ class _RayScheduler(Scheduler[_RayWorker]):
         actor: Any = WorkerActor
         dumps: Any = cloudpickle.dumps
         cpus, gpus = config.resources.cpus, config.resources.gpus
+        # Restarts are ours: `_death` must first learn what the task was, and what it left.
         self.make_actor = actor.options(num_cpus=cpus, num_gpus=gpus, max_restarts=0).remote
         self.arguments, self.versions = (dumps(function), str(Path.cwd())), describe(function)
         self._needs = f"{cpus:g} CPUs and {gpus:g} GPUs"

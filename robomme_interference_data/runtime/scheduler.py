@@ -96,6 +96,7 @@ class Scheduler[H: Handle](ABC):
                 while self._numbers and len(free) < len(waiting):
                     free.append(self.start(self._numbers.popleft()))
                     self.workers.append(free[-1])
+                # Those on a cluster are ready only when a node has room for them.
                 for worker in [worker for worker in free if worker.ready][: len(waiting)]:
                     busy[worker] = waiting.popleft()
                     worker.send(busy[worker].task, time_limit)
@@ -114,6 +115,7 @@ class Scheduler[H: Handle](ABC):
                     if outcome.worker != "alive":
                         self._drop(worker)  # its number is free for the one that replaces it
                     if queued.needs_retry(outcome, attempts, again):
+                        # At the end: it may kill another worker, and the other tasks come first.
                         waiting.append(queued)
                     else:
                         count = queued.failures + queued.losses

@@ -106,6 +106,7 @@ class Registry[K: SpecKind]:
         kind = self.kinds[name]
         target = target if colon else kind.default
         match = re.fullmatch(kind.target, target, re.DOTALL)
+        # The comparison is true for `policy:` with nothing behind the colon.
         if match is None or bool(colon) > bool(target) or not kind.valid(target):
             module_hint = _module_hint(target) if name == "python" else None
             raise InvalidOptionError.expected(self._what, text, kind.form, module_hint)

@@ -20,6 +20,7 @@ def end_if_starting() -> None:
 
     Then a script that starts work at module level gets one error, from its own process.
     """
+    # Python sets it while a spawned process imports the script that started it.
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         sys.exit(STARTED_AGAIN)
 

@@ -77,6 +77,7 @@ def _column(field: pa.Field, records: Sequence[Any]) -> pa.Array:
     if codec.item is None:
         return pa.array([codec.write(value) for value in values], field.type)
     listed = [item for value in values for item in value]
+    # By identity: the rows of a query share their sessions, which are costly to compare.
     distinct = {id(item): item for item in listed}
     position = {key: number for number, key in enumerate(distinct)}
     converted = [codec.item(item) for item in distinct.values()]
@@ -151,6 +152,7 @@ def _codec_of(hint: Any) -> _Converter:
         kind, types, expected = _SCALARS[hint]
 
         def scalar(value: Any) -> Any:
+            # Not `isinstance`: to Python, true is also a whole number.
             if type(value) is not hint:
                 _of(types, value, expected)
             if type(value) is int and not -_LARGEST <= value < _LARGEST:
@@ -167,6 +169,7 @@ def _codec_of(hint: Any) -> _Converter:
     return _Converter(lambda keys: pa.null(), lambda value: value)
 
 
+# Types are few, and read and written for every row.
 _codec: Callable[[Any], _Converter] = cache(_codec_of)
 
 

@@ -168,6 +168,7 @@ _KINDS = (
 KINDS: dict[str, ConditionKind] = {kind.name: kind for kind in _KINDS}
 """All kinds by name, in the order of tables."""
 
+# No leading zeros: a condition has one spelling.
 _COUNTED = re.compile(r"(?:(?P<kind>[a-z]+)-)?k(?P<k>0|[1-9][0-9]?)")
 
 

@@ -167,5 +167,6 @@ class _UnreadSessions:
 
 
 def _hash(seed: int, *parts: str) -> bytes:
+    # The version is hashed, too: new rules make new draws, instead of nearly the same ones.
     text = "\n".join((f"robomme-interference draw {RULE_VERSION}", str(seed), *parts))
     return hashlib.sha256(text.encode()).digest()

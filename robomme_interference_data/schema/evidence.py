@@ -80,6 +80,7 @@ def map_evidence(
     mapped: list[Evidence] = []
     for session in sessions:
         entry, spans = session.entry, recorded(session.entry)
+        # A unit's frames show nothing of the answer, whether its source labels frames or not.
         if spans is None and session.role in _TEACHING:
             return None
         for span in spans or ():
@@ -118,6 +119,7 @@ def known_parts(
             entry.start <= frame < entry.stop for frame in kept
         )
     texts: dict[int, str] = {}
+    # The last one that shows a part is the first to be set, and stays.
     for entry in reversed(evidence):
         if counts[entry.span.part, entry.span.text] >= frames and entry.seen(kept):
             texts.setdefault(entry.span.part, entry.span.text)

@@ -106,6 +106,7 @@ def spread(start: int, stop: int, count: int) -> list[int]:
 def runs(frames: Iterable[int]) -> tuple[tuple[int, int], ...]:
     """Return start and stop (excluded) of each run of consecutive numbers in ascending indices."""
     spans = []
+    # Within a run, number and place differ by the same amount.
     for _, run in groupby(enumerate(frames), lambda pair: pair[1] - pair[0]):
         indices = [index for _, index in run]
         spans.append((indices[0], indices[-1] + 1))

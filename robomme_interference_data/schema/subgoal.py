@@ -12,6 +12,7 @@ POINT = "<point>"
 Pixel = tuple[int, int]
 """A point of an image: row and column, (y, x), from 0."""
 
+# `at` goes with its point: `pick up the cube at <point>` becomes `pick up the cube`.
 _NAMED_AT = re.compile(rf"\s*(?:\bat\s+)?{POINT}")
 
 
@@ -59,6 +60,7 @@ def write_points(text: str, written: Sequence[str]) -> str:
 
 def read_points(text: str, pattern: "re.Pattern[str]") -> tuple[str, list[dict[str, int]]]:
     """Replace each match by `<point>`; return the text and the numbers of each match's groups."""
+    # A model may write the placeholder itself.
     text = text.replace(POINT, "")
     numbers = [
         {name: int(value) for name, value in match.groupdict().items() if value is not None}

@@ -82,6 +82,7 @@ class FeatureDigests:
 
     def update(self, feature: str, values: NDArray[Any]) -> None:
         """Add the next value, or several stacked along a first axis, of a feature."""
+        # The same bytes on machines of either byte order.
         if values.dtype == np.float32:
             values = values.astype("<f4", copy=False)
         elif values.dtype != np.uint8:

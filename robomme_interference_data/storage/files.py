@@ -150,6 +150,7 @@ def check_relative(relative: str, where: str) -> str:
 
 def canonical_json(value: Any) -> str:
     """Return the one JSON text of a value: sorted keys, no spaces, UTF-8, no NaN."""
+    # Any program can make the same text: no escapes but those that JSON requires.
     return json.dumps(
         value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
     )
@@ -159,6 +160,7 @@ def digest_json(values: Iterable[Any], end: str = "") -> str:
     """Return the SHA-256 over the canonical JSON of values in turn, `end` after each."""
     digest = hashlib.sha256()
     for value in values:
+        # Half a surrogate pair, which a JSON file may hold, has no UTF-8.
         digest.update((canonical_json(value) + end).encode(errors="backslashreplace"))
     return digest.hexdigest()
 
@@ -172,6 +174,7 @@ def indented_json(value: Any) -> str:
 def read_bytes(path: Path, most: int) -> bytes:
     """Return the bytes of a file that has at most `most`."""
     with path.open("rb") as file:
+        # Of the open file: by now, another one may have the path.
         size = os.fstat(file.fileno()).st_size
         if size > most:
             raise FormatError.damaged(path, f"{size:,} bytes; expected at most {most:,}")
@@ -187,6 +190,7 @@ def parse_json(data: bytes, where: object) -> dict[str, Any]:
     """Parse a JSON object in UTF-8, in which keys are unique and numbers are finite."""
     try:
         value = _JSON.decode(data.decode())
+        # The number of brackets bounds the depth, and is quickly counted.
         if data.count(b"[") + data.count(b"{") > _MAX_DEPTH and _is_deep(value):
             raise ValueError(f"over {_MAX_DEPTH} nested arrays and objects")
     except (ValueError, RecursionError) as error:
@@ -207,6 +211,7 @@ def _not_finite(text: str) -> NoReturn:
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     value = dict(pairs)
+    # Of two equal keys, readers take different ones: what one checks, another does not use.
     if len(value) < len(pairs):
         names = [name for name, _ in pairs]
         duplicate = next(name for name in names if names.count(name) > 1)
@@ -277,12 +282,14 @@ def atomic_path(path: Path, *, flush: bool = True) -> Iterator[Path]:
     With `flush`, the data reaches the disk before the file gets its name.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
+    # In the same folder: a rename to another disk is not atomic.
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".partial")
     os.close(handle)
     partial = Path(name)
     try:
         with with_filename(path):
             yield partial
+            # `mkstemp` makes files that only their owner can read.
             partial.chmod(0o644)
             if flush:
                 with partial.open("rb+") as file:  # Windows flushes only what is open for writing

@@ -23,6 +23,7 @@ _LOCATION = re.compile(rf"({_NAME}/{_NAME})((?:/{_NAME})*)(?:@(.+))?")
 _VERSION = re.compile(r"data-\d+\.\d+\.\d+")
 _ENDPOINT = re.compile(r"https?://([\w.-]+|\[[\da-fA-F:.]+\])(:[1-9]\d{0,4})?(/\S*)?")
 _PUBLIC = "https://huggingface.co"
+# As many as the client's own `snapshot_download` has.
 _PARALLEL_DOWNLOADS = 8
 
 

@@ -96,8 +96,10 @@ class HubCall:
         ) as error:
             cause: BaseException = error
             vague = (RuntimeError, errors.LocalEntryNotFoundError, errors.RevisionResolutionError)
+            # These only say that a call failed; what they were raised from says why.
             while isinstance(cause, vague) and cause.__cause__ is not None:
                 cause = cause.__cause__
+            # An error of this machine, such as a full disk, not of the Hub.
             if isinstance(cause, OSError) and cause.errno is not None:
                 with with_filename(constants.HF_HUB_CACHE if self.revision else self.repo_id):
                     raise cause from None

@@ -96,6 +96,7 @@ class LeRobotFiles:
         feature = self.info["features"][column]
         shape = tuple(feature["shape"])
         if feature["dtype"] in ("video", "image"):
+            # LeRobot's older datasets have the channels first.
             if len(shape) == 3 and shape[2] != 3:
                 shape = (*shape[1:], shape[0])
             if len(shape) != 3 or shape[2] != 3:
@@ -115,6 +116,7 @@ class LeRobotFiles:
             column = table[name] if name in table.column_names else pa.nulls(1)
             if column.null_count or not pa.types.is_integer(column.type):
                 raise FormatError.damaged(where, f"its episodes have no whole numbers {name!r}")
+        # Its lines may come in any order, since they are found by number.
         if self.version == "v2.1":
             table = table.sort_by("episode_index")
         # LeRobot finds an episode of v3.0 by its place, not by its number.
@@ -132,6 +134,7 @@ class LeRobotFiles:
             rows = list(self._json_lines(_V21_TASKS))
         else:
             rows = RowSpan(self.files.path(TASKS_PATH)).table().to_pylist()
+        # LeRobot stores the texts as pandas' index, which pandas names so if it has no name.
         texts = (str(row.get("task", row.get("__index_level_0__"))) for row in rows)
         return {text: row.get("task_index") for text, row in zip(texts, rows, strict=True)}
 
@@ -155,6 +158,7 @@ class LeRobotFiles:
         location = self.locate(index)
         path = self.files.path(location.data)
         file = RowSpan(path)
+        # By value: row numbers in the metadata count over all files, and may be damaged.
         found = np.flatnonzero(file.scalars("episode_index") == index)
         start = int(found[0]) if len(found) else 0
         rows = file.part(start, start + len(found))
@@ -277,6 +281,7 @@ def fill_template(template: str, where: object, **values: str | int) -> str:
             raise invalid
         return f"{value:0{match[2]}d}" if match[2] else str(value)
 
+    # Not by `str.format`, with which a template can reach attributes of the values.
     filled = _FIELD.sub(fill, template)
     if "{" in filled or "}" in filled:
         raise invalid
@@ -308,6 +313,7 @@ def _locate_episode(
         valid = isinstance(start, int | float) and 0 <= start < 1e9
         if not valid or (frame := round(start * fps)) > _MAX_FRAME:
             raise FormatError.damaged(where, f"{name} is {start!r}")
+        # Rounded seconds miss a frame by far less than a tenth of its duration.
         if abs(frame - start * fps) > 0.1:
             raise FormatError.damaged(where, f"{name} {start!r} lies between two frames")
         return frame

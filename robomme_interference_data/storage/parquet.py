@@ -22,6 +22,7 @@ from robomme_interference_data.errors import FormatError
 from .files import atomic_path, reading
 from .parquet_pages import decoded_size
 
+# An image may be a PNG of some megabytes.
 _IMAGES_AT_ONCE = 8
 
 _MAX_METADATA_BYTES = 16 << 20
@@ -148,6 +149,7 @@ def is_plain(kind: pa.DataType) -> bool:
     if pa.types.is_dictionary(kind) or is_listed(kind):
         return is_plain(kind.value_type)
     if pa.types.is_struct(kind):
+        # Two fields of one name cannot become a dict.
         unique = len({field.name for field in kind}) == kind.num_fields
         return unique and all(is_plain(field.type) for field in kind)
     return kind in _PLAIN

@@ -56,6 +56,7 @@ def staging_dir(out: Path) -> Iterator[Path]:
                 yield work
             finished = True
         finally:
+            # Hidden files are half-written, and of no use to the next attempt.
             if finished or not any(work.glob("*/[!.]*")):
                 shutil.rmtree(work, ignore_errors=True)
 
@@ -77,6 +78,7 @@ def copy_folder(source: Path, out: Path) -> None:
 
     def copy(path: str, to: str) -> None:
         try:
+            # Of a link, as in the Hub's cache, the file: its target may be relative.
             os.link(os.path.realpath(path), to)
         except OSError:  # another disk, or one without hard links
             shutil.copyfile(path, to)

@@ -239,6 +239,7 @@ def _boxes_without_frames(file: BinaryIO) -> Iterator[bytes]:
         file.seek(start)
         header = file.read(16)
         size = int.from_bytes(header[:4])
+        # The real size then follows, in 64 bits.
         if size == 1:
             size = int.from_bytes(header[8:])
         elif size == 0:  # up to the end of the file

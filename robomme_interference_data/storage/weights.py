@@ -15,6 +15,7 @@ def digest_weights(folder: Path, patterns: Sequence[str]) -> str:
         {path for pattern in patterns for path in folder.rglob(pattern) if path.is_file()}
     )
     stats = [(str(path.relative_to(folder)), path.stat()) for path in paths]
+    # A copy can keep the time of writing, but not that of the last change of the inode.
     state = [[name, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns] for name, stat in stats]
     key = canonical_json([str(folder.resolve()), state])
     name = hashlib.sha256(key.encode("utf-8", "surrogateescape")).hexdigest()

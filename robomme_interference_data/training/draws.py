@@ -37,12 +37,15 @@ class Weights:
         """Return the name that a key draws, the same on every machine."""
         if len(self.names) == 1:
             return self.names[0]
+        # 53 bits, as many as a float holds exactly: evenly from 0 to below 1.
         lot = (number_from(*key) >> 11) / 2**53
         numbers = (n for n, stop in enumerate(self.cumulative) if lot < stop)
+        # Rounding may leave the last sum just below 1.
         return self.names[next(numbers, len(self.names) - 1)]
 
 
 def number_from(*key: int | str) -> int:
     """Return an integer of 64 bits that follows from a key, evenly distributed."""
+    # Python's own `hash` of a text differs between processes.
     text = "\n".join(map(str, key))
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest())

@@ -106,6 +106,7 @@ class Histories:
         if self._drawing is None or self._drawing[0] != epoch:
             seed, units = self._redraw
             source = SessionSource(self._set.datasets, number_from("draw", seed, epoch), units)
+            # Those of an earlier epoch are not drawn again.
             self._drawing, self._known = (epoch, source), {}
         if key not in self._known:
             query, source = self._set.query(episode), self._drawing[1]
@@ -126,6 +127,7 @@ class Histories:
         if buffer.evidence is not None:
             evidence = np.zeros((len(rows), self.parts), bool)
             for entry in buffer.evidence:
+                # A contradicting lesson shows parts of another answer.
                 if entry.session.role != "contradiction":
                     evidence[entry.start : entry.stop, entry.span.part] = True
         if self._retrieval is not None and len(rows):

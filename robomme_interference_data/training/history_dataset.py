@@ -27,7 +27,7 @@ from robomme_interference_data.schema.shifts import NO_SHIFT, Shift, parse_shift
 
 from .draws import Weights
 from .histories import DrawnHistory, Histories
-from .moments import check_arguments, check_size, choose_moments, needed_datasets
+from .moments import check_arguments, check_size, choose_moments, drawable_rows, needed_datasets
 from .question_tensors import QuestionTensors
 from .rows import PADDING, StoredRows
 
@@ -183,17 +183,20 @@ class HistoryDataset:
         draws = (seed, units) if redraw else None
         self._histories = Histories(self.buffer_set, self._rows, step, draws)
         self._questions = QuestionTensors(self.buffer_set, self.episode_ids) if questions else None
-        # Sessions that are drawn anew are opened when they are drawn: not all of them may be.
-        now = used = self._live_rows()
-        if not redraw:
+        now = self._live_rows()
+        if redraw:
+            history = drawable_rows(datasets, self._rows, self.episode_ids, units)
+        else:
             with WorkProgress(quiet=quiet) as progress, progress.status("Laying out histories"):
                 self._histories.plan(
                     self._conditions.names, self.episode_ids, self._shift_of.values()
                 )
-            used = np.concatenate([now, self._histories.rows])
-        self._rows.prepare((*self.cameras, STATE), used, quiet=quiet)
+            history = self._histories.rows
+        # Here, not when they are first used: a loader's forked workers share what is open now.
+        self._rows.prepare((*self.cameras, STATE), np.concatenate([now, history]), quiet=quiet)
         if actions:
             self._rows.prepare((ACTION,), now, quiet=quiet)
+        # All items have as many places, so that they can be batched.
         self._size = self.memory_frames
         import torch
 
@@ -285,6 +288,7 @@ class HistoryDataset:
             kept = np.asarray(self.memory.earlier(len(past) + drawn.moment), np.int64)
             count, ended = len(kept), int(kept.searchsorted(len(past)))
             rows[place, :ended] = past[kept[:ended]]
+            # Frames after the history are of the execution, which begins at its own row.
             rows[place, ended:count] = kept[ended:] + (
                 self._moments.first[drawn.number] - len(past)
             )
@@ -306,6 +310,7 @@ class HistoryDataset:
         if self.chunk:
             steps = moment[:, None] + np.arange(self.chunk)
             last = self._moments.actions[numbers][:, None] - 1
+            # After the end the last action repeats, as LeRobot pads its chunks.
             batch[ACTION] = self._rows.take(ACTION, first[:, None] + np.minimum(steps, last))
             batch["action_is_pad"] = steps > last
         batch["frame_index"] = moment

@@ -1,13 +1,13 @@
 """Which datasets and moments a `HistoryDataset` has, and the checks of its arguments."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import DEMONSTRATIONS, EXECUTIONS, SHIFTED
+from robomme_interference_data.constants import CONTRADICTIONS, DEMONSTRATIONS, EXECUTIONS, SHIFTED
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.loading import open_dataset
@@ -148,8 +148,38 @@ def choose_moments(
         raise InvalidOptionError.expected("episodes", episodes, expected, hint)
     records = [recorded[episode] for episode in chosen]
     counts = np.array([record.length if actions else 0 for record in records])
+    # In the demonstrations, the first live frame follows the lesson; executions begin with it.
     first = [
         rows.first(live.kind, record.episode_index) + (record.exec_start_idx or 0)
         for record in records
     ]
     return Moments(chosen, np.array(first), counts, np.cumsum(np.maximum(counts, 1)))
+
+
+def drawable_rows(
+    datasets: Mapping[str, Dataset],
+    rows: StoredRows,
+    episodes: Collection[EpisodeId],
+    units: Collection[int] | None,
+) -> NDArray[np.int64]:
+    """Return the first rows of all sessions that histories which are drawn anew may have.
+
+    Args:
+        datasets: The datasets by name.
+        rows: Their rows.
+        episodes: The query episodes.
+        units: Indices of the episodes whose units may be drawn; None for all.
+    """
+    queries, first = frozenset(episodes), []
+    for name, dataset in datasets.items():
+        if name in (EXECUTIONS, SHIFTED):  # of which no history has a session
+            continue
+        for record in dataset.records():
+            episode = record.episode_id
+            if name in (DEMONSTRATIONS, CONTRADICTIONS):
+                used = episode.scene in queries
+            else:
+                used = units is None or episode.index in units
+            if used:
+                first.append(rows.first(name, record.episode_index))
+    return np.array(first)

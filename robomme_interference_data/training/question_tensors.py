@@ -30,6 +30,7 @@ class QuestionTensors:
         for number, question in enumerate(self._questions):
             for option, values in enumerate(question.pixels):
                 pixels = np.reshape(np.array(values, np.float32), (-1, 2))
+                # The center of pixel 0 lies at 0.5.
                 points[number, option, : len(pixels)] = (pixels + 0.5) / np.array(
                     shape[:2], np.float32
                 )

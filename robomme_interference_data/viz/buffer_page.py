@@ -100,6 +100,7 @@ def write_page(
         "videos": [_read(path) for path in videos],
         "data": json.dumps(data),
         "script": script,
+        # The page's policy runs this script alone: a goal from a stranger cannot add one.
         "script_hash": base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     }
     text = fill(__package__, "buffer.html.j2", values, what="the page", autoescape=True)
@@ -117,6 +118,7 @@ def _place(
         for camera in cameras
     ]
     for path, _ in stored:
+        # Sessions of one file, such as the halves of a lesson, share its copy in the page.
         videos.setdefault(path, f"video-{len(videos)}")
     return {
         "start": session.start,

@@ -72,6 +72,7 @@ class EpisodeVideo:
                 left = place * VIEW
                 canvas[HEAD : HEAD + small.shape[0], left : left + small.shape[1]] = small
         lines = [line for text in paragraphs for line in textwrap.wrap(text, _LETTERS) or [""]]
+        # Room for an empty line and for the ending, which is never cut.
         lines = lines[: _LINES - len(ending) - 1]
         self._encoder.add(self._lettered(canvas, list(views), [*lines, "", *ending]))
 

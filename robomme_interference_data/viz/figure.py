@@ -64,6 +64,7 @@ def open_figure() -> Iterator[Any]:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise MissingExtraError.needs("drawing", "matplotlib", "score") from error
+    # Without a salt, ids in SVG files are random; composed, all its pictures would become one.
     settings: dict[str, Any] = {"svg.hashsalt": MAKER, "image.composite_image": False}
     names = ("text.color", "axes.labelcolor", "xtick.color", "ytick.color")
     settings |= dict.fromkeys(names, INK)
@@ -76,6 +77,7 @@ def open_figure() -> Iterator[Any]:
         matplotlib.rc_context(settings),
         warnings.catch_warnings(),
     ):
+        # A goal may have letters that no installed font has: boxes are drawn for them.
         warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)
         yield Figure(facecolor="white")
 
@@ -148,6 +150,7 @@ class Page:
         """Write a line below `y`; text wider than `width` shrinks by a quarter, or is cut."""
         text = _printable(text)
         if width is not None and (measured := self.text_width(text, size, bold=bold)) > width:
+            # Smaller letters than that cannot be read.
             size *= max(0.75, width / measured)
             if 0.75 * measured > width:
                 text = self._shortened(text, size, width, bold)
@@ -226,6 +229,7 @@ def ink_on(color: str) -> str:
     """Return black or white, whichever has the higher contrast (WCAG 2) with a color."""
     linear = [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in _rgb(color)]
     luminance = sum(w * v for w, v in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
+    # Contrast with black is (l + 0.05) / 0.05, with white 1.05 / (l + 0.05).
     return "black" if (luminance + 0.05) ** 2 > 1.05 * 0.05 else "white"
 
 

@@ -59,6 +59,7 @@ def arrange(frames: Sequence[int]) -> tuple[int, list[Block]]:
 
     A unit takes one slot, a longer session as many as its frames fill, up to a row.
     """
+    # More sessions on a page, each with fewer frames.
     slots = 4 if len(frames) <= 12 else 6
     blocks, row, slot = [], 0, 0
     for count in frames:
@@ -82,6 +83,7 @@ def session_colors(sessions: Sequence[Session]) -> list[str]:
 
 def round_step(frames: int, most: int) -> int:
     """Return the distance of labels on a timeline, such as 50, for at most so many of them."""
+    # Round numbers: 1, 2, 5, 10, 20, 50, …
     steps = (digit * 10**power for power in range(9) for digit in (1, 2, 5))
     return next(step for step in steps if step * most >= frames)
 
@@ -205,6 +207,7 @@ def _draw_card(
 def _draw_timeline(page: Page, buffer: "Buffer", top: float) -> None:
     """Draw the history to scale, the live observation after it, and the frames of the sample."""
     width = _INNER - _LIVE - 0.42
+    # One frame more, for the live observation.
     scale = width / (len(buffer) + 1)
     caption = "history to scale; ticks: the even sample, and its frames in each session"
     if buffer.evidence:

@@ -61,6 +61,7 @@ def write_recording(buffer: "Buffer", out: Path, live: Mapping[str, NDArray[np.u
         recording.log("state", rerun.Scalars(buffer.query.state()))
         recording.log("text", rerun.TextLog("first live observation"))
         recording.flush()
+        # Closes the file, which only then gets its name.
         recording.disconnect()
 
 

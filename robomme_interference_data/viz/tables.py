@@ -89,6 +89,7 @@ class Table:
     def grid(self) -> str:
         """Return the table as Markdown, without title and note."""
         rule, heads, rows = self._layout("---", "---:")
+        # A bar would end the cell.
         cells = ([cell.replace("|", "\\|") for cell in row] for row in rows)
         return "\n".join(f"| {' | '.join(line)} |" for line in [heads, rule, *cells])
 
@@ -126,6 +127,7 @@ class Table:
         """
         width = width or max(80, shutil.get_terminal_size().columns)
         sides, heads, rows = self._layout("left", "right")
+        # Plain text has no bold letters: a star marks them.
         rows = [[_COUNT_OF.sub(_NO_BREAK, _BOLD.sub(r"\1*", cell)) for cell in row] for row in rows]
         widths = self._widths(heads, rows, width)
         parts = [_fill(self.title, width)]
@@ -147,6 +149,7 @@ class Table:
         ]
         while sum(widths) + _GAP * (len(widths) - 1) > width and widths != least:
             wrappable = (place for place, size in enumerate(widths) if size > least[place])
+            # The widest gives way first, a letter at a time.
             widths[max(wrappable, key=widths.__getitem__)] -= 1
         return widths
 

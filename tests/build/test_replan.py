@@ -152,3 +152,17 @@ def test_a_request_for_buffers_alone_needs_no_source(own_buffers: Path, run: Any
         assert (code, error["type"]) == (1, "InvalidOptionError")
         assert error["command"] == f"robomme-interference build {own_buffers} --only manifests"
     assert contents(own_buffers) == before
+
+
+def test_the_files_of_a_repository_are_not_planned_again(tmp_path: Path, run: Any) -> None:
+    root = tmp_path / "exported"
+    words = ("publish", GOLDEN, "--repo-id", "someone/tiny", "--to", root)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("robomme_interference_data.cards.checks.check_buffer_set", lambda *_: None)
+        assert run(*words)[0] == 0
+    before = contents(root)
+    code, _, err = run("build", root, "--drop", "k7", "--yes", "--json")
+    error = json.loads(err)
+    assert (code, error["type"]) == (1, "BuildError")
+    assert f"--demonstrations {root / 'demonstrations'} " in error["command"]
+    assert contents(root) == before

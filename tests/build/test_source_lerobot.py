@@ -187,6 +187,10 @@ def test_families_are_kept_with_the_buffer_set(tmp_path: Path, run: Any) -> None
     file.unlink()
     assert run("build", root, *source, "--split", "test", "--conditions", "k0,k1")[0] == 0
     assert run("verify", root)[0] == 0
+    other = write_lerobot(tmp_path / "e", {"0": make_episode(0, 9, "push")}, episode_id=None)
+    with raises(SourceError) as caught:
+        open_source(f"lerobot:{other}", kept_families=root / "families.csv").episodes()
+    assert "`families_file`" in (caught.value.hint or "")
     edit_columns(data / TABLE, episode_id=["Fold/test/7", "Open/train/0"])
     assert [
         str(episode.id)

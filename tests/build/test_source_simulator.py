@@ -16,6 +16,7 @@ from robomme_interference_data.build_dataset.sources import Recording, open_sour
 from robomme_interference_data.constants import DEMONSTRATIONS, FAMILIES
 from robomme_interference_data.errors import (
     InvalidOptionError,
+    MissingFileError,
     SimulatorError,
     SourceError,
     UnknownNameError,
@@ -162,7 +163,7 @@ def test_a_simulator_of_ones_own_is_a_source(name: str) -> None:
         (f"{OWN}nothing", UnknownNameError, "'nothing' is not in module"),
         ("__main__:make", InvalidOptionError, "worker processes run another program"),
         ("no_such_module:make", InvalidOptionError, "MODULE:NAME of a simulator of your own"),
-        ("frames:make", SourceError, "frames.parquet"),
+        ("frames:make", MissingFileError, "no folder make"),
     ],
 )
 def test_sources_that_give_no_episode(text: str, error: type[Exception], words: str) -> None:

@@ -9,6 +9,7 @@ import pytest
 from support.buffer_sets import build
 
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
+from robomme_interference_data.data.loading import next_build
 
 
 @pytest.mark.parametrize(
@@ -55,3 +56,8 @@ def test_a_dataset_without_buffers_is_one_violation(own_buffers: Path, run: Any)
     assert f"build {own_buffers} --only manifests" in violation["what"]
     assert run("build", own_buffers, "--only", "manifests")[0] == 0
     assert run("verify", own_buffers, "--no-decode")[0] == 0
+
+
+def test_a_planned_set_is_planned_again_wherever_its_demonstrations_are(own_buffers: Path) -> None:
+    shutil.rmtree(own_buffers / "demonstrations")
+    assert next_build(own_buffers) == f"build {own_buffers} --only manifests"

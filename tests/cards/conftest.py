@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from support.buffer_sets import CONDITIONS, copy_buffer_set, plan_again
 from support.cards import cards
 from support.publishing import plain_cards
 
@@ -39,3 +40,11 @@ def _somebody(login: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> No
 def _unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out the checks, which decode everything and import lerobot."""
     monkeypatch.setattr(checks, "check_buffer_set", lambda *_: None)
+
+
+@pytest.fixture
+def extended(tmp_path: Path) -> Path:
+    """The golden buffer set with one condition more."""
+    root = copy_buffer_set(tmp_path / "extended")
+    plan_again(root, [*CONDITIONS, "k2"])
+    return root

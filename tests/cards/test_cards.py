@@ -84,7 +84,8 @@ def test_the_citation_is_the_project_s() -> None:
     [author] = paper["authors"]
     name = f"{author['family-names']}, {author['given-names']}"
     assert paper["url"] == PAPER
-    for part in (paper["title"], paper["url"], paper["year"], paper["month"], name):
+    [preprint] = paper["identifiers"]
+    for part in (paper["title"], paper["url"], paper["year"], preprint["value"], name):
         assert f"{{{part}}}" in BIBTEX
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.buffer_sets import CONDITIONS, GOLDEN, contents, copy_buffer_set, stored_frames
+from support.buffer_sets import GOLDEN, contents, copy_buffer_set, stored_frames
 from support.hub_server import HubServer
 from support.messages import raises
-from support.publishing import LESSONS, UNITS, files, plan, plan_again, publish, tags, writes
+from support.publishing import LESSONS, UNITS, files, plan, publish, tags, writes
 from support.tabletop import TABLETOP, copy_tabletop
 
 from robomme_interference_data import load_buffer, load_buffer_set
@@ -126,14 +126,6 @@ def test_lerobot_opens_what_was_published(hub: HubServer, run: Run, tmp_path: Pa
 
 
 # --- versions ------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def extended(tmp_path: Path) -> Path:
-    """The golden buffer set with one condition more."""
-    root = copy_buffer_set(tmp_path / "extended")
-    plan_again(root, [*CONDITIONS, "k2"])
-    return root
 
 
 def test_a_published_version_never_changes(hub: HubServer, extended: Path) -> None:

@@ -26,7 +26,7 @@ from support.messages import raises
 
 from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.data.buffer import Buffer
-from robomme_interference_data.errors import FormatError
+from robomme_interference_data.errors import FormatError, HashMismatchError
 from robomme_interference_data.schema.codec import from_dict, to_dict
 from robomme_interference_data.schema.manifest import BufferManifest, SessionEntry
 
@@ -107,7 +107,9 @@ def test_a_buffer_has_a_bounded_number_of_frames_and_sessions(change: dict[str, 
 
 
 @pytest.mark.parametrize("digest", ["../../written", "/written", "0" * 64, "", "x\0"])
-def test_the_cache_ignores_digests_that_are_not_of_the_frames(tmp_path: Path, digest: str) -> None:
+def test_the_cache_stores_nothing_under_a_digest_that_is_only_claimed(
+    tmp_path: Path, digest: str
+) -> None:
     """Else a buffer set could write elsewhere, or give another one its frames."""
     root = copy_buffer_set(tmp_path / "buffer_set")
     path = root / "distractors/meta/interference.parquet"
@@ -119,12 +121,17 @@ def test_the_cache_ignores_digests_that_are_not_of_the_frames(tmp_path: Path, di
     cache = tmp_path / "cache" / "inner"
     for _ in range(2):
         buffer = load_buffer(QUERIES[0], "k1", buffer_set=root, cache=cache)
-        expected = expected_frames(buffer.manifest.sessions, "front")
-        assert np.array_equal(buffer.frames(), expected)
-        streamed = [chunk.frames["front"] for chunk in buffer.stream(cameras=["front"])]
-        assert np.array_equal(np.concatenate(streamed), expected)
+        with raises(HashMismatchError):
+            buffer.frames()
+        with raises(HashMismatchError):
+            list(buffer.stream(cameras=["front"]))
+    lesson = load_buffer(QUERIES[0], "k0", buffer_set=root, cache=cache).frames()
     assert len(list(cache.iterdir())) == 1  # the lesson, whose digest is right
     assert {name for name in contents(tmp_path) if not name.startswith("cache/")} == set(before)
+    buffer = load_buffer(QUERIES[0], "k1", buffer_set=root)  # without a cache, and not verified
+    expected = expected_frames(buffer.manifest.sessions, "front")
+    assert np.array_equal(buffer.frames(), expected)
+    assert np.array_equal(lesson, expected[: len(lesson)])
 
 
 def test_frames_that_need_too_much_memory_raise(tmp_path: Path) -> None:

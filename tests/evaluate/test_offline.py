@@ -282,6 +282,20 @@ def test_a_policy_of_another_robot_is_refused_with_those_that_fit(
     assert isinstance(raised.value, InvalidOptionError)
     assert raised.value.hint is not None
     assert all(policy in raised.value.hint for policy in ("hold", "mean", "python:"))
+    words = (raised.value.command or "").split()
+    assert words == f"evaluate {arms} --offline --policy hold --out {tmp_path / 'run'}".split()
+
+
+@pytest.mark.parametrize("conditions", [(), ("k0",)])
+def test_a_baseline_needs_the_condition_without_history(
+    arms: Path, tmp_path: Path, conditions: tuple[str, ...]
+) -> None:
+    root = Path(shutil.copytree(arms, tmp_path / "arms"))
+    plan_again(root, ("k0",))
+    with raises(InvalidOptionError) as raised:
+        evaluate(root, tmp_path / "run", policy="hold", conditions=conditions)
+    planning = f"build {root} --only manifests --conditions no-history"
+    assert raised.value.command == planning
 
 
 def test_buffer_sets_without_executions(tmp_path: Path, own_buffers: Path) -> None:

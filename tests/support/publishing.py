@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.buffer_sets import plan_again  # noqa: F401
 from support.hub_server import HubServer
 
 from robomme_interference_data import load_buffer_set

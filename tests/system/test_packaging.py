@@ -162,6 +162,7 @@ cached = load_buffer("MoveCube/test/0", "k3", buffer_set=buffers, cache=os.path.
 print(cached.frames().shape)
 for command in (
     ["list", buffers],
+    ["verify", buffers],
     ["show", buffers, "MoveCube/test/0", "k3", "--out", os.path.join(out, "strip.png")],
     ["score", run, "--out", os.path.join(out, "score")],
 ):
@@ -187,8 +188,9 @@ def test_the_light_core_needs_nothing_of_one_platform(platform: str, tmp_path: P
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
     assert lines[:2] == ["(144, 32, 32, 3)", "(144, 32, 32, 3)"]
-    assert [line for line in lines if re.fullmatch(r"(list|show|score) \d+", line)] == [
+    assert [line for line in lines if re.fullmatch(r"(list|verify|show|score) \d+", line)] == [
         "list 0",
+        "verify 0",
         "show 0",
         "score 0",
     ]
