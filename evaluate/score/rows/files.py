@@ -188,7 +188,7 @@ def _read_record(path: Path, names: Sequence[str], has_system: bool) -> FileColu
 
     The types are those of a rollout's row; a row object for each line would take ten times as long.
     """
-    from robomme_interference_data.evaluate.run.row import whole_lines
+    from robomme_interference_data.evaluate.run.row import rows_that_count, whole_lines
 
     data = whole_lines(path)
     if not data:
@@ -196,12 +196,7 @@ def _read_record(path: Path, names: Sequence[str], has_system: bool) -> FileColu
     _check_count(data.count(b"\n"))
     columns = _columns(path, _parse_record(path, data, record_schema({*names, *KEY_COLUMNS})))
     keys = [*zip(*(columns[name] for name in KEY_COLUMNS), strict=True)]
-    last = {key: at for at, key in enumerate(keys)}
-    kept = [
-        at
-        for at, (key, status) in enumerate(zip(keys, columns["status"], strict=True))
-        if status != Status.ERROR or last[key] == at
-    ]
+    kept = rows_that_count(keys, columns["status"])
     return FileColumns(
         {name: [columns[name][at] for at in kept] for name in names}, [at + 1 for at in kept]
     )
