@@ -95,12 +95,19 @@ class RolloutFunction(RunFunction[RunConfig]):
             return self._start_simulator(task.episode, worker)
         return self._run(task, worker)
 
-    def _start_simulator(self, episode: EpisodeId | None, worker: Worker) -> None:
-        policy = self._open_policy(worker)
-        simulator = self._open_simulator(policy, worker)
-        if episode is not None:
-            cameras = used_cameras(self.config, policy.cameras, self._demonstrations)
-            self._try_out(simulator, episode, cameras, worker)
+    def describe(self) -> dict[str, str]:
+        """Return the buffer set's revision and all versions."""
+        config = self.config
+        return super().describe() | simulator_versions(config.simulator, config.robomme_python)
+
+    def close(self) -> None:
+        """Release simulator, policy and subgoal writer."""
+        for resource in (self._policy, self._simulator, self._writer):
+            # It may be broken already, and the first error is the one to report.
+            with suppress(Exception):
+                if resource is not None:
+                    resource.close()
+        self._policy = self._simulator = self._writer = None
 
     def _start_server(
         self, asks: bool, worker: Worker
@@ -115,6 +122,28 @@ class RolloutFunction(RunFunction[RunConfig]):
         metadata = policy_metadata(self.config.policy, policy)
         keeps = policy.keeps_frames() if asks else None
         return metadata, declared_memory(policy, metadata), keeps
+
+    def _start_simulator(self, episode: EpisodeId | None, worker: Worker) -> None:
+        policy = self._open_policy(worker)
+        simulator = self._open_simulator(policy, worker)
+        if episode is not None:
+            cameras = used_cameras(self.config, policy.cameras, self._demonstrations)
+            self._try_out(simulator, episode, cameras, worker)
+
+    def _try_out(
+        self, simulator: Simulator, episode: EpisodeId, cameras: set[str], worker: Worker
+    ) -> None:
+        """Begin an episode; raise only for what no episode can work with."""
+        limit = worker.limit(self.config.simulator_timeout_s, "the simulator's reset")
+        try:
+            with limit:
+                lesson, first, info = simulator.reset(str(episode), demonstration=False)
+            check_drawn(lesson, first, sorted(cameras))
+            check_episode(self.buffer_set.query(episode), lesson, first, info)
+        except SimulatorError:
+            raise
+        except Exception:
+            self.close()  # the rollout of this episode becomes an error row
 
     def _run(self, job: Job[RunConfig], worker: Worker) -> tuple[Rollout, str | None]:
         item, config, clip = job.item, self.config, None
@@ -136,53 +165,6 @@ class RolloutFunction(RunFunction[RunConfig]):
             raise
         self._send_files(item, worker, clip, Status(row.status))
         return row, clip.problem if clip else None
-
-    @property
-    def _demonstrations(self) -> Dataset:
-        return self.buffer_set.datasets[DEMONSTRATIONS]
-
-    def _open_policy(self, worker: Worker) -> Policy:
-        if self._policy is None:
-            self._policy = self._make_policy(worker)
-            self._checked = False
-        return self._policy
-
-    def _make_policy(self, worker: Worker) -> Policy:
-        config = self.config
-        if self._made_policy is not None:
-            return self._made_policy
-        if not self._addresses:
-            return make_policy(config.policy, config.policy_options, worker=worker.number)
-        address = self._addresses[worker.number % len(self._addresses)]
-        return optional.SharedPolicy.open(address, worker.number)
-
-    def _open_simulator(self, policy: Policy, worker: Worker) -> Simulator:
-        config = self.config
-        if self._simulator is None:
-            options = simulator_options(config, policy.cameras, self._demonstrations)
-            with worker.limit(config.simulator_timeout_s, "the simulator's start"):
-                self._simulator = make_simulator(config.simulator, **options)
-        return self._simulator
-
-    def _try_out(
-        self, simulator: Simulator, episode: EpisodeId, cameras: set[str], worker: Worker
-    ) -> None:
-        """Begin an episode; raise only for what no episode can work with."""
-        limit = worker.limit(self.config.simulator_timeout_s, "the simulator's reset")
-        try:
-            with limit:
-                lesson, first, info = simulator.reset(str(episode), demonstration=False)
-            check_drawn(lesson, first, sorted(cameras))
-            check_episode(self.buffer_set.query(episode), lesson, first, info)
-        except SimulatorError:
-            raise
-        except Exception:
-            self.close()  # the rollout of this episode becomes an error row
-
-    def _open_writer(self) -> "SubgoalWriter | None":
-        if self._writer is None and self.config.subgoals is not None:
-            self._writer = optional.make_writer(self.config)
-        return self._writer
 
     def _roll(self, job: Job[RunConfig], worker: Worker, clip: Any) -> Rollout:
         if self._answers is not None and job.item not in self._answers:
@@ -209,19 +191,27 @@ class RolloutFunction(RunFunction[RunConfig]):
             answer=(self._answers or {}).get(job.item),
         )
 
-    def describe(self) -> dict[str, str]:
-        """Return the buffer set's revision and all versions."""
-        config = self.config
-        return super().describe() | simulator_versions(config.simulator, config.robomme_python)
+    def _check_served(self, policy: Policy, metadata: Mapping[str, Any]) -> None:
+        """Retire the worker if its server reports other metadata than at the start of the run."""
+        if "server_metadata" not in metadata:  # the policy has no server
+            return
+        from robomme_interference_data.evaluate.run.identity import plain
 
-    def close(self) -> None:
-        """Release simulator, policy and subgoal writer."""
-        for resource in (self._policy, self._simulator, self._writer):
-            # It may be broken already, and the first error is the one to report.
-            with suppress(Exception):
-                if resource is not None:
-                    resource.close()
-        self._policy = self._simulator = self._writer = None
+        reported = plain(policy.metadata())["server_metadata"]
+        first = metadata["server_metadata"]
+        if reported != first:
+            raise WorkerRetiredError(
+                f"a worker's policy server reports {reported}; the run began with {first}",
+                "Serve the same checkpoint everywhere; on a cluster localhost is each node's own.",
+            )
+
+    def _check_reachable(self, worker: Worker) -> None:
+        """Retire the worker if the policy's server cannot be reached."""
+        try:
+            with closing(self._make_policy(worker)) as policy:
+                policy.metadata()  # connects
+        except PolicyServerError as error:
+            raise WorkerRetiredError(error.message, error.hint) from error
 
     def _send_files(
         self, item: WorkItem, worker: Worker, clip: Any, status: Status, error: str | None = None
@@ -248,24 +238,34 @@ class RolloutFunction(RunFunction[RunConfig]):
         for log in self._logs.items():
             worker.send_file(*log)
 
-    def _check_served(self, policy: Policy, metadata: Mapping[str, Any]) -> None:
-        """Retire the worker if its server reports other metadata than at the start of the run."""
-        if "server_metadata" not in metadata:  # the policy has no server
-            return
-        from robomme_interference_data.evaluate.run.identity import plain
+    def _open_policy(self, worker: Worker) -> Policy:
+        if self._policy is None:
+            self._policy = self._make_policy(worker)
+            self._checked = False
+        return self._policy
 
-        reported = plain(policy.metadata())["server_metadata"]
-        first = metadata["server_metadata"]
-        if reported != first:
-            raise WorkerRetiredError(
-                f"a worker's policy server reports {reported}; the run began with {first}",
-                "Serve the same checkpoint everywhere; on a cluster localhost is each node's own.",
-            )
+    def _make_policy(self, worker: Worker) -> Policy:
+        config = self.config
+        if self._made_policy is not None:
+            return self._made_policy
+        if not self._addresses:
+            return make_policy(config.policy, config.policy_options, worker=worker.number)
+        address = self._addresses[worker.number % len(self._addresses)]
+        return optional.SharedPolicy.open(address, worker.number)
 
-    def _check_reachable(self, worker: Worker) -> None:
-        """Retire the worker if the policy's server cannot be reached."""
-        try:
-            with closing(self._make_policy(worker)) as policy:
-                policy.metadata()  # connects
-        except PolicyServerError as error:
-            raise WorkerRetiredError(error.message, error.hint) from error
+    def _open_simulator(self, policy: Policy, worker: Worker) -> Simulator:
+        config = self.config
+        if self._simulator is None:
+            options = simulator_options(config, policy.cameras, self._demonstrations)
+            with worker.limit(config.simulator_timeout_s, "the simulator's start"):
+                self._simulator = make_simulator(config.simulator, **options)
+        return self._simulator
+
+    def _open_writer(self) -> "SubgoalWriter | None":
+        if self._writer is None and self.config.subgoals is not None:
+            self._writer = optional.make_writer(self.config)
+        return self._writer
+
+    @property
+    def _demonstrations(self) -> Dataset:
+        return self.buffer_set.datasets[DEMONSTRATIONS]

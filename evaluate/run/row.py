@@ -1,6 +1,6 @@
 """The row of a rollout, its line in the record of a run, and the reader of a record."""
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -115,24 +115,51 @@ def whole_lines(record: Path) -> bytes:
     return data[: data.rfind(b"\n") + 1]
 
 
+def rows_that_count(rollouts: Sequence[Hashable], statuses: Sequence[str]) -> list[int]:
+    """Return which rows of a record count: all finished ones, and of other rollouts the last row.
+
+    A rollout that broke runs again, and its earlier rows stay in the record.
+    """
+    last = {rollout: place for place, rollout in enumerate(rollouts)}
+    return [
+        place
+        for place, (rollout, status) in enumerate(zip(rollouts, statuses, strict=True))
+        if status != Status.ERROR or last[rollout] == place
+    ]
+
+
 def read_record(folder: Path) -> dict[WorkItem, Rollout]:
-    """Read the row that counts of each rollout; none from a missing file."""
+    """Read the row that counts of each rollout; none from a missing file.
+
+    Raises:
+        FormatError: A line is no row, or a rollout has a second row after a finished one.
+    """
     path = folder / RUN_RECORD
-    rows: dict[WorkItem, Rollout] = {}
     if not path.exists():
-        return rows
+        return {}
+    rows: list[Rollout] = []
+    items: list[WorkItem] = []
     for number, line in enumerate(whole_lines(path).splitlines(), 1):
         try:
             row = row_of(line)
             item = WorkItem.of(row)
-            if item in rows and is_done(rows[item]):
-                raise ValueError(f"it is a second one of {item}")
             if row.video not in (None, item.clip):  # a path that would be read and written
                 raise ValueError(f"video {row.video!r}; expected {item.clip} or null")
         except ValueError as error:
-            raise FormatError(
-                f"{path}, line {number} is no row of a rollout: {first_line(error)}",
-                "Remove the line to run that rollout again.",
-            ) from None
-        rows[item] = row
-    return rows
+            raise _bad_line(path, number, error) from None
+        rows.append(row)
+        items.append(item)
+    counted: dict[WorkItem, Rollout] = {}
+    for place in rows_that_count(items, [row.status for row in rows]):
+        item = items[place]
+        if item in counted:
+            raise _bad_line(path, place + 1, ValueError(f"it is a second one of {item}"))
+        counted[item] = rows[place]
+    return counted
+
+
+def _bad_line(path: Path, number: int, reason: ValueError) -> FormatError:
+    return FormatError(
+        f"{path}, line {number} is no row of a rollout: {first_line(reason)}",
+        "Remove the line to run that rollout again.",
+    )

@@ -1,5 +1,6 @@
 """Policy servers of a run: identified, of the right kind, locked, and started by workers."""
 
+import json
 import shlex
 import subprocess
 import sys
@@ -225,6 +226,13 @@ def test_a_worker_starts_its_server_and_ends_it(tmp_path: Path) -> None:
     identity = header(tmp_path / "run")["identity"]
     assert identity["policy"] == "websocket"  # the command is no part of the identity
     assert identity["policy_metadata"]["server_metadata"] == {"checkpoint": "tiny/1"}
+
+
+def test_a_server_that_a_worker_starts_declares_its_memory(tmp_path: Path) -> None:
+    said = json.dumps({"checkpoint": "a", "capabilities": {"memory": "window"}})
+    result = serve(tmp_path / "run", "--metadata", said, conditions=("k0",), families=("MoveCube",))
+    assert [(row.memory, row.evidence_kept) for row in result.rows] == [("window:32", 0.5)]
+    assert header(tmp_path / "run")["identity"]["facts"]["memory"] == "window:32"
 
 
 def test_a_server_that_dies_is_started_again(tmp_path: Path) -> None:

@@ -28,12 +28,7 @@ def _read(file: RowFile, names: Sequence[str]) -> FileColumns:
     check_count(data.count(b"\n"))
     columns = plain_columns(path, _parse(path, data, record_schema({*names, *KEY_COLUMNS})))
     keys = [*zip(*(columns[name] for name in KEY_COLUMNS), strict=True)]
-    last = {key: at for at, key in enumerate(keys)}
-    kept = [
-        at
-        for at, (key, status) in enumerate(zip(keys, columns["status"], strict=True))
-        if status != Status.ERROR or last[key] == at
-    ]
+    kept = rows_that_count(keys, columns["status"])
     return FileColumns(
         {name: [columns[name][at] for at in kept] for name in names}, [at + 1 for at in kept]
     )
