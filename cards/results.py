@@ -14,7 +14,7 @@ from robomme_interference_data.constants import (
     RUN_TABLES,
 )
 from robomme_interference_data.errors import InvalidOptionError, PublishError
-from robomme_interference_data.evaluate.run.log import RunHeader
+from robomme_interference_data.evaluate.run.record import RunHeader
 from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.score.config import Expected, Settings
 from robomme_interference_data.evaluate.score.outcomes import STATUSES

@@ -19,8 +19,8 @@ from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.storage.files import digest_json
 
 from .config import RetrievalConfig
-from .log import Invocation
 from .plan import RunPlan
+from .record import Invocation
 from .worker import RunContext, make_selector, package_versions
 
 _DEEPEST = 20

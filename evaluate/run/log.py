@@ -9,7 +9,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,82 +17,18 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
 from robomme_interference_data.constants import FORMAT_VERSION, RUN_HEADER, RUN_RECORD, RUN_TABLES
-from robomme_interference_data.errors import FormatError, RunError, named, visible
+from robomme_interference_data.errors import RunError, named, visible
 from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
 from robomme_interference_data.schema.rollouts import FINAL, Status
 from robomme_interference_data.storage.files import atomic_path, read_header, write_json
 from robomme_interference_data.storage.parquet import writing
 from robomme_interference_data.storage.staging import file_lock
 
-from .plan import RunPlan, WorkItem
-from .row import Rollout, is_done, read_record, row_line, whole_lines
+from .plan import WorkItem
+from .record import Invocation, RunHeader, whole_lines
+from .row import Rollout, is_done, read_record, row_line
 
 ERRORS_LOG = "errors.log"
-
-_MAX_ROLLOUTS = 1 << 20
-"""Maximum rollouts of all plans of a run: the paper's grid has 25,200."""
-
-
-@dataclass(frozen=True)
-class Invocation:
-    """One invocation of the command: its settings, its plan, and where it ran.
-
-    Attributes:
-        command: The command line; empty from Python.
-        versions: Of Python, this package, what it used, and the simulator.
-        git: Commit of the source tree, with `-dirty` if it was changed; None if there is none.
-        policy: Metadata of the policy.
-        started: When, UTC, `2026-01-31T12:00:00Z`.
-        ended: When; None while it runs, or if it was killed.
-        stopped: Why it ended early, or None.
-    """
-
-    command: tuple[str, ...]
-    settings: dict[str, Any]
-    plan: RunPlan
-    versions: dict[str, str]
-    git: str | None
-    machine: str
-    policy: dict[str, Any]
-    started: str
-    ended: str | None = None
-    stopped: str | None = None
-
-
-@dataclass(frozen=True)
-class RunHeader:
-    """`run.json`.
-
-    Attributes:
-        identity: What can change a result: it identifies the run.
-        buffer_set: Label of the buffer set in all rows.
-        plans: The plans of all invocations, each once.
-        status: `running`, `complete`, or, if something is missing or broke, `incomplete`.
-        planned: Rollouts of all plans together.
-        counts: Rows by status.
-        invocations: One for each time that the command was started or resumed.
-        merged: Names of the folders that a merged run is made of.
-    """
-
-    format_version: int
-    identity: dict[str, Any]
-    buffer_set: str
-    plans: tuple[RunPlan, ...] = ()
-    status: str = "running"
-    planned: int = 0
-    counts: dict[str, int] = field(default_factory=dict)
-    invocations: tuple[Invocation, ...] = ()
-    merged: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        planned = sum(plan.most for plan in self.plans)
-        if planned > _MAX_ROLLOUTS:
-            raise FormatError(f"plans of {planned} rollouts; expected at most {_MAX_ROLLOUTS}")
-
-    @property
-    def items(self) -> tuple[WorkItem, ...]:
-        """All planned rollouts, each once, in canonical order."""
-        return tuple(sorted({item for plan in self.plans for item in plan.items()}))
 
 
 def with_counts(header: RunHeader, rows: Mapping[WorkItem, Rollout], status: str = "") -> RunHeader:

@@ -1,20 +1,21 @@
 """The row of a rollout, its line in the record of a run, and the reader of a record."""
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from robomme_interference_data.constants import MAX_ROW_BYTES, RUN_RECORD
+from robomme_interference_data.constants import RUN_RECORD
 from robomme_interference_data.errors import FormatError, first_line
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.retrieval.columns import RetrievalColumns
 from robomme_interference_data.schema.codec import from_dict, to_dict
 from robomme_interference_data.schema.rollouts import OutcomeColumns, RolloutKey, Status, Timing
 from robomme_interference_data.schema.sampling import HistoryColumns
-from robomme_interference_data.storage.files import canonical_json, parse_json, read_bytes
+from robomme_interference_data.storage.files import canonical_json, parse_json
 
 from .plan import WorkItem
+from .record import rows_that_count, whole_lines
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,25 +108,6 @@ def row_of(line: bytes) -> Rollout:
 def row_line(row: Rollout) -> bytes:
     """Return a row's line in a record."""
     return (canonical_json(to_dict(row)) + "\n").encode()
-
-
-def whole_lines(record: Path) -> bytes:
-    """Return the bytes of `rollouts.jsonl`, without a last line that a crash cut short."""
-    data = read_bytes(record, MAX_ROW_BYTES)
-    return data[: data.rfind(b"\n") + 1]
-
-
-def rows_that_count(rollouts: Sequence[Hashable], statuses: Sequence[str]) -> list[int]:
-    """Return which rows of a record count: all finished ones, and of other rollouts the last row.
-
-    A rollout that broke runs again, and its earlier rows stay in the record.
-    """
-    last = {rollout: place for place, rollout in enumerate(rollouts)}
-    return [
-        place
-        for place, (rollout, status) in enumerate(zip(rollouts, statuses, strict=True))
-        if status != Status.ERROR or last[rollout] == place
-    ]
 
 
 def read_record(folder: Path) -> dict[WorkItem, Rollout]:

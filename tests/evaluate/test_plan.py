@@ -13,8 +13,8 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     UnknownNameError,
 )
-from robomme_interference_data.evaluate.run.log import RunHeader
 from robomme_interference_data.evaluate.run.plan import RunPlan, WorkItem, plan_work, shuffle_work
+from robomme_interference_data.evaluate.run.record import RunHeader
 from robomme_interference_data.ids import EpisodeId
 
 KNOWN = [EpisodeId(f, "test", i) for f in ("MoveCube", "RouteStick") for i in (0, 1, 2, 5)]

@@ -15,8 +15,8 @@ from support import scoring as made
 from support.browser import open_page
 from support.scoring import BASE, OWN, RETRIEVAL, cells
 
-from robomme_interference_data.evaluate.run.log import Invocation
 from robomme_interference_data.evaluate.run.plan import RunPlan
+from robomme_interference_data.evaluate.run.record import Invocation
 from robomme_interference_data.evaluate.score.plots.data import Data
 from robomme_interference_data.evaluate.score.plots.figures import (
     FIGURES,

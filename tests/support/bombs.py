@@ -281,7 +281,7 @@ BOMBS = {
 
 def read(kind: str, path: Path) -> object:
     """Read a file as what it is."""
-    from robomme_interference_data.evaluate.run.row import whole_lines
+    from robomme_interference_data.evaluate.run.record import whole_lines
     from robomme_interference_data.storage.arrays import read_array
     from robomme_interference_data.storage.encode import decode_image
     from robomme_interference_data.storage.files import read_json, read_sums

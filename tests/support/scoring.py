@@ -12,7 +12,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from robomme_interference_data.evaluate.run.log import RunHeader
+from robomme_interference_data.evaluate.run.record import RunHeader
 from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.score import commands
 from robomme_interference_data.evaluate.score.config import Against, Expected, Settings

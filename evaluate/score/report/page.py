@@ -15,7 +15,7 @@ from urllib.parse import quote
 import numpy as np
 
 from robomme_interference_data.constants import DIFFICULTIES
-from robomme_interference_data.evaluate.run.log import RunHeader
+from robomme_interference_data.evaluate.run.record import RunHeader
 from robomme_interference_data.evaluate.score.config import Expected
 from robomme_interference_data.evaluate.score.outcomes import STATUSES, mean_errors, success
 from robomme_interference_data.evaluate.score.plots.data import FEW

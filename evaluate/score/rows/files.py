@@ -16,7 +16,7 @@ from .run_record import RUN_RECORD_FORMAT
 from .vla_eval import VLA_EVAL
 
 if TYPE_CHECKING:
-    from robomme_interference_data.evaluate.run.log import RunHeader
+    from robomme_interference_data.evaluate.run.record import RunHeader
 
 FORMATS = (RUN_RECORD_FORMAT, PARQUET, CSV, VLA_EVAL, LEROBOT_EVAL)
 """Every format that can be read."""
@@ -44,7 +44,7 @@ def find_sources(paths: Sequence[Path]) -> "dict[Path, RunHeader | None]":
 
 def _read_run_header(path: Path) -> "RunHeader":
     # Files of rows alone do without runs.
-    from robomme_interference_data.evaluate.run.log import RunHeader
+    from robomme_interference_data.evaluate.run.record import RunHeader
 
     return read_header(path, RunHeader)
 

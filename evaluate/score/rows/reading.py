@@ -24,7 +24,7 @@ from .stated import ScenesOf, notes_on, of_other_scenes, scenes_of, with_stated
 from .values import DEFAULTS, Row, parse, shifted
 
 if TYPE_CHECKING:
-    from robomme_interference_data.evaluate.run.log import RunHeader
+    from robomme_interference_data.evaluate.run.record import RunHeader
 
 _SHOWN = 10  # bad rows that are listed; the others are counted
 

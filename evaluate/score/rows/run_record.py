@@ -7,7 +7,7 @@ import pyarrow as pa
 import pyarrow.json as pa_json
 
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.schema.rollouts import KEY_COLUMNS, Status
+from robomme_interference_data.schema.rollouts import KEY_COLUMNS
 
 from .columns import plain_columns
 from .row_format import FileColumns, RowFile, RowFormat, check_count
@@ -19,7 +19,7 @@ def _read(file: RowFile, names: Sequence[str]) -> FileColumns:
 
     The types are those of a rollout's row; a row object for each line would take ten times as long.
     """
-    from robomme_interference_data.evaluate.run.row import whole_lines
+    from robomme_interference_data.evaluate.run.record import rows_that_count, whole_lines
 
     path = file.path
     data = whole_lines(path)
