@@ -59,6 +59,13 @@ class WorkConfig(WorkersConfig, RetrievalConfig):
         None, group=_EPISODES, help="Label of the rows; see docs/reference/policies.md."
     )
     model_seed: int = setting(0, group=_EXECUTION, help="Seed for all random draws.")
+    training_seed: int | None = setting(
+        None,
+        group=_EXECUTION,
+        help="Seed of the training run that made the weights, for rows.",
+        shown="the one that the policy reports",
+        rare=True,
+    )
     rollout_timeout_s: float = setting(
         3600.0,
         group=_EXECUTION,

@@ -37,6 +37,7 @@ def run_identity(run: RunContext[Any], plan: RunPlan, buffer_set: BufferSet) -> 
         "revision": run.revision,
         "split": config.split,
         "shift": config.shift,
+        "training_seed": run.training_seed,
         "model_seed": config.model_seed,
         "retrieval_index": _retrieval_index(config, plan, buffer_set),
         "protocol_version": PROTOCOL_VERSION,

@@ -52,6 +52,21 @@ class RunContext[C: RunConfig | AskConfig]:
     identity: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
 
+    @property
+    def training_seed(self) -> int | None:
+        """Seed of the training run of the weights: the setting, or else what the policy reports.
+
+        A policy reports it as `training_seed` in its metadata, a server in that of the server.
+        None if nobody knows it.
+        """
+        if self.config.training_seed is not None:
+            return self.config.training_seed
+        for reported in (self.metadata, self.metadata.get("server_metadata")):
+            seed = reported.get("training_seed") if isinstance(reported, Mapping) else None
+            if isinstance(seed, int) and not isinstance(seed, bool) and seed >= 0:
+                return seed
+        return None
+
     def key(self, item: WorkItem) -> dict[str, Any]:
         """Return what identifies the row of a work item: its `KEY_COLUMNS`."""
         return {
@@ -64,6 +79,7 @@ class RunContext[C: RunConfig | AskConfig]:
             "split": item.episode.split,
             "episode": item.episode.index,
             "shift": self.config.shift,
+            "training_seed": self.training_seed,
             "model_seed": self.config.model_seed,
             "protocol_version": PROTOCOL_VERSION,
         }

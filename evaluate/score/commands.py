@@ -60,15 +60,17 @@ def score(
     Examples:
     ```
     robomme-interference score my-run another-run --out my-score
-    robomme-interference score rollouts.csv --system retrieval-framesamp-modul \
+    robomme-interference score canonical_rollouts.csv retrieval_rollouts.csv \
       --against paper --out my-score
+    robomme-interference score act/eval_info.json pi0/eval_info.json \
+      --system act --system pi0 --out my-score
     ```
     """
     from robomme_interference_data.progress import WorkProgress
     from robomme_interference_data.runtime.memory import memory_limit
     from robomme_interference_data.viz.tables import tables_text
 
-    from .report.page import headlines
+    from .report.headline import headlines
     from .scoring import score as compute
     from .writing import write_score
 
@@ -127,6 +129,10 @@ def compare(
             metavar="LOOK/OF",
         ),
     ] = "1/1",
+    model_seed: Annotated[
+        int | None,
+        typer.Option(help="Seed of files that name none, such as lerobot-eval's --seed."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     r"""Compare two runs, or two conditions of one run, paired over shared episodes.
@@ -147,7 +153,8 @@ def compare(
 
     look = _look(looks)
     with memory_limit(_MEMORY_BYTES):
-        compared = compute(run_a, run_b, (system_a, system_b), lenient, conditions or (), look)
+        systems = (system_a, system_b)
+        compared = compute(run_a, run_b, systems, lenient, conditions or (), look, model_seed)
     _print_notes(compared.runs, compared.notes)
     if as_json:
         print_json(
@@ -165,8 +172,33 @@ def power(
     margin: Annotated[float, typer.Option(help="A difference of interest, in points.")] = 5.0,
     episodes: Annotated[int, typer.Option(help="Episodes that run on both sides.")] = 450,
     flips: Annotated[
-        float, typer.Option(help="Share of the episodes that flips between two equal systems.")
-    ] = 0.06,
+        float,
+        typer.Option(
+            help="Share of the episodes that differs between two systems of equal rates; of the "
+            "learned ones in docs/results/training.md 9 to 44% do at k0, between two runs of one "
+            "system 6 to 8%."
+        ),
+    ] = 0.25,
+    difference: Annotated[
+        float,
+        typer.Option(
+            help="The difference that these flips contain, in points, as in a row of the table "
+            "matrix: it is subtracted."
+        ),
+    ] = 0.0,
+    rate: Annotated[
+        float, typer.Option(help="Success rate of two equal systems, for equivalence.")
+    ] = 0.5,
+    runs: Annotated[
+        int | None, typer.Option(help="Training runs of each of two systems, 3 or more.")
+    ] = None,
+    run_spread: Annotated[
+        float,
+        typer.Option(
+            help="Standard deviation of the success rates of training runs, in points, as in the "
+            "table main."
+        ),
+    ] = 5.0,
     tests: Annotated[
         int, typer.Option(help="Number of tests that are corrected together, such as 66 pairs.")
     ] = 1,
@@ -177,19 +209,28 @@ def power(
 ) -> None:
     """Compute which differences a number of episodes can detect.
 
-    The share that flips by chance is in the notes of a score with repeats, and in the output of
-    compare for two runs of one system. Two different systems differ in far more episodes than two
-    runs of one: for them, take flips of the table matrix.
+    Two different systems differ in far more episodes than two runs of one: for systems that were
+    scored, take flips and difference of the table matrix. For two runs of one system, the share is
+    in the notes of a score with repeats, and in the output of compare.
 
     Examples:
     ```
-    robomme-interference power --margin 5 --episodes 450 --flips 0.06
-    robomme-interference power --margin 10 --flips 0.3 --tests 66 --looks 5
+    robomme-interference power --margin 5 --episodes 450
+    robomme-interference power --flips 0.31 --difference 6.2 --tests 66 --looks 5
+    robomme-interference power --margin 10 --runs 5 --run-spread 3
     ```
     """
     from .power import plan
 
-    planned = plan(margin / 100, episodes, flips, tests, looks)
+    by_chance = round(flips - abs(difference) / 100, 12)
+    if not 0 <= by_chance <= 1:
+        raise InvalidOptionError(
+            f"flips {flips} with a difference of {difference:g} points; expected a share from 0 to "
+            "1 that contains the difference",
+            "Take both from one row of the table matrix.",
+        )
+    over_runs = None if runs is None else (runs, run_spread / 100)
+    planned = plan(margin / 100, episodes, by_chance, tests, looks, rate, over_runs)
     if as_json:
         print_json(asdict(planned))
         return
@@ -199,13 +240,24 @@ def power(
         "smallest difference found with 80% power": least,
         f"power to find {margin:g} points": f"{planned.power:.0%}",
         f"episodes that find {margin:g} points with 80% power": f"{planned.needed:,}",
-        "smallest margin of equivalence with 80% power": f"±{100 * planned.equal:.1f} points",
+        f"smallest margin of equivalence with 80% power, at rates of {rate:.0%}": (
+            f"±{100 * planned.equal:.1f} points"
+        ),
     }
+    if planned.runs is not None:
+        of_runs = planned.runs
+        which = f"with {of_runs.runs} training runs each that differ by {run_spread:g} points"
+        needed = "more than 100" if of_runs.needed is None else str(of_runs.needed)
+        lines |= {
+            f"smallest difference {which}": f"{100 * of_runs.smallest:.1f} points",
+            f"power to find {margin:g} points {which}": f"{of_runs.power:.0%}",
+            f"training runs each that find {margin:g} points with 80% power": needed,
+        }
     for look, level in enumerate(planned.looks, start=1):
         at = round(episodes * look / looks)
         lines[f"look {look} after {at:,} episodes: significant if p holm is below"] = f"{level:.2g}"
     corrected = f", corrected for {tests:,} tests" if tests > 1 else ""
-    echo(f"{episodes:,} episodes, of which {100 * flips:g}% flip by chance{corrected}\n")
+    echo(f"{episodes:,} episodes, of which {100 * by_chance:g}% flip by chance{corrected}\n")
     width = max(map(len, lines))
     for name, value in lines.items():
         echo(f"{name:{width}}  {value}")

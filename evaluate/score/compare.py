@@ -5,6 +5,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from robomme_interference_data.constants import RECORDINGS
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.schema.conditions import parse_condition
@@ -13,7 +15,8 @@ from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.stats.signs import sign_flips
 from robomme_interference_data.viz.tables import Table
 
-from .outcomes import mean_errors
+from .outcomes import Repeat, Statuses, mean_errors
+from .partners import related
 from .rows.reading import CheckedRows, read_rows
 from .sides import (
     Side,
@@ -36,7 +39,8 @@ from .tables.comparison import (
     detectable,
 )
 from .tables.contrast import START, Contrast, Effect, Measure
-from .tables.pairs import Pairs, pair, pair_errors
+from .tables.correction import correct
+from .tables.pairs import Pairs, compare_cells, pair_errors
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,7 @@ def compare(
     lenient: bool = False,
     conditions: Sequence[str] = (),
     look: tuple[int, int] = (1, 1),
+    model_seed: int | None = None,
 ) -> RunComparison:
     """Compare two runs of one simulator over shared conditions and episodes.
 
@@ -69,20 +74,22 @@ def compare(
     are the same. Differences are the second's rate − the first's. Without a second run, two
     `conditions` of the first are compared; with one, also a single condition of both. `look` is the
     number of this look at the data and of all planned ones; with several, intervals and levels
-    spend 5% over all looks.
+    spend 5% over all looks. `model_seed` is the seed of files that name none.
     """
     _check_arguments(first, second, conditions, systems[0], lenient=lenient)
+    seeds = () if model_seed is None else (model_seed,)
     if len(conditions) == 1:
         conditions = (conditions[0], conditions[0])  # the same in both runs
     alpha = look_levels(look[1])[look[0] - 1] if look[1] > 1 else ALPHA
-    a_rows = read_rows([first], systems[0], lenient)
-    b_rows = a_rows if second is None else read_rows([second], systems[1], lenient)
+    a_rows = _read(first, systems[0], lenient, seeds)
+    b_rows = a_rows if second is None else _read(second, systems[1], lenient, seeds)
     runs = (a_rows,) if second is None else (a_rows, b_rows)
     measure = _measure(runs)
     check_scenes(a_rows, b_rows)
     a_sides, b_sides = sides_of(a_rows), sides_of(b_rows)
     matched = list(matched_sides((a_rows, b_rows), (a_sides, b_sides)))
-    notes = list(differing(a_rows, b_rows, matched))
+    notes = [*dict.fromkeys(note for rows in runs for note in rows.notes)]
+    notes += differing(a_rows, b_rows, matched)
     contrasts = list[Contrast]()
     for a, b in matched:
         own = list(_contrasts(a, b, conditions, measure, alpha))
@@ -102,6 +109,7 @@ def compare(
             f"no episode of {paths} counts on both sides under {under}",
             f"They hold {' and '.join(dict.fromkeys(held))}. Compare the same episodes.",
         )
+    contrasts = correct(contrasts, alpha)
     notes += stopped_early("a", a_sides.values())
     if second is not None:
         notes += stopped_early("b", b_sides.values())
@@ -162,6 +170,7 @@ def _contrasts(
                     measure=measure,
                     family=family,
                     columns={"low": bounds.low, "high": bounds.high},
+                    group=bool(family),
                 )
 
 
@@ -172,7 +181,6 @@ def _table(contrasts: Sequence[Contrast], measure: Measure, alpha: float, title:
         name="compare",
         title=title,
         columns=SIDES | {"family": "text"} | (RATES if success else ACTION_ERRORS) | COMPLETE,
-        group=_group,
         corrected="the rows of all families, and among those of single families, of a simulator",
         note=(
             "system and condition are of b, those against are of a. Over the n episodes that count "
@@ -183,14 +191,16 @@ def _table(contrasts: Sequence[Contrast], measure: Measure, alpha: float, title:
     )
     table = comparison_table(spec, contrasts)
     if success:
-        more = detectable(contrasts, _group)
+        more = detectable(contrasts)
     else:
         more = f"A negative difference is better. {ACTION_ERRORS_NOTE}"
     return replace(table, note=f"{table.note} {more}".strip())
 
 
-def _group(contrast: Contrast) -> tuple[str, bool]:
-    return contrast.simulator, bool(contrast.family)
+def _read(
+    path: Path, system: str | None, lenient: bool, model_seeds: Sequence[int] = ()
+) -> CheckedRows:
+    return read_rows([path], () if system is None else (system,), lenient, model_seeds)
 
 
 def _check_arguments(
@@ -204,7 +214,7 @@ def _check_arguments(
     for name in conditions:
         parse_condition(name)
     if len(conditions) > 2 or (second is None and len({*conditions}) < 2):
-        hint, command = _two_conditions(first, read_rows([first], system, lenient))
+        hint, command = _two_conditions(first, _read(first, system, lenient))
         raise InvalidOptionError(
             f"conditions to compare: {' '.join(conditions) or 'none'}; expected two different "
             "ones, or two runs and at most two conditions",
@@ -212,7 +222,7 @@ def _check_arguments(
             command,
         )
     if second is not None and first.exists() and second.exists() and first.samefile(second):
-        hint, command = _two_conditions(first, read_rows([first], system, lenient))
+        hint, command = _two_conditions(first, _read(first, system, lenient))
         raise InvalidOptionError(f"{first} is given twice", hint, command)
 
 
@@ -245,9 +255,35 @@ def _pairs(a: Side, b: Side, conditions: tuple[str, str], family: str) -> Pairs:
         after = mean_errors(b.outcomes.action_l1)[b_cell][b_shared]
         [test] = sign_flips((after - before).round(12)[:, None], RECORDINGS)
         return pair_errors(before, after, test)
-    # Shared model seeds are paired; without any, the lowest with the lowest, and so on.
-    seeds, others = a.outcomes.model_seeds, b.outcomes.model_seeds
-    matched = [(seeds.index(seed), others.index(seed)) for seed in seeds if seed in others]
-    if not matched:
-        matched = [(place, place) for place in range(min(len(seeds), len(others)))]
-    return pair(a.outcomes.status[a_cell][a_shared], b.outcomes.status[b_cell][b_shared], matched)
+    repeats, (before, after) = _aligned(
+        (a.outcomes.repeats, b.outcomes.repeats),
+        (a.outcomes.status[a_cell][a_shared], b.outcomes.status[b_cell][b_shared]),
+    )
+    seeds = [repeat.training_seed for repeat in repeats]
+    runs = {seed: place for place, seed in enumerate(dict.fromkeys(seeds))}
+    return compare_cells(
+        before,
+        after,
+        np.array([runs[seed] for seed in seeds]),
+        same_weights=a.system == b.system or related(a.facts, b.facts),
+    )
+
+
+def _aligned(
+    repeats: tuple[Sequence[Repeat], Sequence[Repeat]], sides: tuple[Statuses, Statuses]
+) -> tuple[list[Repeat], list[Statuses]]:
+    """Return all repeats of two sides, and both sides with an axis of these.
+
+    If they have none in common, the lowest of both are paired, and so on, as those of the first.
+    """
+    first, second = repeats
+    if not {*first} & {*second}:
+        renamed = [*first[: len(second)], *second[len(first) :]]
+        second = renamed if len({*renamed}) == len(second) else second
+    every = list(dict.fromkeys([*first, *second]))
+    aligned = list[Statuses]()
+    for own, status in zip((first, second), sides, strict=True):
+        whole = np.full((len(status), len(every)), -1, np.int8)
+        whole[:, [every.index(repeat) for repeat in own]] = status
+        aligned.append(whole)
+    return every, aligned

@@ -16,7 +16,9 @@ from robomme_interference_data.evaluate.systems import FACT_COLUMNS, SYSTEMS, Sy
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, in_order
 from robomme_interference_data.schema.rollouts import Status
-from robomme_interference_data.stats.intervals import effective_n, wilson
+from robomme_interference_data.stats.bootstrap import Interval
+from robomme_interference_data.stats.intervals import LEVEL, effective_n, wilson
+from robomme_interference_data.stats.runs import ONE_RUN, RunSpread, run_spread
 
 from .config import Expected
 from .rows.reading import CheckedRows
@@ -26,21 +28,29 @@ STATUSES = (Status.SUCCESS, Status.FAIL, Status.TIMEOUT, Status.ERROR, Status.ME
 """In the order of their numbers in `Outcomes.status`."""
 
 TEST_EPISODES = 50
-_SUCCESS, _ERROR = 0, 3
+_SUCCESS, ERROR = 0, 3
+"""Numbers in `Outcomes.status`."""
 
 Statuses = NDArray[np.int8]
 Flags = NDArray[np.bool_]
 
 
+class Repeat(NamedTuple):
+    """A rollout of an episode among others: the weights, and the draws with these."""
+
+    training_seed: int | None  # None if unknown
+    model_seed: int
+
+
 @dataclass(frozen=True)
 class Outcomes:
-    """The outcomes in one simulator: S systems, C conditions, E episodes, M model seeds."""
+    """The outcomes in one simulator: S systems, C conditions, E episodes, M repeats."""
 
     simulator: str
     systems: tuple[str, ...]  # with rows, in the order of tables
     conditions: tuple[str, ...]  # with rows or expected, in the order of tables
     episodes: tuple[EpisodeId, ...]  # with rows or expected, in canonical order
-    model_seeds: tuple[int, ...]  # ascending
+    repeats: tuple[Repeat, ...]  # ascending, an unknown training seed first
     status: Statuses  # index into STATUSES, −1 without a rollout, (S, C, E, M) int8
     evidence: NDArray[np.float64]  # share of the evidence kept, NaN if unknown, (S, C, E, M)
     action_l1: NDArray[np.float64]  # action error offline, NaN if not measured, (S, C, E, M)
@@ -50,6 +60,7 @@ class Outcomes:
     in_tables: Flags  # the cells that are expected or have rows, (S, C)
     without_revision: Flags  # systems whose rows name no revision of a buffer set, (S,)
     facts: tuple[frozenset[SystemFacts], ...]  # of each system; only `policy_id` varies, (S,)
+    seeds_repeat: bool = True  # whether another model seed repeats an episode in the same scene
 
     def cell(self, system: str, condition: str) -> tuple[int, int]:
         """Return the place of a cell on the first two axes."""
@@ -62,6 +73,13 @@ class Outcomes:
     def is_reference(self, system: str) -> bool:
         """Whether a system is only a reference, which is never ranked."""
         return any(facts.reference for facts in self.facts_of(system))
+
+    @cached_property
+    def training(self) -> NDArray[np.int64]:
+        """The number of each repeat's training run, `(M,)`; an unknown seed is a run."""
+        seeds = [repeat.training_seed for repeat in self.repeats]
+        places = {seed: place for place, seed in enumerate(dict.fromkeys(seeds))}
+        return np.array([places[seed] for seed in seeds])
 
     @property
     def retrieving(self) -> list[str]:
@@ -144,24 +162,53 @@ class Outcomes:
     def repeat_flips(self) -> tuple[int, int]:
         """The number of repeated rollouts, and of those whose outcome flips.
 
-        Repeats differ only in the model seed; the two lowest of an episode that count are compared.
+        Repeats have the same weights, and differ in the model seed; the two lowest of an episode
+        that count are compared.
         """
-        counts = counting(self.status)
-        order = counts.cumsum(axis=-1) * counts  # 1 for the lowest model seed that counts, …
-        first, second = (((order == n) & (self.status == _SUCCESS)).any(axis=-1) for n in (1, 2))
-        repeated = (order == 2).any(axis=-1)
-        return int(repeated.sum()), int((first != second)[repeated].sum())
+        if not self.seeds_repeat:
+            return 0, 0
+        pairs = flips = 0
+        for run in range(int(self.training.max()) + 1):
+            status = self.status[..., self.training == run]
+            counts = counting(status)
+            order = counts.cumsum(axis=-1) * counts  # 1 for the lowest model seed that counts, …
+            first, second = (((order == n) & (status == _SUCCESS)).any(axis=-1) for n in (1, 2))
+            repeated = (order == 2).any(axis=-1)
+            pairs += int(repeated.sum())
+            flips += int((first != second)[repeated].sum())
+        return pairs, flips
+
+    def with_errors_as(self, status: Status) -> "Outcomes":
+        """Return the outcomes as if every error had another status."""
+        return replace(self, status=errors_as(self.status, status))
 
 
 def counting(status: Statuses) -> Flags:
     """Whether rollouts count: an error is neither success nor failure."""
-    return (status >= 0) & (status != _ERROR)
+    return (status >= 0) & (status != ERROR)
 
 
 def success(status: Statuses) -> NDArray[np.float64]:
     """Return the mean success of an episode's repeats, the last axis, NaN where none counts."""
     with np.errstate(invalid="ignore"):
         return np.asarray((status == _SUCCESS).sum(-1) / counting(status).sum(-1))
+
+
+def errors_as(status: Statuses, other: Status) -> Statuses:
+    """Return statuses, of any shape, with another one instead of each error."""
+    return np.where(status == ERROR, np.int8(STATUSES.index(other)), status)
+
+
+def success_by_run(status: Statuses, training: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the mean success of each training run's repeats, `(…, R)`, NaN where none counts.
+
+    `status` has the repeats as its last axis, `training` the number of each one's run. Only runs
+    with a rollout that counts are returned, and at least one.
+    """
+    counts = counting(status)
+    ran = np.unique(training[counts.reshape(-1, len(training)).any(axis=0)])
+    by_run = [success(status[..., training == run]) for run in ran.tolist()]
+    return np.stack(by_run or [np.full(status.shape[:-1], np.nan)], axis=-1)
 
 
 def mean_errors(action_l1: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -177,15 +224,26 @@ class SuccessRate(NamedTuple):
     n: int  # episodes that count
     value: float  # mean of their success, NaN if there are none
     trials: float  # effective number of independent trials: n, and more with repeats
+    spread: RunSpread = ONE_RUN  # over training runs
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Its 95% Wilson interval; `(0, 1)` without episodes."""
-        return wilson(self.value * self.trials if self.n else 0, self.trials)
+        """Its 95% Wilson interval, widened by training runs; `(0, 1)` without episodes."""
+        if not self.n:
+            return 0.0, 1.0
+        bounds = wilson(self.value * self.trials, self.trials)
+        _, low, high = self.spread.widen(Interval(self.value, *bounds), LEVEL, (0.0, 1.0))
+        return low, high
 
 
-def rate_of(status: Statuses) -> SuccessRate:
-    """Return the rate of rollouts, `(E, M) int8`."""
+def rate_of(status: Statuses, training: NDArray[np.int64] | None = None) -> SuccessRate:
+    """Return the rate of rollouts, `(E, M) int8`; `training` is the run of each repeat, `(M,)`.
+
+    Without it, all repeats have the same weights.
+    """
+    spread = ONE_RUN
+    if training is not None and training.any():
+        spread = run_spread(success_by_run(status, training))
     won, of = (status == _SUCCESS).sum(-1), counting(status).sum(-1)
     won, of = won[of > 0], of[of > 0]
     n, counts = len(of), np.unique(of).tolist()
@@ -195,20 +253,24 @@ def rate_of(status: Statuses) -> SuccessRate:
     value = float(sum(Fraction(int(won[of == count].sum()), count) for count in counts) / n)
     rates = won / of
     if n < 2:
-        return SuccessRate(n, value, n)
-    spread = float(rates.var(ddof=1))
-    return SuccessRate(n, value, effective_n(float(rates.mean()), spread, n, int(of.sum())))
+        return SuccessRate(n, value, n, spread)
+    variance = float(rates.var(ddof=1))
+    trials = effective_n(float(rates.mean()), variance, n, int(of.sum()))
+    return SuccessRate(n, value, trials, spread)
 
 
 def outcomes_of(rows: CheckedRows, expected: Expected) -> dict[str, Outcomes]:
     """Return the outcomes of each simulator, by its name; recordings have none."""
-    return {
-        name: _outcomes(
-            [r for r in rows if r.simulator == name], name, expected, rows.without_revision
-        )
-        for name in rows.names("simulator")
-        if name != RECORDINGS
-    }
+    found = {}
+    for name in rows.names("simulator"):
+        if name != RECORDINGS:
+            here = [row for row in rows if row.simulator == name]
+            # Other benchmarks do not have this one's grid, and their seeds may change the scene.
+            other = name in {simulator for simulator, _ in rows.scenes}
+            grid = Expected.OBSERVED if other else expected
+            outcomes = _outcomes(here, name, grid, rows.without_revision)
+            found[name] = replace(outcomes, seeds_repeat=not other)
+    return found
 
 
 def offline_outcomes(rows: CheckedRows) -> Outcomes | None:
@@ -241,7 +303,8 @@ def _outcomes(
     observed = {row.condition for row in rows}
     expected_conditions = observed if which is Expected.OBSERVED else {*DEFAULT_CONDITIONS}
     conditions = tuple(condition.name for condition in in_order(observed | expected_conditions))
-    model_seeds = tuple(sorted({row.model_seed for row in rows}))
+    seeds = {(row.training_seed, row.model_seed) for row in rows}
+    repeats = tuple(Repeat(*seed) for seed in sorted(seeds, key=_repeat_order))
     ids = {(row.family, row.split, row.episode) for row in rows}
     expected = ids | {(episode.family, episode.split, episode.index) for episode in planned}
     if which is Expected.BENCHMARK:
@@ -252,9 +315,12 @@ def _outcomes(
 
     # The values along each axis, their places, and the places of all rows (`at`): at most one row
     # is at each, because reading keeps one row of a rollout.
-    axes = (systems, conditions, [(e.family, e.split, e.index) for e in episodes], model_seeds)
+    axes = (systems, conditions, [(e.family, e.split, e.index) for e in episodes], repeats)
     places = [{name: place for place, name in enumerate(axis)} for axis in axes]
-    keys = [(r.system, r.condition, (r.family, r.split, r.episode), r.model_seed) for r in rows]
+    keys = [
+        (r.system, r.condition, (r.family, r.split, r.episode), (r.training_seed, r.model_seed))
+        for r in rows
+    ]
     at = tuple(
         np.array([place[key] for key in column])
         for place, column in zip(places, zip(*keys, strict=True), strict=True)
@@ -287,7 +353,7 @@ def _outcomes(
         systems,
         conditions,
         tuple(episodes),
-        model_seeds,
+        repeats,
         status,
         evidence,
         action_l1,
@@ -305,6 +371,11 @@ def _facts_of(rows: Sequence[Row], systems: Sequence[str]) -> tuple[frozenset[Sy
     for system, *values in set(map(attrgetter("system", *FACT_COLUMNS), rows)):
         facts[system].add(SystemFacts(**dict(zip(FACT_COLUMNS, values, strict=True))))
     return tuple(map(frozenset, facts.values()))
+
+
+def _repeat_order(seed: tuple[int | None, int]) -> tuple[int, int]:
+    training_seed, model_seed = seed
+    return -1 if training_seed is None else training_seed, model_seed
 
 
 def _table_order(system: str) -> tuple[int, str]:

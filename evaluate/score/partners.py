@@ -1,6 +1,6 @@
 """Which system another one is compared with: by their facts, never by their labels."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 from robomme_interference_data.constants import ORACLE
@@ -18,6 +18,18 @@ def base_of(outcomes: Outcomes, system: str) -> str | None:
         if facts.retrieval is not None and facts.policy_id is not None
     }
     return next((name for name in outcomes.systems if without & outcomes.facts_of(name)), None)
+
+
+def share_weights(outcomes: Outcomes, system: str, other: str) -> bool:
+    """Whether two systems are one policy, so that equal training seeds mean the same weights."""
+    return system == other or related(outcomes.facts_of(system), outcomes.facts_of(other))
+
+
+def related(facts: Iterable[SystemFacts], others: Iterable[SystemFacts]) -> bool:
+    """Whether facts of two systems are of one policy."""
+    ids, other_ids = ({(each.policy, each.policy_id) for each in side} for side in (facts, others))
+    # Two unknown policies are not the same one.
+    return any(policy_id is not None for _, policy_id in ids & other_ids)
 
 
 def ceilings_of(outcomes: Outcomes, system: str) -> list[str]:

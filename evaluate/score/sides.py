@@ -4,7 +4,8 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import InvalidOptionError, named
+from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.stats.intervals import wilson
 from robomme_interference_data.viz.tables import percent
@@ -25,6 +26,11 @@ class Side:
     planned: Mapping[str, set[EpisodeId]]  # by condition, in all plans of its runs
 
     @property
+    def facts(self) -> frozenset[SystemFacts]:
+        """What the system is."""
+        return self.outcomes.facts_of(self.system)
+
+    @property
     def conditions(self) -> list[str]:
         """The conditions under which it has rows."""
         return self.outcomes.ran(self.system)
@@ -35,10 +41,17 @@ class Side:
         return bool(whole) and self.planned.get(condition, set()) <= self.counted(condition)
 
     def repeats(self, other: "Side", rows: CheckedRows, other_rows: CheckedRows) -> bool:
-        """Whether another run's side is the same system with the same scenes and histories."""
+        """Whether another run's side is the same weights with the same scenes and histories."""
         name = self.outcomes.simulator
         same = (self.system, name) == (other.system, other.outcomes.simulator)
-        return same and rows.revisions.get(name) == other_rows.revisions.get(name)
+        weights, other_weights = (
+            {repeat.training_seed for repeat in side.outcomes.repeats} for side in (self, other)
+        )
+        return (
+            same
+            and weights == other_weights
+            and rows.revisions.get(name) == other_rows.revisions.get(name)
+        )
 
     def counted(self, condition: str) -> set[EpisodeId]:
         """The episodes that count under a condition."""
@@ -99,7 +112,16 @@ def matched_sides(
 
 
 def check_scenes(rows: CheckedRows, other_rows: CheckedRows) -> None:
-    """Check that the two runs have the same seed for each episode."""
+    """Check that the two runs have the same scenes, as far as their rows tell."""
+    for simulator in dict.fromkeys(simulator for simulator, _ in rows.scenes):
+        both = (*rows.scenes.items(), *other_rows.scenes.items())
+        found = {scenes for (name, _), scenes in both if name == simulator}
+        if len(found) > 1 or any(seed is None for scenes in found for _, seed in scenes):
+            raise InvalidOptionError(
+                f"the scenes in {simulator} are not known to be the same in both files",
+                f"If their seeds are the same, name them: {named('model_seed')}; `score` compares "
+                "them without pairs.",
+            )
     known, others = (
         {
             (unshifted(row.simulator), row.family, row.split, row.episode): row.seed
@@ -132,6 +154,8 @@ def differing(
                 "is the effect of the shift."
             )
         revisions = [rows.revisions.get(first), other_rows.revisions.get(second)]
+        if any(simulator == first for simulator, _ in rows.scenes):
+            continue  # of another benchmark, whose scenes are known to be the same
         if rows is not other_rows and revisions == [None, None]:
             yield f"The rows of {first} name no revision of a buffer set: the histories may differ."
         elif revisions[0] != revisions[1]:
@@ -154,7 +178,9 @@ def noise_floor(a: Side, b: Side, pairs: Mapping[str, Pairs]) -> Iterator[str]:
             )
     if not shares:
         return
-    seeds, other_seeds = {*a.outcomes.model_seeds}, {*b.outcomes.model_seeds}
+    seeds, other_seeds = (
+        {repeat.model_seed for repeat in side.outcomes.repeats} for side in (a, b)
+    )
     if seeds == other_seeds:
         which = "the same"
     else:

@@ -37,6 +37,7 @@ SETTINGS = (
     "families",
     "episodes",
     "split",
+    "training_seed",
     "model_seed",
     # The simulator:
     "simulator",

@@ -104,6 +104,7 @@ def rows(model: MemoryModel, args: argparse.Namespace) -> Iterator[Rollout]:
                     split=episode.split,
                     episode=episode.index,
                     shift="none",
+                    training_seed=config.seed,
                     model_seed=config.seed,
                     protocol_version=PROTOCOL_VERSION,
                     seed=record.seed,

@@ -88,4 +88,9 @@ class MemoryPolicy(Policy):
     def metadata(self) -> dict[str, Any]:
         """Return what identifies the policy."""
         weights = sha256_file(self._folder / "model.safetensors")
-        return {"policy": "memory_policy", "weights_sha256": weights, **vars(self.config)}
+        return {
+            "policy": "memory_policy",
+            "weights_sha256": weights,
+            "training_seed": self.config.seed,
+            **vars(self.config),
+        }

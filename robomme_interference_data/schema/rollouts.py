@@ -52,7 +52,10 @@ class RolloutKey:
     split: Annotated[str, "`train`, `val` or `test`."]
     episode: Annotated[int, "Index of the query episode."]
     shift: Annotated[str, "Difference of the live scene to the lesson's, `light:2`; or `none`."]
-    model_seed: Annotated[int, "Seed of the policy."]
+    training_seed: Annotated[
+        int | None, "Seed of the training run that made the weights, or None if unknown."
+    ] = None
+    model_seed: Annotated[int, "Seed of the policy: a repeat with the same weights."]
     protocol_version: Annotated[int, "`PROTOCOL_VERSION` of the run."]
 
     def __post_init__(self) -> None:

@@ -27,7 +27,7 @@ STILL = f"{OWN}Still"
 IDENTITY = {
     WorkConfig: {
         *("retrieval", "retrieval_rule", "retrieval_camera"),  # in Selector.identity
-        *("system", "split", "model_seed"),
+        *("system", "split", "training_seed", "model_seed"),
     },
     RunConfig: {
         *("policy", "policy_options"),  # in policy_identity
@@ -68,6 +68,7 @@ def test_every_setting_is_classified(config: type) -> None:
     [
         ({"system": "yours"}, "system is 'mine' there, 'yours' here"),
         ({"model_seed": 7}, "model_seed is 0 there, 7 here"),
+        ({"training_seed": 7}, "training_seed is None there, 7 here"),
         ({"policy": "noop", "policy_options": ()}, f"policy is {STILL!r} there, 'noop' here"),
         ({"policy_options": ("gripper=1",)}, "policy_options.gripper is -1.0 there, 1.0 here"),
     ],

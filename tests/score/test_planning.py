@@ -17,7 +17,7 @@ from support.scoring import BASE, RETRIEVAL, cells, record, records, run
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.score.config import Expected, Settings
 from robomme_interference_data.evaluate.score.power import needed, plan, power, smallest
-from robomme_interference_data.evaluate.score.report.headline import headline
+from robomme_interference_data.evaluate.score.report.headline import headlines
 from robomme_interference_data.evaluate.score.tables.equivalence import (
     BEYOND,
     EQUIVALENT,
@@ -44,12 +44,10 @@ def test_the_released_rows_are_equivalent_to_their_own_k0_alone() -> None:
     assert (paper["against_condition"], paper["against_rows"]) == ("k0", "published")
     assert (paper["low_90"], paper["high_90"]) == newcombe(202, 450, 204, 450, 0.9)
     assert paper["verdict"] == "not shown"
-    text = headline(wide, "robomme")
     assert (
-        "Its k7 is equivalent to its own k0 within ±5 points (90% interval −1.9 to +1.9). Its k7 "
-        "is not shown to be within ±5 points of FrameSamp-Modul's published k0 (90% interval −5.9 "
-        "to +5.0)."
-    ) in text
+        "A fall of Retrieval-FrameSamp-Modul of more than 5.0 points is excluded (90% interval of "
+        "k7 − k0: −1.9 to +1.9)."
+    ) in headlines(wide)["robomme"]
 
 
 def test_retrieval_is_set_against_the_rows_without_it(tmp_path: Path) -> None:
@@ -139,6 +137,44 @@ def test_a_plan_by_hand() -> None:
     assert power(found.smallest, 450, 0.06) == pytest.approx(0.8, abs=0.002)
 
 
+def test_two_learned_systems_need_more_episodes_than_two_runs_of_one() -> None:
+    assert (plan(0.05, 450).needed, plan(0.05, 450, 0.06).needed) == (975, 367)
+    assert round(plan(0.05, 450).power, 2) == 0.46
+
+
+def test_the_margin_of_equivalence_is_that_of_a_rate() -> None:
+    # Where all others fail, the interval of no flips is that of Wilson's bound of 0 of 450.
+    assert plan(0.05, 450, 0.0, rate=0.0).equal == newcombe_paired(0, 0, 0, 450, 0.9)[1]
+    assert plan(0.05, 450, 0.06, rate=0.05).equal > plan(0.05, 450, 0.06).equal
+    with raises(InvalidOptionError) as raised:
+        plan(0.05, 450, 0.25, rate=0.05)
+    assert raised.value.command is None
+
+
+def test_training_runs_are_planned() -> None:
+    planned = plan(0.1, 450, 0.25, runs=(3, 0.05)).runs
+    # 0.25/450 + 2 · 0.05²/3 = 0.0022222; half: √(1.96² · 0.25/450 + 2.7764² · 2 · 0.05²/3).
+    assert planned is not None
+    half = (1.959964**2 * 0.25 / 450 + 2.776445**2 * 2 * 0.05**2 / 3) ** 0.5
+    assert planned.smallest == pytest.approx(half + 0.841621 * 0.0022222**0.5, abs=1e-5)
+    assert planned.power == pytest.approx(NormalDist().cdf((0.1 - half) / 0.0022222**0.5), abs=1e-4)
+    assert planned.needed is not None
+    enough, few = (
+        plan(0.1, 450, runs=(n, 0.05)).runs for n in (planned.needed, planned.needed - 1)
+    )
+    assert enough is not None and few is not None and enough.power >= 0.8 > few.power
+    assert plan(0.01, 450, runs=(3, 0.05)).runs.needed is None
+    for runs in ((2, 0.05), (3, 0.0)):
+        with raises(InvalidOptionError):
+            plan(0.1, 450, runs=runs)
+
+
+def test_flips_of_a_table_contain_the_difference() -> None:
+    done = run("power", "--flips", "0.31", "--difference", "-6", "--json")
+    assert json.loads(done.stdout)["flips"] == 0.25
+    assert run("power", "--flips", "0.05", "--difference", "6").exit_code != 0
+
+
 @given(st.integers(1, 200), st.floats(0, 0.5), st.floats(0.01, 0.5))
 def test_power_is_a_probability_that_grows(episodes: int, flips: float, margin: float) -> None:
     found = power(margin, episodes, flips)
@@ -197,7 +233,21 @@ def test_looks_spend_the_level() -> None:
     alone, often = plan(0.05, 450, 0.06), plan(0.05, 450, 0.06, looks=5)
     assert often.looks == levels and alone.looks == ()
     assert alone.power - 0.06 < often.power < alone.power + 0.02
-    done = run("power", "--looks", "5")
-    assert "look 5 after 450 episodes: significant if p holm is below  0.042" in done.stdout
+    done = run("power", "--flips", "0.06", "--looks", "5")
+    last = done.stdout.splitlines()[-1]
+    assert last.split() == [
+        "look",
+        "5",
+        "after",
+        "450",
+        "episodes:",
+        "significant",
+        "if",
+        "p",
+        "holm",
+        "is",
+        "below",
+        "0.042",
+    ]
     with raises(InvalidOptionError):
         plan(0.05, 450, 0.06, looks=21)

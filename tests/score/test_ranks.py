@@ -99,7 +99,15 @@ def test_which_system_falls_faster(tmp_path: Path) -> None:
     assert row["difference"] == pytest.approx(-14 / 90)
     # Fourteen fall with the base alone: 2/2¹⁴, and no draw of 2,000 but the observed one.
     assert (row["gained"], row["lost"]) == (0, 14)
-    assert row["p"] <= 3 / 2001 and row["p_holm"] == pytest.approx(3 * row["p"])
+    # Corrected among three slopes and, of three systems, k7 against k0.
+    assert row["p"] <= 3 / 2001 and row["primary"]
+    falls = [r for r in records(found, "effects", effect="sessions") if r["primary"]]
+    assert [(r["system"], r["condition"]) for r in falls] == [
+        (name, "k7") for name in (BASE, RETRIEVAL, OWN)
+    ]
+    tests = [*records(found, "interaction"), *falls]
+    ps = sorted(r["p"] for r in tests)
+    assert row["p_holm"] == pytest.approx((len(tests) - ps.index(row["p"])) * row["p"])
     assert row["low"] < row["difference"] < row["high"] < 0
     assert row["joint_low"] < row["low"] and row["high"] < row["joint_high"]
     own = record(found, "interaction", system=RETRIEVAL, against_system=OWN)

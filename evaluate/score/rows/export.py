@@ -37,12 +37,12 @@ def export(rows: CheckedRows, folder: Path) -> list[Path]:
     The released columns name no system, buffer set or revision; rows of a simulator other than
     RoboMME get its name as one more column. A timeout is written as `ongoing`.
     """
-    seeds = len(rows.names("model_seed"))
+    seeds = len({(row.training_seed, row.model_seed) for row in rows})
     other_splits = sum(row.split != "test" for row in rows)
     offline = sum(row.simulator == RECORDINGS for row in rows)
     wrong = []
     if seeds > 1:
-        wrong.append(f"{seeds} model seeds")
+        wrong.append(f"{seeds} seeds of training or model")
     if other_splits:
         wrong.append(f"{other_splits:,} rows of train or val episodes")
     if offline:

@@ -33,7 +33,6 @@ ACTION_ERROR_EFFECTS = ComparisonTable(
     name="action_error_effects",
     title="Differences of the action error",
     columns=SIDES | {"effect": "text"} | ACTION_ERRORS | COMPLETE,
-    group=_between_systems,
     corrected="the tests between systems, and among those between conditions of a system",
     note=(
         "difference: action error of the system and condition minus that of those against, over "
@@ -80,6 +79,7 @@ def error_contrasts(outcomes: Outcomes, draws: int = DRAWS) -> list[Contrast]:
                     pairs,
                     complete=_complete(outcomes, against) and _complete(outcomes, cell),
                     measure=Measure.ACTION_ERROR,
+                    group=("action error", effect is Effect.SYSTEMS),
                 )
             )
     return contrasts

@@ -10,28 +10,30 @@ import numpy as np
 
 from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.evaluate.score.outcomes import (
+    ERROR,
     STATUSES,
     Flags,
     Outcomes,
     SuccessRate,
+    errors_as,
     rate_of,
 )
 from robomme_interference_data.ids import EpisodeId, format_numbers
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.stats.bootstrap import Interval
 from robomme_interference_data.stats.intervals import stratified_n, wilson
+from robomme_interference_data.stats.runs import MIN_RUNS, ONE_RUN, RunSpread
 from robomme_interference_data.viz.tables import Columns, Table
 
 from .comparison import record_table
+from .contrast import Scope, scope_of
 from .ranks import Standing, all_pairs, standings
 
-_FAIL = np.int8(STATUSES.index(Status.FAIL))
-_ERROR = np.int8(STATUSES.index(Status.ERROR))
-
 NOTE = (
-    "Rates with 95% Wilson intervals. n: episodes that count; an error is neither success nor "
-    "failure. †: the cell lacks episodes, or has episodes outside the grid, and is not ranked; a "
-    "cell without any rollout is missing."
+    "Rates with 95% Wilson intervals. scope: they hold for other training runs, if there are "
+    f"{MIN_RUNS} runs or more, otherwise for this checkpoint alone. n: episodes that count; an "
+    "error is neither success nor failure. †: the cell lacks episodes, or has episodes outside the "
+    "grid, and is not ranked; a cell without any rollout is missing."
 )
 BEST = (
     "Best (bold, in text *): above zero, and no other system is significantly better, by p after "
@@ -39,8 +41,10 @@ BEST = (
 )
 _MAIN_NOTE = (
     "fixed low to fixed high: Wilson's interval for other episodes of the same families in the "
-    "same numbers, narrower because the families' rates differ. if errors fail: the rate if every "
-    "error were a failure, the least that it can be if errors depend on the outcome. rank low to "
+    "same numbers, narrower because the families' rates differ; none with training runs. if errors "
+    "fail, if errors succeed: the rate if every error were a failure, or a success: the bounds if "
+    "errors depend on the outcome. run spread: standard deviation of the rates of training runs. "
+    "rank low to "
     "rank high: the ranks that the system can have, from the significant differences of the table "
     "matrix (p holm below 0.05): 1 + the systems that are better, to the number of systems less "
     "those that are worse; all of a condition hold at once with 95% confidence. difference: the "
@@ -81,7 +85,7 @@ class Coverage:
     @property
     def errors(self) -> int:
         """The number of errors."""
-        return self.counts[_ERROR]
+        return self.counts[ERROR]
 
     @property
     def mark(self) -> str:
@@ -97,7 +101,9 @@ class SuccessCell(Coverage):
     interval: tuple[float, float]  # 95% Wilson; (0, 1) if n is 0
     trials: float  # effective number of independent trials: n, and more with repeats
     fixed: tuple[float, float] = (math.nan, math.nan)  # interval for just these families
+    spread: RunSpread = ONE_RUN  # over training runs, which the interval holds
     if_errors_fail: float = math.nan  # rate if every error were a failure; NaN without rollouts
+    if_errors_succeed: float = math.nan  # … a success
     chance: float = math.nan  # mean success of guessing; NaN unless all episodes are questions
     rank: int | None = None  # among complete cells, 1 for the highest rate; None for references
     best: bool = False  # one of several, and no other one is significantly better
@@ -106,7 +112,22 @@ class SuccessCell(Coverage):
     @property
     def as_rate(self) -> SuccessRate:
         """Its rate, for comparisons."""
-        return SuccessRate(self.n, self.rate, self.trials)
+        return SuccessRate(self.n, self.rate, self.trials, self.spread)
+
+    @property
+    def runs(self) -> int:
+        """The number of training runs."""
+        return self.spread.runs
+
+    @property
+    def scope(self) -> Scope:
+        """What the interval holds for."""
+        return scope_of(self.runs)
+
+    @property
+    def run_spread(self) -> float:
+        """Standard deviation of the training runs' rates; NaN for one."""
+        return self.spread.deviation
 
 
 def coverage_of(
@@ -123,7 +144,7 @@ def coverage_of(
         "counts": tuple(counts[here].sum(axis=0).tolist()),
         "expected": int((maybe_here & outcomes.expected).sum()),
         "missing": outcomes.episodes_of(maybe_here & outcomes.missing[system, condition]),
-        "broken": outcomes.episodes_of(here & (counts[:, _ERROR] > 0)),
+        "broken": outcomes.episodes_of(here & (counts[:, ERROR] > 0)),
         "unexpected": outcomes.episodes_of(here & outcomes.unexpected[system, condition]),
     }
 
@@ -155,7 +176,8 @@ def _cells(outcomes: Outcomes) -> list[SuccessCell]:
                 continue
             counted = here & outcomes.counted[s, c]
             status = outcomes.status[s, c, here]
-            rate = rate_of(status)
+            rate = rate_of(status, outcomes.training)
+            failed, won = (errors_as(status, other) for other in (Status.FAIL, Status.SUCCESS))
             fixed = (math.nan, math.nan) if part else _fixed(outcomes, s, c, rate)
             cells.append(
                 SuccessCell(
@@ -168,7 +190,9 @@ def _cells(outcomes: Outcomes) -> list[SuccessCell]:
                     rate.interval,
                     rate.trials,
                     fixed=fixed,
-                    if_errors_fail=rate_of(np.where(status == _ERROR, _FAIL, status)).value,
+                    spread=rate.spread,
+                    if_errors_fail=rate_of(failed).value,
+                    if_errors_succeed=rate_of(won).value,
                     chance=float(outcomes.chance[counted].mean()) if rate.n else math.nan,
                     **coverage_of(outcomes, s, c, here, maybe_here),
                 )
@@ -179,7 +203,12 @@ def _cells(outcomes: Outcomes) -> list[SuccessCell]:
 def _fixed(
     outcomes: Outcomes, system: int, condition: int, rate: SuccessRate
 ) -> tuple[float, float]:
-    """Return the interval of a rate for its families as fixed strata; none for one family."""
+    """Return the interval of a rate for its families as fixed strata.
+
+    None for one family, and with training runs as a random effect.
+    """
+    if scope_of(rate.spread.runs) is Scope.TRAINING:
+        return math.nan, math.nan
     status = outcomes.status[system, condition]
     by_family = [rate_of(status[outcomes.of_family(name)]) for name in outcomes.families]
     by_family = [family for family in by_family if family.n]
@@ -220,7 +249,14 @@ def _ranked(
 
 _CELL: Columns = {"simulator": "text", "system": "text", "condition": "text"}
 
-_RATE: Columns = {"n": "count", "rate": "rate", "low": "rate", "high": "rate"}
+_RATE: Columns = {
+    "n": "count",
+    "runs": "count",
+    "scope": "text",
+    "rate": "rate",
+    "low": "rate",
+    "high": "rate",
+}
 
 _COUNTS: Columns = {
     "successes": "count",
@@ -236,7 +272,13 @@ _COUNTS: Columns = {
 MAIN: Columns = (
     _CELL
     | _RATE
-    | {"fixed_low": "rate", "fixed_high": "rate", "if_errors_fail": "rate"}
+    | {
+        "run_spread": "points",
+        "fixed_low": "rate",
+        "fixed_high": "rate",
+        "if_errors_fail": "rate",
+        "if_errors_succeed": "rate",
+    }
     | _COUNTS
     | {
         "rank_low": "count",
@@ -292,12 +334,16 @@ def _record(cell: SuccessCell) -> dict[str, Any]:
         "condition": cell.condition,
         "part": cell.part,
         "n": cell.n,
+        "runs": cell.runs if cell.n else None,
+        "scope": cell.scope if cell.n else "",
         "rate": cell.rate,
         "low": low,
         "high": high,
+        "run_spread": cell.run_spread,
         "fixed_low": cell.fixed[0],
         "fixed_high": cell.fixed[1],
         "if_errors_fail": cell.if_errors_fail,
+        "if_errors_succeed": cell.if_errors_succeed,
         "successes": successes,
         "fails": fails,
         "timeouts": timeouts,

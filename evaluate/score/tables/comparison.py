@@ -1,18 +1,17 @@
 """Tables of comparisons and of tests: their columns, Holm's correction, and how to read them."""
 
-import math
-from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from operator import attrgetter
 from typing import Any
 
 from robomme_interference_data.evaluate.score import power
-from robomme_interference_data.stats.significance import ALPHA, holm
+from robomme_interference_data.stats.runs import MIN_RUNS
+from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.stats.signs import simultaneous
 from robomme_interference_data.viz.tables import Columns, Table
 
 from .contrast import Contrast
+from .correction import corrected
 
 SIDES: Columns = {
     "simulator": "text",
@@ -23,13 +22,25 @@ SIDES: Columns = {
 }
 """The two sides of a comparison."""
 
+RUNS_NOTE = (
+    f"runs: training runs of the side with fewer. scope: with {MIN_RUNS} runs or more, interval "
+    "and test hold for other training runs too, otherwise for this checkpoint alone. if failures, "
+    "if successes: the value if every error on either side were a failure, or a success; verdict: "
+    "p holm is below 0.05 or not, or this depends on errors, because one of the two would change "
+    "it."
+)
+
 RATES: Columns = {
     "n": "count",
+    "runs": "count",
+    "scope": "text",
     "rate": "rate",
     "against_rate": "rate",
     "difference": "points",
     "low": "points",
     "high": "points",
+    "if_failures": "points",
+    "if_successes": "points",
     "gained": "count",
     "lost": "count",
     "flips": "rate",
@@ -37,6 +48,7 @@ RATES: Columns = {
     "p_holm": "p",
     "joint_low": "points",
     "joint_high": "points",
+    "verdict": "text",
 }
 """The rates of both sides, their difference, and its test."""
 
@@ -74,10 +86,8 @@ class ComparisonTable:
     Attributes:
         name: Its name.
         title: Its subject, in a line.
-        columns: Its columns: values of `_values`, of `Contrast.columns`, `p_holm`, and `joint_low`
-            and `joint_high`, the interval that holds with all others of the group.
-        group: Comparisons for which this is equal are corrected together.
-        corrected: The group in words, for the note.
+        columns: Its columns: values of `_values`, and of `Contrast.columns`.
+        corrected: In words, for the note, with which others a comparison is corrected.
         note: How to read it, before the explanation of intervals and tests.
         explain: Whether the note explains intervals and tests of success rates.
         alpha: One minus the level of the joint intervals.
@@ -86,7 +96,6 @@ class ComparisonTable:
     name: str
     title: str
     columns: Columns
-    group: Callable[[Contrast], Hashable] = attrgetter("simulator")
     corrected: str = "the tests of this table in one simulator"
     note: str = BOTH_SIDES
     explain: bool = True
@@ -94,15 +103,12 @@ class ComparisonTable:
 
 
 def comparison_table(spec: ComparisonTable, contrasts: Iterable[Contrast]) -> Table:
-    """Return a row for each comparison."""
+    """Return a row for each comparison, which is corrected already."""
     contrasts = list(contrasts)
-    tests = tests_of(contrasts, spec.group)
-    holms = corrected([c.pairs.p for c in contrasts], [spec.group(c) for c in contrasts])
     rows = []
-    for contrast, count, p_holm in zip(contrasts, tests, holms, strict=True):
-        joint = contrast.pairs.at(simultaneous(count, spec.alpha))
-        values = _values(contrast)
-        values |= {"p_holm": p_holm, "joint_low": joint.low, "joint_high": joint.high}
+    for contrast in contrasts:
+        joint = contrast.pairs.at(simultaneous(contrast.tests, spec.alpha))
+        values = _values(contrast) | {"joint_low": joint.low, "joint_high": joint.high}
         values |= contrast.columns
         rows.append([values[name] for name in spec.columns])
     notes = [spec.note]
@@ -115,6 +121,8 @@ def comparison_table(spec: ComparisonTable, contrasts: Iterable[Contrast]) -> Ta
             "joint low to joint high: intervals that hold for all of these at once with 95% "
             "(Bonferroni)."
         )
+    if "verdict" in spec.columns:
+        notes.append(RUNS_NOTE)
     if spec.explain and not all(contrast.complete for contrast in contrasts):
         notes.append("p†: provisional, because a cell is incomplete; early looks find too much.")
     return Table(spec.name, spec.title, spec.columns, rows, " ".join(notes))
@@ -134,6 +142,8 @@ def _values(contrast: Contrast) -> dict[str, Any]:
         "asks": contrast.asks,
         "family": contrast.family or "all",
         "n": pairs.n,
+        "runs": contrast.runs,
+        "scope": contrast.scope,
         "rate": pairs.second,
         "against_rate": pairs.first,
         "action_l1": pairs.second,  # in place of a rate, offline
@@ -143,10 +153,15 @@ def _values(contrast: Contrast) -> dict[str, Any]:
         "high": pairs.change.high,
         "low_90": pairs.within.low,
         "high_90": pairs.within.high,
+        "if_failures": contrast.if_failures,
+        "if_successes": contrast.if_successes,
         "gained": pairs.gained if pairs.paired else None,
         "lost": pairs.lost if pairs.paired else None,
         "flips": pairs.flips,
         "p": pairs.p,
+        "p_holm": contrast.p_holm,
+        "primary": contrast.primary,
+        "verdict": contrast.verdict or "",
         "retention": contrast.retention.value,
         "retention_low": contrast.retention.low,
         "retention_high": contrast.retention.high,
@@ -155,18 +170,10 @@ def _values(contrast: Contrast) -> dict[str, Any]:
     }
 
 
-def tests_of(contrasts: Sequence[Contrast], group: Callable[[Contrast], Hashable]) -> list[int]:
-    """Return the number of comparisons that each one is corrected with."""
-    sizes = Counter(group(contrast) for contrast in contrasts)
-    return [sizes[group(contrast)] for contrast in contrasts]
-
-
-def detectable(
-    contrasts: Sequence[Contrast], group: Callable[[Contrast], Hashable], effect: str = ""
-) -> str:
+def detectable(contrasts: Sequence[Contrast], effect: str = "") -> str:
     """Return a sentence on the differences that such comparisons can detect; empty without any."""
     counts = [(c.pairs.pairs, c.pairs.gained, c.pairs.lost) for c in contrasts if not c.family]
-    return power.note(counts, max(tests_of(contrasts, group), default=1), effect)
+    return power.note(counts, max((c.tests for c in contrasts), default=1), effect)
 
 
 def tested_table(
@@ -197,16 +204,6 @@ def record_table(
     return Table(name, title, columns, rows, note)
 
 
-def corrected(p_values: Sequence[float], groups: Sequence[Hashable]) -> list[float]:
-    """Return p-values after Holm's correction within each group."""
-    adjusted = [math.nan] * len(p_values)
-    for group in dict.fromkeys(groups):
-        places = [place for place, of in enumerate(groups) if of == group]
-        for place, p in zip(places, holm([p_values[at] for at in places]), strict=True):
-            adjusted[place] = p
-    return adjusted
-
-
 def _how_to_read(contrasts: Sequence[Contrast]) -> str:
     """Explain the intervals and tests of some comparisons of success rates."""
     methods = {contrast.pairs.method for contrast in contrasts}
@@ -220,6 +217,11 @@ def _how_to_read(contrasts: Sequence[Contrast]) -> str:
             " With repeats, interval and p use the episodes' means: the score interval from "
             "cluster-adjusted Wilson intervals of both sides, and the exact sign-flip test; gained "
             "and lost are of the lowest model seed that counts on both sides."
+        )
+    if any(contrast.pairs.spread.variance for contrast in contrasts):
+        note += (
+            f" With {MIN_RUNS} training runs or more, the interval is widened, and p raised, by "
+            "the variance between runs (Student's t)."
         )
     if "unpaired" in methods:
         note += (

@@ -1,13 +1,15 @@
 """One comparison, what it is for, and which kinds of conditions are compared with which."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, NamedTuple
 
 from robomme_interference_data.schema.conditions import KINDS, NO_HISTORY, parse_condition
 from robomme_interference_data.stats.bootstrap import Interval
+from robomme_interference_data.stats.runs import MIN_RUNS
+from robomme_interference_data.stats.signs import simultaneous
 
 from .pairs import Pairs
 
@@ -34,6 +36,26 @@ class Measure(StrEnum):
 
     SUCCESS = "success"
     ACTION_ERROR = "action error"  # along recordings; lower is better
+
+
+class Verdict(StrEnum):
+    """What a comparison shows, after correction."""
+
+    SHOWN = "shown"
+    NOT_SHOWN = "not shown"
+    DEPENDS = "depends on errors"  # another verdict if all errors were failures, or successes
+
+
+class Scope(StrEnum):
+    """What intervals and tests hold for, beside other episodes."""
+
+    TRAINING = "training runs"  # other runs of the same training
+    CHECKPOINT = "checkpoint"  # these weights alone
+
+
+def scope_of(runs: int) -> Scope:
+    """Return what holds with a number of training runs."""
+    return Scope.TRAINING if runs >= MIN_RUNS else Scope.CHECKPOINT
 
 
 class Comparison(NamedTuple):
@@ -76,6 +98,37 @@ class Contrast:
     retention: Interval = NO_RETENTION  # of a lift: the share of the lift at k0 that is left
     retention_n: int | None = None  # episodes that count under all three conditions
     columns: Mapping[str, Any] = field(default_factory=dict)  # values that a single table adds
+    group: Hashable = ""  # comparisons with the same one are corrected together
+    primary: bool = False  # whether it is part of the primary analysis
+    # Set by `correction.correct`:
+    tests: int = 1  # comparisons of the group
+    p_holm: float = math.nan  # corrected within the group
+    verdict: Verdict | None = None  # None without a p-value
+
+    @property
+    def joint(self) -> Interval:
+        """The difference, with an interval that holds with all others of the group at once."""
+        return self.pairs.at(simultaneous(self.tests))
+
+    @property
+    def runs(self) -> int:
+        """Training runs of the side with fewer."""
+        return self.pairs.spread.runs
+
+    @property
+    def scope(self) -> Scope:
+        """What interval and test hold for."""
+        return scope_of(self.runs)
+
+    @property
+    def if_failures(self) -> float:
+        """The difference if every error were a failure."""
+        return (self.pairs.if_failures or self.pairs).change.value
+
+    @property
+    def if_successes(self) -> float:
+        """The difference if every error were a success."""
+        return (self.pairs.if_successes or self.pairs).change.value
 
     @property
     def asks(self) -> str:

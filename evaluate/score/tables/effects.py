@@ -4,12 +4,14 @@ All comparisons are paired over the episodes that count under both conditions.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from robomme_interference_data.evaluate.score.outcomes import Outcomes, success
+from robomme_interference_data.evaluate.score.outcomes import Flags, Outcomes, success
+from robomme_interference_data.evaluate.score.partners import share_weights
 from robomme_interference_data.schema.conditions import NO_HISTORY, parse_condition
 from robomme_interference_data.stats.bootstrap import Floats, Interval
 from robomme_interference_data.stats.intervals import fieller
@@ -25,8 +27,8 @@ from .comparison import (
     comparison_table,
     detectable,
 )
-from .contrast import START, Contrast, Effect, comparable
-from .pairs import pair
+from .contrast import START, Contrast, Effect, Scope, comparable
+from .pairs import compare_cells, shared_runs
 
 TESTED_TOGETHER = {
     Effect.HISTORY: "history",
@@ -36,10 +38,6 @@ TESTED_TOGETHER = {
     Effect.CEILING: "the ideal observer",
 }
 """The comparisons of the table `effects`, and the effects that each is corrected with."""
-
-
-def _group(contrast: Contrast) -> tuple[str, str]:
-    return contrast.simulator, TESTED_TOGETHER[contrast.effect]
 
 
 EFFECTS = ComparisonTable(
@@ -54,11 +52,12 @@ EFFECTS = ComparisonTable(
         "retention_high": "ratio",
         "retention_n": "count",
     }
+    | {"primary": "flag"}
     | COMPLETE,
-    group=_group,
     corrected=(
-        "the tests of the same effect in one simulator, with those of sessions and of retrieval as "
-        "one effect"
+        "the tests of the primary analysis in one simulator (primary: k7 against k0 of each "
+        "system, and the table interaction), and for the others, which are exploratory, among "
+        "those of the same effect, with sessions and retrieval as one effect"
     ),
     note=(
         f"effect: history, against no history (without history, a system with retrieval is the "
@@ -81,8 +80,19 @@ def effects_table(contrasts: Iterable[Contrast]) -> Table:
         if contrast.effect in TESTED_TOGETHER:
             groups[TESTED_TOGETHER[contrast.effect]].append(contrast)
     table = comparison_table(EFFECTS, [contrast for group in groups.values() for contrast in group])
-    notes = [detectable(group, _group, effect) for effect, group in groups.items()]
+    notes = []
+    for effect, group in groups.items():
+        exploratory = [contrast for contrast in group if not contrast.primary]
+        notes.append(detectable(exploratory or group, effect))
     return replace(table, note=" ".join([table.note, *filter(None, notes)]))
+
+
+class _Compared(NamedTuple):
+    """Two cells, each a system and a condition, and what their comparison measures."""
+
+    against: tuple[str, str]
+    cell: tuple[str, str]
+    effect: Effect
 
 
 def effects_of(
@@ -94,62 +104,109 @@ def effects_of(
     and under each condition the system with its `base` (the one without retrieval, whose
     `no-history` serves both) and with its `ceiling` (the ideal observer).
     """
-    cells = [
-        (name, condition)
-        for name in (system, base, ceiling)
-        if name
-        for condition in outcomes.ran(name)
-    ]
-    at = {cell: place for place, cell in enumerate(cells)}
-    ran_in = [outcomes.has_episode[outcomes.systems.index(name)] for name in (system, base) if name]
-    here = np.logical_or.reduce(ran_in)
-    sides = [outcomes.status[outcomes.cell(*cell)][here] for cell in cells]
-    values = np.stack([success(side) for side in sides], axis=1)
-    complete = [bool(outcomes.complete[outcomes.cell(*cell)]) for cell in cells]
-
-    ran = outcomes.ran(system)
-    ks = [name for name in ran if parse_condition(name).kind.name == "k"]
-    later = [name for name in ks if name != START] if START in ks else []
-    floors = [(name, NO_HISTORY) for name in (system, base) if name]
-    floor = next((cell for cell in floors if cell in at), None)
-    effects: dict[tuple[str, tuple[str, str]], Effect] = {}
-    if floor:
-        effects |= {(name, floor): Effect.HISTORY for name in ks}
-    for name in later:
-        effects[name, (system, START)] = Effect.SESSIONS
+    floor = _floor(outcomes, system, base)
+    # A comparison that is listed twice is that of the last effect.
+    compared = {(pair.cell, pair.against): pair for pair in _compared(outcomes, system, floor)}
+    for pair in _partners(outcomes, system, base, ceiling):
+        compared[pair.cell, pair.against] = pair
+    here = outcomes.has_episode[outcomes.systems.index(system)]
     if base:
-        effects |= {(name, (base, name)): Effect.RETRIEVAL for name in ran if (base, name) in at}
-        if (base, START) in at:
-            effects |= {(name, (base, START)): Effect.RETRIEVAL_FALL for name in later}
-    for name, against in comparable(system, ran, floor):
-        effects[name, against] = Effect.INTERFERENCE
-    if ceiling:
-        effects |= {
-            (name, (ceiling, name)): Effect.CEILING for name in ran if (ceiling, name) in at
-        }
-
-    contrasts = {}
-    for (name, against), effect in effects.items():
-        first, second = at[against], at[system, name]
-        contrasts[name, against] = Contrast(
-            outcomes.simulator,
-            system,
-            name,
-            against,
-            effect,
-            pair(sides[first], sides[second]),
-            complete[first] and complete[second],
-        )
-    # Retention is a share of the lift at k0, so that lift must be significantly above zero.
-    lift = contrasts.get((START, floor)) if floor else None
-    if floor and lift and lift.pairs.change.value > 0 and lift.pairs.p < ALPHA:
-        for name in later:
-            three = values[:, [at[floor], at[system, START], at[system, name]]]
-            three = three[~np.isnan(three).any(axis=1)]
-            history, fall = contrasts[name, floor], contrasts[name, (system, START)]
-            kept = retained(three, history.pairs.change, fall.pairs.change)
-            contrasts[name, floor] = replace(history, retention=kept, retention_n=len(three))
+        here = here | outcomes.has_episode[outcomes.systems.index(base)]
+    contrasts = {key: _contrast(outcomes, pair, here) for key, pair in compared.items()}
+    if floor:
+        _add_retention(outcomes, system, floor, here, contrasts)
     return list(contrasts.values())
+
+
+def _floor(outcomes: Outcomes, system: str, base: str | None) -> tuple[str, str] | None:
+    """Return the cell without history: of the system, or else of its base."""
+    for name in (system, base):
+        if name and NO_HISTORY in outcomes.ran(name):
+            return name, NO_HISTORY
+    return None
+
+
+def _counted(outcomes: Outcomes, system: str) -> list[str]:
+    """Return the `k<n>` under which a system has rows."""
+    return [name for name in outcomes.ran(system) if parse_condition(name).kind.name == "k"]
+
+
+def _compared(
+    outcomes: Outcomes, system: str, floor: tuple[str, str] | None
+) -> Iterator[_Compared]:
+    """Yield the comparisons between conditions of a system."""
+    ks = _counted(outcomes, system)
+    if floor:
+        for condition in ks:
+            yield _Compared(floor, (system, condition), Effect.HISTORY)
+    if START in ks:
+        for condition in ks:
+            if condition != START:
+                yield _Compared((system, START), (system, condition), Effect.SESSIONS)
+    for condition, against in comparable(system, outcomes.ran(system), floor):
+        yield _Compared(against, (system, condition), Effect.INTERFERENCE)
+
+
+def _partners(
+    outcomes: Outcomes, system: str, base: str | None, ceiling: str | None
+) -> Iterator[_Compared]:
+    """Yield the comparisons of a system with the one without retrieval, and the ideal observer."""
+    ran = outcomes.ran(system)
+    for partner, effect in ((base, Effect.RETRIEVAL), (ceiling, Effect.CEILING)):
+        for condition in ran:
+            if partner and condition in outcomes.ran(partner):
+                yield _Compared((partner, condition), (system, condition), effect)
+    if base and START in ran and START in outcomes.ran(base):
+        for condition in _counted(outcomes, system):
+            if condition != START:
+                yield _Compared((base, START), (system, condition), Effect.RETRIEVAL_FALL)
+
+
+def _contrast(outcomes: Outcomes, compared: _Compared, here: Flags) -> Contrast:
+    """Compare two cells over the episodes `here`."""
+    against, cell = outcomes.cell(*compared.against), outcomes.cell(*compared.cell)
+    system, condition = compared.cell
+    return Contrast(
+        outcomes.simulator,
+        system,
+        condition,
+        compared.against,
+        compared.effect,
+        compare_cells(
+            outcomes.status[against][here],
+            outcomes.status[cell][here],
+            outcomes.training,
+            same_weights=share_weights(outcomes, system, compared.against[0]),
+        ),
+        bool(outcomes.complete[against] and outcomes.complete[cell]),
+        group=TESTED_TOGETHER.get(compared.effect, compared.effect),
+    )
+
+
+def _add_retention(
+    outcomes: Outcomes,
+    system: str,
+    floor: tuple[str, str],
+    here: Flags,
+    contrasts: dict[tuple[tuple[str, str], tuple[str, str]], Contrast],
+) -> None:
+    """Add the share of the lift at k0 that is left, which must be significantly above zero."""
+    start = (system, START)
+    lift = contrasts.get((start, floor))
+    if lift is None or not (lift.pairs.change.value > 0 and lift.pairs.p < ALPHA):
+        return
+    for (cell, against), fall in list(contrasts.items()):
+        if fall.effect is not Effect.SESSIONS or against != start:
+            continue
+        sides = [outcomes.status[outcomes.cell(*at)][here] for at in (floor, start, cell)]
+        shared = shared_runs(sides, outcomes.training)
+        values = np.stack([success(side[:, shared]) for side in sides], axis=1)
+        values = values[~np.isnan(values).any(axis=1)]
+        history = contrasts[cell, floor]
+        kept = retained(values, history.pairs.change, fall.pairs.change)
+        if history.scope is Scope.TRAINING:  # Fieller's interval is one for fixed training runs
+            kept = Interval(kept.value)
+        contrasts[cell, floor] = replace(history, retention=kept, retention_n=len(values))
 
 
 def retained(values: Floats, lift: Interval, fall: Interval) -> Interval:

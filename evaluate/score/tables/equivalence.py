@@ -10,6 +10,7 @@ from robomme_interference_data.viz.tables import Columns, Table
 from .cells import SuccessCell
 from .comparison import SIDES, ComparisonTable, comparison_table
 from .contrast import START, Contrast, Effect
+from .correction import correct
 from .pairs import Pairs, compare_unpaired
 
 EQUIVALENT, BEYOND, OPEN = "equivalent", "beyond", "not shown"
@@ -18,6 +19,8 @@ EQUIVALENT, BEYOND, OPEN = "equivalent", "beyond", "not shown"
 _COLUMNS: Columns = SIDES | {
     "against_rows": "text",
     "n": "count",
+    "runs": "count",
+    "scope": "text",
     "difference": "points",
     "low_90": "points",
     "high_90": "points",
@@ -62,7 +65,7 @@ def equivalence_table(
         "published rates. †: provisional, because a cell is incomplete.",
         explain=False,
     )
-    return comparison_table(spec, rows)
+    return comparison_table(spec, correct(rows))
 
 
 def _compared(contrast: Contrast, source: str, margin: float) -> Contrast:
@@ -74,7 +77,7 @@ def _compared(contrast: Contrast, source: str, margin: float) -> Contrast:
         "verdict": outcome if contrast.complete else f"{outcome}†",
     }
     pairs = replace(contrast.pairs, p=tost(contrast.pairs, margin))
-    return replace(contrast, pairs=pairs, columns=columns)
+    return replace(contrast, pairs=pairs, columns=columns, group="equivalence")
 
 
 def _with_published(

@@ -2,9 +2,9 @@
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,9 @@ from .contrast import Contrast, Effect
 
 DRAWS = 2000
 """Random signs, and draws of families and episodes."""
+
+MIN_IN_FAMILY = 20
+"""Episodes of each family from which p families holds: with 10 it finds too much, 19%."""
 
 _EFFECTS = (Effect.HISTORY, Effect.SESSIONS, Effect.RETRIEVAL, Effect.INTERFERENCE)
 
@@ -57,8 +60,9 @@ FAMILIES = ComparisonTable(
         "tasks beyond these, much wider, and with so few families still too narrow. Both from "
         f"{DRAWS:,} draws, if at least {MIN_EPISODES} episodes differ. p families: a test of "
         f"whether the difference varies between families, by {DRAWS:,} random sign flips of the "
-        "differences from their family's mean; p families holm: after Holm's correction within a "
-        "simulator."
+        "differences from their family's mean, if each family has at least "
+        f"{MIN_IN_FAMILY} episodes; p families holm: after Holm's correction within a simulator. "
+        "All of it is for these checkpoints: training runs are fixed."
     ),
     explain=False,
 )
@@ -69,25 +73,29 @@ def families_table(all_outcomes: Iterable[Outcomes], contrasts: Sequence[Contras
     rows = list[Contrast]()
     for outcomes in all_outcomes:
         labels = outcomes.family
-        effects, differences, counts = list[Contrast](), list[Floats](), list[int]()
+        effects, differences, counts = list[Contrast](), list[Floats](), list[NDArray[np.int64]]()
         for contrast in contrasts:
             if contrast.simulator != outcomes.simulator or contrast.effect not in _EFFECTS:
                 continue
             before = success(outcomes.status[outcomes.cell(*contrast.against)])
             after = success(outcomes.status[outcomes.cell(contrast.system, contrast.condition)])
-            families = {*labels[~np.isnan(after - before)].tolist()}
-            if len(families) > 1:
+            _, sizes = np.unique(labels[~np.isnan(after - before)], return_counts=True)
+            if len(sizes) > 1:
                 effects.append(contrast)
                 differences.append(after - before)
-                counts.append(len(families))
+                counts.append(sizes)
         if not effects:
             continue
         estimates = over_families(np.stack(differences, axis=1), labels, outcomes.simulator)
+        estimates = [
+            estimate if sizes.min() >= MIN_IN_FAMILY else estimate._replace(p_families=math.nan)
+            for estimate, sizes in zip(estimates, counts, strict=True)
+        ]
         holms = holm([estimate.p_families for estimate in estimates])
-        for contrast, count, estimate, p_holm in zip(
+        for contrast, sizes, estimate, p_holm in zip(
             effects, counts, estimates, holms, strict=True
         ):
-            columns = {"families": count, **estimate._asdict(), "p_families_holm": p_holm}
+            columns = {"families": len(sizes), **estimate._asdict(), "p_families_holm": p_holm}
             rows.append(replace(contrast, columns=columns))
     return comparison_table(FAMILIES, rows)
 
@@ -103,7 +111,7 @@ class OverFamilies(NamedTuple):
     without_low: float  # lowest and highest mean without one of the families
     without_high: float
     spread: float  # standard deviation between families
-    p_families: float
+    p_families: float  # holds with `MIN_IN_FAMILY` episodes of each family or more
 
 
 def over_families(
@@ -137,47 +145,59 @@ def over_families(
     return [by_column[column] for column in range(values.shape[1])]
 
 
+@dataclass(frozen=True)
+class _Families:
+    """The differences of episodes, `(E, K)`, those of a family in consecutive rows."""
+
+    values: Floats
+    starts: NDArray[np.int64]  # the first row of each family, (F,)
+
+    @classmethod
+    def of(cls, values: Floats, labels: NDArray[np.int64]) -> Self:
+        """Sort episodes by the label of their family."""
+        order = np.argsort(labels, kind="stable")
+        return cls(values[order], np.flatnonzero(np.diff(labels[order], prepend=-1)))
+
+    @property
+    def sizes(self) -> NDArray[np.int64]:
+        """Episodes of each family, `(F, 1)`."""
+        return np.diff(self.starts, append=len(self.values))[:, None]
+
+    @property
+    def means(self) -> Floats:
+        """Means of families, `(F, K)`."""
+        return self.sums(self.values) / self.sizes
+
+    @property
+    def residuals(self) -> Floats:
+        """Differences from the mean of their family, `(E, K)`."""
+        return self.values - self.means.repeat(self.sizes[:, 0], axis=0)
+
+    @property
+    def parts(self) -> list[Floats]:
+        """The rows of each family."""
+        return np.split(self.values, self.starts[1:])
+
+    def sums(self, rows: Floats) -> Floats:
+        """Return the sums over each family of values by episode, `(F, K)`."""
+        return np.add.reduceat(rows, self.starts, axis=0)
+
+
 def _over(
     values: Floats, labels: NDArray[np.int64], key: str, draws: int
 ) -> Iterator[OverFamilies]:
     """Yield what `over_families` returns, for values without NaN."""
-    # The rows of a family lie together, so that sums over families are sums over ranges of rows.
-    order = np.argsort(labels, kind="stable")
-    labels, values = labels[order], values[order]
-    starts = np.flatnonzero(np.diff(labels, prepend=-1))
-    sizes = np.diff(starts, append=len(labels))[:, None]
+    families = _Families.of(values, labels)
     generator = generator_of(f"{key}, families")
-
-    means = np.add.reduceat(values, starts, axis=0) / sizes
-    residuals = values - means.repeat(sizes[:, 0], axis=0)
-    noise = np.add.reduceat(residuals**2, starts, axis=0) / np.maximum(1, sizes - 1) / sizes
-    count, spread = len(starts), np.sqrt(np.maximum(0, means.var(axis=0, ddof=1) - noise.mean(0)))
-
-    def variation(sums: Floats) -> Floats:
-        """Return the variation between families of their sums, `(…, F, K)`."""
-        whole = sums.sum(axis=-2) ** 2 / len(values)
-        return np.asarray(((sums * sums / sizes).sum(axis=-2) - whole).round(9))
-
-    residuals *= np.sqrt(sizes / np.maximum(1, sizes - 1)).repeat(sizes[:, 0], axis=0)
-    signs = 1.0 - 2 * generator.integers(0, 2, (draws, len(values)), np.uint8)
-    ends = [*starts.tolist(), len(values)]
-    sums = np.stack([signs[:, a:b] @ residuals[a:b] for a, b in pairwise(ends)], axis=1)
-    reached = (variation(sums) >= variation(means * sizes)).sum(axis=0)
-    p = (1 + reached) / (1 + draws)
-
-    alike = means.mean(axis=0)
-    without = (means.sum(axis=0) - means) / (count - 1)
-    taken = generator.multinomial(len(starts), np.full(len(starts), 1 / len(starts)), draws)
-    parts, intervals = np.split(values, starts[1:]), []
-    # Each family once, for just these families; then as often as drawn, for a sample of families.
-    for often in (np.ones_like(taken), taken):
-        drawn = sum(_resampled(part, often[:, n], generator) for n, part in enumerate(parts))
-        intervals.append(np.quantile(drawn / len(starts), (0.025, 0.975), axis=0))
-    for n, column in enumerate(values.T):
-        bounds = np.concatenate(intervals)[:, n].tolist()
-        if not varies_enough(column):
-            bounds = [math.nan] * len(bounds)
-        alike_low, alike_high, sample_low, sample_high = bounds
+    p = _p_families(families, generator, draws)
+    fixed, sampled = _bootstrap(families, generator, draws)
+    means, count = families.means, len(families.starts)
+    alike, without = means.mean(axis=0), (means.sum(axis=0) - means) / (count - 1)
+    spread = _spread(families)
+    for n, column in enumerate(families.values.T):
+        enough = varies_enough(column)
+        alike_low, alike_high = fixed[:, n].tolist() if enough else (math.nan, math.nan)
+        sample_low, sample_high = sampled[:, n].tolist() if enough else (math.nan, math.nan)
         yield OverFamilies(
             alike=float(alike[n]),
             alike_low=alike_low,
@@ -189,6 +209,48 @@ def _over(
             spread=float(spread[n]),
             p_families=float(p[n]),
         )
+
+
+def _spread(families: _Families) -> Floats:
+    """Return the standard deviation between families, without the noise of episodes, `(K,)`."""
+    variances = families.sums(families.residuals**2) / np.maximum(1, families.sizes - 1)
+    noise = (variances / families.sizes).mean(axis=0)
+    return np.asarray(np.sqrt(np.maximum(0, families.means.var(axis=0, ddof=1) - noise)))
+
+
+def _p_families(families: _Families, generator: np.random.Generator, draws: int) -> Floats:
+    """Return p of equal differences in all families, `(K,)`."""
+    sizes, episodes = families.sizes, len(families.values)
+    # Residuals vary less than the differences do, in small families most.
+    scale = np.sqrt(sizes / np.maximum(1, sizes - 1))
+    residuals = families.residuals * scale.repeat(sizes[:, 0], axis=0)
+    signs = 1.0 - 2 * generator.integers(0, 2, (draws, episodes), np.uint8)
+    ends = [*families.starts.tolist(), episodes]
+    flipped = np.stack([signs[:, a:b] @ residuals[a:b] for a, b in pairwise(ends)], axis=1)
+
+    def variation(sums: Floats) -> Floats:
+        """Return the variation between families of their sums, `(…, F, K)`."""
+        whole = sums.sum(axis=-2) ** 2 / episodes
+        return np.asarray(((sums * sums / sizes).sum(axis=-2) - whole).round(9))
+
+    reached = (variation(flipped) >= variation(families.means * sizes)).sum(axis=0)
+    return np.asarray((1 + reached) / (1 + draws))
+
+
+def _bootstrap(
+    families: _Families, generator: np.random.Generator, draws: int
+) -> tuple[Floats, Floats]:
+    """Return the 95% intervals of the mean of families, `(2, K)`: for these, and for a sample."""
+    count = len(families.starts)
+    taken = generator.multinomial(count, np.full(count, 1 / count), draws)
+    intervals = []
+    # Each family once, for just these families; then as often as drawn, for a sample of families.
+    for often in (np.ones_like(taken), taken):
+        drawn = sum(
+            _resampled(part, often[:, n], generator) for n, part in enumerate(families.parts)
+        )
+        intervals.append(np.quantile(drawn / count, (0.025, 0.975), axis=0))
+    return intervals[0], intervals[1]
 
 
 def _resampled(values: Floats, often: NDArray[np.int64], generator: np.random.Generator) -> Floats:

@@ -2,18 +2,24 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robomme_interference_data.evaluate.score.outcomes import (
+    ERROR,
+    Flags,
     Statuses,
     SuccessRate,
     counting,
+    errors_as,
     rate_of,
     success,
+    success_by_run,
 )
+from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.stats.bootstrap import Floats, Interval
 from robomme_interference_data.stats.intervals import (
     LEVEL,
@@ -22,6 +28,7 @@ from robomme_interference_data.stats.intervals import (
     newcombe_paired,
     wilson,
 )
+from robomme_interference_data.stats.runs import ONE_RUN, RunSpread, independent, run_spread
 from robomme_interference_data.stats.significance import mcnemar, sign_flip, two_proportions
 from robomme_interference_data.stats.signs import SignFlips
 
@@ -41,10 +48,13 @@ class Pairs:
     second: float
     at: Callable[[float], Interval]  # second − first, with its interval of any level
     method: str  # of interval and p: `newcombe`, with repeats `clusters`, `unpaired`, `sign-flip`
-    pairs: int  # pairs of rollouts, one per episode: of the lowest shared model seed
+    pairs: int  # pairs of rollouts, one per episode: of the lowest repeat that both sides have
     gained: int  # pairs that succeed on the second side alone
     lost: int  # pairs that succeed on the first side alone
     p: float  # two-sided: McNemar's or sign-flip; unpaired, of two proportions
+    spread: RunSpread = ONE_RUN  # of the difference over training runs, which `at` and `p` hold
+    if_failures: "Pairs | None" = None  # the same if every error were a failure; None without any
+    if_successes: "Pairs | None" = None  # … a success
 
     @cached_property
     def change(self) -> Interval:
@@ -81,13 +91,81 @@ NO_PAIRS = Pairs(
 """The comparison over no episode."""
 
 
-def pair(
-    first: Statuses, second: Statuses, matched: Sequence[tuple[int, int]] | None = None
+def compare_cells(
+    first: Statuses,
+    second: Statuses,
+    training: NDArray[np.int64],
+    *,
+    same_weights: bool,
+    paired: bool = True,
 ) -> Pairs:
-    """Compare two sides over the same episodes: outcomes by episode and model seed, `(E, M) int8`.
+    """Compare two sides, with training runs and errors.
 
-    `matched` lists the places of paired model seeds on both sides, in order of preference; by
-    default seeds at equal places are paired.
+    Args:
+        first: Statuses by episode and repeat, `(E, M) int8`.
+        second: The same of the other side.
+        training: The training run of each repeat, `(M,)`.
+        same_weights: Whether equal runs of both sides have the same weights, so that only runs of
+            both sides are compared. Otherwise the runs of one side have nothing in common with
+            those of the other.
+        paired: Whether both sides had the same histories.
+    """
+    if same_weights and training.any():
+        shared = shared_runs([first, second], training)
+        first, second, training = first[:, shared], second[:, shared], training[shared]
+    compare = partial(_with_runs, training=training, same_weights=same_weights, paired=paired)
+    compared = compare(first, second)
+    if (first == ERROR).any() or (second == ERROR).any():
+        failures, successes = (
+            compare(errors_as(first, status), errors_as(second, status))
+            for status in (Status.FAIL, Status.SUCCESS)
+        )
+        compared = replace(compared, if_failures=failures, if_successes=successes)
+    return compared
+
+
+def shared_runs(sides: Sequence[Statuses], training: NDArray[np.int64]) -> Flags:
+    """Return which repeats, `(M,)`, are of training runs that count on all sides.
+
+    All of them, if no run does. Sides are `(E, M) int8`.
+    """
+    ran = [{*training[counting(side).any(axis=0)].tolist()} for side in sides]
+    shared = set.intersection(*ran)
+    return np.array([run in shared or not shared for run in training.tolist()])
+
+
+def _with_runs(
+    first: Statuses,
+    second: Statuses,
+    training: NDArray[np.int64],
+    *,
+    same_weights: bool,
+    paired: bool,
+) -> Pairs:
+    compared = pair(first, second) if paired else compare_unpaired(rate_of(first), rate_of(second))
+    if not training.any():
+        return compared
+    before, after = (success_by_run(side, training) for side in (first, second))
+    if same_weights and before.shape == after.shape:
+        spread = run_spread(after - before)
+    else:
+        spread = independent(run_spread(before), run_spread(after))
+    return add_runs(compared, spread)
+
+
+def add_runs(pairs: Pairs, spread: RunSpread) -> Pairs:
+    """Return a comparison over fixed training runs with the runs as a random effect."""
+
+    def at(level: float) -> Interval:
+        return spread.widen(pairs.at(level), level)
+
+    return replace(pairs, at=at, p=spread.p(pairs.at, pairs.p), spread=spread)
+
+
+def pair(first: Statuses, second: Statuses) -> Pairs:
+    """Compare two sides over the same episodes: outcomes by episode and repeat, `(E, M) int8`.
+
+    Repeats at equal places are pairs. All repeats have the same weights, or weights that are fixed.
     """
     before, after = success(first), success(second)
     known = ~np.isnan(before + after)
@@ -96,11 +174,11 @@ def pair(
     # As many rollouts as episodes: no repeats.
     if n == counting(first).sum() == counting(second).sum():
         return _of_single(before, after)
-    at = partial(_clusters, first, second)  # over all repeats; `matched` is for gained and lost
-    if matched is not None:
-        first_seeds, second_seeds = zip(*matched, strict=True)
-        first, second = first[:, first_seeds], second[:, second_seeds]
+    at = _clusters(first, second)
     both = counting(first) & counting(second)
+    if not both.any():  # no repeat in common, such as other seeds: each side's lowest
+        first, second = _lowest(first), _lowest(second)
+        both = counting(first) & counting(second)
     episodes = np.flatnonzero(both.any(-1))
     seed = both[episodes].argmax(-1)
     old, new = (side[episodes, seed] == 0 for side in (first, second))
@@ -115,6 +193,12 @@ def pair(
         lost=int((old & ~new).sum()),
         p=sign_flip(after - before),
     )
+
+
+def _lowest(status: Statuses) -> Statuses:
+    """Return the status of each episode's lowest repeat that counts, `(E, 1)`."""
+    lowest = counting(status).argmax(-1)
+    return np.asarray(np.take_along_axis(status, lowest[:, None], axis=-1))
 
 
 def _of_single(before: Floats, after: Floats) -> Pairs:
@@ -143,15 +227,20 @@ def _of_single(before: Floats, after: Floats) -> Pairs:
     )
 
 
-def _clusters(first: Statuses, second: Statuses, level: float) -> Interval:
-    """Return second − first with the interval of means of repeats."""
+def _clusters(first: Statuses, second: Statuses) -> Callable[[float], Interval]:
+    """Return second − first with the intervals of means of repeats, by level."""
     values = [success(side) for side in (first, second)]
     before, after = (float(side.mean()) for side in values)
     spread = float(values[0].std() * values[1].std())
     phi = (float((values[0] * values[1]).mean()) - before * after) / spread if spread else 0.0
     trials = [rate_of(side).trials for side in (first, second)]
-    old, new = (wilson(r * m, m, level) for r, m in zip((before, after), trials, strict=True))
-    return Interval(round(after - before, 12), *mover_interval(after, new, before, old, phi))
+
+    def at(level: float) -> Interval:
+        sides = zip((before, after), trials, strict=True)
+        old, new = (wilson(rate * m, m, level) for rate, m in sides)
+        return Interval(round(after - before, 12), *mover_interval(after, new, before, old, phi))
+
+    return at
 
 
 def pair_errors(before: Floats, after: Floats, test: SignFlips) -> Pairs:

@@ -4,11 +4,11 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from operator import attrgetter
 
 import numpy as np
 
-from robomme_interference_data.evaluate.score.outcomes import Flags, Outcomes, rate_of
+from robomme_interference_data.evaluate.score.outcomes import Flags, Outcomes
+from robomme_interference_data.evaluate.score.partners import share_weights
 from robomme_interference_data.stats.bootstrap import Interval
 from robomme_interference_data.stats.significance import ALPHA, holm
 from robomme_interference_data.stats.signs import simultaneous
@@ -24,7 +24,7 @@ from .comparison import (
     detectable,
 )
 from .contrast import Contrast, Effect, Measure
-from .pairs import Pairs, compare_unpaired, pair
+from .pairs import Pairs, compare_cells
 
 _Compared = Mapping[tuple[str, str], Pairs]
 
@@ -38,10 +38,13 @@ def all_pairs(outcomes: Outcomes, condition: str, systems: Sequence[str], here: 
     for system, other in combinations(systems, 2):
         second = outcomes.status[outcomes.cell(system, condition)][here]
         first = outcomes.status[outcomes.cell(other, condition)][here]
-        if outcomes.pairable(system, other):
-            compared[system, other] = pair(first, second)
-        else:
-            compared[system, other] = compare_unpaired(rate_of(first), rate_of(second))
+        compared[system, other] = compare_cells(
+            first,
+            second,
+            outcomes.training,
+            same_weights=share_weights(outcomes, system, other),
+            paired=outcomes.pairable(system, other),
+        )
     return compared
 
 
@@ -122,7 +125,6 @@ MATRIX = ComparisonTable(
     name="matrix",
     title="All pairs of systems",
     columns=SIDES | RATES | COMPLETE,
-    group=attrgetter("simulator", "condition"),
     corrected="the tests of a condition in one simulator",
     note=f"Complete cells within each condition. {BOTH_SIDES}",
 )
@@ -136,7 +138,7 @@ def matrix_table(contrasts: Iterable[Contrast]) -> Table:
         if contrast.effect is Effect.SYSTEMS and contrast.measure is Measure.SUCCESS
     ]
     table = comparison_table(MATRIX, pairs)
-    return replace(table, note=f"{table.note} {detectable(pairs, MATRIX.group)}".strip())
+    return replace(table, note=f"{table.note} {detectable(pairs)}".strip())
 
 
 def system_pairs(outcomes: Outcomes) -> Iterator[Contrast]:
@@ -160,4 +162,5 @@ def system_pairs(outcomes: Outcomes) -> Iterator[Contrast]:
                 Effect.SYSTEMS,
                 pairs,
                 complete=True,
+                group=("matrix", condition),
             )
