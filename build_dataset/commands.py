@@ -1,5 +1,6 @@
 """The command `build`."""
 
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -90,7 +91,7 @@ def build(
     if leaks:
         raise typer.Exit(1)
     if plan.manifests:
-        print_status(f"Next: robomme-interference verify {root} --audit")
+        print_status(f"Next: robomme-interference verify {shlex.quote(str(root))} --audit")
     elif plan.datasets:  # the buffers, if there are any, are of the old datasets
         print_status(f"Next: robomme-interference {next_build(root)}")
 

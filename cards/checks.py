@@ -1,6 +1,7 @@
 """Check a buffer set before it is published."""
 
 import logging
+import shlex
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -34,7 +35,7 @@ def check_buffer_set(buffer_set: BufferSet, progress: WorkProgress | None = None
             f"{buffer_set.location} has {counted(len(violations), 'violation')}, such as "
             f"{first.where}: {first.what}",
             "List all violations.",
-            f"verify {buffer_set.location}",
+            f"verify {shlex.quote(buffer_set.location)}",
         )
     leaks = audit_buffer_set(buffer_set).leaks
     if leaks:
@@ -42,7 +43,7 @@ def check_buffer_set(buffer_set: BufferSet, progress: WorkProgress | None = None
             f"{buffer_set.location} has {counted(len(leaks), 'leak')}, such as {leaks[0].kind}: "
             f"{leaks[0].where}",
             "List all leaks.",
-            f"verify {buffer_set.location} --audit",
+            f"verify {shlex.quote(buffer_set.location)} --audit",
         )
     for name in buffer_set.header.datasets if "build" not in missing_extras() else ():
         files = buffer_set.dataset_files(name)

@@ -1,5 +1,6 @@
 """The commands `card`, `publish` and `publish-results`."""
 
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -164,7 +165,7 @@ def publish(
     if unpublished and not opened.dataset_files(DEMONSTRATIONS).list(INDEX_DIR):
         print_status(
             "The demonstrations have no embeddings. To add them before publishing: "
-            f"robomme-interference index {buffer_set}"
+            f"robomme-interference index {shlex.quote(buffer_set)}"
         )
     if to is not None:
         check_output(to.resolve().parent)

@@ -20,7 +20,7 @@ from robomme_interference_data.evaluate.score.config import Expected, Settings
 from robomme_interference_data.evaluate.score.outcomes import STATUSES
 from robomme_interference_data.evaluate.score.plots.data import Data
 from robomme_interference_data.evaluate.score.plots.figures import draw_error_figure, draw_figure
-from robomme_interference_data.evaluate.score.report.page import headlines
+from robomme_interference_data.evaluate.score.report.headline import headline
 from robomme_interference_data.evaluate.score.scoring import Score, score
 from robomme_interference_data.evaluate.score.tables.cells import Coverage
 from robomme_interference_data.evaluate.score.writing import write_score
@@ -106,7 +106,8 @@ def results_facts(results: Score | Path) -> Facts:
             "error_counts": "does not count"
             if offline
             else "counts neither as success nor as failure",
-            "headlines": headlines(scored),
+            # A sentence each, because a card shortens long texts.
+            "headlines": [headline(scored, each.simulator) for each in all_outcomes],
             "figures": captions,
             "grids": [
                 {"title": table.title, "table": table, "note": Raw(table.note)}

@@ -60,15 +60,17 @@ def score(
     Examples:
     ```
     robomme-interference score my-run another-run --out my-score
-    robomme-interference score rollouts.csv --system retrieval-framesamp-modul \
+    robomme-interference score canonical_rollouts.csv retrieval_rollouts.csv \
       --against paper --out my-score
+    robomme-interference score act/eval_info.json pi0/eval_info.json \
+      --system act --system pi0 --out my-score
     ```
     """
     from robomme_interference_data.progress import WorkProgress
     from robomme_interference_data.runtime.memory import memory_limit
     from robomme_interference_data.viz.tables import tables_text
 
-    from .report.page import headlines
+    from .report.headline import headlines
     from .scoring import score as compute
     from .writing import write_score
 
@@ -127,6 +129,10 @@ def compare(
             metavar="LOOK/OF",
         ),
     ] = "1/1",
+    model_seed: Annotated[
+        int | None,
+        typer.Option(help="Seed of files that name none, such as lerobot-eval's --seed."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     r"""Compare two runs, or two conditions of one run, paired over shared episodes.
@@ -147,7 +153,8 @@ def compare(
 
     look = _look(looks)
     with memory_limit(_MEMORY_BYTES):
-        compared = compute(run_a, run_b, (system_a, system_b), lenient, conditions or (), look)
+        systems = (system_a, system_b)
+        compared = compute(run_a, run_b, systems, lenient, conditions or (), look, model_seed)
     _print_notes(compared.runs, compared.notes)
     if as_json:
         print_json(

@@ -65,6 +65,7 @@ def compare(
     lenient: bool = False,
     conditions: Sequence[str] = (),
     look: tuple[int, int] = (1, 1),
+    model_seed: int | None = None,
 ) -> RunComparison:
     """Compare two runs of one simulator over shared conditions and episodes.
 
@@ -73,20 +74,22 @@ def compare(
     are the same. Differences are the second's rate − the first's. Without a second run, two
     `conditions` of the first are compared; with one, also a single condition of both. `look` is the
     number of this look at the data and of all planned ones; with several, intervals and levels
-    spend 5% over all looks.
+    spend 5% over all looks. `model_seed` is the seed of files that name none.
     """
     _check_arguments(first, second, conditions, systems[0], lenient=lenient)
+    seeds = () if model_seed is None else (model_seed,)
     if len(conditions) == 1:
         conditions = (conditions[0], conditions[0])  # the same in both runs
     alpha = look_levels(look[1])[look[0] - 1] if look[1] > 1 else ALPHA
-    a_rows = read_rows([first], systems[0], lenient)
-    b_rows = a_rows if second is None else read_rows([second], systems[1], lenient)
+    a_rows = _read(first, systems[0], lenient, seeds)
+    b_rows = a_rows if second is None else _read(second, systems[1], lenient, seeds)
     runs = (a_rows,) if second is None else (a_rows, b_rows)
     measure = _measure(runs)
     check_scenes(a_rows, b_rows)
     a_sides, b_sides = sides_of(a_rows), sides_of(b_rows)
     matched = list(matched_sides((a_rows, b_rows), (a_sides, b_sides)))
-    notes = list(differing(a_rows, b_rows, matched))
+    notes = [*dict.fromkeys(note for rows in runs for note in rows.notes)]
+    notes += differing(a_rows, b_rows, matched)
     contrasts = list[Contrast]()
     for a, b in matched:
         own = list(_contrasts(a, b, conditions, measure, alpha))
@@ -194,6 +197,12 @@ def _table(contrasts: Sequence[Contrast], measure: Measure, alpha: float, title:
     return replace(table, note=f"{table.note} {more}".strip())
 
 
+def _read(
+    path: Path, system: str | None, lenient: bool, model_seeds: Sequence[int] = ()
+) -> CheckedRows:
+    return read_rows([path], () if system is None else (system,), lenient, model_seeds)
+
+
 def _check_arguments(
     first: Path,
     second: Path | None,
@@ -205,7 +214,7 @@ def _check_arguments(
     for name in conditions:
         parse_condition(name)
     if len(conditions) > 2 or (second is None and len({*conditions}) < 2):
-        hint, command = _two_conditions(first, read_rows([first], system, lenient))
+        hint, command = _two_conditions(first, _read(first, system, lenient))
         raise InvalidOptionError(
             f"conditions to compare: {' '.join(conditions) or 'none'}; expected two different "
             "ones, or two runs and at most two conditions",
@@ -213,7 +222,7 @@ def _check_arguments(
             command,
         )
     if second is not None and first.exists() and second.exists() and first.samefile(second):
-        hint, command = _two_conditions(first, read_rows([first], system, lenient))
+        hint, command = _two_conditions(first, _read(first, system, lenient))
         raise InvalidOptionError(f"{first} is given twice", hint, command)
 
 

@@ -31,7 +31,8 @@ class Settings:
 
     Attributes:
         rows: Folders of runs, or files of rows.
-        system: System of rows that name none.
+        system: System of files that name none: for all, or for each in their order.
+        model_seed: Model seed of files that name none, likewise.
         against: Published rates to compare with.
         expected: Episodes of a complete cell.
         margin: Margin of equivalence tests, in points; None for none.
@@ -42,9 +43,23 @@ class Settings:
         name="-",
         whole=True,
         metavar="ROWS",
-        help="Folders of runs, or CSV, parquet or jsonl files.",
+        help="Folders of runs, files of rows, or results of lerobot-eval or vla-eval.",
     )
-    system: str | None = setting(None, help="System of rows that name none.", group="Rows")
+    system: tuple[str, ...] = setting(
+        (),
+        whole=True,
+        metavar="NAME",
+        help="System of files that name none; repeated, of each of them in order.",
+        group="Rows",
+    )
+    model_seed: tuple[int, ...] = setting(
+        (),
+        whole=True,
+        metavar="SEED",
+        help="Seed of files that name none, such as lerobot-eval's --seed; repeated, of each of "
+        "them in order.",
+        group="Rows",
+    )
     against: Against | None = setting(
         None, help="Compare with the published rates.", group="Statistics"
     )

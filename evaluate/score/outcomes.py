@@ -60,6 +60,7 @@ class Outcomes:
     in_tables: Flags  # the cells that are expected or have rows, (S, C)
     without_revision: Flags  # systems whose rows name no revision of a buffer set, (S,)
     facts: tuple[frozenset[SystemFacts], ...]  # of each system; only `policy_id` varies, (S,)
+    seeds_repeat: bool = True  # whether another model seed repeats an episode in the same scene
 
     def cell(self, system: str, condition: str) -> tuple[int, int]:
         """Return the place of a cell on the first two axes."""
@@ -164,6 +165,8 @@ class Outcomes:
         Repeats have the same weights, and differ in the model seed; the two lowest of an episode
         that count are compared.
         """
+        if not self.seeds_repeat:
+            return 0, 0
         pairs = flips = 0
         for run in range(int(self.training.max()) + 1):
             status = self.status[..., self.training == run]
@@ -258,13 +261,16 @@ def rate_of(status: Statuses, training: NDArray[np.int64] | None = None) -> Succ
 
 def outcomes_of(rows: CheckedRows, expected: Expected) -> dict[str, Outcomes]:
     """Return the outcomes of each simulator, by its name; recordings have none."""
-    return {
-        name: _outcomes(
-            [r for r in rows if r.simulator == name], name, expected, rows.without_revision
-        )
-        for name in rows.names("simulator")
-        if name != RECORDINGS
-    }
+    found = {}
+    for name in rows.names("simulator"):
+        if name != RECORDINGS:
+            here = [row for row in rows if row.simulator == name]
+            # Other benchmarks do not have this one's grid, and their seeds may change the scene.
+            other = name in {simulator for simulator, _ in rows.scenes}
+            grid = Expected.OBSERVED if other else expected
+            outcomes = _outcomes(here, name, grid, rows.without_revision)
+            found[name] = replace(outcomes, seeds_repeat=not other)
+    return found
 
 
 def offline_outcomes(rows: CheckedRows) -> Outcomes | None:

@@ -15,10 +15,11 @@ from .config import Against, Expected, Settings
 from .outcomes import Outcomes, offline_outcomes, outcomes_of
 from .partners import base_of, ceilings_of
 from .rows.reading import CheckedRows, read_rows
-from .tables import effects, families, ranks, slopes
+from .tables import effects, families, family_falls, ranks, slopes
 from .tables.cells import SuccessCell, cells_of, main_table, parts_table
 from .tables.contrast import Contrast
 from .tables.correction import correct, with_primary
+from .tables.cost import cost_table
 
 if TYPE_CHECKING:
     from .tables.action_error import ErrorCell
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 TABLES = (
     "main",
     "parts",
-    "chance",
+    "cost",
     "effects",
     "interaction",
     "equivalence",
@@ -34,6 +35,7 @@ TABLES = (
     "evidence_use",
     "decay",
     "families",
+    "family_falls",
     "matrix",
     "action_error",
     "action_error_effects",
@@ -105,9 +107,10 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     simulated = tuple(outcomes.values())
     recordings = offline_outcomes(rows)
     cells = cells_of(simulated)
-    compared, notes = _compared(simulated, draws)
+    compared, unpaired = _compared(simulated, draws)
     contrasts = correct(with_primary(compared, simulated))
-    notes += [sentence for each in simulated if (sentence := _repeat_noise(each))]
+    notes = [*rows.notes, *unpaired]
+    notes += [sentence for each in simulated if (sentence := repeat_noise(each))]
     tables = [
         main_table(cells),
         parts_table(cells),
@@ -115,15 +118,17 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         slopes.interaction_table(contrasts),
         slopes.decay_table(simulated, draws),
         families.families_table(simulated, contrasts),
+        family_falls.family_falls_table(simulated, contrasts),
         ranks.matrix_table(contrasts),
+        cost_table(rows, cells),
     ]
     error_cells = list["ErrorCell"]()
     published: Sequence[SuccessCell] = ()
     # The tables below are for some rows or settings only: what is not used is not imported.
     if any(cell.chance >= 0 for cell in cells):
-        from .tables.chance import chance_table
+        from .tables.chance import with_chance
 
-        tables.append(chance_table(outcomes, cells))
+        tables[0] = with_chance(tables[0], outcomes, cells)
     if any((each.evidence >= 0).any() for each in simulated):
         from .tables.evidence_kept import evidence_tables
 
@@ -172,7 +177,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
 
 def _rows(settings: Settings) -> CheckedRows:
     """Read the rows, of which some must be valid and no errors."""
-    rows = read_rows(settings.rows, settings.system, settings.lenient)
+    rows = read_rows(settings.rows, settings.system, settings.lenient, settings.model_seed)
     sources = ", ".join(map(str, settings.rows))
     if not len(rows):
         if rows.bad_count:
@@ -209,7 +214,7 @@ def _compared(all_outcomes: Sequence[Outcomes], draws: int) -> tuple[list[Contra
     return contrasts, notes
 
 
-def _repeat_noise(outcomes: Outcomes) -> str:
+def repeat_noise(outcomes: Outcomes) -> str:
     """Return a sentence on how often two repeats of a rollout disagree; empty without repeats."""
     pairs, flips = outcomes.repeat_flips
     if not pairs:

@@ -4,7 +4,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import InvalidOptionError, named
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.stats.intervals import wilson
@@ -112,7 +112,16 @@ def matched_sides(
 
 
 def check_scenes(rows: CheckedRows, other_rows: CheckedRows) -> None:
-    """Check that the two runs have the same seed for each episode."""
+    """Check that the two runs have the same scenes, as far as their rows tell."""
+    for simulator in dict.fromkeys(simulator for simulator, _ in rows.scenes):
+        both = (*rows.scenes.items(), *other_rows.scenes.items())
+        found = {scenes for (name, _), scenes in both if name == simulator}
+        if len(found) > 1 or any(seed is None for scenes in found for _, seed in scenes):
+            raise InvalidOptionError(
+                f"the scenes in {simulator} are not known to be the same in both files",
+                f"If their seeds are the same, name them: {named('model_seed')}; `score` compares "
+                "them without pairs.",
+            )
     known, others = (
         {
             (unshifted(row.simulator), row.family, row.split, row.episode): row.seed
@@ -145,6 +154,8 @@ def differing(
                 "is the effect of the shift."
             )
         revisions = [rows.revisions.get(first), other_rows.revisions.get(second)]
+        if any(simulator == first for simulator, _ in rows.scenes):
+            continue  # of another benchmark, whose scenes are known to be the same
         if rows is not other_rows and revisions == [None, None]:
             yield f"The rows of {first} name no revision of a buffer set: the histories may differ."
         elif revisions[0] != revisions[1]:

@@ -1,5 +1,6 @@
 """Commands that list and fetch buffer sets, and check this machine."""
 
+import shlex
 from dataclasses import asdict
 from operator import attrgetter
 from pathlib import Path
@@ -139,7 +140,7 @@ def fetch(
     if as_json:
         print_json({"to": None if to is None else str(to), "repositories": repositories})
     elif not dry_run:
-        print_status(f"Next: robomme-interference list {to or opened.location}")
+        print_status(f"Next: robomme-interference list {shlex.quote(str(to or opened.location))}")
 
 
 def doctor(as_json: AsJson = False) -> None:

@@ -1,5 +1,6 @@
 """The command `show`."""
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -76,7 +77,7 @@ def show(
         return
     if condition is None:
         raise InvalidOptionError(
-            f"{named('condition')} is missing", "Such as k3.", f"list {buffer_set}"
+            f"{named('condition')} is missing", "Such as k3.", f"list {shlex.quote(buffer_set)}"
         )
     scene_shift = parse_shift(shift)
     if out is html is rerun is None:

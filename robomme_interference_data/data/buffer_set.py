@@ -2,6 +2,7 @@
 
 import logging
 import re
+import shlex
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -149,7 +150,8 @@ class BufferSet:
             for name in self.header.datasets
             if self.copy is None or self.copy.has_dataset(self.dataset_files(name))
         ]
-        command = f"build {self.location} --only manifests" if self.is_own else None
+        own = f"build {shlex.quote(self.location)} --only manifests"
+        command = own if self.is_own else None
         return SetDatasets(names, self.dataset_files, self.header, (self.fix, command))
 
     def dataset_files(self, name: str) -> Files:
@@ -222,7 +224,8 @@ class BufferSet:
             command = f"build BUFFER_SET --demonstrations {location} --source KIND:PATH"
             names = [name for name in self.conditions if name not in conditions]
             return f"{command} --conditions {','.join([*names, *conditions])}"
-        return f"build {self.location} --only manifests --conditions {','.join(conditions)}"
+        added = ",".join(conditions)
+        return f"build {shlex.quote(self.location)} --only manifests --conditions {added}"
 
     @property
     def fix(self) -> str:

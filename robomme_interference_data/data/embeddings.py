@@ -5,6 +5,7 @@ dataset, encoder and camera. Every episode has its own file (`docs/reference/fil
 Only this module turns features into embeddings, both of stored frames and of live images.
 """
 
+import shlex
 from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
@@ -272,4 +273,4 @@ def _remedy(files: Files, encoder: str, camera: str) -> tuple[str, str]:
     else:
         hint = f"Fetch {files.describe()} and embed its frames, or ask its publisher to."
     option = "" if camera == "front" else f" --camera {camera}"
-    return hint, f"index {folder} --encoder {encoder}{option}"
+    return hint, f"index {shlex.quote(str(folder))} --encoder {encoder}{option}"

@@ -2,6 +2,7 @@
 
 import logging
 import re
+import shlex
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -205,7 +206,7 @@ def _needed(
     if not queries:
         raise InvalidOptionError(
             f"no buffer of {buffer_set.location} has one of the episodes {config.episodes}",
-            command=f"list {buffer_set.location}",
+            command=f"list {shlex.quote(buffer_set.location)}",
         )
     datasets = {
         name: buffer_set.datasets[name]

@@ -1,5 +1,6 @@
 """What a copy of a published buffer set holds: `fetch --to` may have copied a part of it."""
 
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -32,7 +33,7 @@ def open_copy(root: Path) -> "FetchedCopy":
 
 def fetch_command(root: Path, record: FetchRecord) -> str:
     """Return the command that adds all that a copy lacks."""
-    return f"fetch {record.location} --to {root}"
+    return f"fetch {record.location} --to {shlex.quote(str(root))}"
 
 
 def earlier_files(to: Path, location: str, header: Path) -> tuple[str, ...]:

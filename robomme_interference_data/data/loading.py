@@ -194,13 +194,13 @@ def open_dataset(buffer_set: BufferSet, name: str, more: str = "") -> Dataset:
     hint, command = "Ask its publisher to add them.", None
     if buffer_set.is_own and Path(buffer_set.location, name, IDENTITY_PATH).is_file():
         hint = "It is built; plan the buffers again to include it."
-        command = f"build {buffer_set.location} --only manifests"
+        command = f"build {shlex.quote(buffer_set.location)} --only manifests"
     elif buffer_set.is_own:
         hint = (
             "Build them from the source of its demonstrations, with the same options as then, such "
             f"as {named('families_file')}; then plan the buffers again."
         )
-        command = f"build {buffer_set.location} --only {name} --source KIND:PATH"
+        command = f"build {shlex.quote(buffer_set.location)} --only {name} --source KIND:PATH"
     raise MissingFileError(
         f"{buffer_set.location} has no {name}", f"{hint} {more}".strip(), command
     )

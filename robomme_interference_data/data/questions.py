@@ -1,6 +1,7 @@
 """Questions about the past: at most one per query of a buffer set, with a marked picture."""
 
 import re
+import shlex
 import string
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -100,7 +101,7 @@ def read_questions(buffer_set: BufferSet) -> dict[EpisodeId, Question]:
     if all(record.simulator is None for record in recorded):
         hint = "Questions need demonstrations of a simulator that lists the possible answers."
     elif buffer_set.is_own:
-        hint, command = "", f"build {buffer_set.location} --only questions"
+        hint, command = "", f"build {shlex.quote(buffer_set.location)} --only questions"
     try:
         path = buffer_set.files.path(QUESTIONS_PATH)
     except MissingFileError:

@@ -32,7 +32,8 @@ class SignFlips:
 
     def at(self, level: float = LEVEL) -> Interval:
         """Return the mean and its interval: all values that the test does not reject."""
-        rank = math.floor((1 - level) * (1 + len(self.low)) + 1e-9)
+        # At most all draws: a level of 0 would be one more.
+        rank = min(math.floor((1 - level) * (1 + len(self.low)) + 1e-9), len(self.low))
         if not (self.wide and rank):
             return Interval(self.value)
         return Interval(self.value, float(self.low[rank - 1]), float(self.high[rank - 1]))

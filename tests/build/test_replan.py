@@ -159,7 +159,8 @@ def test_the_files_of_a_repository_are_not_planned_again(tmp_path: Path, run: An
     words = ("publish", GOLDEN, "--repo-id", "someone/tiny", "--to", root)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("robomme_interference_data.cards.checks.check_buffer_set", lambda *_: None)
-        assert run(*words)[0] == 0
+        code, _, err = run(*words)
+        assert code == 0, err
     before = contents(root)
     code, _, err = run("build", root, "--drop", "k7", "--yes", "--json")
     error = json.loads(err)

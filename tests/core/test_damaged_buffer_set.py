@@ -1,6 +1,7 @@
 """Buffer sets with missing, damaged or exchanged parts: one error each."""
 
 import json
+import shlex
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from support.buffer_sets import GOLDEN
+from support.buffer_sets import GOLDEN, copy_buffer_set
 from support.damage import HEADER, ROWS, edit, renew_header
 from support.lerobot_layouts import edit_columns, edit_info
 from support.messages import raises
@@ -47,6 +48,18 @@ def test_what_is_no_buffer_set(tmp_path: Path) -> None:
         load_buffer_set(str(tmp_path / "nowhere"))
     with raises(InvalidOptionError):
         load_buffer_set(GOLDEN, revision="data-1.0.0")
+
+
+def test_commands_quote_the_folder(tmp_path: Path) -> None:
+    root = copy_buffer_set(tmp_path / "my set")
+    with pytest.raises(UnknownNameError) as caught:
+        load_buffer_set(root).planned("k2")
+    words = ["build", str(root), "--only", "manifests"]
+    assert shlex.split(caught.value.command or "")[:4] == words
+    shutil.rmtree(root / "manifests")
+    with pytest.raises(MissingFileError) as missing:
+        load_buffer_set(root)
+    assert shlex.split(missing.value.command or "") == words
 
 
 @pytest.mark.parametrize("name", ["demonstrations", "distractors", ROWS])

@@ -18,8 +18,8 @@ from robomme_interference_data.evaluate.run.plan import RunPlan
 from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.score.compare import compare
 from robomme_interference_data.evaluate.score.plots.figures import draw_error_figure
+from robomme_interference_data.evaluate.score.report.headline import headlines
 from robomme_interference_data.evaluate.score.report.methods import methods
-from robomme_interference_data.evaluate.score.report.page import headlines
 from robomme_interference_data.evaluate.score.rows.export import export
 from robomme_interference_data.evaluate.score.rows.reading import read_rows
 from robomme_interference_data.evaluate.score.writing import write_score
@@ -124,7 +124,8 @@ def test_broken_recordings_are_counted(broken: Path) -> None:
     pair = made.record(found, "action_error_effects", effect="systems")
     assert (pair["system"], pair["against_system"], pair["n"]) == ("other", "mine", 4)
     assert (pair["difference"], pair["complete"]) == (0, False)
-    assert "errors" in headlines(found)["recordings"].lower()
+    # The two of `mine`.
+    assert "2 broke" in headlines(found)["recordings"]
 
 
 def test_planned_recordings_are_expected(tmp_path: Path) -> None:
@@ -203,7 +204,7 @@ def test_the_lowest_error_is_named_and_each_system_that_is_worse_than_a_baseline
     text = headline_of(tmp_path, {**BASELINES, **systems})
     first, second, *rest = text.split(". ")
     assert "good has the lowest" in first and "0.1000 under k0" in first
-    assert second.startswith("bad is worse") and "Hold (0.1797)" in second
+    assert second.startswith("Under k0, bad (0.2000) is worse") and "Hold (0.1797)" in second
     assert "worse" not in "".join(rest)
 
 

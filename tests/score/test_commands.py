@@ -17,7 +17,7 @@ import pytest
 from support import scoring as made
 from support.bombs import write_rows_bomb
 from support.messages import raises
-from support.scoring import OWN, RETRIEVAL, run
+from support.scoring import OWN, run
 
 from robomme_interference_data.errors import (
     FormatError,
@@ -54,7 +54,7 @@ def test_score_and_export_on_the_command_line(
 ) -> None:
     out = tmp_path / "out"
     words = [
-        *("score", made.RELEASED, "--system", RETRIEVAL, "--against", "paper", "--out", out),
+        *("score", made.RELEASED, "--against", "paper", "--out", out),
         *("--export", tmp_path / "export", "--json"),
     ]
     monkeypatch.setattr(sys, "argv", ["robomme-interference", *map(str, words)])
@@ -66,11 +66,11 @@ def test_score_and_export_on_the_command_line(
     assert f"Report: {out / 'report.html'}" in done.stderr
     beyond = {"evidence_effects", "evidence_use"}  # the rows know no evidence
     beyond |= {"matrix", "interaction"}  # one system alone
-    beyond |= {"equivalence", "chance"}  # no margin, and no questions
+    beyond |= {"equivalence", "cost"}  # no margin, and no times
     beyond |= {"action_error", "action_error_effects"}  # nor offline
     assert {path.stem for path in (out / "tables").glob("*.csv")} == {*TABLES} - beyond
     drawn = sorted(path.name for path in (out / "figures").iterdir())
-    kinds = ("difficulty", "effects", "families", "heatmap", "retrieval", "success")
+    kinds = ("difficulty", "effects", "families", "family_falls", "heatmap", "retrieval", "success")
     assert drawn == [f"{kind}-robomme.svg" for kind in kinds]
     # The released rows come back byte for byte.
     (exported,) = (tmp_path / "export").iterdir()
@@ -172,7 +172,8 @@ def test_exported_runs_are_read_back_the_same(tmp_path: Path) -> None:
     again = read_rows(exported)  # their names tell the systems
     columns = attrgetter("simulator", "system", "condition", "family", "episode", "status")
     assert sorted(map(columns, again)) == sorted(map(columns, rows))
-    assert read_rows([exported[1]], OWN).names("system") == [OWN]  # what is given goes first
+    with raises(InvalidOptionError):
+        read_rows([exported[1]], ["another"])
     odd = exported[1].rename(tmp_path / "a b-tabletop_rollouts.csv")
     with raises(InvalidIdError):
         read_rows([odd])
@@ -288,4 +289,4 @@ def test_a_score_of_a_run_imports_few_modules(tmp_path: Path) -> None:
     )
     modules = done.stdout.split()
     assert "robomme_interference_data.evaluate.score.tables.evidence_kept" in modules
-    assert len(modules) <= 47, sorted(modules)
+    assert len(modules) <= 45, sorted(modules)

@@ -23,6 +23,7 @@ from robomme_interference_data.evaluate.score.plots.figures import (
 from robomme_interference_data.evaluate.score.plots.styles import SeriesStyle, styles_of
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import PAPER_SYSTEMS, SYSTEMS
+from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.viz.figure import open_figure
 
 
@@ -168,6 +169,50 @@ def test_twelve_systems_are_named_at_their_values_without_dodge(full: Score, fig
         lines = [line for line in other.axes[0].lines if len(line.get_xdata()) > 1]
         assert lines[0].get_ydata()[0] == pytest.approx(100 * 204 / 450)
         assert len(lines[0].get_xdata()) == 4
+
+
+@pytest.mark.slow
+def test_numbers_in_figures_are_those_of_tables(full: Score) -> None:
+    shown = Data(full, "robomme")
+    systems = {style.label: name for name, style in shown.styles.items()}
+    with open_figure() as figure:
+        assert draw_figure("heatmap", figure, shown)
+        for axes in figure.axes[: len(shown.systems)]:
+            conditions = [label.get_text() for label in axes.get_xticklabels()]
+            assert axes.texts
+            for text in axes.texts:
+                x, y = text.get_position()
+                system = systems[axes.get_title().replace("\n", " ")]
+                condition = NO_HISTORY if conditions[x] == "none" else conditions[x]
+                key = {"system": system, "condition": condition, "part": shown.families[y]}
+                assert text.get_text() == f"{100 * made.record(full, 'parts', **key)['rate']:.0f}"
+    with open_figure() as figure:
+        assert draw_figure("matrix", figure, shown)
+        for axes in figure.axes:
+            rows, columns = (
+                [systems[label.get_text().replace("\n", " ")] for label in labels]
+                for labels in (axes.get_yticklabels(), axes.get_xticklabels())
+            )
+            for text in axes.texts:
+                x, y = text.get_position()
+                [pair] = [
+                    record
+                    for record in made.records(full, "matrix", condition=axes.get_title())
+                    if {record["system"], record["against_system"]} == {rows[y], columns[x]}
+                ]
+                points = 100 * pair["difference"] * (1 if pair["system"] == rows[y] else -1)
+                assert int(text.get_text().replace("\N{MINUS SIGN}", "-")) == round(points)
+                assert (text.get_weight() == "bold") == (pair["verdict"] == "shown")
+    with open_figure() as figure:
+        assert draw_figure("family_falls", figure, shown)
+        for axes, system in zip(figure.axes, shown.systems[1:], strict=False):  # without π0.5
+            falls = made.record(
+                full, "families", system=system, condition="k7", against_condition="k0"
+            )
+            lines = [line for line in axes.lines if line.get_marker() == "|"]
+            [without] = [sorted(line.get_xdata()) for line in lines]
+            ends = [100 * falls[name] for name in ("without_low", "without_high")]
+            assert [without[0], without[-1]] == pytest.approx(ends)
 
 
 def test_systems_of_equal_rates_keep_the_order_of_tables(tmp_path: Path, figure: Any) -> None:

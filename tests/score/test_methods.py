@@ -28,8 +28,10 @@ def test_methods_are_those_of_the_rows(full: Score) -> None:
     )
     for told in (
         "under 5 conditions of RoboMME-Interference [@rathi2026robomme] (no-history, k0, ",
-        "25,200 rollouts of 450 episodes of 9 families. 56 of 56 cells (system × condition) are "
-        "complete. No rollout ended with an error.",
+        "25,200 rollouts of 450 episodes of 9 families.\n56 of 56 cells (system × condition) are "
+        "complete.\nNo rollout ended with an error.",
+        "The primary analysis compares k7 with k0",
+        "not for other runs of the same training",
         "exact McNemar tests",
         "200 draws of episodes",
         "robomme-interference-data ",

@@ -17,7 +17,7 @@ from support.scoring import GOOD
 
 from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
 from robomme_interference_data.evaluate.score.compare import compare
-from robomme_interference_data.evaluate.score.rows import files
+from robomme_interference_data.evaluate.score.rows import row_format
 from robomme_interference_data.evaluate.score.rows.export import export
 from robomme_interference_data.evaluate.score.rows.reading import CheckedRows, read_rows
 
@@ -294,7 +294,7 @@ def test_rows_under_several_shifts_never_mix(tmp_path: Path) -> None:
         f"{made.OWN}-tabletop+light:2_rollouts.csv",
         f"{made.OWN}-tabletop_rollouts.csv",
     ]
-    assert told(read_rows(exported, made.OWN)) == told(found.rows)
+    assert told(read_rows(exported, [made.OWN])) == told(found.rows)
     both = [made.write_csv(tmp_path / "b.csv", rows), made.write_csv(tmp_path / "c.csv", lit)]
     # Only a comparison that is asked for pairs them, and says so.
     (note, *_) = compare(*both).notes
@@ -316,7 +316,7 @@ def test_what_is_no_shift_is_a_bad_row(tmp_path: Path, column: str, value: str) 
 @pytest.mark.parametrize(
     ("header", "message"),
     [
-        ("family,condition,episode,status", "lacks the columns success"),
+        ("family,condition,episode", "lacks the columns status or success"),
         ("family,condition,episode,status,success", "names no system"),
         ("system,family,family,condition,episode,status,success", "two columns 'family'"),
         ("", "lacks the columns"),
@@ -381,7 +381,7 @@ def test_a_damaged_line_of_a_record_is_numbered_as_in_an_editor(
 def test_files_of_too_many_rows_are_not_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(files, "_MAX_ROWS", 100)
+    monkeypatch.setattr(row_format, "_MAX_ROWS", 100)
     rows = made.rows()
     sources = (
         made.write_csv(tmp_path / "a.csv", rows),

@@ -1,10 +1,11 @@
-"""Results of vla-eval as rows: what fails is an error, and what is no result is refused."""
+"""Results of vla-eval as rows: of this benchmark, and of others, of which less is known."""
 
 import json
 from pathlib import Path
 from typing import Any
 
 import pytest
+from support import scoring as made
 from support.messages import raises
 from support.scoring import OWN, REVISION
 
@@ -59,3 +60,86 @@ def test_episodes_beyond_the_last_are_bad_rows(tmp_path: Path) -> None:
 def test_other_files_are_no_results(tmp_path: Path, episode: Any) -> None:
     with raises(FormatError):
         read_rows([write(tmp_path / "a.json", episode)])
+
+
+# --- other benchmarks --------------------------------------------------------------------------
+
+
+def of_libero(
+    path: Path, letters: str, seed: int | None = 7, suite: str = "spatial", **changed: Any
+) -> Path:
+    """Results of one task of LIBERO, a letter for each episode, as vla-eval 0.8 writes them."""
+    episodes = [
+        {"episode_id": n, "metrics": {"success": letter == "s"}, "steps": 2000, "elapsed_sec": 3.2}
+        for n, letter in enumerate(letters)
+    ]
+    for episode, letter in zip(episodes, letters, strict=True):
+        if letter == "e":
+            episode["failure_reason"] = "server_unreachable"
+    task = {"task": "pick up the bowl", "episodes": episodes, "num_episodes": len(letters)}
+    results = {"benchmark": "LIBEROBenchmark", "mode": "sync", "tasks": [task]}
+    results["config"] = {"params": {"suite": suite, "seed": seed}}
+    if seed is not None:
+        results["seed"] = seed
+    path.write_text(json.dumps(results | changed))
+    return path
+
+
+def test_episodes_of_other_benchmarks(tmp_path: Path) -> None:
+    rows = read_rows([of_libero(tmp_path / "a.json", "sfe")], ["act"])
+    shared = ("act", "LIBEROBenchmark", "no-history", "pick_up_the_bowl", 7)
+    assert [
+        (
+            row.system,
+            row.simulator,
+            row.condition,
+            row.family,
+            row.model_seed,
+            row.episode,
+            row.status,
+        )
+        for row in rows
+    ] == [(*shared, n, status) for n, status in enumerate(("success", "fail", "error"))]
+
+
+@pytest.mark.parametrize(
+    ("changed", "paired"),
+    [({}, True), ({"seed": 8}, False), ({"suite": "goal"}, False), ({"seed": None}, False)],
+)
+def test_systems_are_paired_in_the_same_evaluation(
+    tmp_path: Path, changed: dict[str, Any], paired: bool
+) -> None:
+    first = of_libero(tmp_path / "a.json", "sfff")
+    second = of_libero(tmp_path / "b.json", "ssff", **changed)
+    found = made.score(first, second, system=("act", "smolvla"))
+    assert (made.record(found, "matrix")["gained"] is not None) is paired
+
+
+def test_seeds_in_the_results_keep_repeats_apart(tmp_path: Path) -> None:
+    paths = [of_libero(tmp_path / "a.json", "sfff"), of_libero(tmp_path / "b.json", "ssff", seed=8)]
+    found = made.score(*paths, system=("act",))
+    assert made.record(found, "main")["rate"] == 3 / 8
+    with raises(FormatError):
+        read_rows([paths[0], of_libero(tmp_path / "c.json", "ssff")], ["act"])
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"benchmark": None},
+        {"seed": "7"},
+        {"tasks": [{"task": "x", "episodes": [{"episode_id": 0, "metrics": {"success": 0.5}}]}]},
+        {"tasks": [{"task": "x", "episodes": [{"episode_id": 0, "metrics": {}}]}]},
+        {"tasks": [{"task": "x", "episodes": [{"episode_id": "0", "metrics": {"success": True}}]}]},
+        {"tasks": [{"task": "a b", "episodes": []}, {"task": "a_b", "episodes": []}]},
+    ],
+)
+def test_other_results_that_are_no_outcomes(tmp_path: Path, changed: dict[str, Any]) -> None:
+    with raises(FormatError):
+        read_rows([of_libero(tmp_path / "a.json", "sf", **changed)], ["act"], lenient=True)
+
+
+def test_results_without_episodes_are_no_score(tmp_path: Path) -> None:
+    path = of_libero(tmp_path / "a.json", "s", tasks=[])
+    with raises(FormatError):
+        made.score(path, system=("act",))

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from support import eval_info
 from support.buffer_sets import GOLDEN
 from support.damage import renew_header
 from support.recordings import encode_image
@@ -45,6 +46,15 @@ _SCENES = {
     for one in json.loads((GOLDEN.parent / "robomme" / "scenes.json").read_text())
 }
 """Family to the recorded scene of an episode."""
+
+_EPISODE = {"episode_id": 0, "metrics": {"success": True}, "steps": 9}
+_RESULTS = {
+    "benchmark": "LIBERO",
+    "seed": 7,
+    "config": {"params": {"suite": "spatial"}},
+    "tasks": [{"task": "pick up the bowl", "episodes": [_EPISODE]}],
+}
+"""Results of vla-eval with another benchmark."""
 
 _MAX_LISTED = 64  # of what a file lists, so many are looked at: there may be any number
 
@@ -85,6 +95,8 @@ def places(root: Path) -> Path:
     (root / "single/a.png").write_bytes(image)
     shutil.copy(GOLDEN / "demonstrations/meta/SHA256SUMS", root / "single")
     (root / "single/scene.json").write_text(_SCENES["VideoUnmaskSwap"])
+    eval_info.write(root / "single/eval_info.json", {("pusht", 0): "sf", ("pusht", 1): "fs"})
+    (root / "single/results.json").write_text(json.dumps(_RESULTS))
     return root
 
 
@@ -176,8 +188,13 @@ def _run(root: Path) -> None:
 def _record(root: Path) -> None:
     path = root / "run" / RUN_RECORD
     with suppress(InterferenceError):  # which is told again below
-        read_rows([path], "mine", lenient=True)
+        read_rows([path], ["mine"], lenient=True)
     read_run(root / "run")
+
+
+def _outcomes(name: str) -> Callable[[Path], object]:
+    """Return a reader of results of another program."""
+    return lambda root: read_rows([root / "single" / name], ["mine"])
 
 
 def _image(root: Path) -> None:
@@ -228,6 +245,8 @@ TARGETS = {
     "index": Target("buffer_set/distractors/index/thumbnail/index.json", _index),
     "run": Target(f"run/{RUN_HEADER}", _run),
     "record": Target(f"run/{RUN_RECORD}", _record),
+    "lerobot-eval": Target("single/eval_info.json", _outcomes("eval_info.json")),
+    "vla-eval": Target("single/results.json", _outcomes("results.json")),
 }
 """All readers of untrusted files, by name."""
 

@@ -217,6 +217,8 @@ def score(
     **options: Any,
 ) -> Score:
     """Score rows; by their own grid and with few draws, unless it is said otherwise."""
+    if isinstance(system := options.get("system"), str):
+        options["system"] = (system,)
     against = Against.PAPER if paper else None
     return compute(Settings(paths, expected=expected, against=against, **options), draws)
 

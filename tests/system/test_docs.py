@@ -16,7 +16,7 @@ from typing import Any
 import av
 import numpy as np
 import pytest
-from support import worlds
+from support import eval_info, worlds
 from support.buffer_sets import GOLDEN, QUERIES
 from support.chat_server import ChatServer
 from support.command_lines import parse
@@ -132,6 +132,8 @@ def test_the_commands_of_the_pages_run(
     (tmp_path / "demo").mkdir()
     for name in ("my-buffers", "my-training", "acting-buffers", "demo/buffers"):
         (tmp_path / name).symlink_to(buffer_set)
+    for name, letters in (("act", "ssff"), ("pi0", "sssf")):
+        eval_info.write(tmp_path / name / "eval_info.json", {("pusht", 0): letters})
     monkeypatch.chdir(tmp_path)
     world = buffer_set if asked else tiny_buffers
     monkeypatch.setenv(worlds.BUFFER_SET, str(world))

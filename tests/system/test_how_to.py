@@ -32,7 +32,7 @@ HOW_TO = ROOT / "docs" / "how-to"
 PAGES = sorted(path.name for path in HOW_TO.glob("*.md"))
 
 NOT_RUN = {
-    ("compare-systems.md", "score retrieval_rollouts.csv"): "a file that the paper's authors host",
+    ("compare-systems.md", "score canonical_rollouts.csv"): "files that the paper's authors host",
     (
         "connect-a-policy.md",
         "evaluate my-buffers --policy lerobot",

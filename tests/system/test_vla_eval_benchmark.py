@@ -69,7 +69,7 @@ def test_its_rows_are_those_of_evaluate(tmp_path: Path) -> None:
     }
     # They are scored together with those of runs.
     scored = read_rows([results])
-    same = {"video": None, "policy": None, "policy_id": None}
+    same = dict.fromkeys(("video", "policy", "policy_id", "history_s", "policy_s", "model_s"))
     own = {row._replace(**same) for row in read_rows([tmp_path / "own"])}
     assert {row._replace(**same) for row in scored} == own
 

@@ -8,6 +8,7 @@ from typing import Any, Self
 from robomme_interference_data.evaluate.score.partners import base_of
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.cells import SuccessCell
+from robomme_interference_data.evaluate.score.tables.contrast import Verdict
 from robomme_interference_data.evaluate.systems import published_base
 from robomme_interference_data.schema.conditions import (
     Condition,
@@ -15,7 +16,6 @@ from robomme_interference_data.schema.conditions import (
     in_order,
     parse_condition,
 )
-from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.viz.figure import INK
 
 from .styles import SeriesStyle, styles_of
@@ -43,8 +43,10 @@ class Data:
         least: The fewest sessions of a condition with counted sessions.
         contrasts: Comparisons of the systems that have rows.
         flips: Share of outcomes that differ between repeats; None without repeats.
-        distinguishable: Condition and pair of systems that differ significantly.
+        distinguishable: Condition and pair of systems that are shown to differ, in `matrix`.
         by_evidence_kept: The rate of each level of evidence, as rows of `evidence_effects`.
+        costs: The cost of each cell over all episodes, as rows of `cost`.
+        family_falls: The fall of each system in each family, as rows of `family_falls`.
         chance: Success of guessing by part of the episodes, if all are questions.
     """
 
@@ -61,7 +63,7 @@ class Data:
         self.distinguishable = {
             (record["condition"], frozenset((record["system"], record["against_system"])))
             for record in _records(score, "matrix", simulator)
-            if record["p_holm"] < ALPHA
+            if record["verdict"] == Verdict.SHOWN
         }
         # Rows with `against_kept` compare two levels of evidence.
         self.by_evidence_kept = [
@@ -69,6 +71,8 @@ class Data:
             for record in _records(score, "evidence_effects", simulator)
             if not record["against_kept"]
         ]
+        self.costs = _records(score, "cost", simulator)
+        self.family_falls = _records(score, "family_falls", simulator)
         asked = sorted((cell for cell in own if cell.chance >= 0), key=lambda cell: cell.n)
         self.chance = {cell.part: cell.chance for cell in asked}
         bases = [base for name in self.systems if (base := published_base(name))]

@@ -11,7 +11,7 @@ from robomme_interference_data.evaluate.systems import published_base
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
 from robomme_interference_data.viz.figure import INK, open_figure, save_figure
 
-from . import curves, forests, matrices
+from . import cost, curves, family_forest, forests, matrices
 from .curves import curve, explained, legend
 from .data import FEW, PUBLISHED, Data
 
@@ -22,6 +22,7 @@ _ALL_KINDS = ("heatmap", "kinds", "interference", "ceiling")
 _ALL = "All families"
 
 FIGURES = {
+    "family_falls": "Fall in each family, and over all other families",
     "interference": "Effect of each kind of interference",
     "kinds": "Success by condition and kind of condition",
     "effects": "Effect of each condition, paired over episodes",
@@ -33,6 +34,7 @@ FIGURES = {
     "retrieval": "Systems with and without retrieval",
     "by_evidence_kept": "Success by whether the memory kept the evidence",
     "ceiling": "Gap to the ideal observer with the same memory",
+    "cost": "Success against the seconds of a rollout",
     "matrix": "Which systems differ significantly",
     "action_error": "Action error by condition",
 }
@@ -183,6 +185,7 @@ def _panels(
 
 
 _DRAWERS = {
+    "family_falls": family_forest.family_falls,
     "interference": forests.interference,
     "kinds": _kinds,
     "effects": forests.effects,
@@ -194,5 +197,6 @@ _DRAWERS = {
     "retrieval": _retrieval,
     "by_evidence_kept": forests.by_evidence_kept,
     "ceiling": forests.ceiling,
+    "cost": cost.cost,
     "matrix": matrices.matrix,
 }

@@ -10,7 +10,7 @@ import numpy as np
 from robomme_interference_data.evaluate.score.outcomes import Outcomes
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables import families
-from robomme_interference_data.evaluate.score.tables.contrast import Measure
+from robomme_interference_data.evaluate.score.tables.contrast import Effect, Measure, Scope
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.viz.templates import fill
 
@@ -29,6 +29,16 @@ def methods(score: Score) -> tuple[str, str]:
         "parts": [_part(score, outcomes) for outcomes in score.outcomes.values()],
         "offline": None if score.recordings is None else _offline(score, score.recordings),
         "repeats": any(outcomes.repeat_flips[0] for outcomes in score.outcomes.values()),
+        "runs": any(cell.scope is Scope.TRAINING for cell in score.cells),
+        # The conditions that are compared with k0.
+        "primary": list(
+            dict.fromkeys(
+                contrast.condition
+                for contrast in successes
+                if contrast.primary and contrast.effect is Effect.SESSIONS
+            )
+        ),
+        "chance": any(cell.chance >= 0 for cell in score.cells),
         "tables": set(score.tables),
         "intervals": {contrast.pairs.method for contrast in successes},
         "retention": any(not math.isnan(each.retention.value) for each in successes),
@@ -70,8 +80,8 @@ def _part(score: Score, outcomes: Outcomes) -> dict[str, Any]:
         "rollouts": sum(sum(cell.counts) for cell in cells),
         "episodes": len(present),
         "families": len({outcomes.episodes[place].family for place in present}),
-        "seeds": len({repeat.model_seed for repeat in outcomes.repeats}),
         "runs": len({repeat.training_seed for repeat in outcomes.repeats}),
+        "seeds": len({repeat.model_seed for repeat in outcomes.repeats}),
         "complete": sum(cell.complete for cell in cells),
         "cells": len(cells),
         "errors": sum(cell.errors for cell in cells),

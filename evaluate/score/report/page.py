@@ -23,6 +23,7 @@ from robomme_interference_data.evaluate.score.plots.figures import FIGURES
 from robomme_interference_data.evaluate.score.rows.reading import CheckedRows
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.contrast import START
+from robomme_interference_data.evaluate.score.tables.correction import NULL_FINDINGS
 from robomme_interference_data.evaluate.systems import SYSTEMS, display_name
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import in_order, parse_condition
@@ -30,15 +31,15 @@ from robomme_interference_data.storage.files import sha256_file, write_text
 from robomme_interference_data.viz.tables import Table
 from robomme_interference_data.viz.templates import fill
 
-from .headline import headline
-from .strongest import strongest
+from .primary import screens
 
 _LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
 """Libraries that numbers and figures depend on."""
 
 _SHOWN_IN = {
+    "family_falls": ("family_falls", "families"),
     "effects": ("effects",),
-    "success": ("main", "chance", "paper"),
+    "success": ("main", "paper"),
     "families": ("parts",),
     "heatmap": ("parts",),
     "difficulty": ("parts",),
@@ -48,10 +49,18 @@ _SHOWN_IN = {
     "interference": ("effects",),
     "by_evidence_kept": ("evidence_effects", "evidence_use"),
     "ceiling": ("effects",),
+    "cost": ("cost",),
     "matrix": ("matrix", "main"),
     "action_error": ("action_error", "action_error_effects"),
 }
 """Figure to the tables with its numbers."""
+
+EXPLORATORY = (
+    "Everything below is exploratory: it is corrected within a table or a part of one, not over "
+    f"all tables. Without any effect, {NULL_FINDINGS} hold a finding in some table. Take one as a "
+    "question for the next run."
+)
+"""What to make of findings outside the primary analysis."""
 
 _GRIDS = {
     Expected.BENCHMARK: "the benchmark's: nine families, test episodes 0 to 49 each",
@@ -65,10 +74,11 @@ def write_report(
     """Write the page: the same bytes for the same rows, options and command."""
     names = {name for outcomes in score.all_outcomes for name in outcomes.conditions}
     conditions = [condition.name for condition in in_order(names)] if names else []
+    shown = screens(score)
     values = {
-        "headlines": headlines(score),
-        "strongest": {name: strongest(score, name) for name in _simulators(score)},
-        "grids": score.grids,
+        "screens": shown,
+        "exploratory": EXPLORATORY,
+        "primary_figures": {name for screen in shown for name in screen.figures},
         "tables": score.tables.values(),
         "systems": _names(score),
         "known": {name: system.display for name, system in SYSTEMS.items()},
@@ -85,15 +95,6 @@ def write_report(
     }
     html = fill(__package__, "report.html.j2", values, what="the report", autoescape=True)
     write_text(out, html)
-
-
-def headlines(score: Score) -> dict[str, str]:
-    """Return the main finding of each simulator, and of recordings."""
-    return {name: headline(score, name) for name in _simulators(score)}
-
-
-def _simulators(score: Score) -> list[str]:
-    return [outcomes.simulator for outcomes in score.all_outcomes]
 
 
 def _number(text: str) -> str:

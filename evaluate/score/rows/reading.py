@@ -14,11 +14,13 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     counted,
 )
-from robomme_interference_data.evaluate.systems import FACT_COLUMNS, SYSTEMS, name_system
+from robomme_interference_data.evaluate.systems import FACT_COLUMNS, SYSTEMS
 from robomme_interference_data.schema.rollouts import FINAL, Status, success_of
 from robomme_interference_data.schema.shifts import NO_SHIFT
 
-from .files import FileColumns, find_sources, read_file, system_of
+from .files import find_sources, read_file
+from .row_format import FileColumns
+from .stated import ScenesOf, notes_on, of_other_scenes, scenes_of, with_stated
 from .values import DEFAULTS, Row, parse, shifted
 
 if TYPE_CHECKING:
@@ -39,7 +41,10 @@ class CheckedRows:
         rows: The rows.
         sources: The files that were read (see `files.find_sources`).
         revisions: Simulator to the revision of its buffer set, where rows name one.
-        without_revision: Simulator and system of rows that name no revision, such as released ones.
+        without_revision: Simulator and system of rows that name no revision, such as released ones,
+            and of evaluations by other programs whose scenes are not known to be the same.
+        scenes: What decides the scenes of evaluations by other programs.
+        notes: What readers must know of them.
         bad_reasons: The first bad rows that were left out: location and reason.
         bad_count: The number of bad rows.
     """
@@ -48,6 +53,8 @@ class CheckedRows:
     sources: "Mapping[Path, RunHeader | None]"
     revisions: Mapping[str, str] = field(default_factory=dict)
     without_revision: frozenset[tuple[str, str]] = frozenset()
+    scenes: ScenesOf = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
     bad_reasons: tuple[str, ...] = ()
     bad_count: int = 0
 
@@ -63,24 +70,27 @@ class CheckedRows:
 
 
 def read_rows(
-    paths: Sequence[Path], system: str | None = None, lenient: bool = False
+    paths: Sequence[Path],
+    systems: Sequence[str] = (),
+    lenient: bool = False,
+    model_seeds: Sequence[int] = (),
 ) -> CheckedRows:
     """Read rows from folders of runs and files, and check each of them.
 
     Args:
-        paths: Folders of runs, `.jsonl`, `.parquet` and `.csv` files, and `.json` of vla-eval.
-        system: System of rows that name none; by default the one in the name of an exported file.
+        paths: Folders of runs, and files of one of `files.FORMATS`.
+        systems: System of files that name none, for all or for each in their order; by default the
+            one in the name of a released or exported file.
+        model_seeds: Seeds of files that name none, likewise.
         lenient: Leave bad rows out, and count them. Of identical rows of one rollout the first is
             kept, of rows that contradict each other none.
     """
     sources = find_sources(paths)
+    parts = {path: read_file(path, Row._fields) for path in sources}
+    parts = with_stated(parts, systems, model_seeds)
     checks = _Checks()
     for path, run in sources.items():
-        name = system_of(path) if system is None else system
-        if name is not None:
-            name_system(name)
-        part = read_file(path, Row._fields, name is not None)
-        checks.add(path, part, name, None if run is None else path.parent)
+        checks.add(path, parts[path], None if run is None else path.parent)
     checks.check_alike("revision", ("simulator",), "rows of different buffer sets do not mix")
     for column in ("difficulty", "seed", "chance"):
         checks.check_alike(column, _EPISODE, "an episode has one")
@@ -99,6 +109,8 @@ def read_rows(
     without_revision = frozenset(
         (simulator, name) for simulator, name, revision in cells if not revision
     )
+    scenes = scenes_of(parts)
+    same_scenes = scenes.keys() - of_other_scenes(scenes)
     revisions = {simulator: revision for simulator, _, revision in cells if revision}
     for simulator, name, revision in sorted(cells - {(*cell, None) for cell in without_revision}):
         if (simulator, name) in without_revision:  # protocol, rule 5
@@ -108,7 +120,16 @@ def read_rows(
                 "Their histories may differ: score the files separately, or compare them.",
             )
     shown = tuple(bad_reasons[:_SHOWN])
-    return CheckedRows(rows, sources, revisions, without_revision, shown, len(bad_reasons))
+    return CheckedRows(
+        rows,
+        sources,
+        revisions,
+        without_revision - same_scenes,
+        scenes,
+        tuple(notes_on(parts, scenes)),
+        shown,
+        len(bad_reasons),
+    )
 
 
 _Location = tuple[int, int]
@@ -123,11 +144,11 @@ class _Checks:
         self.reasons: dict[_Location, str] = {}
         self._paths: list[Path] = []
 
-    def add(self, path: Path, part: FileColumns, system: str | None, run: Path | None) -> None:
+    def add(self, path: Path, part: FileColumns, run: Path | None) -> None:
         """Add the rows of a file, checking each by itself; videos are relative to `run`."""
         number = len(self._paths)
         self._paths.append(path)
-        default = {**dict.fromkeys(Row._fields), **DEFAULTS, "system": system}
+        default = {**dict.fromkeys(Row._fields), **DEFAULTS}
         wrong: dict[int, str] = {}
         columns = [
             _parsed(name, part.columns[name], run, wrong)

@@ -66,6 +66,10 @@ class Row(NamedTuple):
     action_l1: float | None
     action_l1_values: str | None
     video: Path | None
+    history_s: float | None
+    policy_s: float | None
+    model_s: float | None
+    model_tokens: int | None
 
 
 DEFAULTS = {
@@ -112,13 +116,13 @@ _SEPARATOR = "+"  # between a simulator and its shift; no simulator's name conta
 # Used in file names, so no `/`. A user's simulator is named `module:function`.
 _SIMULATOR = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._:-]{0,127}")
 _WHOLE = re.compile(r"([0-9]{1,18})(?:\.0+)?")  # some programs save whole numbers as floats
-_TRUTH = dict.fromkeys(("1", "true", "1.0"), True) | dict.fromkeys(("0", "false", "0.0"), False)
+TRUTH = dict.fromkeys(("1", "true", "1.0"), True) | dict.fromkeys(("0", "false", "0.0"), False)
 _RANGES = {"steps": (0, MAX_STEPS), "protocol_version": (PROTOCOL_VERSION, PROTOCOL_VERSION)}
 _NAMES = {"split": SPLITS, "difficulty": DIFFICULTIES, "status": FINAL}
 _LARGEST = sys.float_info.max
 _MOST = {name: 1.0 for name in ("evidence_kept", "chance")}
 _MOST |= {name: 1.0 for name in Row._fields if name.endswith("_fraction")}
-_MOST |= {"action_l1": _LARGEST}
+_MOST |= {name: _LARGEST for name in ("action_l1", "history_s", "policy_s", "model_s")}
 _OPTIONAL = {name for name, hint in get_type_hints(Row).items() if isinstance(None, hint)}
 _OPTIONAL -= {"revision"}  # a file that has the column states it in each row
 
@@ -139,10 +143,18 @@ def parse(name: str, value: Any) -> Any:
             if text not in _NAMES[name]:
                 raise InvalidOptionError.one_of(name, text, _NAMES[name])
         case "success" | "reads_history" | "reference":
-            if text.lower() not in _TRUTH:
+            if text.lower() not in TRUTH:
                 raise ValueError("1, 0, true, false or nothing")
-            return _TRUTH[text.lower()]
-        case "episode" | "training_seed" | "model_seed" | "seed" | "steps" | "protocol_version":
+            return TRUTH[text.lower()]
+        case (
+            "episode"
+            | "training_seed"
+            | "model_seed"
+            | "seed"
+            | "steps"
+            | "protocol_version"
+            | "model_tokens"
+        ):
             return _whole(text, *_RANGES.get(name, (0, 10**18 - 1)))  # as in episode ids
         case _ if name in _MOST:
             return _number(text, _MOST[name])

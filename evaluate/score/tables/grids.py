@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from itertools import groupby
 
+from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.evaluate.score.outcomes import Outcomes
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.schema.conditions import in_order
@@ -50,7 +51,7 @@ def main_grids(cells: Sequence[SuccessCell]) -> list[Table]:
         chances = [cell.chance for cell in own if not math.isnan(cell.chance)]
         if chances:
             levels = dict.fromkeys([percent(min(chances)), percent(max(chances))])
-            notes.append(f"Guessing succeeds in {' to '.join(levels)}: see the table chance.")
+            notes.append(f"Guessing succeeds in {' to '.join(levels)}: see the table main.")
         errors = sum(cell.errors for cell in own)
         notes.append(f"Errors: {errors}." if errors else "No errors.")
         title = f"Success by system and condition, {simulator}"
@@ -69,6 +70,36 @@ def _success(cell: SuccessCell | None, *, with_n: bool) -> str:
     rate = f"**{percent(cell.rate)}**" if cell.best else percent(cell.rate)
     n = f" n={cell.n}" if with_n else ""
     return f"{rate}{cell.mark} [{100 * low:.1f}, {100 * high:.1f}]{n}{errors}"
+
+
+def family_grid(cells: Sequence[SuccessCell]) -> Table:
+    """Return the rates by family of one simulator: a row per system and family."""
+    own = [cell for cell in cells if cell.part and cell.part not in DIFFICULTIES]
+    conditions = [
+        condition.name for condition in in_order({cell.condition for cell in own if cell.n})
+    ]
+    at = {(cell.system, cell.part, cell.condition): cell for cell in own}
+    rows = []
+    for system, family in dict.fromkeys((cell.system, cell.part) for cell in own):
+        found = [at.get((system, family, condition)) for condition in conditions]
+        rows.append([display_name(system), family, *map(_of_family, found)])
+    return Table(
+        "parts",
+        "Success by family and condition",
+        dict.fromkeys(["system", "family", *conditions], "text"),
+        rows,
+        "Intervals and complete counts are in the table parts. †: the cell is not complete.",
+    )
+
+
+def _of_family(cell: SuccessCell | None) -> str:
+    """Return the rate of a family without its interval, n and errors."""
+    if cell is None:
+        return NOT_EXPECTED
+    errors = f", errors: {cell.errors}" if cell.errors else ""
+    if not cell.n:
+        return f"no result†{errors}" if any(cell.counts) else "missing†"
+    return f"{percent(cell.rate)}{cell.mark} n={cell.n}{errors}"
 
 
 def error_grid(outcomes: Outcomes, cells: Sequence[action_error.ErrorCell]) -> Table:

@@ -1,0 +1,73 @@
+"""CSV files with a row for each rollout: exported runs, and the paper's released rows."""
+
+import codecs
+import csv
+import io
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from robomme_interference_data.constants import MAX_ROW_BYTES
+from robomme_interference_data.storage.files import read_bytes
+
+from .columns import select, with_outcomes
+from .row_format import FileColumns, RowFile, RowFormat, check_count
+
+_CANONICAL = "canonical_rollouts.csv"
+_CANONICAL_COLUMNS = ("system", "family", "condition", "episode", "difficulty", "success")
+"""The columns that the paper's analysis reads. The file has more, with values of their own."""
+
+_RELEASED_SYSTEMS = {"retrieval_rollouts.csv": "retrieval-framesamp-modul"}
+"""File of released rows without a column for the system, to the system in `SYSTEMS`."""
+
+
+def _read(file: RowFile, names: Sequence[str]) -> FileColumns:
+    path = file.path
+    if path.name == _CANONICAL:
+        names = [name for name in names if name in _CANONICAL_COLUMNS]
+    text = read_bytes(path, MAX_ROW_BYTES).removeprefix(codecs.BOM_UTF8).decode()
+    before = csv.field_size_limit(len(text) + 1)  # of the whole process
+    try:
+        return _parse(path, text, names)
+    finally:
+        csv.field_size_limit(before)
+
+
+def _parse(path: Path, text: str, names: Sequence[str]) -> FileColumns:
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    rows: dict[int, list[str]] = {}
+    malformed: dict[int, str] = {}
+    try:
+        header = next(reader, [])
+        selected = select(path, header, names)
+        line = reader.line_num + 1
+        for fields in reader:
+            check_count(len(rows) + len(malformed))
+            if len(fields) == len(header):
+                rows[line] = fields
+            else:
+                malformed[line] = f"the line has {len(fields)} fields; expected {len(header)}"
+            line = reader.line_num + 1  # quoted text may contain line breaks
+    except csv.Error as error:
+        raise ValueError(f"line {reader.line_num}: {error}") from None
+    columns = {
+        name: [row[at] for row in rows.values()]
+        for name, column in selected.items()
+        for at in [header.index(column)]
+    }
+    return with_outcomes(FileColumns(columns, list(rows), malformed, system_of(path)))
+
+
+def system_of(path: Path) -> str | None:
+    """Return the system in the name of a released or an exported file (see `export`), or None."""
+    if path.name in _RELEASED_SYSTEMS:
+        return _RELEASED_SYSTEMS[path.name]
+    match = re.fullmatch(r"(.+)-[^-]+_rollouts\.csv", path.name)
+    return match[1] if match else None
+
+
+CSV = RowFormat(
+    "rows of a run, or released rows of the paper, as .csv",
+    lambda file: file.suffix == ".csv",
+    _read,
+)

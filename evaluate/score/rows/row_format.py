@@ -1,0 +1,95 @@
+"""What a format of files with outcomes declares, and what reading such a file gives."""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from robomme_interference_data.constants import MAX_ROW_BYTES
+from robomme_interference_data.storage.files import parse_json, read_bytes
+
+_MAX_ROWS = 1 << 20
+"""Rows in a file, at most: the paper's grid has 25,200."""
+
+
+@dataclass(frozen=True)
+class FileColumns:
+    """The columns of one file, and what is known of all of its rows.
+
+    Attributes:
+        columns: The values of the columns that the file has, by their names in `Row`.
+        lines: The line, or number, of each row.
+        malformed: Why other lines are not rows.
+        system: The system that the name of the file states.
+        scenes: Only of evaluations by other programs: what they say of their scenes.
+    """
+
+    columns: Mapping[str, Sequence[Any]]
+    lines: Sequence[int]
+    malformed: Mapping[int, str] = field(default_factory=dict)
+    system: str | None = None
+    scenes: "Scenes | None" = None
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """What the results of another program say of their scenes.
+
+    They name no buffer set. An episode is the same scene for two systems if they agree in
+    `evaluation` and ran with the same seeds.
+
+    Attributes:
+        program: The program that wrote the results.
+        evaluation: What decides the scenes beside number and seed of an episode.
+    """
+
+    program: str
+    evaluation: str
+
+
+class RowFile:
+    """A file that holds outcomes, before its format is known."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.suffix = path.suffix.lower()
+
+    @cached_property
+    def json(self) -> dict[str, Any]:
+        """The object of a JSON file; empty for files of other kinds.
+
+        Raises:
+            FormatError: It is not valid JSON.
+        """
+        if self.suffix != ".json":
+            return {}
+        return parse_json(read_bytes(self.path, MAX_ROW_BYTES), self.path)
+
+
+@dataclass(frozen=True)
+class RowFormat:
+    """A format of files with outcomes; `files.FORMATS` lists all of them.
+
+    Attributes:
+        description: The format in a few words, for the error that lists all formats.
+        matches: Whether a file has this format. No file has two.
+        read: Reads those of the named columns that a file has.
+    """
+
+    description: str
+    matches: Callable[[RowFile], bool]
+    read: Callable[[RowFile, Sequence[str]], FileColumns]
+
+
+def check_count(rows: int) -> None:
+    """Raise a `ValueError` for more rows than a file may have."""
+    if rows > _MAX_ROWS:
+        raise ValueError(f"more than {_MAX_ROWS:,} rows; expected at most that many")
+
+
+def plain_name(text: str) -> str:
+    """Return a name by another program as name of a simulator or family: `pick up` as `pick_up`."""
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "_", text)
+    return name if name[:1].isalpha() else f"task_{name}"
