@@ -16,7 +16,7 @@ from robomme_interference_data.cli.console import (
     print_status,
 )
 from robomme_interference_data.cli.options import AsJson, split_commas, with_settings
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import InvalidOptionError, counted, named
 
 from .config import Settings
 
@@ -207,7 +207,7 @@ def power(
     ] = 1,
     as_json: AsJson = False,
 ) -> None:
-    """Compute which differences a number of episodes can detect.
+    r"""Compute which differences a number of episodes can detect.
 
     Two different systems differ in far more episodes than two runs of one: for systems that were
     scored, take flips and difference of the table matrix. For two runs of one system, the share is
@@ -216,7 +216,8 @@ def power(
     Examples:
     ```
     robomme-interference power --margin 5 --episodes 450
-    robomme-interference power --flips 0.31 --difference 6.2 --tests 66 --looks 5
+    robomme-interference power --flips 0.31 --difference 6.2 \
+      --tests 66 --looks 5
     robomme-interference power --margin 10 --runs 5 --run-spread 3
     ```
     """
@@ -225,8 +226,8 @@ def power(
     by_chance = round(flips - abs(difference) / 100, 12)
     if not 0 <= by_chance <= 1:
         raise InvalidOptionError(
-            f"flips {flips} with a difference of {difference:g} points; expected a share from 0 to "
-            "1 that contains the difference",
+            f"{named('flips', flips)} with a difference of {difference:g} points; expected a "
+            "share from 0 to 1 that contains the difference",
             "Take both from one row of the table matrix.",
         )
     over_runs = None if runs is None else (runs, run_spread / 100)
@@ -276,6 +277,6 @@ def _print_notes(runs: "Sequence[CheckedRows]", notes: Sequence[str]) -> None:
         for reason in rows.bad_reasons:
             print_status(f"left out: {reason}")
         if rows.bad_count:
-            print_status(f"{rows.bad_count:,} bad rows left out")
+            print_status(f"{counted(rows.bad_count, 'bad row')} left out")
     for note in notes:
         print_status(note)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from robomme_interference_data.constants import RECORDINGS
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import InvalidOptionError, named
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.stats.sequential import look_levels
 from robomme_interference_data.stats.significance import ALPHA
@@ -76,13 +76,14 @@ def compare(
     number of this look at the data and of all planned ones; with several, intervals and levels
     spend 5% over all looks. `model_seed` is the seed of files that name none.
     """
-    _check_arguments(first, second, conditions, systems[0], lenient=lenient)
-    seeds = () if model_seed is None else (model_seed,)
+    _check_arguments(first, second, conditions, systems, lenient=lenient)
     if len(conditions) == 1:
         conditions = (conditions[0], conditions[0])  # the same in both runs
     alpha = look_levels(look[1])[look[0] - 1] if look[1] > 1 else ALPHA
-    a_rows = _read(first, systems[0], lenient, seeds)
-    b_rows = a_rows if second is None else _read(second, systems[1], lenient, seeds)
+    a_rows = _read(first, "system_a", systems[0], lenient, model_seed)
+    b_rows = a_rows
+    if second is not None:
+        b_rows = _read(second, "system_b", systems[1], lenient, model_seed)
     runs = (a_rows,) if second is None else (a_rows, b_rows)
     measure = _measure(runs)
     check_scenes(a_rows, b_rows)
@@ -198,23 +199,32 @@ def _table(contrasts: Sequence[Contrast], measure: Measure, alpha: float, title:
 
 
 def _read(
-    path: Path, system: str | None, lenient: bool, model_seeds: Sequence[int] = ()
+    path: Path, option: str, system: str | None, lenient: bool, model_seed: int | None = None
 ) -> CheckedRows:
-    return read_rows([path], () if system is None else (system,), lenient, model_seeds)
+    """Read the rows of one side; `option` is the setting that states its system."""
+    systems = () if system is None else (system,)
+    seeds = () if model_seed is None else (model_seed,)
+    return read_rows([path], systems, lenient, seeds, option)
 
 
 def _check_arguments(
     first: Path,
     second: Path | None,
     conditions: Sequence[str],
-    system: str | None,
+    systems: tuple[str | None, str | None],
     *,
     lenient: bool,
 ) -> None:
+    if second is None and systems[1] is not None:
+        raise InvalidOptionError(
+            f"{named('system_b', systems[1])} without a second run",
+            f"Give the other run, or state the system of the one run: {named('system_a')}.",
+            option="system_b",
+        )
     for name in conditions:
         parse_condition(name)
     if len(conditions) > 2 or (second is None and len({*conditions}) < 2):
-        hint, command = _two_conditions(first, _read(first, system, lenient))
+        hint, command = _two_conditions(first, _read(first, "system_a", systems[0], lenient))
         raise InvalidOptionError(
             f"conditions to compare: {' '.join(conditions) or 'none'}; expected two different "
             "ones, or two runs and at most two conditions",
@@ -222,7 +232,7 @@ def _check_arguments(
             command,
         )
     if second is not None and first.exists() and second.exists() and first.samefile(second):
-        hint, command = _two_conditions(first, _read(first, system, lenient))
+        hint, command = _two_conditions(first, _read(first, "system_a", systems[0], lenient))
         raise InvalidOptionError(f"{first} is given twice", hint, command)
 
 

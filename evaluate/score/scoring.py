@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-from robomme_interference_data.errors import FormatError, RunError, counted, named
+from robomme_interference_data.errors import RunError, counted, named
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.stats.bootstrap import DRAWS
 from robomme_interference_data.stats.intervals import wilson
@@ -178,15 +178,8 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
 def _rows(settings: Settings) -> CheckedRows:
     """Read the rows, of which some must be valid and no errors."""
     rows = read_rows(settings.rows, settings.system, settings.lenient, settings.model_seed)
-    sources = ", ".join(map(str, settings.rows))
-    if not len(rows):
-        if rows.bad_count:
-            message = f"all {rows.bad_count:,} rows in {sources} are bad; the first is "
-            message += rows.bad_reasons[0]
-        else:
-            message = f"there are no rows in {sources}"
-        raise FormatError(message, "Give at least one valid row.")
     if all(row.status == Status.ERROR for row in rows):
+        sources = ", ".join(map(str, settings.rows))
         raise RunError(
             f"{counted(len(rows), 'row')} in {sources}, and all are errors: there is nothing to "
             "score",

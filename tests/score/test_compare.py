@@ -152,3 +152,14 @@ def test_one_condition_of_two_runs(tmp_path: Path) -> None:
     assert (found[0]["n"], found[0]["lost"]) == (4, 2)
     with pytest.raises(InvalidOptionError):
         compare(a, conditions=["k7"])
+
+
+def test_a_system_that_is_stated_for_no_file_is_an_error(tmp_path: Path) -> None:
+    path = made.write_csv(tmp_path / "a.csv", made.rows())
+    other = made.write_csv(tmp_path / "b.csv", made.rows())
+    with raises(InvalidOptionError) as raised:
+        compare(path, None, (None, "mine"), conditions=("k0", "k7"))
+    assert raised.value.option == "system_b"
+    with raises(InvalidOptionError) as raised:
+        compare(path, other, ("mine", None))
+    assert raised.value.option == "system_a"

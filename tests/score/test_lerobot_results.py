@@ -44,6 +44,10 @@ def test_the_system_is_stated(tmp_path: Path) -> None:
     other = write(tmp_path / "other.json", BETTER)
     with raises(InvalidOptionError):
         read_rows([path, other], ["act", "act", "smolvla"])
+    for seed in (-1, 10**18):
+        with raises(InvalidOptionError) as raised:
+            read_rows([path], ["act"], model_seeds=[seed])
+        assert raised.value.option == "model_seed"
     assert read_rows([path, other], ["act", "smolvla"]).names("system") == ["act", "smolvla"]
 
 

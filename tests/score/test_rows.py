@@ -94,7 +94,8 @@ def test_a_record_holds_what_came_last(tmp_path: Path) -> None:
     record.write_bytes(record.read_bytes() + b'{"system": "my')
     assert len(read_rows([folder])) == 2
     record.write_bytes(b'{"system": "my')
-    assert len(read_rows([folder])) == 0
+    with raises(FormatError):
+        read_rows([folder])
     # What did not break is not run again: two rows contradict each other.
     made.write_run(folder, [good, broken])
     with raises(FormatError):
@@ -118,6 +119,26 @@ def test_the_released_layout(tmp_path: Path) -> None:
     text = path.read_text(encoding="utf-8").replace("system", "variant", 1)
     path.write_text(text, encoding="utf-8-sig")
     assert told(read_rows([path])) == expected
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_csv_files_as_other_programs_save_them(tmp_path: Path, end: str) -> None:
+    """With the line ends of any system, a mark at the start, and empty lines."""
+    text = made.write_csv(tmp_path / "a.csv", made.rows()).read_text(encoding="utf-8")
+    lines = [*text.splitlines(), "", ""]
+    lines.insert(5, "")
+    saved = tmp_path / "b.csv"
+    saved.write_text(end.join(lines), encoding="utf-8-sig", newline="")
+    assert told(read_rows([saved])) == told(read_rows([tmp_path / "a.csv"]))
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_other_separators_are_named(tmp_path: Path, separator: str) -> None:
+    path = made.released(tmp_path / "rows.csv", [GOOD])
+    path.write_text(path.read_text(encoding="utf-8").replace(",", separator))
+    with raises(FormatError) as raised:
+        read_rows([path])
+    assert "commas" in raised.value.message
 
 
 def test_simulators_have_revisions_scenes_and_names_of_their_own(tmp_path: Path) -> None:
@@ -169,7 +190,7 @@ BAD = {
     "two difficulties": ("my-memory,MoveCube,k1,0,7,hard,fail,0,9", "difficulty 'hard' beside"),
     "too short": ("my-memory,MoveCube,k0,1,7,easy,fail,0", "the line has 8 fields; expected 9"),
     "twice": (GOOD, "the same rollout as"),
-    "blank": ("", "the line has 0 fields; expected 9"),
+    "no columns": ('""', "the line has 1 field; expected 9"),
 }
 
 
@@ -182,7 +203,7 @@ def test_bad_rows_are_refused_with_file_line_and_reason(
         read_rows([path])
     assert raised.value.message.startswith(f"1 bad row:\n{path}, line 3: ")
     assert reason in raised.value.message
-    assert raised.value.hint is not None and "lenient=True" in raised.value.hint
+    assert raised.value.hint is not None and "lenient" in raised.value.hint
     # Leniently it is left out and counted; the others stay.
     found = read_rows([path], lenient=True)
     assert (found.bad_count, len(found)) == (1, 2)
@@ -239,7 +260,7 @@ def test_lines_are_right_after_quoted_line_breaks(tmp_path: Path) -> None:
 
 def test_many_bad_rows_are_counted_and_ten_are_named(tmp_path: Path) -> None:
     lines = [f"my-memory,MoveCube,k0,{n},{n},easy,fail,1,9" for n in range(25)]
-    path = made.released(tmp_path / "rows.csv", lines)
+    path = made.released(tmp_path / "rows.csv", [*lines, GOOD])
     with pytest.raises(FormatError) as raised:
         read_rows([path])
     shown = raised.value.message.splitlines()
@@ -276,6 +297,8 @@ def test_nothing_but_bad_rows_and_no_rows_are_no_score(tmp_path: Path) -> None:
         made.score(path, lenient=True)
     with raises(FormatError):
         made.score(made.write_csv(tmp_path / "b.csv", []))
+    with raises(FormatError):
+        compare(tmp_path / "b.csv", path)
 
 
 # --- shifts ------------------------------------------------------------------------------------
@@ -354,6 +377,7 @@ def test_files_that_cannot_be_read(tmp_path: Path, capfd: pytest.CaptureFixture[
         with raises(FormatError) as raised:
             read_rows([tmp_path / name], lenient=True)
         assert name in raised.value.message
+        assert "UTF-8" in (raised.value.hint or "") or name not in ("a.csv", "late.csv", "cut.csv")
     nested = write(tmp_path / "n.parquet", family=pa.nulls(107, pa.list_(pa.string())))
     with raises(FormatError):
         read_rows([nested])

@@ -31,41 +31,45 @@ def select(path: Path, header: Sequence[str], names: Sequence[str]) -> dict[str,
         missing.append(" or ".join(_OUTCOME))
     if missing:
         raise FormatError(
-            f"{path} lacks the columns {', '.join(missing)}; it has {', '.join(header) or 'none'}",
+            # Quoted, so that a space in a name is seen.
+            f"{path} lacks the columns {', '.join(missing)}; it has "
+            f"{', '.join(map(repr, header)) or 'none'}",
             "Expected the rows of a run, or of the released CSVs (docs/reference/score-tables.md).",
         )
     return {name: columns[name] for name in names if name in columns}
 
 
-def with_outcomes(part: FileColumns) -> FileColumns:
+def with_outcomes(contents: FileColumns) -> FileColumns:
     """Return the columns of a file with both status and success."""
-    columns = part.columns
+    columns = contents.columns
     if "success" not in columns:
         known = {str(status): success_of(status) for status in Status}
         outcomes = [known.get(str(status)) for status in columns["status"]]
-        return replace(part, columns={**columns, "success": outcomes})
+        return replace(contents, columns={**columns, "success": outcomes})
     if "status" not in columns:
-        return _with_status(part)
-    return part
+        return _with_status(contents)
+    return contents
 
 
-def _with_status(part: FileColumns) -> FileColumns:
+def _with_status(contents: FileColumns) -> FileColumns:
     """Return the columns with a status; without one, a rollout is a success or a failure."""
     statuses = {True: Status.SUCCESS, False: Status.FAIL}
-    outcomes = [TRUTH.get(str(value).lower()) for value in part.columns["success"]]
+    outcomes = [TRUTH.get(str(value).lower()) for value in contents.columns["success"]]
     kept = [at for at, outcome in enumerate(outcomes) if outcome is not None]
     malformed = {
         line: f"success {value!r}; expected 1, 0, true or false: the file has no status"
-        for line, value, outcome in zip(part.lines, part.columns["success"], outcomes, strict=True)
+        for line, value, outcome in zip(
+            contents.lines, contents.columns["success"], outcomes, strict=True
+        )
         if outcome is None
     }
-    columns = {name: [values[at] for at in kept] for name, values in part.columns.items()}
+    columns = {name: [values[at] for at in kept] for name, values in contents.columns.items()}
     columns["status"] = [str(statuses[outcome]) for outcome in outcomes if outcome is not None]
     return replace(
-        part,
+        contents,
         columns=columns,
-        lines=[part.lines[at] for at in kept],
-        malformed={**part.malformed, **malformed},
+        lines=[contents.lines[at] for at in kept],
+        malformed={**contents.malformed, **malformed},
     )
 
 

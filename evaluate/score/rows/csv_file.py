@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from robomme_interference_data.constants import MAX_ROW_BYTES
+from robomme_interference_data.errors import FormatError, counted
 from robomme_interference_data.storage.files import read_bytes
 
 from .columns import select, with_outcomes
@@ -25,7 +26,15 @@ def _read(file: RowFile, names: Sequence[str]) -> FileColumns:
     path = file.path
     if path.name == _CANONICAL:
         names = [name for name in names if name in _CANONICAL_COLUMNS]
-    text = read_bytes(path, MAX_ROW_BYTES).removeprefix(codecs.BOM_UTF8).decode()
+    data = read_bytes(path, MAX_ROW_BYTES).removeprefix(codecs.BOM_UTF8)
+    try:
+        text = data.decode()
+    except UnicodeDecodeError as error:
+        # Spreadsheet programs save other encodings unless asked: the file need not be damaged.
+        raise FormatError(
+            f"{path} is not UTF-8 text: {error.reason} at byte {error.start:,}",
+            "Save it again as CSV in UTF-8.",
+        ) from None
     before = csv.field_size_limit(len(text) + 1)  # of the whole process
     try:
         return _parse(path, text, names)
@@ -39,14 +48,19 @@ def _parse(path: Path, text: str, names: Sequence[str]) -> FileColumns:
     malformed: dict[int, str] = {}
     try:
         header = next(reader, [])
+        _check_separator(path, header)
         selected = select(path, header, names)
         line = reader.line_num + 1
         for fields in reader:
             check_count(len(rows) + len(malformed))
-            if len(fields) == len(header):
+            if not fields:
+                pass  # an empty line, as editors leave at the end
+            elif len(fields) == len(header):
                 rows[line] = fields
             else:
-                malformed[line] = f"the line has {len(fields)} fields; expected {len(header)}"
+                malformed[line] = (
+                    f"the line has {counted(len(fields), 'field')}; expected {len(header)}"
+                )
             line = reader.line_num + 1  # quoted text may contain line breaks
     except csv.Error as error:
         raise ValueError(f"line {reader.line_num}: {error}") from None
@@ -56,6 +70,15 @@ def _parse(path: Path, text: str, names: Sequence[str]) -> FileColumns:
         for at in [header.index(column)]
     }
     return with_outcomes(FileColumns(columns, list(rows), malformed, system_of(path)))
+
+
+def _check_separator(path: Path, header: Sequence[str]) -> None:
+    for separator, name in ((";", "semicolons"), ("\t", "tabs")):
+        if len(header) == 1 and separator in header[0]:
+            raise FormatError(
+                f"{path} separates its columns by {name}; expected commas",
+                "Save it again with commas between columns.",
+            )
 
 
 def system_of(path: Path) -> str | None:

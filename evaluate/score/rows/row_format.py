@@ -33,6 +33,10 @@ class FileColumns:
     scenes: "Scenes | None" = None
 
 
+ReadFiles = Mapping[Path, FileColumns]
+"""Files with their columns."""
+
+
 @dataclass(frozen=True)
 class Scenes:
     """What the results of another program say of their scenes.

@@ -119,6 +119,9 @@ _WHOLE = re.compile(r"([0-9]{1,18})(?:\.0+)?")  # some programs save whole numbe
 TRUTH = dict.fromkeys(("1", "true", "1.0"), True) | dict.fromkeys(("0", "false", "0.0"), False)
 _RANGES = {"steps": (0, MAX_STEPS), "protocol_version": (PROTOCOL_VERSION, PROTOCOL_VERSION)}
 _NAMES = {"split": SPLITS, "difficulty": DIFFICULTIES, "status": FINAL}
+MAX_NUMBER = 10**18 - 1
+"""The largest number of an episode or a seed, as in episode ids."""
+
 _LARGEST = sys.float_info.max
 _MOST = {name: 1.0 for name in ("evidence_kept", "chance")}
 _MOST |= {name: 1.0 for name in Row._fields if name.endswith("_fraction")}
@@ -155,7 +158,7 @@ def parse(name: str, value: Any) -> Any:
             | "protocol_version"
             | "model_tokens"
         ):
-            return _whole(text, *_RANGES.get(name, (0, 10**18 - 1)))  # as in episode ids
+            return _whole(text, *_RANGES.get(name, (0, MAX_NUMBER)))
         case _ if name in _MOST:
             return _number(text, _MOST[name])
     return text
