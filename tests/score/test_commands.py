@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from errno import ENOSPC
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -148,6 +149,43 @@ def test_a_score_leaves_nothing_of_an_earlier_one_and_all_of_others(
     write_score(second, fresh)
     assert "tables/paper.csv" not in files(fresh)
     assert files(out) == files(fresh) | others | {"notes.txt"}
+
+
+@pytest.mark.parametrize("stop", [OSError(ENOSPC, "No space left on device"), KeyboardInterrupt()])
+def test_a_score_that_stops_in_the_middle_leaves_the_earlier_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: BaseException
+) -> None:
+    def draw(score: Any, folder: Path, suffixes: Any) -> dict[str, Path]:
+        folder.mkdir()
+        (folder / "success-tabletop.svg").touch()
+        raise stop
+
+    rows = made.rows()
+    own = [row for row in rows if row.system == OWN]
+    out = tmp_path / "out"
+    monkeypatch.setattr(figures, "draw_figures", lambda score, folder, suffixes: {})
+    write_score(made.score(made.write_csv(tmp_path / "a.csv", rows)), out)
+    before = {name: (out / name).read_bytes() for name in files(out)}
+    monkeypatch.setattr(figures, "draw_figures", draw)
+    scored = made.score(made.write_csv(tmp_path / "b.csv", own))
+    for folder in (out, tmp_path / "fresh"):
+        with pytest.raises(type(stop)):
+            write_score(scored, folder)
+    assert {name: (out / name).read_bytes() for name in files(out)} == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.csv", "b.csv", "out"]
+
+
+@pytest.mark.usefixtures("no_pictures")
+@pytest.mark.parametrize("taken", ["tables", "tables/main.csv/mine", "report.html/mine"])
+def test_a_path_that_is_taken_leaves_nothing_half_written(tmp_path: Path, taken: str) -> None:
+    """By a file in place of a folder, or a folder in place of a file."""
+    out = tmp_path / "out"
+    (out / taken).parent.mkdir(parents=True)
+    (out / taken).touch()
+    scored = made.score(made.write_csv(tmp_path / "a.csv", made.rows()))
+    with pytest.raises(OSError):
+        write_score(scored, out)
+    assert files(out) == {taken}
 
 
 @pytest.mark.parametrize("library", ["matplotlib", "jinja2"])

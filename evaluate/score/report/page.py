@@ -69,9 +69,16 @@ _GRIDS = {
 
 
 def write_report(
-    score: Score, figures: Mapping[str, Path], out: Path, command: str | None = None
+    score: Score,
+    figures: Mapping[str, Path],
+    out: Path,
+    command: str | None = None,
+    opened_in: Path | None = None,
 ) -> None:
-    """Write the page: the same bytes for the same rows, options and command."""
+    """Write the page: the same bytes for the same rows, options and command.
+
+    It names videos relative to the folder that it is `opened_in`, by default that of `out`.
+    """
     names = {name for outcomes in score.all_outcomes for name in outcomes.conditions}
     conditions = [condition.name for condition in in_order(names)] if names else []
     shown = screens(score)
@@ -89,7 +96,7 @@ def write_report(
         "number": _number,
         "numbers": _numbers,
         "conditions": conditions,
-        "episodes": _episodes(score, conditions, out.parent),
+        "episodes": _episodes(score, conditions, opened_in or out.parent),
         "sources": {str(path): _source(path, run) for path, run in score.rows.sources.items()},
         "facts": _facts(score, command),
     }
