@@ -37,7 +37,7 @@ _LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
 """Libraries that numbers and figures depend on."""
 
 _SHOWN_IN = {
-    "family_falls": ("family_falls", "families"),
+    "family_falls": ("parts", "families"),
     "effects": ("effects",),
     "success": ("main", "paper"),
     "families": ("parts",),
