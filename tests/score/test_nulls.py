@@ -17,9 +17,10 @@ import pytest
 from support import scoring as made
 
 from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.evaluate.score.outcomes import Outcomes
+from robomme_interference_data.evaluate.score.outcomes import Outcomes, Repeat
 from robomme_interference_data.evaluate.score.plots import figures
 from robomme_interference_data.evaluate.score.tables import slopes
+from robomme_interference_data.evaluate.score.tables.correction import correct
 from robomme_interference_data.evaluate.score.tables.equivalence import tost
 from robomme_interference_data.evaluate.score.tables.evidence_kept import evidence_tables
 from robomme_interference_data.evaluate.score.tables.families import over_families
@@ -63,7 +64,7 @@ def made_up(
         systems=tuple(f"system-{number:02}" for number in range(systems)),
         conditions=tuple(conditions),
         episodes=EPISODES,
-        model_seeds=(0,),
+        repeats=(Repeat(None, 0),),
         status=status,
         evidence=np.full(status.shape, np.nan),
         action_l1=np.full(status.shape, np.nan),
@@ -92,11 +93,11 @@ def simulated(case: str) -> dict[str, float]:
     counts = defaultdict[str, list[bool]](list)
     for grid in range(GRIDS):
         outcomes = made_up(*CASES[case], f"{case}, {grid}")
-        pairs = matrix_table(system_pairs(outcomes)).records()
+        pairs = matrix_table(correct(system_pairs(outcomes))).records()
         rows = {
             "matrix": [row for row in pairs if row["condition"] == "k0"],
             "interaction": slopes.interaction_table(
-                slopes.interactions_of(outcomes, 2000)
+                correct(slopes.interactions_of(outcomes, 2000))
             ).records(),
         }
         for name, records in rows.items():
