@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.data.buffer import Buffer
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import counted
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.sampling import spread
 from robomme_interference_data.schema.subgoal import Pixel, Subgoal
 from robomme_interference_data.simulators.episode import EpisodeInfo, Observation
+from robomme_interference_data.viz.buffer_page import RetrievedPart, write_page
 from robomme_interference_data.viz.episode_video import VIEW, EpisodeVideo
 from robomme_interference_data.viz.filmstrip import session_colors
 
@@ -48,12 +50,15 @@ def _harmless[**P](method: Callable[P, None]) -> Callable[P, None]:
 class Clip:
     """Draws and encodes a rollout at the pace of its recordings; `data` is the closed MP4 file.
 
-    A fault in the clip does not break the rollout: `problem` has its traceback, and `data` is None.
+    Beside it, `page` is the web page of the buffer that the rollout received, with the received
+    part; None without a history. A fault in the clip does not break the rollout: `problem` has its
+    traceback, and `data` is None.
     """
 
     def __init__(self, item: WorkItem, system: str, folder: str | None = None):
         self._folder = folder
         self.data: bytes | None = None
+        self.page: bytes | None = None
         self.problem: str | None = None
         self._heading = (system, str(item.episode), f"condition {item.condition}")
         self._goal = ""
@@ -73,7 +78,12 @@ class Clip:
 
     @_harmless
     def begin(
-        self, buffer: Buffer, received: Sequence[int], first: Observation, info: EpisodeInfo
+        self,
+        buffer_set: BufferSet,
+        buffer: Buffer,
+        received: Sequence[int],
+        first: Observation,
+        info: EpisodeInfo,
     ) -> None:
         """Draw the first picture, with the history frames that were received."""
         self._goal, self._fps = info.goal, max(1, round(buffer.query.dataset.fps))
@@ -88,6 +98,12 @@ class Clip:
         self._path = Path(folder) / "clip.mp4"
         self._video = EpisodeVideo(self._path, self._fps, 2 + _LIVE_CAMERAS)
         self._draw(Status.ONGOING)
+        if len(buffer) and self._pointed in first.images:
+            buffer.fetch([self._pointed])
+            page = Path(folder) / "buffer.html"
+            live = {self._pointed: first.images[self._pointed]}
+            write_page(buffer_set, buffer, page, live, _received_part(buffer, received))
+            self.page = page.read_bytes()
 
     @_harmless
     def step(self, observation: Observation, status: Status, subgoal: Subgoal | None) -> None:
@@ -129,6 +145,20 @@ class Clip:
             text += ["", "error:", error]
         if self._video is not None:
             self._video.add(views, text, (f"step {self._steps} of {MAX_STEPS}", str(status)))
+
+
+def _received_part(buffer: Buffer, received: Sequence[int]) -> list[RetrievedPart]:
+    """Return what a retrieval step passed on; nothing if all frames were received."""
+    if len(received) == len(buffer):
+        return []
+    lesson = sum(
+        session.start <= frame < session.stop
+        for frame in received
+        for session in buffer.sessions
+        if session.role == "lesson"
+    )
+    grade = f"{lesson} of {counted(len(received), 'frame')} are of the lesson"
+    return [RetrievedPart("the retrieval step of this rollout", received, grade)]
 
 
 def _lesson_of(buffer: Buffer) -> Generator[NDArray[np.uint8]]:

@@ -97,7 +97,7 @@ def run_rollout(
             received = selector.select(buffer, first.images[camera]).tolist()
         check_history(name_system(run.system), {item.condition: len(received)})
     if clip is not None:
-        clip.begin(buffer, received, first, info)
+        clip.begin(buffer_set, buffer, received, first, info)
     rollout_info = RolloutInfo(info.goal, len(received), config.model_seed)
     if policy.privileged:
         evidence = buffer.evidence and evidence_among(buffer.evidence, received)

@@ -226,6 +226,8 @@ class RolloutFunction(RunFunction[RunConfig]):
             clip.close(status, error)
             if clip.data is not None:
                 worker.send_file(item.clip, clip.data)
+                if clip.page is not None:
+                    worker.send_file(item.page, clip.page)
 
     def _send_logs(self, worker: Worker) -> None:
         """Send the output of servers that the worker started.

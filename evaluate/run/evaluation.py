@@ -240,7 +240,8 @@ def _save_files(
             error = RuntimeError(f"its row cannot be stored: {first_line(unstorable)}")
     if error is not None:
         row = _error_row(run, outcome, error, buffer_set)
-    (log.folder / item.clip).unlink(missing_ok=True)  # of an earlier attempt
+    for path in (item.clip, item.page):  # of an earlier attempt
+        (log.folder / path).unlink(missing_ok=True)
     # Rows matter more than clips: a full disk costs a clip only.
     problems = [_write(log.folder, path, data) for path, data in outcome.files.items()]
     lost = [problem for problem in problems if problem is not None]

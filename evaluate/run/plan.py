@@ -49,6 +49,11 @@ class WorkItem:
         """Path of its clip inside the run's folder."""
         return f"videos/{self.file_name}.mp4"
 
+    @property
+    def page(self) -> str:
+        """Path of the page of its buffer, beside the clip."""
+        return f"videos/{self.file_name}.html"
+
     def transcript(self, folder: str, lines: Iterable[Mapping[str, Any]]) -> tuple[str, bytes]:
         """Return path and bytes of what models were asked and answered."""
         text = "".join(canonical_json(dict(line)) + "\n" for line in lines)

@@ -15,11 +15,12 @@ from .config import Against, Expected, Settings
 from .outcomes import Outcomes, offline_outcomes, outcomes_of
 from .partners import base_of, ceilings_of
 from .rows.reading import CheckedRows, read_rows
-from .tables import effects, families, family_falls, ranks, slopes
-from .tables.cells import SuccessCell, cells_of, main_table, parts_table
+from .tables import effects, families, ranks, slopes
+from .tables.cells import SuccessCell, cells_of, main_table
 from .tables.contrast import Contrast
 from .tables.correction import correct, with_primary
 from .tables.cost import cost_table
+from .tables.parts import parts_table
 
 if TYPE_CHECKING:
     from .tables.action_error import ErrorCell
@@ -35,7 +36,6 @@ TABLES = (
     "evidence_use",
     "decay",
     "families",
-    "family_falls",
     "matrix",
     "action_error",
     "action_error_effects",
@@ -113,12 +113,11 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     notes += [sentence for each in simulated if (sentence := repeat_noise(each))]
     tables = [
         main_table(cells),
-        parts_table(cells),
+        parts_table(cells, simulated, contrasts),
         effects.effects_table(contrasts),
         slopes.interaction_table(contrasts),
         slopes.decay_table(simulated, draws),
         families.families_table(simulated, contrasts),
-        family_falls.family_falls_table(simulated, contrasts),
         ranks.matrix_table(contrasts),
         cost_table(rows, cells),
     ]

@@ -56,6 +56,19 @@ def test_a_rollout_writes_a_video(tmp_path: Path, buffer: Buffer) -> None:
         assert np.abs(seen.astype(int) - taught).mean() < 10
 
 
+def test_the_page_of_the_buffer_lies_beside_the_video(tmp_path: Path, buffer: Buffer) -> None:
+    conditions = ("no-history", "k1")
+    run_one(tmp_path / "run", conditions=conditions, policy="noop", videos=True)
+    videos = {path.name for path in (tmp_path / "run" / "videos").iterdir()}
+    assert videos == {
+        "MoveCube_test_0_k1.html",
+        "MoveCube_test_0_k1.mp4",
+        "MoveCube_test_0_no-history.mp4",
+    }
+    page = (tmp_path / "run" / K1.page).read_text(encoding="utf-8")
+    assert all(str(session.source) in page for session in buffer.sessions)
+
+
 def test_a_video_has_the_pace_of_the_recordings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -154,7 +154,7 @@ def test_the_row_states_what_the_policy_got(tiny_buffers: Path) -> None:
     manifest = buffer_set.manifest(EPISODE, "k3")
     assert row.key == (
         *("mine", "support.worlds:World", "buffer_set", buffer_set.revision),
-        *("MoveCube", "k3", "test", 0, "none", 0, 1),
+        *("MoveCube", "k3", "test", 0, "none", None, 0, 1),
     )
     assert (row.seed, row.goal) == (manifest.seed, manifest.goal)
     assert (row.history_frames, row.lesson_frames) == (144, 48)

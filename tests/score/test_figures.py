@@ -213,6 +213,8 @@ def test_numbers_in_figures_are_those_of_tables(full: Score) -> None:
             [without] = [sorted(line.get_xdata()) for line in lines]
             ends = [100 * falls[name] for name in ("without_low", "without_high")]
             assert [without[0], without[-1]] == pytest.approx(ends)
+            parts = made.records(full, "parts", system=system, by="family", condition="k7")
+            assert without == pytest.approx(sorted(100 * part["fall_without"] for part in parts))
 
 
 def test_systems_of_equal_rates_keep_the_order_of_tables(tmp_path: Path, figure: Any) -> None:

@@ -27,7 +27,8 @@ def test_methods_are_those_of_the_rows(full: Score) -> None:
         "# Methods\n\nWe rolled out 12 systems (π0.5 (baseline), FrameSamp-Modul, "
     )
     for told in (
-        "under 5 conditions of RoboMME-Interference [@rathi2026robomme] (no-history, k0, ",
+        "under 5 conditions of RoboMME-Interference [@rathi2026robommeinterference] ",
+        "(no-history, k0, ",
         "25,200 rollouts of 450 episodes of 9 families.\n56 of 56 cells (system × condition) are "
         "complete.\nNo rollout ended with an error.",
         "The primary analysis compares k7 with k0",

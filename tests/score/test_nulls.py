@@ -17,9 +17,16 @@ import pytest
 from support import scoring as made
 
 from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.evaluate.score.outcomes import Outcomes
+from robomme_interference_data.evaluate.score.outcomes import Outcomes, Repeat
 from robomme_interference_data.evaluate.score.plots import figures
 from robomme_interference_data.evaluate.score.tables import slopes
+from robomme_interference_data.evaluate.score.tables.contrast import Contrast
+from robomme_interference_data.evaluate.score.tables.correction import (
+    correct,
+    primary_falls,
+    with_primary,
+)
+from robomme_interference_data.evaluate.score.tables.effects import effects_of
 from robomme_interference_data.evaluate.score.tables.equivalence import tost
 from robomme_interference_data.evaluate.score.tables.evidence_kept import evidence_tables
 from robomme_interference_data.evaluate.score.tables.families import over_families
@@ -36,7 +43,6 @@ from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.stats.bootstrap import generator_of
 from robomme_interference_data.stats.sequential import look_levels
 from robomme_interference_data.stats.significance import holm, mcnemar
-from robomme_interference_data.stats.signs import simultaneous
 
 pytestmark = pytest.mark.slow
 
@@ -63,7 +69,7 @@ def made_up(
         systems=tuple(f"system-{number:02}" for number in range(systems)),
         conditions=tuple(conditions),
         episodes=EPISODES,
-        model_seeds=(0,),
+        repeats=(Repeat(None, 0),),
         status=status,
         evidence=np.full(status.shape, np.nan),
         action_l1=np.full(status.shape, np.nan),
@@ -81,6 +87,16 @@ def found_any(rows: list[dict[str, Any]], p: str = "p_holm") -> bool:
     return any(row[p] is not None and row[p] < 0.05 for row in rows)
 
 
+def primary(outcomes: Outcomes, differences: Sequence[Contrast]) -> list[Contrast]:
+    """The effects on all systems and the differences of their falls, corrected as in a score."""
+    contrasts = [
+        contrast
+        for system in outcomes.systems
+        for contrast in effects_of(outcomes, system, base=None, ceiling=None)
+    ]
+    return correct(with_primary([*contrasts, *differences], [outcomes]))
+
+
 def departs(rows: list[dict[str, Any]]) -> bool:
     """Whether any p fit is below 0.05 after Holm's correction, which tables leave out."""
     return min(holm([row["p_fit"] for row in rows])) < 0.05
@@ -92,12 +108,11 @@ def simulated(case: str) -> dict[str, float]:
     counts = defaultdict[str, list[bool]](list)
     for grid in range(GRIDS):
         outcomes = made_up(*CASES[case], f"{case}, {grid}")
-        pairs = matrix_table(system_pairs(outcomes)).records()
+        pairs = matrix_table(correct(system_pairs(outcomes))).records()
+        differences = slopes.interactions_of(outcomes, 2000)
         rows = {
             "matrix": [row for row in pairs if row["condition"] == "k0"],
-            "interaction": slopes.interaction_table(
-                slopes.interactions_of(outcomes, 2000)
-            ).records(),
+            "interaction": slopes.interaction_table(correct(differences)).records(),
         }
         for name, records in rows.items():
             counts[name].append(found_any(records))
@@ -114,9 +129,8 @@ def simulated(case: str) -> dict[str, float]:
         counts["ranks"].append(
             all((one.rank_low, one.rank_high) == (1, len(stands)) for one in stands)
         )
-        leader = outcomes.status[:, 0, :, 0].mean(axis=1).argmin()  # 0 is success
-        change = pair(*outcomes.status[leader, [0, 3]]).at(simultaneous(len(outcomes.systems)))
-        counts["headline"].append(change.low <= 0 <= change.high)
+        falls = [fall.joint for fall in primary_falls(primary(outcomes, differences), "made-up")]
+        counts["headline"].append(all(fall.low <= 0 <= fall.high for fall in falls))
         counts["interaction, fit"].append(departs(rows["interaction"]))
         decays = slopes.decay_table([outcomes], 2000).records()
         counts["decay"].append(found_any(decays))

@@ -56,6 +56,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made.write_run(folder, rows, status="complete", invocations=starts)
     (folder / VIDEO).parent.mkdir(parents=True)
     (folder / VIDEO).write_bytes(b"video")
+    (folder / VIDEO).with_suffix(".html").write_text("page")
     return folder
 
 
@@ -150,12 +151,13 @@ def test_the_report_works_in_a_browser(report: Path, small: Score) -> None:
         page.click("#flipped")
         assert len(texts(rows)) == 12
 
-        # The one video that is there has a link that leads to it.
+        # The one video that is there, and the page beside it, have links that lead to them.
         page.run("document.querySelector('#table-episodes input[type=search]').select()")
         page.call("Input.insertText", text="framesamp-modul movecube")
-        assert texts("#table-episodes a") == ["success"]
-        address = page.run("document.querySelector('#table-episodes a').href")
-        assert address == (report.parent.parent / "my run" / VIDEO).resolve().as_uri()
+        assert texts("#table-episodes a") == ["success", "buffer"]
+        addresses = page.run("[...document.querySelectorAll('#table-episodes a')].map(a => a.href)")
+        video = (report.parent.parent / "my run" / VIDEO).resolve()
+        assert addresses == [video.as_uri(), video.with_suffix(".html").as_uri()]
 
         # On a phone nothing sticks out.
         size = {"width": 400, "height": 900, "deviceScaleFactor": 1, "mobile": True}
@@ -255,7 +257,8 @@ def test_episodes_show_every_outcome(tmp_path: Path) -> None:
         *("tabletop", BASE, "MoveCube", "test/0", "easy"),
         ["success", "1/2", "success", "success", "success"],
         "k1 gained",
-        [""] * 5,
+        [""] * 5,  # videos
+        [""] * 5,  # pages of buffers
     ]
     own = {row[3]: row[5] for row in found if row[1:3] == [OWN, "MoveCube"]}
     assert own["test/2"] == ["fail", "0/1", "", "", ""]  # the other one broke
@@ -278,7 +281,7 @@ def test_each_rollout_has_its_video_whatever_seeds_others_have(tmp_path: Path) -
             if video != "gone.mp4":
                 (tmp_path / name / video).touch()
     found = episodes(made.score(*(tmp_path / name for name in given)), tmp_path)
-    assert [row[-1] for row in found] == [["a/a0.mp4"], ["caf%E9/b1.mp4"], ["caf%E9/b2.mp4"]]
+    assert [row[-2] for row in found] == [["a/a0.mp4"], ["caf%E9/b1.mp4"], ["caf%E9/b2.mp4"]]
     # Of a file by itself nobody knows where its videos lie.
     alone = made.write_csv(tmp_path / "a.csv", [replace(first, video="a0.mp4")])
-    assert episodes(made.score(alone), tmp_path)[0][-1] == [""]
+    assert episodes(made.score(alone), tmp_path)[0][-2] == [""]

@@ -9,6 +9,7 @@ from robomme_interference_data.evaluate.score.partners import base_of
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.cells import SuccessCell
 from robomme_interference_data.evaluate.score.tables.contrast import Verdict
+from robomme_interference_data.evaluate.score.tables.correction import primary_falls
 from robomme_interference_data.evaluate.systems import published_base
 from robomme_interference_data.schema.conditions import (
     Condition,
@@ -46,7 +47,8 @@ class Data:
         distinguishable: Condition and pair of systems that are shown to differ, in `matrix`.
         by_evidence_kept: The rate of each level of evidence, as rows of `evidence_effects`.
         costs: The cost of each cell over all episodes, as rows of `cost`.
-        family_falls: The fall of each system in each family, as rows of `family_falls`.
+        falls: The primary fall of each system.
+        family_falls: Its fall in each family, as rows of `parts`.
         chance: Success of guessing by part of the episodes, if all are questions.
     """
 
@@ -72,7 +74,10 @@ class Data:
             if not record["against_kept"]
         ]
         self.costs = _records(score, "cost", simulator)
-        self.family_falls = _records(score, "family_falls", simulator)
+        self.falls = {fall.system: fall for fall in primary_falls(self.contrasts, simulator)}
+        self.family_falls = [
+            record for record in _records(score, "parts", simulator) if record["fall_n"] is not None
+        ]
         asked = sorted((cell for cell in own if cell.chance >= 0), key=lambda cell: cell.n)
         self.chance = {cell.part: cell.chance for cell in asked}
         bases = [base for name in self.systems if (base := published_base(name))]

@@ -12,7 +12,7 @@ from .data import Data
 _WIDE = 4
 """The most panels in a row."""
 
-_OWN = ("difference", "low", "high")
+_OWN = ("fall", "fall_low", "fall_high")
 
 
 def family_falls(figure: Any, data: Data) -> bool:
@@ -21,7 +21,7 @@ def family_falls(figure: Any, data: Data) -> bool:
     if not systems:
         return False
     families = [
-        name for name in data.families if any(row["family"] == name for row in data.family_falls)
+        name for name in data.families if any(row["part"] == name for row in data.family_falls)
     ]
     wide = min(_WIDE, len(systems))
     high = 0.45 + 0.19 * len(families)
@@ -30,13 +30,12 @@ def family_falls(figure: Any, data: Data) -> bool:
     for axes, system in zip(panels, systems, strict=True):
         own = [row for row in data.family_falls if row["system"] == system]
         axes.axvline(0, color=GRAY, linewidth=0.8, zorder=0)
-        points = [
-            (families.index(row["family"]), *(100 * row[name] for name in _OWN)) for row in own
-        ]
+        points = [(families.index(row["part"]), *(100 * row[name] for name in _OWN)) for row in own]
         style = data.styles[system]
-        draw_points(axes, points, style, system, [row["complete"] for row in own], horizontal=True)
+        complete = [data.falls[system].complete for _ in own]
+        draw_points(axes, points, style, system, complete, horizontal=True)
         places = [point[0] for point in points]
-        without = [100 * row["without"] for row in own]
+        without = [100 * row["fall_without"] for row in own]
         mark(axes.plot(without, places, "|", color=INK, markersize=9, zorder=2), system)
         tidy(axes)
         axes.set_title(style.label, size=HEADING, color=INK)
@@ -46,7 +45,7 @@ def family_falls(figure: Any, data: Data) -> bool:
     compared = f"{' or '.join(ends)} − {START}"
     figure.suptitle(f"Falls by family, {data.simulator}", size=TITLE, color=INK)
     notes = [f"{compared}, points, with 95% intervals", "upright lines: all other families"]
-    if not all(row["complete"] for row in data.family_falls):
+    if not all(data.falls[system].complete for system in systems):
         notes.append("hollow: incomplete cell")
     legend(figure, "; ".join(notes))
     return True

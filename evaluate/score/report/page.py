@@ -37,7 +37,7 @@ _LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
 """Libraries that numbers and figures depend on."""
 
 _SHOWN_IN = {
-    "family_falls": ("family_falls", "families"),
+    "family_falls": ("parts", "families"),
     "effects": ("effects",),
     "success": ("main", "paper"),
     "families": ("parts",),
@@ -156,7 +156,8 @@ def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
 
     `names` holds the systems' display names; `rows` one row for each system and episode: simulator,
     system, family, the rest of the id, difficulty, the outcome under each condition, the flips, and
-    the address of a video under each condition, relative to the page's folder.
+    under each condition the address of a video and that of the page of its buffer, relative to the
+    folder of the report.
     """
     videos = _videos(score.rows)
     rows = []
@@ -186,7 +187,8 @@ def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
                     DIFFICULTIES[difficulty] if difficulty >= 0 else "",
                     [outcome_under.get(c, "") for c in conditions],
                     flips(outcomes.conditions, rates[number]),
-                    [_address(video, folder) if video else "" for video in shown],
+                    [_address(video, folder) for video in shown],
+                    [_address(video and video.with_suffix(".html"), folder) for video in shown],
                 )
                 rows.append(row)
     data = {"names": _names(score), "rows": rows}
@@ -194,8 +196,11 @@ def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
     return text.replace("<", "\\u003c")
 
 
-def _address(video: Path, folder: Path) -> str:
-    return quote(os.fsencode(os.path.relpath(video, folder)))  # names may not be UTF-8
+def _address(path: Path | None, folder: Path) -> str:
+    """Return where a file lies from a folder, for a link; empty if there is no file."""
+    if path is None or not path.is_file():
+        return ""
+    return quote(os.fsencode(os.path.relpath(path, folder)))  # names may not be UTF-8
 
 
 def flips(conditions: Sequence[str], rates: Sequence[float]) -> str:

@@ -52,11 +52,6 @@ _MAIN_NOTE = (
     "difference low to difference high, and p holm are corrected over all pairs of systems, since "
     "the best is chosen by its rate."
 )
-_PARTS_NOTE = (
-    "Rows of families list episodes, by split and index. An episode counts if one of its rollouts "
-    "is not an error. With "
-    "repeats, one that does not count with every model seed of the condition is missing."
-)
 
 
 @dataclass(frozen=True)
@@ -247,9 +242,9 @@ def _ranked(
     return cells
 
 
-_CELL: Columns = {"simulator": "text", "system": "text", "condition": "text"}
+CELL: Columns = {"simulator": "text", "system": "text", "condition": "text"}
 
-_RATE: Columns = {
+RATE: Columns = {
     "n": "count",
     "runs": "count",
     "scope": "text",
@@ -258,7 +253,7 @@ _RATE: Columns = {
     "high": "rate",
 }
 
-_COUNTS: Columns = {
+COUNTS: Columns = {
     "successes": "count",
     "fails": "count",
     "timeouts": "count",
@@ -269,9 +264,9 @@ _COUNTS: Columns = {
     "best": "flag",
 }
 
-MAIN: Columns = (
-    _CELL
-    | _RATE
+_MAIN: Columns = (
+    CELL
+    | RATE
     | {
         "run_spread": "points",
         "fixed_low": "rate",
@@ -279,7 +274,7 @@ MAIN: Columns = (
         "if_errors_fail": "rate",
         "if_errors_succeed": "rate",
     }
-    | _COUNTS
+    | COUNTS
     | {
         "rank_low": "count",
         "rank_high": "count",
@@ -299,32 +294,16 @@ EPISODES: Columns = {
 }
 """Which episodes a cell lacks, which have errors, and which it has beyond the expected ones."""
 
-PARTS: Columns = _CELL | {"by": "text", "part": "text"} | _RATE | _COUNTS | EPISODES
-
 
 def main_table(cells: Sequence[SuccessCell]) -> Table:
     """Return a row for each cell over all episodes."""
-    records = [_record(cell) | _standing(cell) for cell in cells if not cell.part]
+    records = [rate_record(cell) | _standing(cell) for cell in cells if not cell.part]
     note = f"{NOTE} {BEST} {_MAIN_NOTE}"
-    return record_table("main", "Success by system and condition", MAIN, records, note)
+    return record_table("main", "Success by system and condition", _MAIN, records, note)
 
 
-def parts_table(cells: Sequence[SuccessCell]) -> Table:
-    """Return a row for each cell over a family, and over a difficulty; families come first."""
-    families, difficulties = list[dict[str, Any]](), list[dict[str, Any]]()
-    for cell in cells:
-        if cell.part in DIFFICULTIES:
-            record = _record(cell) | episodes_record(cell, listed=False)
-            difficulties.append(record | {"by": "difficulty"})
-        elif cell.part:
-            record = _record(cell) | episodes_record(cell, listed=True)
-            families.append(record | {"by": "family"})
-    note = f"{NOTE} {BEST} {_PARTS_NOTE}"
-    title = "Success by family and by difficulty"
-    return record_table("parts", title, PARTS, families + difficulties, note)
-
-
-def _record(cell: SuccessCell) -> dict[str, Any]:
+def rate_record(cell: SuccessCell) -> dict[str, Any]:
+    """Return the values of the columns that the tables `main` and `parts` share, and more."""
     # The interval from 0 to 1 of a cell without episodes says nothing.
     low, high = cell.interval if cell.n else (math.nan, math.nan)
     successes, fails, timeouts, errors, _ = cell.counts

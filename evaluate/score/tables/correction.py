@@ -60,6 +60,17 @@ def _primary_condition(names: Sequence[str]) -> str:
     return max(names, key=lambda name: parse_condition(name).k)
 
 
+def primary_falls(contrasts: Iterable[Contrast], simulator: str) -> list[Contrast]:
+    """Return the primary fall of each system in a simulator."""
+    return [
+        contrast
+        for contrast in contrasts
+        if contrast.simulator == simulator
+        and contrast.primary
+        and contrast.effect is Effect.SESSIONS
+    ]
+
+
 def correct(contrasts: Iterable[Contrast], alpha: float = ALPHA) -> list[Contrast]:
     """Return comparisons with p-values corrected by Holm within their group and simulator.
 

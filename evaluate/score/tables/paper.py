@@ -18,13 +18,15 @@ from .pairs import compare_unpaired
 from .ranks import tied_with_best
 
 _NOTE = (
-    "Published: RoboMME-Interference: Benchmarking Robot Memory Under Interference (Rathi, August "
-    "2026), Tables 3 and 4. complete: over the benchmark's 450 episodes, like the published rates. "
-    "95% intervals: Wilson for rates; Newcombe's hybrid score for differences, with both sides as "
-    "independent samples, because the paper's rows are not available for pairing. published_best: "
-    "no other published rate of its condition is significantly higher, by the test of two "
-    "proportions after Holm's correction over all pairs. A system that is not "
-    "in the paper is listed beside all of them if its cell is complete; this is not a ranking."
+    "Published: RoboMME-Interference: Benchmarking Robot Memory Under Interference (Rathi, "
+    "arXiv:2606.22338), Tables 3 and 4. complete: over the benchmark's 450 episodes, like the "
+    "published rates. 95% intervals: Wilson for rates; Newcombe's hybrid score for differences, "
+    "with both sides as independent samples, because the published tables have no rows. The "
+    "paper's repository has rows of nine systems, canonical_rollouts.csv, which can be scored "
+    "beside these. published_best: no other published rate of its condition is significantly "
+    "higher, by the test of two proportions after Holm's correction over all pairs. A system that "
+    "is not in the paper is listed beside all of them if its cell is complete; this is not a "
+    "ranking."
 )
 _COLUMNS: Columns = {
     "system": "text",
