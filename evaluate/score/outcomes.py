@@ -1,28 +1,20 @@
 """The outcomes of all rollouts in one simulator, or along recordings, as arrays."""
 
 import math
-from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
-from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import DIFFICULTIES, FAMILIES, RECORDINGS
-from robomme_interference_data.evaluate.systems import FACT_COLUMNS, SYSTEMS, SystemFacts
+from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, in_order
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.stats.bootstrap import Interval
 from robomme_interference_data.stats.intervals import LEVEL, effective_n, wilson
 from robomme_interference_data.stats.runs import ONE_RUN, RunSpread, run_spread
-
-from .config import Expected
-from .rows.reading import CheckedRows
-from .rows.values import Row
 
 STATUSES = (Status.SUCCESS, Status.FAIL, Status.TIMEOUT, Status.ERROR, Status.MEASURED)
 """In the order of their numbers in `Outcomes.status`."""
@@ -257,127 +249,3 @@ def rate_of(status: Statuses, training: NDArray[np.int64] | None = None) -> Succ
     variance = float(rates.var(ddof=1))
     trials = effective_n(float(rates.mean()), variance, n, int(of.sum()))
     return SuccessRate(n, value, trials, spread)
-
-
-def outcomes_of(rows: CheckedRows, expected: Expected) -> dict[str, Outcomes]:
-    """Return the outcomes of each simulator, by its name; recordings have none."""
-    found = {}
-    for name in rows.names("simulator"):
-        if name != RECORDINGS:
-            here = [row for row in rows if row.simulator == name]
-            # Other benchmarks do not have this one's grid, and their seeds may change the scene.
-            other = name in {simulator for simulator, _ in rows.scenes}
-            grid = Expected.OBSERVED if other else expected
-            outcomes = _outcomes(here, name, grid, rows.without_revision)
-            found[name] = replace(outcomes, seeds_repeat=not other)
-    return found
-
-
-def offline_outcomes(rows: CheckedRows) -> Outcomes | None:
-    """Return the outcomes of offline runs, or None without any.
-
-    Recordings have no grid: the expected episodes are those that occur in any row or in the plan
-    of a run, and the expected cells those that have rows.
-    """
-    measured = [row for row in rows if row.simulator == RECORDINGS]
-    if not measured:
-        return None
-    planned = {
-        item.episode
-        for run in rows.sources.values()
-        if run is not None and run.identity.get("simulator") == RECORDINGS
-        for item in run.items
-    }
-    outcomes = _outcomes(measured, RECORDINGS, Expected.OBSERVED, rows.without_revision, planned)
-    return replace(outcomes, in_tables=outcomes.has_rows)
-
-
-def _outcomes(
-    rows: Sequence[Row],
-    simulator: str,
-    which: Expected,
-    without_revision: frozenset[tuple[str, str]],
-    planned: Set[EpisodeId] = frozenset(),
-) -> Outcomes:
-    systems = tuple(sorted({row.system for row in rows}, key=_table_order))
-    observed = {row.condition for row in rows}
-    expected_conditions = observed if which is Expected.OBSERVED else {*DEFAULT_CONDITIONS}
-    conditions = tuple(condition.name for condition in in_order(observed | expected_conditions))
-    seeds = {(row.training_seed, row.model_seed) for row in rows}
-    repeats = tuple(Repeat(*seed) for seed in sorted(seeds, key=_repeat_order))
-    ids = {(row.family, row.split, row.episode) for row in rows}
-    expected = ids | {(episode.family, episode.split, episode.index) for episode in planned}
-    if which is Expected.BENCHMARK:
-        expected = {
-            (family, "test", index) for family in FAMILIES for index in range(TEST_EPISODES)
-        }
-    episodes = sorted((EpisodeId(*key) for key in ids | expected), key=lambda each: each.sort_key)
-
-    # The values along each axis, their places, and the places of all rows (`at`): at most one row
-    # is at each, because reading keeps one row of a rollout.
-    axes = (systems, conditions, [(e.family, e.split, e.index) for e in episodes], repeats)
-    places = [{name: place for place, name in enumerate(axis)} for axis in axes]
-    keys = [
-        (r.system, r.condition, (r.family, r.split, r.episode), (r.training_seed, r.model_seed))
-        for r in rows
-    ]
-    at = tuple(
-        np.array([place[key] for key in column])
-        for place, column in zip(places, zip(*keys, strict=True), strict=True)
-    )
-    shape = tuple(map(len, axes))
-    status = np.full(shape, -1, np.int8)
-    evidence, action_l1 = (np.full(shape, np.nan) for _ in range(2))
-    status[at] = [STATUSES.index(row.status) for row in rows]
-    evidence[at] = np.array([row.evidence_kept for row in rows], float)  # None becomes NaN
-    action_l1[at] = np.array([row.action_l1 for row in rows], float)
-    difficulty, chance = np.full(len(episodes), -1), np.full(len(episodes), np.nan)
-    for row, place in zip(rows, at[2].tolist(), strict=True):
-        if row.difficulty is not None:
-            difficulty[place] = DIFFICULTIES.index(row.difficulty)
-        if row.chance is not None:
-            chance[place] = row.chance
-    facts = _facts_of(rows, systems)
-    applies = np.array(
-        [
-            [
-                condition in expected_conditions
-                and all(each.applies(condition) for each in of_system)
-                for condition in conditions
-            ]
-            for of_system in facts
-        ]
-    )
-    return Outcomes(
-        simulator,
-        systems,
-        conditions,
-        tuple(episodes),
-        repeats,
-        status,
-        evidence,
-        action_l1,
-        difficulty,
-        chance,
-        expected=np.array([key in expected for key in axes[2]]),
-        in_tables=applies | (status >= 0).any(axis=(2, 3)),
-        without_revision=np.array([(simulator, name) in without_revision for name in systems]),
-        facts=facts,
-    )
-
-
-def _facts_of(rows: Sequence[Row], systems: Sequence[str]) -> tuple[frozenset[SystemFacts], ...]:
-    facts: dict[str, set[SystemFacts]] = {system: set() for system in systems}
-    for system, *values in set(map(attrgetter("system", *FACT_COLUMNS), rows)):
-        facts[system].add(SystemFacts(**dict(zip(FACT_COLUMNS, values, strict=True))))
-    return tuple(map(frozenset, facts.values()))
-
-
-def _repeat_order(seed: tuple[int | None, int]) -> tuple[int, int]:
-    training_seed, model_seed = seed
-    return -1 if training_seed is None else training_seed, model_seed
-
-
-def _table_order(system: str) -> tuple[int, str]:
-    names = [*SYSTEMS]
-    return names.index(system) if system in SYSTEMS else len(names), system

@@ -12,8 +12,9 @@ from robomme_interference_data.stats.intervals import wilson
 from robomme_interference_data.viz.tables import Table, percent
 
 from .config import Against, Expected, Settings
-from .outcomes import Outcomes, offline_outcomes, outcomes_of
+from .outcomes import Outcomes
 from .partners import base_of, ceilings_of
+from .placing import offline_outcomes, outcomes_of
 from .rows.reading import CheckedRows, read_rows
 from .tables import effects, families, ranks, slopes
 from .tables.cells import SuccessCell, cells_of, main_table
@@ -111,43 +112,21 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     contrasts = correct(with_primary(compared, simulated))
     notes = [*rows.notes, *unpaired]
     notes += [sentence for each in simulated if (sentence := repeat_noise(each))]
-    tables = [
-        main_table(cells),
-        parts_table(cells, simulated, contrasts),
-        effects.effects_table(contrasts),
-        slopes.interaction_table(contrasts),
-        slopes.decay_table(simulated, draws),
-        families.families_table(simulated, contrasts),
-        ranks.matrix_table(contrasts),
-        cost_table(rows, cells),
-    ]
+    tables = [*_tables(outcomes, cells, contrasts, draws), cost_table(rows, cells)]
     error_cells = list["ErrorCell"]()
-    published: Sequence[SuccessCell] = ()
-    # The tables below are for some rows or settings only: what is not used is not imported.
-    if any(cell.chance >= 0 for cell in cells):
-        from .tables.chance import with_chance
-
-        tables[0] = with_chance(tables[0], outcomes, cells)
-    if any((each.evidence >= 0).any() for each in simulated):
-        from .tables.evidence_kept import evidence_tables
-
-        tables += evidence_tables(simulated)
     if recordings is not None:
-        from .tables import action_error, action_error_effects
-
-        error_cells = action_error.error_cells(recordings, draws)
-        errors = correct(action_error_effects.error_contrasts(recordings, draws))
-        tables.append(action_error.error_table(error_cells))
-        tables.append(action_error_effects.error_effects_table(errors))
+        error_cells, errors, error_tables = _offline(recordings, draws)
         contrasts += errors
+        tables += error_tables
         notes += _not_compared_offline(recordings)
+    published: Sequence[SuccessCell] = ()
     if settings.against is Against.PAPER and not simulated:
         notes.append(
             f"{named('against', settings.against)} has no effect on recordings: the paper has no "
             "action errors."
         )
     elif settings.against is Against.PAPER:
-        from .tables import paper
+        from .tables import paper  # only for this setting
 
         published = paper.published()
         # The paper's rates are over the benchmark's grid.
@@ -155,10 +134,10 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         tables.append(paper.paper_table(whole))
         notes += paper.not_compared(whole)
     if settings.margin is not None:
-        from .tables.equivalence import equivalence_table
+        from .tables.equivalence import equivalence_table  # only for this setting
 
         tables.append(equivalence_table(contrasts, cells, published, settings.margin))
-    filled = [table for table in tables if table.rows]
+    filled = {table.name: table for table in tables if table.rows}
     return Score(
         settings,
         draws,
@@ -170,8 +149,50 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         published,
         cells,
         error_cells,
-        {table.name: table for table in sorted(filled, key=lambda t: TABLES.index(t.name))},
+        {name: filled[name] for name in TABLES if name in filled},
     )
+
+
+def _tables(
+    outcomes: Mapping[str, Outcomes],
+    cells: Sequence[SuccessCell],
+    contrasts: Sequence[Contrast],
+    draws: int,
+) -> list[Table]:
+    """Return the tables of rollouts that need no setting, in any order and some without rows."""
+    simulated = tuple(outcomes.values())
+    main = main_table(cells)
+    # What only some rows have is imported for these alone.
+    if any(cell.chance >= 0 for cell in cells):
+        from .tables.chance import with_chance
+
+        main = with_chance(main, outcomes, cells)
+    tables = [
+        main,
+        parts_table(cells, simulated, contrasts),
+        effects.effects_table(contrasts),
+        slopes.interaction_table(contrasts),
+        slopes.decay_table(simulated, draws),
+        families.families_table(simulated, contrasts),
+        ranks.matrix_table(contrasts),
+    ]
+    if any((each.evidence >= 0).any() for each in simulated):
+        from .tables.evidence_kept import evidence_tables
+
+        tables += evidence_tables(simulated)
+    return tables
+
+
+def _offline(
+    recordings: Outcomes, draws: int
+) -> "tuple[list[ErrorCell], list[Contrast], list[Table]]":
+    """Return cells, corrected comparisons and tables of offline runs."""
+    from .tables import action_error, action_error_effects  # only for these runs
+
+    cells = action_error.error_cells(recordings, draws)
+    contrasts = correct(action_error_effects.error_contrasts(recordings, draws))
+    tables = [action_error.error_table(cells), action_error_effects.error_effects_table(contrasts)]
+    return cells, contrasts, tables
 
 
 def _rows(settings: Settings) -> CheckedRows:

@@ -11,7 +11,8 @@ from robomme_interference_data.stats.intervals import wilson
 from robomme_interference_data.viz.tables import percent
 
 from .config import Expected
-from .outcomes import Outcomes, offline_outcomes, outcomes_of
+from .outcomes import Outcomes
+from .placing import offline_outcomes, outcomes_of
 from .rows.reading import CheckedRows
 from .rows.values import unshifted
 from .tables.pairs import Pairs
