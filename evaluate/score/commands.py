@@ -21,6 +21,7 @@ from robomme_interference_data.errors import InvalidOptionError, counted, named
 from .config import Settings
 
 if TYPE_CHECKING:
+    from .planning import PowerPlan
     from .rows.reading import CheckedRows
 
 
@@ -221,7 +222,7 @@ def power(
     robomme-interference power --margin 10 --runs 5 --run-spread 3
     ```
     """
-    from .power import plan
+    from .planning import plan
 
     by_chance = round(flips - abs(difference) / 100, 12)
     if not 0 <= by_chance <= 1:
@@ -235,13 +236,26 @@ def power(
     if as_json:
         print_json(asdict(planned))
         return
+    _print_plan(planned, run_spread)
+
+
+def _look(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([0-9]{1,2})/([0-9]{1,2})", text)
+    look, of = map(int, match.groups()) if match else (0, 0)
+    if not 1 <= look <= of <= 20:
+        raise InvalidOptionError.expected("looks", text, "LOOK/OF, such as 2/5, of at most 20")
+    return look, of
+
+
+def _print_plan(planned: "PowerPlan", run_spread: float) -> None:
+    margin = 100 * planned.margin
     least = "none" if planned.smallest is None else f"{100 * planned.smallest:.1f} points"
     lines = {
         "noise: 95% range between two equal systems": f"±{100 * planned.noise:.1f} points",
         "smallest difference found with 80% power": least,
         f"power to find {margin:g} points": f"{planned.power:.0%}",
         f"episodes that find {margin:g} points with 80% power": f"{planned.needed:,}",
-        f"smallest margin of equivalence with 80% power, at rates of {rate:.0%}": (
+        f"smallest margin of equivalence with 80% power, at rates of {planned.rate:.0%}": (
             f"±{100 * planned.equal:.1f} points"
         ),
     }
@@ -255,21 +269,14 @@ def power(
             f"training runs each that find {margin:g} points with 80% power": needed,
         }
     for look, level in enumerate(planned.looks, start=1):
-        at = round(episodes * look / looks)
+        at = round(planned.episodes * look / len(planned.looks))
         lines[f"look {look} after {at:,} episodes: significant if p holm is below"] = f"{level:.2g}"
-    corrected = f", corrected for {tests:,} tests" if tests > 1 else ""
-    echo(f"{episodes:,} episodes, of which {100 * by_chance:g}% flip by chance{corrected}\n")
+    corrected = f", corrected for {planned.tests:,} tests" if planned.tests > 1 else ""
+    flips = f"{100 * planned.flips:g}%"
+    echo(f"{planned.episodes:,} episodes, of which {flips} flip by chance{corrected}\n")
     width = max(map(len, lines))
     for name, value in lines.items():
         echo(f"{name:{width}}  {value}")
-
-
-def _look(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"([0-9]{1,2})/([0-9]{1,2})", text)
-    look, of = map(int, match.groups()) if match else (0, 0)
-    if not 1 <= look <= of <= 20:
-        raise InvalidOptionError.expected("looks", text, "LOOK/OF, such as 2/5, of at most 20")
-    return look, of
 
 
 def _print_notes(runs: "Sequence[CheckedRows]", notes: Sequence[str]) -> None:

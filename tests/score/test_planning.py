@@ -16,7 +16,8 @@ from support.scoring import BASE, RETRIEVAL, cells, record, records, run
 
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.score.config import Expected, Settings
-from robomme_interference_data.evaluate.score.power import needed, plan, power, smallest
+from robomme_interference_data.evaluate.score.planning import plan
+from robomme_interference_data.evaluate.score.power import needed, power, smallest
 from robomme_interference_data.evaluate.score.report.headline import headlines
 from robomme_interference_data.evaluate.score.tables.equivalence import (
     BEYOND,
