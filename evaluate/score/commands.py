@@ -114,10 +114,10 @@ def compare(
         ),
     ] = None,
     system_a: Annotated[
-        str | None, typer.Option(help="System of rows of A that name none.")
+        str | None, typer.Option(help="Name of the system in A, if its rows state none.")
     ] = None,
     system_b: Annotated[
-        str | None, typer.Option(help="System of rows of B that name none.")
+        str | None, typer.Option(help="Name of the system in B, if its rows state none.")
     ] = None,
     lenient: Annotated[
         bool, typer.Option("--lenient", help="Leave out bad rows and count them.")
@@ -125,14 +125,16 @@ def compare(
     looks: Annotated[
         str,
         typer.Option(
-            help="Number of this look at the data, and of all that are planned, equally spaced: "
-            "stricter intervals and levels, so that looking at incomplete runs is allowed.",
+            help="To compare runs before they end: the number of this look at the data, and of all "
+            "that are planned, equally spaced. Intervals and levels become stricter.",
             metavar="LOOK/OF",
         ),
     ] = "1/1",
     model_seed: Annotated[
         int | None,
-        typer.Option(help="Seed of files that name none, such as lerobot-eval's --seed."),
+        typer.Option(
+            help="Seed of the rollouts in files that state none, such as lerobot-eval's --seed."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -170,21 +172,21 @@ def compare(
 
 
 def power(
-    margin: Annotated[float, typer.Option(help="A difference of interest, in points.")] = 5.0,
-    episodes: Annotated[int, typer.Option(help="Episodes that run on both sides.")] = 450,
+    margin: Annotated[float, typer.Option(help="The difference to find, in points.")] = 5.0,
+    episodes: Annotated[int, typer.Option(help="Episodes that both systems run.")] = 450,
     flips: Annotated[
         float,
         typer.Option(
-            help="Share of the episodes that differs between two systems of equal rates; of the "
-            "learned ones in docs/results/training.md 9 to 44% do at k0, between two runs of one "
-            "system 6 to 8%."
+            help="Share of the episodes whose outcomes differ between two systems of equal rates. "
+            "Learned systems in docs/results/training.md differ in 9 to 44% at k0, two runs of one "
+            "system in 6 to 8%."
         ),
     ] = 0.25,
     difference: Annotated[
         float,
         typer.Option(
-            help="The difference that these flips contain, in points, as in a row of the table "
-            "matrix: it is subtracted."
+            help="Difference of the two systems that flips are of, in points; it is subtracted. A "
+            "row of the table matrix has both."
         ),
     ] = 0.0,
     rate: Annotated[
@@ -236,18 +238,24 @@ def power(
     if as_json:
         print_json(asdict(planned))
         return
-    _print_plan(planned, run_spread)
+    _print_plan(planned)
 
 
 def _look(text: str) -> tuple[int, int]:
+    from robomme_interference_data.stats.sequential import MAX_LOOKS
+
     match = re.fullmatch(r"([0-9]{1,2})/([0-9]{1,2})", text)
     look, of = map(int, match.groups()) if match else (0, 0)
-    if not 1 <= look <= of <= 20:
-        raise InvalidOptionError.expected("looks", text, "LOOK/OF, such as 2/5, of at most 20")
+    if not 1 <= look <= of <= MAX_LOOKS:
+        raise InvalidOptionError.expected(
+            "looks", text, f"LOOK/OF, such as 2/5, of at most {MAX_LOOKS}"
+        )
     return look, of
 
 
-def _print_plan(planned: "PowerPlan", run_spread: float) -> None:
+def _print_plan(planned: "PowerPlan") -> None:
+    from .planning import MAX_RUNS
+
     margin = 100 * planned.margin
     least = "none" if planned.smallest is None else f"{100 * planned.smallest:.1f} points"
     lines = {
@@ -260,9 +268,9 @@ def _print_plan(planned: "PowerPlan", run_spread: float) -> None:
         ),
     }
     if planned.runs is not None:
-        of_runs = planned.runs
-        which = f"with {of_runs.runs} training runs each that differ by {run_spread:g} points"
-        needed = "more than 100" if of_runs.needed is None else str(of_runs.needed)
+        of_runs, spread = planned.runs, 100 * planned.runs.spread
+        which = f"with {of_runs.runs} training runs each that differ by {spread:g} points"
+        needed = f"more than {MAX_RUNS}" if of_runs.needed is None else str(of_runs.needed)
         lines |= {
             f"smallest difference {which}": f"{100 * of_runs.smallest:.1f} points",
             f"power to find {margin:g} points {which}": f"{of_runs.power:.0%}",

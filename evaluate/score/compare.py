@@ -20,6 +20,7 @@ from .partners import related
 from .rows.reading import CheckedRows, read_rows
 from .sides import (
     Side,
+    Sides,
     check_scenes,
     differing,
     left_out,
@@ -100,16 +101,7 @@ def compare(
             overall = {each.condition: each.pairs for each in own if not each.family}
             notes += noise_floor(a, b, overall)
     if not contrasts:
-        paths = " and ".join(str(path) for path in (first, second) if path)
-        under = " and ".join(conditions) or "a common condition"
-        held = [
-            "; ".join(f"{side.system}: {', '.join(side.conditions)}" for side in sides.values())
-            for sides in (a_sides, b_sides)
-        ]
-        raise InvalidOptionError(
-            f"no episode of {paths} counts on both sides under {under}",
-            f"They hold {' and '.join(dict.fromkeys(held))}. Compare the same episodes.",
-        )
+        raise _nothing_shared((first, second), (a_sides, b_sides), conditions)
     contrasts = correct(contrasts, alpha)
     notes += stopped_early("a", a_sides.values())
     if second is not None:
@@ -119,10 +111,32 @@ def compare(
     table = _table(
         contrasts, measure, alpha, "Two runs compared" if second else "Two conditions compared"
     )
-    note = [f"a: {first}; b: {second or first}.", table.note]
-    if look[1] > 1:
-        note.append(
-            f"Look {look[0]} of {look[1]} (alpha spending like O'Brien and Fleming's boundaries): "
+    note = [f"a: {first}; b: {second or first}.", table.note, *_notes_below(runs, look, alpha)]
+    return RunComparison(replace(table, note=" ".join(note)), tuple(notes), runs)
+
+
+def _nothing_shared(
+    paths: tuple[Path, Path | None], runs: tuple[Sides, Sides], conditions: Sequence[str]
+) -> InvalidOptionError:
+    """Return the error for runs without an episode that counts in both."""
+    given = " and ".join(str(path) for path in paths if path)
+    under = " and ".join(conditions) or "a common condition"
+    held = [
+        "; ".join(f"{side.system}: {', '.join(side.conditions)}" for side in sides.values())
+        for sides in runs
+    ]
+    return InvalidOptionError(
+        f"no episode of {given} counts on both sides under {under}",
+        f"They hold {' and '.join(dict.fromkeys(held))}. Compare the same episodes.",
+    )
+
+
+def _notes_below(runs: Sequence[CheckedRows], look: tuple[int, int], alpha: float) -> Iterator[str]:
+    """Yield what the note of the table states of looks, and of files that have no plan."""
+    number, planned = look
+    if planned > 1:
+        yield (
+            f"Look {number} of {planned} (alpha spending like O'Brien and Fleming's boundaries): "
             f"a difference is significant if p holm is below {alpha:.2g}, and intervals have the "
             f"level {1 - alpha:.4%}."
         )
@@ -130,11 +144,10 @@ def compare(
         str(path) for rows in runs for path, run in rows.sources.items() if not run
     )
     if unplanned:
-        note.append(
+        yield (
             "Without the record of a run, complete means all episodes that occur: "
             f"{', '.join(unplanned)}."
         )
-    return RunComparison(replace(table, note=" ".join(note)), tuple(notes), runs)
 
 
 def _measure(runs: Sequence[CheckedRows]) -> Measure:

@@ -31,8 +31,8 @@ class Settings:
 
     Attributes:
         rows: Folders of runs, or files of rows.
-        system: System of files that name none: for all, or for each in their order.
-        model_seed: Model seed of files that name none, likewise.
+        system: System of files that state none: for all, or for each in their order.
+        model_seed: Model seed of files that state none, likewise.
         against: Published rates to compare with.
         expected: Episodes of a complete cell.
         margin: Margin of equivalence tests, in points; None for none.
@@ -49,15 +49,16 @@ class Settings:
         (),
         whole=True,
         metavar="NAME",
-        help="System of files that name none; repeated, of each of them in order.",
+        help="Name of the system in files that state none: once for all, or once for each such "
+        "file in order.",
         group="Rows",
     )
     model_seed: tuple[int, ...] = setting(
         (),
         whole=True,
         metavar="SEED",
-        help="Seed of files that name none, such as lerobot-eval's --seed; repeated, of each of "
-        "them in order.",
+        help="Seed of the rollouts in files that state none, such as lerobot-eval's --seed: once "
+        "for all, or once for each such file in order.",
         group="Rows",
     )
     against: Against | None = setting(
@@ -72,8 +73,8 @@ class Settings:
     margin: float | None = setting(
         None,
         metavar="POINTS",
-        help="Test whether differences are within this many points: k against k0, and a system "
-        "with retrieval against the one without.",
+        help="Test whether differences are smaller than this many points: of k1, k2, … from k0, "
+        "and of a system with retrieval from the same one without.",
         group="Statistics",
     )
     lenient: bool = setting(False, help="Leave out bad rows and count them.", group="Rows")
