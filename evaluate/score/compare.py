@@ -5,30 +5,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from robomme_interference_data.constants import RECORDINGS
 from robomme_interference_data.errors import InvalidOptionError, named
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.stats.sequential import look_levels
 from robomme_interference_data.stats.significance import ALPHA
-from robomme_interference_data.stats.signs import sign_flips
 from robomme_interference_data.viz.tables import Table
 
-from .outcomes import Repeat, Statuses, mean_errors
-from .partners import related
+from .compare_notes import below_table, differing, left_out, noise_floor, stopped_early
 from .rows.reading import CheckedRows, read_rows
-from .sides import (
-    Side,
-    Sides,
-    check_scenes,
-    differing,
-    left_out,
-    matched_sides,
-    noise_floor,
-    sides_of,
-    stopped_early,
-)
+from .sides import Side, Sides, check_scenes, matched_sides, pairs_of, sides_of
 from .tables.comparison import (
     ACTION_ERRORS,
     ACTION_ERRORS_NOTE,
@@ -41,7 +27,6 @@ from .tables.comparison import (
 )
 from .tables.contrast import START, Contrast, Effect, Measure
 from .tables.correction import correct
-from .tables.pairs import Pairs, compare_cells, pair_errors
 
 
 @dataclass(frozen=True)
@@ -111,7 +96,7 @@ def compare(
     table = _table(
         contrasts, measure, alpha, "Two runs compared" if second else "Two conditions compared"
     )
-    note = [f"a: {first}; b: {second or first}.", table.note, *_notes_below(runs, look, alpha)]
+    note = [f"a: {first}; b: {second or first}.", table.note, *below_table(runs, look, alpha)]
     return RunComparison(replace(table, note=" ".join(note)), tuple(notes), runs)
 
 
@@ -129,25 +114,6 @@ def _nothing_shared(
         f"no episode of {given} counts on both sides under {under}",
         f"They hold {' and '.join(dict.fromkeys(held))}. Compare the same episodes.",
     )
-
-
-def _notes_below(runs: Sequence[CheckedRows], look: tuple[int, int], alpha: float) -> Iterator[str]:
-    """Yield what the note of the table states of looks, and of files that have no plan."""
-    number, planned = look
-    if planned > 1:
-        yield (
-            f"Look {number} of {planned} (alpha spending like O'Brien and Fleming's boundaries): "
-            f"a difference is significant if p holm is below {alpha:.2g}, and intervals have the "
-            f"level {1 - alpha:.4%}."
-        )
-    unplanned = dict.fromkeys(
-        str(path) for rows in runs for path, run in rows.sources.items() if not run
-    )
-    if unplanned:
-        yield (
-            "Without the record of a run, complete means all episodes that occur: "
-            f"{', '.join(unplanned)}."
-        )
 
 
 def _measure(runs: Sequence[CheckedRows]) -> Measure:
@@ -170,7 +136,7 @@ def _contrasts(
     compared = [(before, after) for before, after in compared if after in b.conditions]
     for family in ("", *a.outcomes.families):
         for before, after in compared:
-            pairs = _pairs(a, b, (before, after), family)
+            pairs = pairs_of(a, b, (before, after), family)
             if pairs.n:
                 bounds = pairs.at(1 - alpha)
                 yield Contrast(
@@ -259,54 +225,3 @@ def _two_conditions(path: Path, rows: CheckedRows) -> tuple[str, str | None]:
     before = START if START in held[:-1] else held[0]
     command = f"compare {shlex.quote(str(path))} --conditions {before},{held[-1]}"
     return f"{path} holds {names}. Compare two of them, such as:", command
-
-
-def _pairs(a: Side, b: Side, conditions: tuple[str, str], family: str) -> Pairs:
-    """Compare two sides over shared episodes, all or those of a family."""
-    a_places, b_places = (
-        {episode: place for place, episode in enumerate(side.outcomes.episodes)} for side in (a, b)
-    )
-    shared = [
-        episode for episode in a_places if episode in b_places and family in ("", episode.family)
-    ]
-    a_cell = a.outcomes.cell(a.system, conditions[0])
-    b_cell = b.outcomes.cell(b.system, conditions[1])
-    a_shared = [a_places[episode] for episode in shared]
-    b_shared = [b_places[episode] for episode in shared]
-    if a.outcomes.simulator == RECORDINGS:
-        before = mean_errors(a.outcomes.action_l1)[a_cell][a_shared]
-        after = mean_errors(b.outcomes.action_l1)[b_cell][b_shared]
-        [test] = sign_flips((after - before).round(12)[:, None], RECORDINGS)
-        return pair_errors(before, after, test)
-    repeats, (before, after) = _aligned(
-        (a.outcomes.repeats, b.outcomes.repeats),
-        (a.outcomes.status[a_cell][a_shared], b.outcomes.status[b_cell][b_shared]),
-    )
-    seeds = [repeat.training_seed for repeat in repeats]
-    runs = {seed: place for place, seed in enumerate(dict.fromkeys(seeds))}
-    return compare_cells(
-        before,
-        after,
-        np.array([runs[seed] for seed in seeds]),
-        same_weights=a.system == b.system or related(a.facts, b.facts),
-    )
-
-
-def _aligned(
-    repeats: tuple[Sequence[Repeat], Sequence[Repeat]], sides: tuple[Statuses, Statuses]
-) -> tuple[list[Repeat], list[Statuses]]:
-    """Return all repeats of two sides, and both sides with an axis of these.
-
-    If they have none in common, the lowest of both are paired, and so on, as those of the first.
-    """
-    first, second = repeats
-    if not {*first} & {*second}:
-        renamed = [*first[: len(second)], *second[len(first) :]]
-        second = renamed if len({*renamed}) == len(second) else second
-    every = list(dict.fromkeys([*first, *second]))
-    aligned = list[Statuses]()
-    for own, status in zip((first, second), sides, strict=True):
-        whole = np.full((len(status), len(every)), -1, np.int8)
-        whole[:, [every.index(repeat) for repeat in own]] = status
-        aligned.append(whole)
-    return every, aligned

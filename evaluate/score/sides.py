@@ -1,21 +1,24 @@
-"""The sides of a comparison of runs: which are compared, and what a reader must know of them."""
+"""The sides of a comparison of runs: which are compared, and over which episodes."""
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
+from robomme_interference_data.constants import RECORDINGS
 from robomme_interference_data.errors import InvalidOptionError, named
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.stats.intervals import wilson
-from robomme_interference_data.viz.tables import percent
+from robomme_interference_data.stats.signs import sign_flips
 
 from .config import Expected
-from .outcomes import Outcomes
+from .outcomes import Outcomes, Repeat, Statuses, mean_errors
+from .partners import related
 from .placing import offline_outcomes, outcomes_of
 from .rows.reading import CheckedRows
 from .rows.values import unshifted
-from .tables.pairs import Pairs
+from .tables.pairs import Pairs, compare_cells, pair_errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,93 +143,52 @@ def check_scenes(rows: CheckedRows, other_rows: CheckedRows) -> None:
             )
 
 
-# --- notes -------------------------------------------------------------------------------------
-
-
-def differing(
-    rows: CheckedRows, other_rows: CheckedRows, matched: Iterable[tuple[Side, Side]]
-) -> Iterator[str]:
-    """Yield notes on what differs between two runs: shifts, and revisions of buffer sets."""
-    names = dict.fromkeys((a.outcomes.simulator, b.outcomes.simulator) for a, b in matched)
-    for first, second in names:
-        if first != second:
-            yield (
-                f"a is of {first} and b of {second}: the scenes are the same, and the difference "
-                "is the effect of the shift."
-            )
-        revisions = [rows.revisions.get(first), other_rows.revisions.get(second)]
-        if any(simulator == first for simulator, _ in rows.scenes):
-            continue  # of another benchmark, whose scenes are known to be the same
-        if rows is not other_rows and revisions == [None, None]:
-            yield f"The rows of {first} name no revision of a buffer set: the histories may differ."
-        elif revisions[0] != revisions[1]:
-            named = " and ".join(revision or "unknown" for revision in revisions)
-            yield (
-                f"The rows of {first} are of different buffer sets (revisions {named}): the "
-                "histories may differ."
-            )
-
-
-def noise_floor(a: Side, b: Side, pairs: Mapping[str, Pairs]) -> Iterator[str]:
-    """Yield a note on the share of episodes that flip between two runs of a system, if any."""
-    shares = []
-    for condition, compared in pairs.items():
-        if compared.pairs:
-            low, high = wilson(compared.gained + compared.lost, compared.pairs)
-            shares.append(
-                f"{condition} {percent(compared.flips)} of {compared.pairs} "
-                f"(95% interval {100 * low:.1f} to {100 * high:.1f})"
-            )
-    if not shares:
-        return
-    seeds, other_seeds = (
-        {repeat.model_seed for repeat in side.outcomes.repeats} for side in (a, b)
+def pairs_of(a: Side, b: Side, conditions: tuple[str, str], family: str) -> Pairs:
+    """Compare two sides under a condition each, over shared episodes: all, or those of a family."""
+    a_places, b_places = (
+        {episode: place for place, episode in enumerate(side.outcomes.episodes)} for side in (a, b)
     )
-    if seeds == other_seeds:
-        which = "the same"
-    else:
-        which = "partly other" if seeds & other_seeds else "other"
-    yield (
-        f"{a.system} ran in both, with {which} model seeds, in "
-        f"{a.outcomes.simulator}. If nothing else differs, this share of episodes flips by chance "
-        f"(the noise floor): {', '.join(shares)}."
+    shared = [
+        episode for episode in a_places if episode in b_places and family in ("", episode.family)
+    ]
+    a_cell = a.outcomes.cell(a.system, conditions[0])
+    b_cell = b.outcomes.cell(b.system, conditions[1])
+    a_shared = [a_places[episode] for episode in shared]
+    b_shared = [b_places[episode] for episode in shared]
+    if a.outcomes.simulator == RECORDINGS:
+        before = mean_errors(a.outcomes.action_l1)[a_cell][a_shared]
+        after = mean_errors(b.outcomes.action_l1)[b_cell][b_shared]
+        [test] = sign_flips((after - before).round(12)[:, None], RECORDINGS)
+        return pair_errors(before, after, test)
+    repeats, (before, after) = _aligned(
+        (a.outcomes.repeats, b.outcomes.repeats),
+        (a.outcomes.status[a_cell][a_shared], b.outcomes.status[b_cell][b_shared]),
+    )
+    seeds = [repeat.training_seed for repeat in repeats]
+    runs = {seed: place for place, seed in enumerate(dict.fromkeys(seeds))}
+    return compare_cells(
+        before,
+        after,
+        np.array([runs[seed] for seed in seeds]),
+        same_weights=a.system == b.system or related(a.facts, b.facts),
     )
 
 
-def stopped_early(name: str, sides: Iterable[Side]) -> Iterator[str]:
-    """Yield a note on planned episodes of a run that do not count, if any."""
-    lacking = []
-    for side in sides:
-        for condition, planned in side.planned.items():
-            count = len(planned - side.counted(condition))
-            if count:
-                lacking.append(
-                    f"{side.system} in {side.outcomes.simulator}, {condition} "
-                    f"({count:,} of {len(planned):,})"
-                )
-    if lacking:
-        yield (
-            f"{name} was stopped early, is still running, or broke in part; planned episodes that "
-            f"do not count: {'; '.join(lacking)}. Looking again and again finds too much: plan the "
-            "looks (--looks)."
-        )
+def _aligned(
+    repeats: tuple[Sequence[Repeat], Sequence[Repeat]], sides: tuple[Statuses, Statuses]
+) -> tuple[list[Repeat], list[Statuses]]:
+    """Return all repeats of two sides, and both sides with an axis of these.
 
-
-def left_out(
-    name: str, sides: Iterable[Side], matched: Mapping[Side, Side], conditions: Sequence[str]
-) -> Iterator[str]:
-    """Yield a note on the episodes of a run that the comparison leaves out, if any."""
-    listed = []
-    for side in sides:
-        other = matched.get(side)
-        lone = []
-        both = [tuple(conditions)] if conditions else [(c, c) for c in side.conditions]
-        for here, there in both:
-            counted_there = set[EpisodeId]() if other is None else other.counted(there)
-            count = len(side.counted(here) - counted_there)
-            if count:
-                lone.append(f"{here} ({count:,})")
-        if lone:
-            listed.append(f"{side.system} in {side.outcomes.simulator}, {', '.join(lone)}")
-    if listed:
-        yield f"Only in {name}, and left out (episodes): {'; '.join(listed)}."
+    If they have none in common, the lowest of both are paired, and so on, as those of the first.
+    """
+    first, second = repeats
+    if not {*first} & {*second}:
+        renamed = [*first[: len(second)], *second[len(first) :]]
+        second = renamed if len({*renamed}) == len(second) else second
+    every = list(dict.fromkeys([*first, *second]))
+    aligned = list[Statuses]()
+    for own, status in zip((first, second), sides, strict=True):
+        whole = np.full((len(status), len(every)), -1, np.int8)
+        whole[:, [every.index(repeat) for repeat in own]] = status
+        aligned.append(whole)
+    return every, aligned
