@@ -356,6 +356,11 @@ def test_files_without_what_is_needed_are_refused(
     assert raised.value.hint
 
 
+def test_a_folder_that_is_of_no_run(tmp_path: Path) -> None:
+    with raises(MissingFileError):
+        read_rows([tmp_path])
+
+
 def test_files_that_cannot_be_read(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     whole = made.write_parquet(tmp_path / "rows.parquet", made.rows()).read_bytes()
     text = made.write_csv(tmp_path / "rows.csv", made.rows()).read_bytes()

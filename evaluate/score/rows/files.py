@@ -32,6 +32,11 @@ def find_sources(paths: Sequence[Path]) -> "dict[Path, RunHeader | None]":
         path = path_or_folder
         if path.is_dir():
             path = path / RUN_RECORD
+            if not path.is_file():
+                raise MissingFileError(
+                    f"{path_or_folder} is not the folder of a run: it has no {RUN_RECORD}",
+                    f"Give {_known()}.",
+                )
         if not path.is_file():
             raise MissingFileError(f"there is no file {path}", f"Give {_known()}.")
         if any(path.samefile(source) for source in sources):

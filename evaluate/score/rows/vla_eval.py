@@ -29,7 +29,9 @@ def _read(file: RowFile, names: Sequence[str]) -> FileColumns:
         if any("buffer_set" in {**episode, **episode["metrics"]} for episode in episodes):
             return _own_rows(episodes, names)
         return _rows_of_others(file)
-    except (KeyError, TypeError, AttributeError, IndexError):
+    except KeyError as error:
+        raise FormatError(f"{file.path} has no key {error}, as vla-eval writes it", _HINT) from None
+    except (TypeError, AttributeError, IndexError):
         raise FormatError(f"{file.path} holds no results of vla-eval", _HINT) from None
 
 
