@@ -1,7 +1,8 @@
 """Figures of a score, one set for each simulator."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,33 +17,7 @@ from .curves import curve, explained, legend
 from .data import FEW, PUBLISHED, Data
 
 _PAPER = {parse_condition(name).kind for name in DEFAULT_CONDITIONS}
-_ALL_KINDS = ("heatmap", "kinds", "interference", "ceiling")
-"""Figures that show all kinds of conditions; the others show the paper's."""
-
 _ALL = "All families"
-
-FIGURES = {
-    "family_falls": "Fall in each family, and over all other families",
-    "interference": "Effect of each kind of interference",
-    "kinds": "Success by condition and kind of condition",
-    "effects": "Effect of each condition, paired over episodes",
-    "success": "Success by condition, all families",
-    "families": "Success by condition and family",
-    "difficulty": "Success by condition and difficulty",
-    "retention": "Share of the lift that is left at the most sessions",
-    "heatmap": "Success by family and condition",
-    "retrieval": "Systems with and without retrieval",
-    "by_evidence_kept": "Success by whether the memory kept the evidence",
-    "ceiling": "Gap to the ideal observer with the same memory",
-    "cost": "Success against the seconds of a rollout",
-    "matrix": "Which systems differ significantly",
-    "action_error": "Action error by condition",
-}
-"""Figure to its title, in the order of the report.
-
-The first ones show conditions beyond the paper's, where there are any: they are what such a run is
-about, and the figures after them leave them out.
-"""
 
 
 def draw_figures(
@@ -55,7 +30,7 @@ def draw_figures(
     drawn = {}
     for simulator in score.outcomes:
         data = Data(score, simulator)
-        for kind in _DRAWERS:
+        for kind in [name for name, known in FIGURES.items() if known.draw is not None]:
             with open_figure() as figure:
                 if draw_figure(kind, figure, data):
                     name = f"{kind}-{simulator}"
@@ -82,10 +57,12 @@ def draw_error_figure(figure: Any, score: Score) -> None:
 
 
 def draw_figure(kind: str, figure: Any, data: Data) -> bool:
-    """Draw one of `FIGURES`; return False if there is no data for it."""
-    shown = data if kind in _ALL_KINDS else data.of(_PAPER)
+    """Draw one of `FIGURES` of rollouts; return False if there is no data for it."""
+    known = FIGURES[kind]
+    assert known.draw is not None
+    shown = data if known.all_kinds else data.of(_PAPER)
     figure.set_layout_engine("constrained")
-    if not (shown.cells and _DRAWERS[kind](figure, shown)):
+    if not (shown.cells and known.draw(figure, shown)):
         return False
     _finish(figure)
     return True
@@ -184,19 +161,67 @@ def _panels(
     return True
 
 
-_DRAWERS = {
-    "family_falls": family_forest.family_falls,
-    "interference": forests.interference,
-    "kinds": _kinds,
-    "effects": forests.effects,
-    "success": _success,
-    "families": _families,
-    "difficulty": _difficulty,
-    "retention": forests.retention,
-    "heatmap": matrices.heatmap,
-    "retrieval": _retrieval,
-    "by_evidence_kept": forests.by_evidence_kept,
-    "ceiling": forests.ceiling,
-    "cost": cost.cost,
-    "matrix": matrices.matrix,
+@dataclass(frozen=True)
+class FigureKind:
+    """A kind of figure.
+
+    Attributes:
+        title: Its title.
+        tables: The tables with its numbers.
+        draw: Draws it; returns False without data for it. None for the figure of offline runs.
+        all_kinds: Whether it shows all kinds of conditions; the others show the paper's.
+    """
+
+    title: str
+    tables: tuple[str, ...]
+    draw: Callable[[Any, Data], bool] | None
+    all_kinds: bool = False
+
+
+FIGURES = {
+    "family_falls": FigureKind(
+        "Fall in each family, and over all other families",
+        ("parts", "families"),
+        family_forest.family_falls,
+    ),
+    "interference": FigureKind(
+        "Effect of each kind of interference", ("effects",), forests.interference, all_kinds=True
+    ),
+    "kinds": FigureKind(
+        "Success by condition and kind of condition", ("main",), _kinds, all_kinds=True
+    ),
+    "effects": FigureKind(
+        "Effect of each condition, paired over episodes", ("effects",), forests.effects
+    ),
+    "success": FigureKind("Success by condition, all families", ("main", "paper"), _success),
+    "families": FigureKind("Success by condition and family", ("parts",), _families),
+    "difficulty": FigureKind("Success by condition and difficulty", ("parts",), _difficulty),
+    "retention": FigureKind(
+        "Share of the lift that is left at the most sessions", ("effects",), forests.retention
+    ),
+    "heatmap": FigureKind(
+        "Success by family and condition", ("parts",), matrices.heatmap, all_kinds=True
+    ),
+    "retrieval": FigureKind("Systems with and without retrieval", ("effects", "parts"), _retrieval),
+    "by_evidence_kept": FigureKind(
+        "Success by whether the memory kept the evidence",
+        ("evidence_effects", "evidence_use"),
+        forests.by_evidence_kept,
+    ),
+    "ceiling": FigureKind(
+        "Gap to the ideal observer with the same memory",
+        ("effects",),
+        forests.ceiling,
+        all_kinds=True,
+    ),
+    "cost": FigureKind("Success against the seconds of a rollout", ("cost",), cost.cost),
+    "matrix": FigureKind("Which systems differ significantly", ("matrix", "main"), matrices.matrix),
+    "action_error": FigureKind(
+        "Action error by condition", ("action_error", "action_error_effects"), None
+    ),
 }
+"""Figures by name, in the order of the report.
+
+The first ones show conditions beyond the paper's, where there are any: they are what such a run is
+about, and the figures after them leave them out.
+"""

@@ -28,25 +28,6 @@ from .primary import screens
 _LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
 """Libraries that numbers and figures depend on."""
 
-_SHOWN_IN = {
-    "family_falls": ("parts", "families"),
-    "effects": ("effects",),
-    "success": ("main", "paper"),
-    "families": ("parts",),
-    "heatmap": ("parts",),
-    "difficulty": ("parts",),
-    "retention": ("effects",),
-    "retrieval": ("effects", "parts"),
-    "kinds": ("main",),
-    "interference": ("effects",),
-    "by_evidence_kept": ("evidence_effects", "evidence_use"),
-    "ceiling": ("effects",),
-    "cost": ("cost",),
-    "matrix": ("matrix", "main"),
-    "action_error": ("action_error", "action_error_effects"),
-}
-"""Figure to the tables with its numbers."""
-
 EXPLORATORY = (
     "Everything below is exploratory: it is corrected within a table or a part of one, not over "
     f"all tables. Without any effect, {NULL_FINDINGS} hold a finding in some table. Take one as a "
@@ -83,8 +64,7 @@ def write_report(
         "known": {name: system.display for name, system in SYSTEMS.items()},
         "leader": _leader(score),
         "figures": _inline(figures),
-        "titles": FIGURES,
-        "shown_in": _SHOWN_IN,
+        "figure_kinds": FIGURES,
         "number": _number,
         "numbers": _numbers,
         "conditions": conditions,
@@ -129,7 +109,7 @@ def _inline(figures: Mapping[str, Path]) -> dict[str, str]:
         text = re.sub(r'id="system:([^":]*):[0-9]+"', r'data-system="\1"', text)
         text = re.sub(r' id="image[0-9a-f]+"', "", text)  # equal images share one
         text = re.sub(r'( id="|href="#|url\(#)', rf"\g<1>f{number}-", text)
-        label = escape(f"{FIGURES[figure]}, {simulator}")
+        label = escape(f"{FIGURES[figure].title}, {simulator}")
         inlined[name] = text.replace("<svg", f'<svg role="img" aria-label="{label}"', 1)
     return inlined
 
