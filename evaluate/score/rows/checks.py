@@ -15,10 +15,8 @@ from robomme_interference_data.schema.shifts import NO_SHIFT
 from .row_format import FileColumns
 from .values import DEFAULTS, Row, parse, shifted
 
-EPISODE = ("simulator", "family", "split", "episode")
-"""The columns that name an episode."""
-
-_ROLLOUT = ("system", "condition", "training_seed", "model_seed", *EPISODE)
+_EPISODE = ("simulator", "family", "split", "episode")
+_ROLLOUT = ("system", "condition", "training_seed", "model_seed", *_EPISODE)
 _SUCCESS = {str(status): success_of(status) for status in FINAL}
 
 _Location = tuple[int, int]
@@ -26,11 +24,11 @@ _Location = tuple[int, int]
 
 
 class Checks:
-    """The rows that passed every check so far (`sound`), and why others did not (`reasons`)."""
+    """The rows that passed every check so far (`sound`), and why others did not."""
 
     def __init__(self) -> None:
         self.sound: dict[_Location, Row] = {}
-        self.reasons: dict[_Location, str] = {}
+        self._reasons: dict[_Location, str] = {}
         self._paths: list[Path] = []
 
     def add(self, path: Path, contents: FileColumns, run: Path | None) -> None:
@@ -52,20 +50,33 @@ class Checks:
             if at not in wrong and (contradiction := _contradiction(row)):
                 wrong[at] = contradiction
             if at in wrong:
-                self.reasons[number, line] = wrong[at]
+                self._reasons[number, line] = wrong[at]
             elif row.shift == NO_SHIFT:
                 self.sound[number, line] = row
             else:
                 simulator = shifted(row.simulator, row.shift)
                 self.sound[number, line] = row._replace(simulator=simulator)
-        self.reasons |= {(number, line): reason for line, reason in contents.malformed.items()}
+        self._reasons |= {(number, line): reason for line, reason in contents.malformed.items()}
 
-    def locate(self, row: _Location) -> str:
+    def _locate(self, row: _Location) -> str:
         """Return where a row is, for messages."""
         path = self._paths[row[0]]
         return f"{path}, {'line' if path.suffix.lower() in ('.csv', '.jsonl') else 'row'} {row[1]}"
 
-    def check_alike(
+    def bad_reasons(self) -> list[str]:
+        """Return location and reason of each bad row, in the order of files and lines."""
+        return [f"{self._locate(at)}: {reason}" for at, reason in sorted(self._reasons.items())]
+
+    def check_together(self) -> None:
+        """Leave out rows that do not fit the others, after all files are added."""
+        self._check_alike("revision", ("simulator",), "rows of different buffer sets do not mix")
+        for column in ("difficulty", "seed", "chance"):
+            self._check_alike(column, _EPISODE, "an episode has one")
+        self._check_facts()
+        # Last, because a row that was left out repeats none.
+        self._check_repeats()
+
+    def _check_alike(
         self, name: str, group: Sequence[str], why: str, *, none_counts: bool = False
     ) -> None:
         """Leave out rows whose value differs from the most frequent one of the same group.
@@ -85,7 +96,7 @@ class Checks:
             if (none_counts or value is not None) and value != usual[key]
         )
 
-    def check_facts(self) -> None:
+    def _check_facts(self) -> None:
         """Leave out rows whose facts differ from the most frequent ones of their system.
 
         Rows of several seeds may be of different weights.
@@ -94,9 +105,9 @@ class Checks:
             group = ["system", "simulator"]
             if column == "policy_id":
                 group += ["training_seed", "model_seed"]
-            self.check_alike(column, group, "a system has one", none_counts=True)
+            self._check_alike(column, group, "a system has one", none_counts=True)
 
-    def check_repeats(self) -> None:
+    def _check_repeats(self) -> None:
         """Keep one row of each rollout, and none where its rows contradict each other."""
         groups = defaultdict[Any, list[_Location]](list)
         for at, key in zip(
@@ -109,13 +120,13 @@ class Checks:
             reason = "the same rollout as {}"
             if contradicted:
                 reason += "; its rows contradict each other"
-                self._leave_out([(first, reason.format(self.locate(repeats[0])))])
-            self._leave_out((at, reason.format(self.locate(first))) for at in repeats)
+                self._leave_out([(first, reason.format(self._locate(repeats[0])))])
+            self._leave_out((at, reason.format(self._locate(first))) for at in repeats)
 
     def _leave_out(self, rows: Iterable[tuple[_Location, str]]) -> None:
         for at, reason in list(rows):
             del self.sound[at]
-            self.reasons[at] = reason
+            self._reasons[at] = reason
 
 
 def _with_known_facts(row: Row) -> Row:

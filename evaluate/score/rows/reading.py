@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from robomme_interference_data.errors import FormatError, InvalidOptionError, counted, named
 
-from .checks import EPISODE, Checks
+from .checks import Checks
 from .files import find_sources, read_file
 from .scenes import ScenesOf, check_apart, notes_on, of_other_scenes, scenes_of
 from .stated import with_stated
@@ -85,14 +85,8 @@ def read_rows(
     checks = Checks()
     for path, run in sources.items():
         checks.add(path, files[path], None if run is None else path.parent)
-    checks.check_alike("revision", ("simulator",), "rows of different buffer sets do not mix")
-    for column in ("difficulty", "seed", "chance"):
-        checks.check_alike(column, EPISODE, "an episode has one")
-    checks.check_facts()
-    checks.check_repeats()
-    bad_reasons = [
-        f"{checks.locate(at)}: {reason}" for at, reason in sorted(checks.reasons.items())
-    ]
+    checks.check_together()
+    bad_reasons = checks.bad_reasons()
     if bad_reasons and not lenient:
         lines = [f"{counted(len(bad_reasons), 'bad row')}:", *bad_reasons[:_SHOWN]]
         if len(bad_reasons) > _SHOWN:
