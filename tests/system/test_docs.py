@@ -83,7 +83,6 @@ ELSEWHERE = (
     "--source frames",  # recordings
     "--shift ",  # a renderer
     "k31",  # more units than the golden buffer set has
-    "stale-k7",  # contradicting lessons, which a renderer plays
     "lerobot:",  # a checkpoint
     "python:memory_policy",  # has a test of its own
     "answers:mixture",  # answers of that policy
