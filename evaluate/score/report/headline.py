@@ -152,7 +152,7 @@ def _rates(score: Score, cells: Sequence[TableRow]) -> Sentence:
             parts.append(say(text, count=number_of(rows), rates=_range(rows), **words))
             continue
         each = [
-            say("{name} in {rate}", name=display_name(row["system"]), rate=_rate(row))
+            say("{name} succeeds in {rate}", name=display_name(row["system"]), rate=_rate(row))
             for row in rows
         ]
         listed = joined(each, ", ", " and ")
