@@ -210,7 +210,11 @@ def test_all_systems_have_a_verdict_of_their_own(tmp_path: Path) -> None:
         ({("a", "no-history"): "sffffffffffff"}, "under no history", "run k0"),
         ({("a", "k0"): "sfs"}, "under k0", "run k7"),
         ({("oracle", "k0"): "s", ("a", "k0"): "f"}, "a succeeds in 0.0%", "run k7"),
-        ({("oracle", "k0"): "s", ("oracle", "k7"): "f"}, "Oracle succeeds in 100.0%", "no reference"),
+        (
+            {("oracle", "k0"): "s", ("oracle", "k7"): "f"},
+            "Oracle succeeds in 100.0%",
+            "no reference",
+        ),
     ],
 )
 def test_without_a_fall_only_rates_are_stated(
