@@ -64,11 +64,11 @@ class PowerPlan:
     equal: float
     tests: int = 1
     looks: tuple[float, ...] = ()
-    runs: "RunPlan | None" = None
+    runs: "TrainingRunPlan | None" = None
 
 
 @dataclass(frozen=True)
-class RunPlan:
+class TrainingRunPlan:
     """What several training runs of each of two systems can detect, in fractions.
 
     Attributes:
@@ -150,7 +150,7 @@ def _check(margin: float, episodes: int, flips: float, tests: int, looks: int, r
 
 def _plan_runs(
     margin: float, episodes: int, flips: float, alpha: float, runs: int, spread: float
-) -> RunPlan:
+) -> TrainingRunPlan:
     if not MIN_RUNS <= runs <= MAX_RUNS:
         raise InvalidOptionError.expected(
             "runs", runs, f"a number of training runs from {MIN_RUNS} to {MAX_RUNS}"
@@ -172,7 +172,7 @@ def _plan_runs(
 
     error, half = deviations(runs)
     counts = range(MIN_RUNS, MAX_RUNS + 1)
-    return RunPlan(
+    return TrainingRunPlan(
         runs,
         spread,
         power_of(runs),
