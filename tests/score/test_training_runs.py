@@ -45,8 +45,16 @@ def test_the_variance_that_runs_add() -> None:
     assert (found.runs, found.freedom) == (3, 2)
     assert found.deviation == pytest.approx(math.sqrt(1 / 12))
     assert found.variance == pytest.approx((1 / 12 - noise / 4) / 3)
-    # An episode that a run lacks takes no part.
-    assert run_spread(np.vstack([values, [1.0, math.nan, 1.0]])) == found
+    # An episode that a run lacks takes part in the weights alone: 4/15 + 1/10 twice, and 4/15.
+    lacking = run_spread(np.vstack([values, [1.0, math.nan, 1.0]]))
+    weights = (11 / 30) ** 2 * 2 + (4 / 15) ** 2
+    assert lacking.variance == pytest.approx(found.variance * 3 * weights)
+    assert lacking.deviation == found.deviation
+    # Runs that share the episodes out: the means 1, 1/2 and 0, with nothing subtracted.
+    apart = np.full((6, 3), math.nan)
+    apart[[0, 1], 0], apart[[2, 3], 1], apart[[4, 5], 2] = 1.0, (0.0, 1.0), 0.0
+    assert run_spread(apart).variance == pytest.approx(1 / 4 / 3)
+    assert run_spread(apart).freedom == 2
     # Two runs add nothing: what holds is for their checkpoints.
     assert run_spread(values[:, 1:]) == RunSpread(2, pytest.approx(math.sqrt(1 / 8)))
     # Equal runs, and a single one.
