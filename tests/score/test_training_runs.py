@@ -243,3 +243,16 @@ def test_equal_systems_with_training_runs_seldom_differ(
     assert sum(held) / len(held) >= 0.92 - error
     for name, of_table in found.items():
         assert sum(of_table) / len(of_table) <= 0.07 + error, name
+
+
+def test_a_fall_is_not_complete_if_a_run_lacks_one_of_its_conditions(tmp_path: Path) -> None:
+    letters = {("k0", 0): "ss", ("k0", 1): "ss", ("k0", 2): "ff", ("k7", 0): "sf", ("k7", 1): "sf"}
+    rows = [
+        replace(made.row("alpha", condition, "MoveCube", at, letter), training_seed=run)
+        for (condition, run), text in letters.items()
+        for at, letter in enumerate(text)
+    ]
+    scored = made.score(made.write_parquet(tmp_path / "rows.parquet", rows), expected=OWN)
+    [fall] = records(scored, "effects")
+    assert (fall["runs"], fall["against_rate"], fall["rate"]) == (2, 1.0, 0.5)
+    assert not fall["complete"]
