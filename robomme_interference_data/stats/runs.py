@@ -91,27 +91,36 @@ def run_spread(values: Floats) -> RunSpread:
     """Return the spread over training runs of values, `(E, R) float64`, NaN where missing.
 
     With the variance s² of the runs' means over n episodes and the residual variance r of episodes
-    and runs, the runs add max(s² / 4, s² − r / n) / R, with R − 1 degrees of freedom: the noise of
-    single rollouts is in the interval over episodes already. At least a quarter of s², because
+    and runs, the runs add max(s² / 4, s² − r / n) · Σ w², with R − 1 degrees of freedom: the noise
+    of single rollouts is in the interval over episodes already. At least a quarter of s², because
     three runs are often alike by chance: without it, tests of three runs reject too often, 7%.
-    Episodes that a run lacks are left out.
+
+    The weights w of the runs in the mean over episodes are 1 / R each, and unequal if runs lack
+    episodes: few episodes of a run are not another run. Means are those of the episodes that all
+    runs have, or if these are fewer than two, as of runs that share the episodes out, of each run's
+    own: their differences are larger, with nothing subtracted.
 
     Source: components of variance of two crossed random effects, Searle (1971), Linear Models,
     chapter 9.
     """
     runs = values.shape[1]
-    values = values[~np.isnan(values).any(axis=1)]
-    n = len(values)
-    if runs < 2 or not n:
+    known = ~np.isnan(values)
+    if runs < 2 or not known.any(axis=0).all():
         return RunSpread(runs)
-    means = values.mean(axis=0)
+    shared = values[known.all(axis=1)]
+    n = len(shared)
+    means = shared.mean(axis=0) if n > 1 else np.nanmean(values, axis=0)
     spread = float(means.var(ddof=1))
     deviation = math.sqrt(spread)
-    if runs < MIN_RUNS or n < 2:
+    if runs < MIN_RUNS:
         return RunSpread(runs, deviation)
-    residuals = values - means - values.mean(axis=1, keepdims=True) + values.mean()
-    noise = float((residuals**2).sum()) / ((runs - 1) * (n - 1))
-    variance = max(_LEAST * spread, spread - noise / n) / runs
+    noise = 0.0
+    if n > 1:
+        residuals = shared - means - shared.mean(axis=1, keepdims=True) + shared.mean()
+        noise = float((residuals**2).sum()) / ((runs - 1) * (n - 1) * n)
+    known = known[known.any(axis=1)]
+    weights = (known / known.sum(axis=1, keepdims=True)).mean(axis=0)
+    variance = max(_LEAST * spread, spread - noise) * float(weights @ weights)
     if variance < 1e-18:  # equal means can differ in the last digits
         return RunSpread(runs, deviation)
     return RunSpread(runs, deviation, variance, runs - 1)

@@ -45,8 +45,16 @@ def test_the_variance_that_runs_add() -> None:
     assert (found.runs, found.freedom) == (3, 2)
     assert found.deviation == pytest.approx(math.sqrt(1 / 12))
     assert found.variance == pytest.approx((1 / 12 - noise / 4) / 3)
-    # An episode that a run lacks takes no part.
-    assert run_spread(np.vstack([values, [1.0, math.nan, 1.0]])) == found
+    # An episode that a run lacks takes part in the weights alone: 4/15 + 1/10 twice, and 4/15.
+    lacking = run_spread(np.vstack([values, [1.0, math.nan, 1.0]]))
+    weights = (11 / 30) ** 2 * 2 + (4 / 15) ** 2
+    assert lacking.variance == pytest.approx(found.variance * 3 * weights)
+    assert lacking.deviation == found.deviation
+    # Runs that share the episodes out: the means 1, 1/2 and 0, with nothing subtracted.
+    apart = np.full((6, 3), math.nan)
+    apart[[0, 1], 0], apart[[2, 3], 1], apart[[4, 5], 2] = 1.0, (0.0, 1.0), 0.0
+    assert run_spread(apart).variance == pytest.approx(1 / 4 / 3)
+    assert run_spread(apart).freedom == 2
     # Two runs add nothing: what holds is for their checkpoints.
     assert run_spread(values[:, 1:]) == RunSpread(2, pytest.approx(math.sqrt(1 / 8)))
     # Equal runs, and a single one.
@@ -235,3 +243,16 @@ def test_equal_systems_with_training_runs_seldom_differ(
     assert sum(held) / len(held) >= 0.92 - error
     for name, of_table in found.items():
         assert sum(of_table) / len(of_table) <= 0.07 + error, name
+
+
+def test_a_fall_is_not_complete_if_a_run_lacks_one_of_its_conditions(tmp_path: Path) -> None:
+    letters = {("k0", 0): "ss", ("k0", 1): "ss", ("k0", 2): "ff", ("k7", 0): "sf", ("k7", 1): "sf"}
+    rows = [
+        replace(made.row("alpha", condition, "MoveCube", at, letter), training_seed=run)
+        for (condition, run), text in letters.items()
+        for at, letter in enumerate(text)
+    ]
+    scored = made.score(made.write_parquet(tmp_path / "rows.parquet", rows), expected=OWN)
+    [fall] = records(scored, "effects")
+    assert (fall["runs"], fall["against_rate"], fall["rate"]) == (2, 1.0, 0.5)
+    assert not fall["complete"]

@@ -53,8 +53,9 @@ class Fall:
 
     @property
     def same_episodes(self) -> bool:
-        """Whether its cells are over the episodes that it is paired over."""
-        return bool(self.row["n"] == self.start["n"] == self.end["n"])
+        """Whether its cells are over the episodes, and training runs, that it is paired over."""
+        cells = (self.start, self.end)
+        return all(self.row[name] == cell[name] for cell in cells for name in ("n", "runs"))
 
     @property
     def finding(self) -> Finding:

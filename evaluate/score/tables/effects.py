@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robomme_interference_data.evaluate.score.outcomes import Flags, Outcomes, success
+from robomme_interference_data.evaluate.score.outcomes import Flags, Outcomes, counting, success
 from robomme_interference_data.evaluate.score.partners import share_weights
 from robomme_interference_data.schema.conditions import NO_HISTORY, parse_condition
 from robomme_interference_data.stats.bootstrap import Floats, Interval
@@ -166,6 +166,11 @@ def _contrast(outcomes: Outcomes, compared: _Compared, here: Flags) -> Contrast:
     """Compare two cells over the episodes `here`."""
     against, cell = outcomes.cell(*compared.against), outcomes.cell(*compared.cell)
     system, condition = compared.cell
+    complete = bool(outcomes.complete[against] and outcomes.complete[cell])
+    if system == compared.against[0]:  # a run of one condition alone is left out
+        ran = [counting(outcomes.status[at]).any(axis=0) for at in (against, cell)]
+        runs, others = (set(outcomes.training[side].tolist()) for side in ran)
+        complete = complete and runs == others
     return Contrast(
         outcomes.simulator,
         system,
@@ -178,7 +183,7 @@ def _contrast(outcomes: Outcomes, compared: _Compared, here: Flags) -> Contrast:
             outcomes.training,
             same_weights=share_weights(outcomes, system, compared.against[0]),
         ),
-        bool(outcomes.complete[against] and outcomes.complete[cell]),
+        complete,
         group=TESTED_TOGETHER.get(compared.effect, compared.effect),
     )
 
