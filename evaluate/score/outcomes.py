@@ -198,7 +198,7 @@ def success_by_run(status: Statuses, training: NDArray[np.int64]) -> NDArray[np.
     with a rollout that counts are returned, and at least one.
     """
     counts = counting(status)
-    ran = np.unique(training[counts.reshape(-1, len(training)).any(axis=0)])
+    ran = np.unique(training[counts.any(axis=tuple(range(counts.ndim - 1)))])
     by_run = [success(status[..., training == run]) for run in ran.tolist()]
     return np.stack(by_run or [np.full(status.shape[:-1], np.nan)], axis=-1)
 

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 from support import scoring as made
 from support.null_rows import NullGrid
-from support.scoring import OWN, cells, record, records
+from support.scoring import BASE, OWN, cells, record, records
 
 from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.score.compare import compare
@@ -256,3 +256,20 @@ def test_a_fall_is_not_complete_if_a_run_lacks_one_of_its_conditions(tmp_path: P
     [fall] = records(scored, "effects")
     assert (fall["runs"], fall["against_rate"], fall["rate"]) == (2, 1.0, 0.5)
     assert not fall["complete"]
+
+
+def test_conditions_of_different_training_runs_are_not_compared(tmp_path: Path) -> None:
+    """k0 of one run and k7 of another are not a fall of either."""
+    pair = [row for row in made.rows() if row.condition in ("k0", "k7")]
+    apart = [
+        replace(row, training_seed=0 if row.condition == "k0" else 1)
+        for row in pair
+        if row.system == BASE
+    ]
+    same = [replace(row, system="same", training_seed=0) for row in pair if row.system == BASE]
+    found = made.score(made.write_csv(tmp_path / "rows.csv", [*apart, *same]), draws=200)
+    effects = {row["system"]: row for row in records(found, "effects")}
+    assert (effects[BASE]["n"], effects[BASE]["difference"], effects[BASE]["p"]) == (0, None, None)
+    assert effects["same"]["n"] > 0 and effects["same"]["difference"] is not None
+    assert [row["system"] for row in records(found, "decay")] == ["same"]
+    assert "interaction" not in found.tables

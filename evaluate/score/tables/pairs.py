@@ -106,12 +106,14 @@ def compare_cells(
         second: The same of the other side.
         training: The training run of each repeat, `(M,)`.
         same_weights: Whether equal runs of both sides have the same weights, so that only runs of
-            both sides are compared. Otherwise the runs of one side have nothing in common with
-            those of the other.
+            both sides are compared, and none without a common run. Otherwise the runs of one side
+            have nothing in common with those of the other.
         paired: Whether both sides had the same histories.
     """
     if same_weights and training.any():
         shared = shared_runs([first, second], training)
+        if not shared.any():
+            return NO_PAIRS
         first, second, training = first[:, shared], second[:, shared], training[shared]
     compare = partial(_with_runs, training=training, same_weights=same_weights, paired=paired)
     compared = compare(first, second)
@@ -127,11 +129,11 @@ def compare_cells(
 def shared_runs(sides: Sequence[Statuses], training: NDArray[np.int64]) -> Flags:
     """Return which repeats, `(M,)`, are of training runs that count on all sides.
 
-    All of them, if no run does. Sides are `(E, M) int8`.
+    Sides are `(E, M) int8`.
     """
     ran = [{*training[counting(side).any(axis=0)].tolist()} for side in sides]
     shared = set.intersection(*ran)
-    return np.array([run in shared or not shared for run in training.tolist()])
+    return np.array([run in shared for run in training.tolist()])
 
 
 def _with_runs(

@@ -124,8 +124,12 @@ def _decays(outcomes: Outcomes, draws: int) -> list[dict[str, Any]]:
     if not (outcomes.status == ERROR).any():
         return records
     for column, status in (("if_failures", Status.FAIL), ("if_successes", Status.SUCCESS)):
-        others = _fitted(outcomes.with_errors_as(status), draws)
-        for record, other in zip(records, others, strict=True):
+        # With more that counts, there can be further systems.
+        others = {
+            other["system"]: other for other in _fitted(outcomes.with_errors_as(status), draws)
+        }
+        for record in records:
+            other = others[record["system"]]
             record[column] = other["slope"]
             record[f"p_{column}"] = other["p"]
     return records
@@ -134,14 +138,19 @@ def _decays(outcomes: Outcomes, draws: int) -> list[dict[str, Any]]:
 def _fitted(outcomes: Outcomes, draws: int) -> list[dict[str, Any]]:
     key = outcomes.simulator
     ks_of = {system: _shared_ks(outcomes, system) for system in outcomes.systems}
-    ks_of = {system: conditions for system, conditions in ks_of.items() if conditions}
-    if not ks_of:
-        return []
-    falls = []
+    fall_of = {}
     for system, conditions in ks_of.items():
+        if not conditions:
+            continue
         status = _statuses(outcomes, system, conditions)
         shared = shared_runs([*status], outcomes.training)
-        falls.append(_falls(status[..., shared], outcomes.training[shared], conditions))
+        if shared.any():
+            training = outcomes.training[shared]
+            fall_of[system] = _falls(status[..., shared], training, conditions)
+    if not fall_of:
+        return []
+    ks_of = {system: ks_of[system] for system in fall_of}
+    falls = list(fall_of.values())
     tests = sign_flips(np.stack([fall.slopes for fall in falls], axis=1).round(12), key, draws)
     fits = _fits([fall.success for fall in falls], list(ks_of.values()), key, draws)
     records = []
@@ -278,16 +287,15 @@ def interactions_of(outcomes: Outcomes, draws: int = DRAWS) -> list[Contrast]:
     if not (outcomes.status == ERROR).any():
         return contrasts
     failures, successes = (
-        _interactions(outcomes.with_errors_as(status), draws)
-        for status in (Status.FAIL, Status.SUCCESS)
+        # With more that counts, there can be further pairs of systems.
+        {(other.system, other.against): other.pairs for other in _interactions(changed, draws)}
+        for changed in map(outcomes.with_errors_as, (Status.FAIL, Status.SUCCESS))
     )
-    return [
-        replace(
-            contrast,
-            pairs=replace(contrast.pairs, if_failures=failed.pairs, if_successes=won.pairs),
-        )
-        for contrast, failed, won in zip(contrasts, failures, successes, strict=True)
-    ]
+    for place, contrast in enumerate(contrasts):
+        key = contrast.system, contrast.against
+        pairs = replace(contrast.pairs, if_failures=failures[key], if_successes=successes[key])
+        contrasts[place] = replace(contrast, pairs=pairs)
+    return contrasts
 
 
 class _Apart(NamedTuple):
@@ -334,6 +342,8 @@ def _apart(outcomes: Outcomes, system: str, other: str) -> _Apart | None:
         both = [shared_runs([*first, *second], training)] * 2
     else:
         both = [shared_runs([*side], training) for side in (first, second)]
+    if not all(runs.any() for runs in both):
+        return None
     falls = [
         _falls(side[..., runs], training[runs], conditions)
         for side, runs in zip((first, second), both, strict=True)
