@@ -48,7 +48,7 @@ def findings(falls: Sequence[Fall], compared: int) -> Sentence:
             clauses.append(_several(own, finding, falls))
     concluded = [fall for fall in falls if fall.finding is not Finding.ERRORS]
     if any(not fall.complete for fall in concluded):
-        clauses.append(Sentence("provisional, because a cell is incomplete"))
+        clauses.append(Sentence("provisional, because rollouts are missing"))
     return sentence(clauses)
 
 

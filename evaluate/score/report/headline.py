@@ -109,7 +109,8 @@ def _scope(cells: Sequence[TableRow]) -> str:
     if len(lone) < len(systems):
         names = " and ".join(map(display_name, lone))
         return f"for other training runs, too, except those of {names}"
-    return "for this checkpoint" if len(lone) == 1 else "for these checkpoints"
+    single = len(lone) == 1 and all(cell["runs"] == 1 for cell in cells)
+    return "for this checkpoint" if single else "for these checkpoints"
 
 
 def _rate(row: TableRow) -> Sentence:
