@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 from robomme_interference_data.errors import RunError, counted, named
+from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.stats.bootstrap import DRAWS
 from robomme_interference_data.stats.intervals import wilson
@@ -112,6 +113,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     contrasts = correct(with_primary(compared, simulated))
     notes = [*rows.notes, *unpaired]
     notes += [sentence for each in simulated if (sentence := repeat_noise(each))]
+    notes += [sentence for each in simulated for sentence in _unknown_runs(each)]
     tables = [*_tables(outcomes, cells, contrasts, draws), cost_table(rows, cells)]
     error_cells = list["ErrorCell"]()
     if recordings is not None:
@@ -239,6 +241,22 @@ def repeat_noise(outcomes: Outcomes) -> str:
         "another outcome with the next model seed: between conditions, a share of flips that does "
         "not exceed this is noise."
     )
+
+
+def _unknown_runs(outcomes: Outcomes) -> list[str]:
+    """Return a note for each system only some of whose rows state the seed of their training."""
+    notes = []
+    for system, status in zip(outcomes.systems, outcomes.status, strict=True):
+        ran = (status >= 0).any(axis=(0, 1)).tolist()
+        seeds = {
+            repeat.training_seed for repeat, has in zip(outcomes.repeats, ran, strict=True) if has
+        }
+        if None in seeds and len(seeds) > 1:
+            notes.append(
+                f"Some rows of {display_name(system)} state no training_seed, others do: those "
+                "without it count as a training run of their own."
+            )
+    return notes
 
 
 def _not_compared_offline(recordings: Outcomes) -> list[str]:

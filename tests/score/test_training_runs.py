@@ -14,6 +14,7 @@ from support.scoring import BASE, OWN, cells, record, records
 from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.score.compare import compare
 from robomme_interference_data.evaluate.score.scoring import Score
+from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.stats.bootstrap import Interval
 from robomme_interference_data.stats.runs import (
     ONE_RUN,
@@ -273,3 +274,14 @@ def test_conditions_of_different_training_runs_are_not_compared(tmp_path: Path) 
     assert effects["same"]["n"] > 0 and effects["same"]["difference"] is not None
     assert [row["system"] for row in records(found, "decay")] == ["same"]
     assert "interaction" not in found.tables
+
+
+def test_rows_without_a_training_seed_beside_others_are_noted(tmp_path: Path) -> None:
+    rows = [row for row in made.rows() if row.system == BASE]
+    mixed = [replace(row, training_seed=3, system=OWN) for row in rows]
+    mixed[:4] = [replace(row, training_seed=None) for row in mixed[:4]]
+    found = made.score(made.write_csv(tmp_path / "rows.csv", [*rows, *mixed]), draws=200)
+    [note] = [note for note in found.notes if "training_seed" in note]
+    assert display_name(OWN) in note and display_name(BASE) not in note.replace(
+        display_name(OWN), ""
+    )
