@@ -127,7 +127,7 @@ class Chooses:
 
 def test_the_policy_and_the_video_get_the_retrieved_frames() -> None:
     policy, shown = Cheat(), []
-    clip = SimpleNamespace(begin=lambda *given: shown.append(given[1]), step=lambda *_: None)
+    clip = SimpleNamespace(begin=lambda *given: shown.append(given[2]), step=lambda *_: None)
     row = roll("k3", policy, selector=Chooses(*range(40, 60)), clip=clip)
     assert policy.chunks == [(20, 20)] and shown == [[*range(40, 60)]]
     assert (row.retrieval_start, row.retrieval_stop) == (40, 60)

@@ -129,7 +129,7 @@ def test_the_commands_of_the_pages_run(
     buffer_set = copy_tabletop(tmp_path / "tabletop") if asked else own_buffers
     (tmp_path / "docs").symlink_to(ROOT / "docs")  # rows that a page scores
     (tmp_path / "demo").mkdir()
-    for name in ("my-buffers", "my-training", "acting-buffers", "demo/buffers"):
+    for name in ("my-buffers", "my-training", "acting-buffers", "ceilings", "demo/buffers"):
         (tmp_path / name).symlink_to(buffer_set)
     for name, letters in (("act", "ssff"), ("pi0", "sssf")):
         eval_info.write(tmp_path / name / "eval_info.json", {("pusht", 0): letters})

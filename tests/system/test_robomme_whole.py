@@ -44,7 +44,7 @@ def test_an_evaluation_on_it(tmp_path: Path, robomme_python: Path) -> None:
     assert build(DEMONSTRATIONS, replace(queries, cameras=("front",))) == 0
     # The stand-in hides the answers of this family, so its oracle cannot complete an episode.
     with pytest.raises(BuildError) as raised:
-        build(DISTRACTORS, replace(queries, buffer_set=tmp_path / "units"))
+        build(DISTRACTORS, replace(queries, buffer_set=tmp_path / "units", split="train"))
     assert "hides its answers" in raised.value.message
     units = BuildConfig(
         source=("sample:VideoRepick",), buffer_set=tmp_path, split="train", cameras=("front",)

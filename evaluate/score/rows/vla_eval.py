@@ -16,6 +16,10 @@ _HINT = (
 )
 
 
+_REQUIRED = {*KEY_COLUMNS} - {"training_seed"}
+"""Columns that every episode has; vla-eval leaves out what is None, as an unknown seed is."""
+
+
 def _read(file: RowFile, names: Sequence[str]) -> FileColumns:
     """Read the episodes of all tasks.
 
@@ -46,7 +50,7 @@ def _own_rows(episodes: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Fi
                 malformed[line] = f"{episode['name']} has fewer episodes: see episodes_per_task"
                 continue
             row = {**episode, "episode": number, "status": Status.ERROR, "success": None}
-        rows[line] = [row[name] if name in KEY_COLUMNS else row.get(name) for name in names]
+        rows[line] = [row[name] if name in _REQUIRED else row.get(name) for name in names]
         if any(isinstance(value, list | dict) for value in rows[line]):
             raise TypeError
     columns = {name: [row[at] for row in rows.values()] for at, name in enumerate(names)}
