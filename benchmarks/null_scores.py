@@ -18,7 +18,12 @@ from robomme_interference_data.evaluate.score.config import Expected, Settings
 from robomme_interference_data.evaluate.score.scoring import Score, score
 from robomme_interference_data.stats.intervals import wilson
 
-RUNS, EPISODES, SPREADS = (3, 5), (50, 150, 450), (0.0, 0.02, 0.05, 0.1)
+CASES = tuple(itertools.product((0.3,), (3, 5), (50, 150, 450), (0.0, 0.02, 0.05, 0.1)))
+"""Rate, training runs, episodes, and deviation of the runs' rates."""
+
+LOW_RATE = (0.05, 3, 150, 0.05)
+"""Rates of runs are skewed here."""
+
 CONDITIONS = ("no-history", "k0", "k1", "k3", "k7")
 
 
@@ -31,13 +36,28 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="interference-null-") as name:
         path = Path(name) / "rows.parquet"
         lines = [
-            [str(runs), str(episodes), f"{100 * spread:g}", *over_runs(path, grid, options.grids)]
-            for runs, episodes, spread in itertools.product(RUNS, EPISODES, SPREADS)
-            for grid in [NullGrid(runs=runs, episodes=episodes, spread=spread)]
+            [
+                *(f"{100 * rate:g}%", str(runs), str(episodes), f"{100 * spread:g}"),
+                *over_runs(
+                    path,
+                    NullGrid(runs=runs, episodes=episodes, spread=spread, rate=rate),
+                    options.grids,
+                ),
+            ]
+            for rate, runs, episodes, spread in (*CASES, LOW_RATE)
         ]
         print_table(
-            f"Four equal systems with several training runs, rate 30%, {options.grids} grids.",
-            [">runs", ">episodes", ">spread", ">rates", ">effects", ">matrix", ">interaction"],
+            f"Four equal systems with several training runs, {options.grids} grids.",
+            [
+                ">rate",
+                ">runs",
+                ">episodes",
+                ">spread",
+                ">rates",
+                ">effects",
+                ">matrix",
+                ">interaction",
+            ],
             lines,
         )
         lines = [[str(count), *reports(path, count, options.reports)] for count in (3, 12)]

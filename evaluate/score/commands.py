@@ -178,8 +178,7 @@ def power(
         float,
         typer.Option(
             help="Share of the episodes whose outcomes differ between two systems of equal rates. "
-            "Learned systems in docs/results/training.md differ in 9 to 44% at k0, two runs of one "
-            "system in 6 to 8%."
+            "Three pairs of trained systems in docs/results/training.md differ in 22 to 28% at k0."
         ),
     ] = 0.25,
     difference: Annotated[

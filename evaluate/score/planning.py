@@ -24,8 +24,7 @@ from .power import MAX_EPISODES, POWER, needed, power, smallest
 FLIPS = 0.25
 """Share of the episodes that flips between two learned systems of equal rates.
 
-The trained systems of docs/results/training differ in 9 to 44% of the episodes under k0; two runs
-of one released system in 6 to 8%.
+Three pairs of trained systems in docs/results/training differ in 22 to 28% of the episodes at k0.
 """
 
 MAX_RUNS = 100

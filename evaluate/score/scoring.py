@@ -17,7 +17,7 @@ from .outcomes import Outcomes
 from .partners import base_of, ceilings_of
 from .placing import offline_outcomes, outcomes_of
 from .rows.reading import CheckedRows, read_rows
-from .tables import effects, families, ranks, slopes
+from .tables import decay, effects, families, interaction, ranks
 from .tables.cells import SuccessCell, cells_of, main_table
 from .tables.contrast import Contrast
 from .tables.correction import correct, with_primary
@@ -173,8 +173,8 @@ def _tables(
         main,
         parts_table(cells, simulated, contrasts),
         effects.effects_table(contrasts),
-        slopes.interaction_table(contrasts),
-        slopes.decay_table(simulated, draws),
+        interaction.interaction_table(contrasts),
+        decay.decay_table(simulated, draws),
         families.families_table(simulated, contrasts),
         ranks.matrix_table(contrasts),
     ]
@@ -225,7 +225,7 @@ def _compared(all_outcomes: Sequence[Outcomes], draws: int) -> tuple[list[Contra
                     notes.append(f"{system} and {partner} in {simulator} are not paired: {why}.")
             contrasts += effects.effects_of(outcomes, system, **partners)
         contrasts += ranks.system_pairs(outcomes)
-        contrasts += slopes.interactions_of(outcomes, draws)
+        contrasts += interaction.interactions_of(outcomes, draws)
     return contrasts, notes
 
 

@@ -19,7 +19,7 @@ from support import scoring as made
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.outcomes import Outcomes, Repeat
 from robomme_interference_data.evaluate.score.plots import figures
-from robomme_interference_data.evaluate.score.tables import slopes
+from robomme_interference_data.evaluate.score.tables import decay, interaction
 from robomme_interference_data.evaluate.score.tables.contrast import Contrast
 from robomme_interference_data.evaluate.score.tables.correction import (
     correct,
@@ -109,10 +109,10 @@ def simulated(case: str) -> dict[str, float]:
     for grid in range(GRIDS):
         outcomes = made_up(*CASES[case], f"{case}, {grid}")
         pairs = matrix_table(correct(system_pairs(outcomes))).records()
-        differences = slopes.interactions_of(outcomes, 2000)
+        differences = interaction.interactions_of(outcomes, 2000)
         rows = {
             "matrix": [row for row in pairs if row["condition"] == "k0"],
-            "interaction": slopes.interaction_table(correct(differences)).records(),
+            "interaction": interaction.interaction_table(correct(differences)).records(),
         }
         for name, records in rows.items():
             counts[name].append(found_any(records))
@@ -132,7 +132,7 @@ def simulated(case: str) -> dict[str, float]:
         falls = [fall.joint for fall in primary_falls(primary(outcomes, differences), "made-up")]
         counts["headline"].append(all(fall.low <= 0 <= fall.high for fall in falls))
         counts["interaction, fit"].append(departs(rows["interaction"]))
-        decays = slopes.decay_table([outcomes], 2000).records()
+        decays = decay.decay_table([outcomes], 2000).records()
         counts["decay"].append(found_any(decays))
         counts["decay, fit"].append(departs(decays))
     return {name: sum(found) / len(found) for name, found in counts.items()}

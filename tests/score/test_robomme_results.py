@@ -1,4 +1,4 @@
-"""What the pages of docs/results state is what their rows say."""
+"""What docs/results/robomme.md states is what its rows say."""
 
 import json
 from collections import Counter
@@ -18,13 +18,11 @@ from robomme_interference_data.evaluate.score.tables.paper import by_family
 from robomme_interference_data.evaluate.shortcuts import Cues, Shortcut, shortcuts
 from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.schema.sampling import Memory
-from robomme_interference_data.schema.shifts import NO_SHIFT
 from robomme_interference_data.simulators.robomme.recorded_scene import read_scene
 from robomme_interference_data.simulators.robomme.scenes import OfficialScene
 from robomme_interference_data.stats.intervals import newcombe, wilson
 
 ROBOMME = (RESULTS / "robomme.md").read_text(encoding="utf-8")
-TRAINING = (RESULTS / "training.md").read_text(encoding="utf-8")
 LESSONS: list[dict[str, Any]] = pq.read_table(RESULTS / "robomme/lessons.parquet").to_pylist()
 ROLLOUTS: list[dict[str, Any]] = pq.read_table(RESULTS / "robomme/rollouts.parquet").to_pylist()
 
@@ -221,7 +219,7 @@ def test_what_else_reveals_the_answer() -> None:
             assert json.loads(one["scene"])["answer"][0] == 0
 
 
-# --- robomme.md ---
+# --- rollouts of replay ---
 
 FILES = sorted(RESULTS.glob("*.csv"))
 
@@ -304,83 +302,3 @@ def test_retrieval_and_extrapolation_as_the_page_says(robomme: Score) -> None:
         )
         assert alone == retrieved and len(alone) == 150
     assert sum(alone) == 148
-
-
-# --- training.md ---
-
-Outcomes = dict[tuple[str, str, str, int], list[bool]]
-
-
-@pytest.fixture(scope="module")
-def trained() -> Outcomes:
-    """Outcomes by system, condition (with the shift, if there is one), family and model seed."""
-    outcomes: Outcomes = {}
-    for path in sorted((RESULTS / "training").glob("*.parquet")):
-        for row in pq.read_table(path).to_pylist():
-            shift = "" if row["shift"] == NO_SHIFT else f" {row['shift']}"
-            key = row["system"], row["condition"] + shift, row["family"], row["model_seed"]
-            outcomes.setdefault(key, []).append(row["success"])
-    return outcomes
-
-
-def percent(
-    trained: Outcomes,
-    system: str,
-    condition: str,
-    family: str | None = None,
-    seed: int | None = None,
-) -> str:
-    """Return the rate of successes as the page prints it; empty without rows."""
-    chosen = [
-        one
-        for (name, under, of, weights), outcomes in trained.items()
-        if (name, under) == (system, condition) and family in (None, of) and seed in (None, weights)
-        for one in outcomes
-    ]
-    return f"{100 * sum(chosen) / len(chosen):.1f}" if chosen else ""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "first", ["system", "policy", "further conditions", "under shifts", "carried out"]
-)
-def test_rates_by_condition(trained: Outcomes, first: str) -> None:
-    listed = table(TRAINING, first)
-    assert listed
-    for line in listed:
-        system = line.pop(first).strip("`")
-        line.pop("seeds", None)
-        for condition, rate in line.items():
-            assert rate == percent(trained, system, condition), (system, condition)
-
-
-@pytest.mark.slow
-def test_rates_by_training_seed(trained: Outcomes) -> None:
-    for line in table(TRAINING, "by seed"):
-        system, seed = line.pop("by seed").split()
-        for condition, rate in line.items():
-            found = percent(trained, system.strip("`"), condition, seed=int(seed))
-            assert rate == found, (system, seed, condition)
-
-
-@pytest.mark.parametrize("first", ["family", "acting in"])
-def test_rates_by_family(trained: Outcomes, first: str) -> None:
-    for line in table(TRAINING, first):
-        family = line.pop(first)
-        for title, rate in line.items():
-            system, condition = title.split()
-            assert rate == percent(trained, system.strip("`"), condition, family), (title, family)
-
-
-@pytest.mark.parametrize(("first", "learner"), [("condition", "learned"), ("under", "acts")])
-def test_what_training_with_interference_changes(
-    trained: Outcomes, first: str, learner: str
-) -> None:
-    for line in table(TRAINING, first):
-        with_, without = (
-            float(percent(trained, f"{learner}-{mixture}", line[first]))
-            for mixture in ("mixture", "k0")
-        )
-        assert float(line["mixture − k0"].split()[0].replace("−", "-")) == pytest.approx(
-            with_ - without, abs=0.11
-        )
