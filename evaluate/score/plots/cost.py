@@ -55,7 +55,7 @@ def cost(figure: Any, data: Data) -> bool:
     if not all(record["complete"] for record in records):
         notes.insert(0, "hollow: incomplete cell")
     curves.legend(figure, "; ".join(notes))
-    title = f"Success against cost, {data.simulator}, with 95% Wilson intervals"
+    title = f"Success against cost, {data.simulator}, with 95% intervals"
     axes.set_title(title, loc="left", size=curves.TITLE, color=INK)
     return True
 

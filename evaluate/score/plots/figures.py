@@ -96,7 +96,7 @@ def _success(figure: Any, data: Data) -> bool:
     curves.label_ends(axes, ends, data.styles, high - 1, curves.LABEL)
     note = "published rates: in the table “paper”" if len(beside) < len(data.beside) else ""
     legend(figure, explained(data, [*places, *beside], [""], note))
-    title = f"Success by condition, {data.simulator}, with 95% Wilson intervals"
+    title = f"Success by condition, {data.simulator}, with 95% intervals"
     axes.set_title(title, loc="left", size=curves.TITLE, color=INK)
     return True
 
@@ -156,7 +156,7 @@ def _panels(
         curves.set_axes(axes, data, systems, "" if number % wide else "success, %")
     for axes, own_ends in zip(grid, ends, strict=True):
         curves.label_ends(axes, own_ends, data.styles, high - 0.45, curves.SMALL)
-    note = f"95% {'Wilson intervals' if bars else 'intervals: in the table'}"
+    note = "95% intervals" if bars else "95% intervals: in the table"
     legend(figure, explained(data, systems, [p for _, p in panels.values()], note))
     return True
 
