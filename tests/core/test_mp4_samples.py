@@ -11,7 +11,8 @@ import pytest
 from support.messages import raises
 
 from robomme_interference_data.errors import FormatError, InterferenceError
-from robomme_interference_data.storage.video import check_samples, find_container, iter_frames
+from robomme_interference_data.storage.mp4_samples import check_samples
+from robomme_interference_data.storage.video import find_container, iter_frames
 
 
 def box(kind: bytes, *parts: bytes) -> bytes:
