@@ -4,13 +4,10 @@
 folder of PNG images; see `docs/how-to/your-own-recordings.md`.
 """
 
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, override
-
-import numpy as np
-from numpy.typing import NDArray
 
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, SourceError, named
 from robomme_interference_data.ids import EpisodeId

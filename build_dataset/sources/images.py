@@ -83,7 +83,8 @@ def probe_video(path: Path, rate: float | None = None) -> ProbedVideo:
     average = (len(times) - 1) / (times.last_s - times.first_s)
     raise SourceError(
         f"{problem.message} (on average, {average:.4g} are shown per second)",
-        f"{problem.hint} If they are even at another rate, state it in a column fps of the table.",
+        f"{problem.hint}\nIf they have even times already, their rate in a column fps of the table "
+        "corrects the one stated.",
     )
 
 

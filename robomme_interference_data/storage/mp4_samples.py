@@ -40,8 +40,7 @@ def check_samples(path: Path) -> None:
                     entries = np.frombuffer(box, ">u4", 3 * min(count, available), start + 4)
                     longest = max(longest, int(entries[1::3].max(initial=0)))
     if counts.keys() & {b"cmov", b"sidx"}:
-        what = "its metadata is compressed or has a segment index"
-        raise ValueError(f"{what}; convert it with ffmpeg -i OLD -c copy NEW")
+        raise ValueError("its metadata is compressed or has a segment index")
     samples = counts[b"stsz"] + counts[b"stz2"] + counts[b"trun"]
     edits = counts[b"elst"]
     if samples * max(1, edits) > _MAX_SAMPLES:

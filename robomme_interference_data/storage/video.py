@@ -215,7 +215,7 @@ def open_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.Vid
     try:
         kind = find_container(path)
         if kind == "mp4":
-            check_samples(path)
+            _check_mp4(path)
         container = av.open(file_url(path), format=kind, options=limits, container_options=allowed)
     except FileNotFoundError:
         raise MissingFileError(f"{path} does not exist") from None
@@ -239,6 +239,14 @@ def open_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.Vid
         context.options = limits
         stream.thread_count = 1  # sessions are decoded in parallel
         yield container, stream
+
+
+def _check_mp4(path: Path) -> None:
+    try:
+        check_samples(path)
+    except ValueError as error:
+        hint = "Write its metadata again: ffmpeg -i OLD -c copy NEW.mp4"
+        raise FormatError(f"{path} is not a readable video: {error}", hint) from None
 
 
 def _numbered_frames(
