@@ -307,5 +307,5 @@ def _uneven(path: Path, fps: float, what: str) -> FormatError:
     return FormatError(
         f"{path}: at {fps:g} frames per second, {what}",
         "The video has a variable frame rate, or another one than stated. Give its frames even "
-        f"times: ffmpeg -i OLD -vf 'setpts=N/({rate})/TB' -r {rate} -c:v ffv1 NEW.mkv",
+        f"times: ffmpeg -i OLD -vf settb={1 / rate},setpts=N,fps={rate} -c:v ffv1 NEW.mkv",
     )
