@@ -78,10 +78,7 @@ def test_the_matrix_and_range_in_a_file_are_used(tmp_path: Path) -> None:
     (200 - 143) / 1.8556 = 159, Cr = 128 + (100 - 143) / 1.5748 = 101.
     """
     color = (100, 150, 200)
-    for name, options in {
-        "stated": "colormatrix=bt709:fullrange=on",
-        "unstated": "",
-    }.items():
+    for name, options in {"stated": "colormatrix=bt709:fullrange=on", "unstated": ""}.items():
         with av.open(str(tmp_path / f"{name}.mp4"), "w") as container:
             stream = container.add_stream("libx264", 10, options={"qp": "0"})
             stream.options |= {"x264-params": options} if options else {}
@@ -137,7 +134,9 @@ def test_turned_as_stated(
             list(iter_frames(tmp_path / "turned.mp4", 1, 3, 10, PICTURE.shape))
 
 
-@pytest.mark.parametrize("matrix", [(0.7, 0.7, -0.7, 0.7), (2, 0, 0, 2), (0, 0, 0, 0), (1, 1, 0, 1)])
+@pytest.mark.parametrize(
+    "matrix", [(0.7, 0.7, -0.7, 0.7), (2, 0, 0, 2), (0, 0, 0, 0), (1, 1, 0, 1)]
+)
 def test_no_quarter_turn(tmp_path: Path, matrix: tuple[float, ...]) -> None:
     path = turned_video(tmp_path, display_matrix(*matrix))
     with raises(FormatError):
@@ -147,9 +146,7 @@ def test_no_quarter_turn(tmp_path: Path, matrix: tuple[float, ...]) -> None:
 def display_matrix(a: float, b: float, c: float, d: float) -> NDArray[np.int32]:
     """Return the matrix of a container: columns of what is shown, rows of it, and an offset."""
     one = 1 << 16
-    return np.array(
-        [[a * one, b * one, 0], [c * one, d * one, 0], [0, 0, 1 << 30]], dtype=np.int32
-    )
+    return np.array([[a * one, b * one, 0], [c * one, d * one, 0], [0, 0, 1 << 30]], dtype=np.int32)
 
 
 def turned_video(folder: Path, matrix: NDArray[np.int32]) -> Path:
