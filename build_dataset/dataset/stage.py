@@ -47,8 +47,8 @@ from .lerobot_writer import StoredEpisode
 from .plan import DatasetPlan, PlannedEpisode
 
 _RECORD = "record.json"
-_LAYOUT = 7
-"""Version of a staged episode's folder."""
+_LAYOUT = 8
+"""Version of a staged episode's folder, and of how recordings are decoded."""
 
 
 @dataclass(frozen=True)

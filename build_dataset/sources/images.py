@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError, SourceError
 from robomme_interference_data.storage.encode import decode_image, is_png
-from robomme_interference_data.storage.video import open_video, read_times
+from robomme_interference_data.storage.video import RATES, open_video, read_times
 
 _RGB_FORMATS = (
     "rgb24",
@@ -64,14 +64,18 @@ def probe_video(path: Path, rate: float | None = None) -> ProbedVideo:
     """
     with open_video(path) as (_, stream):
         # The basic rate is exact where containers round; of uneven frames it is far too high.
-        stated = [stream.base_rate, stream.average_rate] if rate is None else [rate]
+        stated = [stream.base_rate, stream.average_rate]
         lossless = stream.codec.canonical_name in _LOSSLESS_CODECS
         exact = lossless and stream.pix_fmt in _RGB_FORMATS
-    # Containers store a frame's duration in whole ns or ms: 1001 is the denominator of NTSC rates.
-    rates = [float(Fraction(one).limit_denominator(1001)) for one in stated if one]
+    if rate is None:
+        # Containers store durations in whole ns or ms: 1001 is the denominator of NTSC rates.
+        rates = [float(Fraction(one).limit_denominator(1001)) for one in stated if one]
+        rates = [one for one in dict.fromkeys(rates) if RATES[0] <= one <= RATES[1]]
+    else:
+        rates = [rate]
     times = read_times(path)
     problem = None
-    for tried in dict.fromkeys(rates):
+    for tried in rates:
         try:
             times.first_number(tried, times.first_s)
         except FormatError as error:
@@ -80,9 +84,8 @@ def probe_video(path: Path, rate: float | None = None) -> ProbedVideo:
             return ProbedVideo(tried, len(times), times.first_s, exact)
     if problem is None:
         raise SourceError(f"{path} has no frame rate", "Give it in a column fps of the table.")
-    average = (len(times) - 1) / (times.last_s - times.first_s)
     raise SourceError(
-        f"{problem.message} (on average, {average:.4g} are shown per second)",
+        f"{problem.message} ({len(times)} frames in {times.last_s - times.first_s:.4g} s)",
         f"{problem.hint}\nIf they have even times already, their rate in a column fps of the table "
         "corrects the one stated.",
     )

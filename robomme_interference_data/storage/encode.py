@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import KEY_FRAMES
 from robomme_interference_data.errors import BuildError, FormatError, InvalidOptionError
 
-from .video import MAX_PIXELS, file_url, rate_fraction
+from .video import MAX_PIXELS, RATES, file_url, rate_fraction
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 
@@ -37,7 +37,7 @@ class Codec:
     options: Mapping[str, str]
     exact: bool
     sides: tuple[int, int] = (1, (1 << 16) - 1)  # MP4 has 16 bits for a side
-    rates: tuple[float, float] = (1e-3, 1e4)
+    rates: tuple[float, float] = RATES
     interpolation: str | None = None
 
 

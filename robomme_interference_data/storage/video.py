@@ -24,6 +24,9 @@ from .pixels import to_rgb
 MAX_PIXELS = 1 << 24
 """Upper bound on the pixels of a frame: twice 3840 × 2160."""
 
+RATES = (1e-3, 1e4)
+"""Smallest and largest number of frames per second that is written."""
+
 _LATEST = 1 << 62
 """Upper bound on the ticks of a container to which FFmpeg can seek."""
 
@@ -52,7 +55,7 @@ _DECODERS = (
 
 
 def rate_fraction(fps: float) -> Fraction:
-    """Return a frame rate, at least 0.001, as a fraction: NTSC's 29.97… as 30000/1001."""
+    """Return a frame rate of 0.001 or more as a fraction: NTSC's 29.97… as 30000/1001."""
     # The denominator keeps times of 10,000 frames per second within the 32 bits of MP4.
     return Fraction(fps).limit_denominator(100_000)
 
