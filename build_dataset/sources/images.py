@@ -85,7 +85,8 @@ def probe_video(path: Path, rate: float | None = None) -> ProbedVideo:
     if problem is None:
         raise SourceError(f"{path} has no frame rate", "Give it in a column fps of the table.")
     raise SourceError(
-        f"{problem.message} ({len(times)} frames in {times.last_s - times.first_s:.4g} s)",
+        f"{problem.message} (of {len(times)} frames, the last comes "
+        f"{times.last_s - times.first_s:.4g} s after the first)",
         f"{problem.hint}\nIf they have even times already, their rate in a column fps of the table "
         "corrects the one stated.",
     )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import KEY_FRAMES
 from robomme_interference_data.errors import BuildError, FormatError, InvalidOptionError
 
-from .video import MAX_PIXELS, RATES, file_url, rate_fraction
+from .video import MAX_PIXELS, RATES, file_url, rate_fraction, reason
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 
@@ -190,7 +190,8 @@ class VideoEncoder:
             if self._container is not None:
                 self.abandon()
             hint = "Check the free disk space." if isinstance(error, OSError) else None
-            raise BuildError(f"{self._path}: the video cannot be written: {error}", hint) from error
+            what = f"the video cannot be written: {reason(error)}"
+            raise BuildError(f"{self._path}: {what}", hint) from error
 
 
 def png(image: NDArray[np.uint8]) -> bytes:

@@ -21,25 +21,30 @@ _MATRICES = {
 
 _NOT_STATED = 2
 
+_FULL_RANGE = np.clip(np.rint((np.arange(256) - 16) * 255 / 219), 0, 255).astype(np.uint8)
+"""Gray of the limited range, in the full one; swscale does not convert it."""
+
 _ONE = 1 << 16
 """1 in the display matrix of a container, which has fixed-point numbers."""
 
-_REWRITE = "Write the video again with FFmpeg, which applies what it can."
+_REWRITE = "Write the video again: ffmpeg -i OLD -c:v ffv1 -pix_fmt bgr0 NEW.mkv"
 
 
 def to_rgb(frame: av.VideoFrame) -> NDArray[np.uint8]:
     """Return a decoded frame as it is to be shown, `(H, W, 3) uint8` RGB.
 
     YUV is converted with the matrix and the range (full or limited) that the stream states. Where
-    it states none, BT.601 and the limited range are assumed, as FFmpeg's swscale and LeRobot do;
-    MJPEG always has the full range. Where the container states a rotation by a multiple of 90°, or
-    a mirror image, it is applied; no pixel changes by that.
+    it states none, BT.601 and the limited range are assumed, as FFmpeg's swscale and LeRobot do; of
+    gray pictures and MJPEG, the full range. Where the container states a rotation by a multiple of
+    90°, or a mirror image, it is applied; no pixel changes by that.
 
     Raises:
         FormatError: The matrix is unknown, or the rotation is another one.
     """
     try:
         pixels, shown = _convert(frame), frame.side_data.get(Type.DISPLAYMATRIX)
+    except FormatError:
+        raise
     except (av.error.FFmpegError, ValueError) as error:
         what = f"a frame cannot be converted to RGB: {error}"
         raise FormatError(what, _REWRITE) from None
@@ -53,8 +58,11 @@ def _convert(frame: av.VideoFrame) -> NDArray[np.uint8]:
     # Planar RGB (the lossless codec) needs no color conversion.
     if kind.name == "gbrp":
         return frame.to_ndarray()
-    if kind.is_rgb or kind.has_palette or len(kind.components) < 3:
+    if kind.is_rgb or kind.has_palette:
         return frame.to_ndarray(format="rgb24")
+    if len(kind.components) < 3:
+        gray = frame.to_ndarray(format="rgb24")
+        return _FULL_RANGE[gray] if frame.color_range == ColorRange.MPEG else gray
     matrix = frame.colorspace
     if matrix not in _MATRICES:
         known = ", ".join(_MATRICES.values())
@@ -62,9 +70,9 @@ def _convert(frame: av.VideoFrame) -> NDArray[np.uint8]:
             f"the colors have the matrix number {matrix} of ISO/IEC 23091-2; known are {known}",
             _REWRITE,
         )
-    full = frame.color_range == ColorRange.JPEG or kind.name.startswith("yuvj")
     if matrix == _NOT_STATED:
         matrix = Colorspace.ITU601.value
+    full = frame.color_range == ColorRange.JPEG or kind.name.startswith("yuvj")
     # PyAV ignores what the frame states, unless the source and the target differ.
     return frame.reformat(
         format="rgb24",

@@ -101,7 +101,7 @@ def iter_frames(
             return
         for number, frame in frames:
             if number != expected:
-                raise _uneven(path, fps, f"frame {expected} is missing; the next is {number}")
+                raise _uneven(path, fps, expected - 1, number)
             try:
                 pixels = to_rgb(frame)
             except FormatError as error:
@@ -154,11 +154,8 @@ class FrameTimes:
         numbers = np.rint((self.ticks * float(self.tick_s) - first_s) * fps)
         wrong = np.flatnonzero(np.diff(numbers) != 1)
         if len(wrong):
-            before, after = int(numbers[wrong[0]]), int(numbers[wrong[0] + 1])
-            if before == after:
-                raise _uneven(self.path, fps, f"two frames would be frame {after}")
-            what = f"frame {before + 1} is missing; the next is {after}"
-            raise _uneven(self.path, fps, what)
+            before, after = numbers[wrong[0] : wrong[0] + 2]
+            raise _uneven(self.path, fps, int(before), int(after))
         return int(numbers[0])
 
 
@@ -182,7 +179,7 @@ def read_times(path: Path) -> FrameTimes:
                         raise FormatError(f"{path}: a frame has no presentation time", _REWRITE)
                     ticks.append(tick)
         except av.error.FFmpegError as error:
-            raise FormatError.damaged(path, f"reading stopped: {error}") from error
+            raise FormatError.damaged(path, f"reading stopped: {reason(error)}") from error
         if not ticks:
             raise FormatError.damaged(path, "the video has no frames")
         return FrameTimes(path, np.sort(np.array(ticks, np.int64)), stream.time_base)
@@ -224,8 +221,11 @@ def open_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.Vid
         raise MissingFileError(f"{path} does not exist") from None
     except FormatError:
         raise
-    except (av.error.FFmpegError, OSError, ValueError) as error:  # ValueError: a damaged header
-        raise FormatError.damaged(path, f"not a readable video: {error}") from error
+    except (av.error.FFmpegError, ValueError) as error:  # ValueError: a damaged header
+        raise FormatError.damaged(path, f"not a readable video: {reason(error)}") from error
+    except OSError as error:
+        hint = "Give a file that you are allowed to read."
+        raise FormatError(f"{path} cannot be read: {reason(error)}", hint) from error
     with container:
         if not container.streams.video:
             raise FormatError(f"{path} holds no video stream", "Give a file that shows pictures.")
@@ -284,7 +284,7 @@ def _numbered_frames(
                 if number >= start:
                     yield number, frame
         except av.error.FFmpegError as error:
-            raise FormatError.damaged(path, f"decoding stopped: {error}") from error
+            raise FormatError.damaged(path, f"decoding stopped: {reason(error)}") from error
 
 
 def _is_counted(container: av.container.InputContainer) -> bool:
@@ -305,10 +305,19 @@ def _other_shape(path: Path, found: tuple[int, ...], shape: tuple[int, ...]) -> 
     )
 
 
-def _uneven(path: Path, fps: float, what: str) -> FormatError:
+def _uneven(path: Path, fps: float, before: int, after: int) -> FormatError:
+    """Return the error for a frame that has not the number after the one before."""
+    what = f"frame {before + 1} is missing; the next is {after}"
+    if after <= before:
+        what = f"two frames would be frame {after}"
     rate = rate_fraction(fps)
     return FormatError(
         f"{path}: at {fps:g} frames per second, {what}",
         "The video has a variable frame rate, or another one than stated. Give its frames even "
         f"times: ffmpeg -i OLD -vf settb={1 / rate},setpts=N,fps={rate} -c:v ffv1 NEW.mkv",
     )
+
+
+def reason(error: Exception) -> str:
+    """Return what FFmpeg or the system reports, without the file's name."""
+    return getattr(error, "strerror", None) or str(error)

@@ -59,6 +59,13 @@ def test_colors_worked_out_by_hand(
     assert np.abs(pixels.astype(int) - rgb).max() <= 2
 
 
+@pytest.mark.parametrize(("color_range", "shown"), [(LIMITED, 100), (FULL, 102), (0, 102)])
+def test_gray(color_range: int, shown: int) -> None:
+    frame = av.VideoFrame.from_ndarray(np.full((4, 8), 102, np.uint8), format="gray")
+    frame.color_range = color_range
+    np.testing.assert_array_equal(to_rgb(frame), np.full((4, 8, 3), shown, np.uint8))
+
+
 @pytest.mark.parametrize("matrix", [0, 8, 10, 14])  # RGB, YCgCo, constant luminance, ICtCp
 def test_a_matrix_that_is_not_known(matrix: int) -> None:
     with raises(FormatError):
