@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError, SourceError
 from robomme_interference_data.storage.encode import decode_image, is_png
-from robomme_interference_data.storage.video import RATES, open_video, read_times
+from robomme_interference_data.storage.video import RATES, read_times
+from robomme_interference_data.storage.video_file import open_video
 
 _RGB_FORMATS = (
     "rgb24",

@@ -48,7 +48,7 @@ from robomme_interference_data.storage.files import (
     read_json,
     sha256_file,
 )
-from robomme_interference_data.storage.video import open_video
+from robomme_interference_data.storage.video_file import open_video
 
 from .lerobot_files import lerobot_violations
 

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import KEY_FRAMES
 from robomme_interference_data.errors import BuildError, FormatError, InvalidOptionError
 
-from .video import MAX_PIXELS, RATES, file_url, rate_fraction, reason
+from .video import RATES, rate_fraction
+from .video_file import MAX_PIXELS, file_url, reason
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 

@@ -1,4 +1,4 @@
-"""Decode spans of frames from a video file: the only module that reads video.
+"""Read frames of video files by their numbers, and the times of all frames.
 
 A LeRobot v3 video file holds consecutive episodes at a constant frame rate, so a frame is
 identified by its number in the file: its presentation time multiplied by the rate, and rounded to
@@ -6,8 +6,8 @@ the nearest number, of which each must have exactly one frame. An AVI file store
 times: its frames are counted, in the order in which they are shown.
 """
 
-from collections.abc import Generator, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Generator
+from contextlib import closing
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -16,13 +16,10 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import FormatError, MissingFileError
+from robomme_interference_data.errors import FormatError
 
-from .mp4_samples import check_samples
 from .pixels import to_rgb
-
-MAX_PIXELS = 1 << 24
-"""Upper bound on the pixels of a frame: twice 3840 × 2160."""
+from .video_file import REWRITE, open_video, reason
 
 RATES = (1e-3, 1e4)
 """Smallest and largest number of frames per second that is written."""
@@ -30,41 +27,11 @@ RATES = (1e-3, 1e4)
 _LATEST = 1 << 62
 """Upper bound on the ticks of a container to which FFmpeg can seek."""
 
-_MP4 = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide")
-"""The first box of an MP4 or QuickTime file."""
-
-_DECODERS = (
-    "libdav1d",
-    "libaom-av1",
-    "av1",
-    "h264",
-    "hevc",
-    "vp8",
-    "vp9",
-    "mpeg4",
-    "mjpeg",
-    "ffv1",
-    "png",
-    "rawvideo",
-    "huffyuv",
-    "ffvhuff",
-    "utvideo",
-    "qtrle",
-)
-"""FFmpeg's decoders that are used: those of LeRobot's codecs, and lossless ones."""
-
 
 def rate_fraction(fps: float) -> Fraction:
     """Return a frame rate of 0.001 or more as a fraction: NTSC's 29.97… as 30000/1001."""
     # The denominator keeps times of 10,000 frames per second within the 32 bits of MP4.
     return Fraction(fps).limit_denominator(100_000)
-
-
-def file_url(path: Path) -> str:
-    """Return a path as FFmpeg opens it: in a bare path, it takes what precedes a colon for a
-    protocol.
-    """
-    return f"file:{path}"
 
 
 def iter_frames(
@@ -176,80 +143,13 @@ def read_times(path: Path) -> FrameTimes:
                     # In AVI, packets have numbers in the order of decoding.
                     tick = packet.dts if counted else packet.pts
                     if tick is None:
-                        raise FormatError(f"{path}: a frame has no presentation time", _REWRITE)
+                        raise FormatError(f"{path}: a frame has no presentation time", REWRITE)
                     ticks.append(tick)
         except av.error.FFmpegError as error:
             raise FormatError.damaged(path, f"reading stopped: {reason(error)}") from error
         if not ticks:
             raise FormatError.damaged(path, "the video has no frames")
         return FrameTimes(path, np.sort(np.array(ticks, np.int64)), stream.time_base)
-
-
-def find_container(path: Path) -> str:
-    """Return FFmpeg's name of a video file's container: `mp4`, `matroska` or `avi`.
-
-    FFmpeg must not guess it: it would accept a playlist as a video, whatever the file's name.
-    """
-    with path.open("rb") as file:
-        start = file.read(12)
-    if start.startswith(b"\x1a\x45\xdf\xa3"):
-        return "matroska"
-    if start.startswith(b"RIFF") and start.endswith(b"AVI "):
-        return "avi"
-    if start[4:8] in _MP4:
-        return "mp4"
-    raise FormatError(
-        f"{path} is not a readable video: no MP4, Matroska or AVI file",
-        "Convert it, if it is a video: ffmpeg -i OLD -c copy NEW.mkv",
-    )
-
-
-_REWRITE = "Write it again: ffmpeg -i OLD -c:v ffv1 NEW.mkv"
-
-
-@contextmanager
-def open_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
-    """Open a video file and its first video stream, before anything is decoded."""
-    limits = {"max_pixels": str(MAX_PIXELS)}
-    allowed = {"protocol_whitelist": "file", "codec_whitelist": ",".join(_DECODERS)}
-    try:
-        kind = find_container(path)
-        if kind == "mp4":
-            _check_mp4(path)
-        container = av.open(file_url(path), format=kind, options=limits, container_options=allowed)
-    except FileNotFoundError:
-        raise MissingFileError(f"{path} does not exist") from None
-    except FormatError:
-        raise
-    except (av.error.FFmpegError, ValueError) as error:  # ValueError: a damaged header
-        raise FormatError.damaged(path, f"not a readable video: {reason(error)}") from error
-    except OSError as error:
-        hint = "Give a file that you are allowed to read."
-        raise FormatError(f"{path} cannot be read: {reason(error)}", hint) from error
-    with container:
-        if not container.streams.video:
-            raise FormatError(f"{path} holds no video stream", "Give a file that shows pictures.")
-        stream = container.streams.video[0]
-        context = stream.codec_context
-        # Of a header that is cut short; PyAV would crash the process.
-        if context is None:
-            raise FormatError.damaged(path, "the codec of the video is unknown")
-        if context.name not in _DECODERS:
-            what = f"its codec {context.name} is none of those read: {', '.join(_DECODERS)}"
-            raise FormatError(f"{path} is not a readable video: {what}", _REWRITE)
-        if not stream.time_base:
-            raise FormatError.damaged(path, f"the time base is {stream.time_base}")
-        context.options = limits
-        stream.thread_count = 1  # sessions are decoded in parallel
-        yield container, stream
-
-
-def _check_mp4(path: Path) -> None:
-    try:
-        check_samples(path)
-    except ValueError as error:
-        hint = "Write its metadata again: ffmpeg -i OLD -c copy NEW.mp4"
-        raise FormatError(f"{path} is not a readable video: {error}", hint) from None
 
 
 def _numbered_frames(
@@ -293,7 +193,7 @@ def _is_counted(container: av.container.InputContainer) -> bool:
 
 def _number(path: Path, frame: av.VideoFrame, tick_s: float, fps: float, first_s: float) -> int:
     if frame.pts is None:
-        raise FormatError(f"{path}: a frame has no presentation time", _REWRITE)
+        raise FormatError(f"{path}: a frame has no presentation time", REWRITE)
     return round((frame.pts * tick_s - first_s) * fps)
 
 
@@ -316,8 +216,3 @@ def _uneven(path: Path, fps: float, before: int, after: int) -> FormatError:
         "The video has a variable frame rate, or another one than stated. Give its frames even "
         f"times: ffmpeg -i OLD -vf settb={1 / rate},setpts=N,fps={rate} -c:v ffv1 NEW.mkv",
     )
-
-
-def reason(error: Exception) -> str:
-    """Return what FFmpeg or the system reports, without the file's name."""
-    return getattr(error, "strerror", None) or str(error)

@@ -209,7 +209,7 @@ HARMS: list[tuple[Callable[[Path], Any], str]] = [
         lambda f: shutil.rmtree(f / "images"),
         f"neither videos nor images(.|\n)*videos/CAMERA/{DRAWER}.mkv(.|\n)*`cameras` to none",
     ),
-    (misplaced(f"videos/wrist/{DRAWER}.mkv"), "0.mkv is not a readable video"),
+    (misplaced(f"videos/wrist/{DRAWER}.mkv"), "0.mkv: the file is empty"),
     (misplaced("videos/front/A/train/3.mkv"), "3.mkv belongs to A/train/3, which frames.parq"),
     (misplaced("images/front/A/train/1"), "train/1 is not an episode's image folder"),
 ]
