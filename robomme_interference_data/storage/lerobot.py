@@ -1,4 +1,6 @@
-"""Read LeRobot datasets with pyarrow and PyAV alone: v3.0, and v2.1 as its variant.
+"""Read LeRobot datasets with pyarrow and PyAV alone: v3.0, v2.1 and v2.0.
+
+The older two differ from each other in their statistics only, which are not read.
 
 The only reader of that layout, for datasets of this package and for recordings. Tests compare it
 with lerobot's own reader.
@@ -22,15 +24,15 @@ from . import video
 from .files import Files, parse_json, read_bytes, read_json, reading
 from .parquet import RowSpan, is_plain, open_parquet, read_table
 
-VERSIONS = ("v3.0", "v2.1")
+VERSIONS = ("v3.0", "v2.1", "v2.0")
 
-_V21_EPISODES = "meta/episodes.jsonl"
-_V21_TASKS = "meta/tasks.jsonl"
+_V2_EPISODES = "meta/episodes.jsonl"
+_V2_TASKS = "meta/tasks.jsonl"
 _FIELD = re.compile(r"\{(\w+)(?::0(\d)d)?\}")
 
 # Upper bounds, checked before anything is allocated.
-_MAX_LINES_BYTES = 64 << 20  # of v2.1's per-episode columns: those of half a million episodes
-_MAX_COLUMNS = 1000  # of v2.1's per-episode columns: each row may name others
+_MAX_LINES_BYTES = 64 << 20  # of v2's per-episode columns: those of half a million episodes
+_MAX_COLUMNS = 1000  # of v2's per-episode columns: each row may name others
 _MAX_TABLE_BYTES = 1 << 30  # of the per-episode columns in all: a million episodes have less
 _MAX_VECTOR = 4096  # numbers in a vector of a frame
 _MAX_VALUES = 1 << 26  # values in a frame of a feature: twice an image of 3840 × 2160 pixels
@@ -75,7 +77,7 @@ class LeRobotFiles:
         if self.version not in VERSIONS:
             raise FormatError(
                 f"{files.describe()} is a LeRobot dataset of version {self.version!r}; this "
-                f"package reads {' and '.join(VERSIONS)}",
+                f"package reads {', '.join(VERSIONS)}",
                 "Convert it with LeRobot's own scripts (lerobot.scripts."
                 "convert_dataset_v21_to_v30 and its predecessors).",
             )
@@ -110,14 +112,14 @@ class LeRobotFiles:
     @cached_property
     def table(self) -> pa.Table:
         """The per-episode columns by episode index."""
-        table = self._v30_table() if self.version == "v3.0" else self._v21_table()
+        table = self._v30_table() if self.version == "v3.0" else self._v2_table()
         where = self.files.describe()
         for name in ("episode_index", "length"):
             column = table[name] if name in table.column_names else pa.nulls(1)
             if column.null_count or not pa.types.is_integer(column.type):
                 raise FormatError.damaged(where, f"its episodes have no whole numbers {name!r}")
         # Its lines may come in any order, since they are found by number.
-        if self.version == "v2.1":
+        if self.version != "v3.0":
             table = table.sort_by("episode_index")
         # LeRobot finds an episode of v3.0 by its place, not by its number.
         if not np.array_equal(table["episode_index"].to_numpy(), np.arange(len(self))):
@@ -130,8 +132,8 @@ class LeRobotFiles:
     @cached_property
     def tasks(self) -> dict[str, Any]:
         """The index of each task text that the dataset lists."""
-        if self.version == "v2.1":
-            rows = list(self._json_lines(_V21_TASKS))
+        if self.version != "v3.0":
+            rows = list(self._json_lines(_V2_TASKS))
         else:
             rows = RowSpan(self.files.path(TASKS_PATH)).table().to_pylist()
         # LeRobot stores the texts as pandas' index, which pandas names so if it has no name.
@@ -224,10 +226,10 @@ class LeRobotFiles:
         with reading(paths[0]):  # files with columns of different types
             return pa.concat_tables(tables)
 
-    def _v21_table(self) -> pa.Table:
-        rows = list(self._json_lines(_V21_EPISODES))
+    def _v2_table(self) -> pa.Table:
+        rows = list(self._json_lines(_V2_EPISODES))
         names = dict.fromkeys(name for row in rows for name in row)
-        path = self.files.path(_V21_EPISODES)
+        path = self.files.path(_V2_EPISODES)
         if len(names) > _MAX_COLUMNS:
             raise FormatError.damaged(path, f"{len(names)} columns")
         with reading(path):
@@ -292,7 +294,7 @@ def _locate_episode(
     info: dict[str, Any], index: int, row: dict[str, Any], where: str
 ) -> EpisodeLocation:
     """Return where an episode lies, given its per-episode columns."""
-    old = info["codebase_version"] == "v2.1"
+    old = info["codebase_version"] != "v3.0"
 
     def whole(name: str) -> int:
         value = row.get(name)

@@ -27,7 +27,7 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.schema.records import EvidenceSpan
 
-VERSIONS = ("v3.0", "v2.1")
+VERSIONS = ("v3.0", "v2.1", "v2.0")
 NAME = "MoveCube/train/0"
 FOUR = make_episode(1, 4, MOVE, 2)
 

@@ -1,4 +1,4 @@
-"""The one reader of LeRobot datasets: both layouts, and what may be wrong with them."""
+"""The one reader of LeRobot datasets: all layouts, and what may be wrong with them."""
 
 import json
 from pathlib import Path
@@ -19,10 +19,12 @@ from robomme_interference_data.storage.files import LocalFiles
 from robomme_interference_data.storage.lerobot import LeRobotFiles, fill_template
 
 VIDEO = "videos/observation.images.front/"
-V21 = "chunk-000/episode_000002"
+V2 = "chunk-000/episode_000002"
+V2_LOCATION = (9, f"data/{V2}.parquet", (f"videos/image/{V2}.mkv", 0))
 LOCATIONS = {  # of the third episode, which begins with frame 19 of the common files of v3.0
     "v3.0": (9, DATA, (VIDEO + "chunk-000/file-000.mkv", 19)),
-    "v2.1": (9, f"data/{V21}.parquet", (f"videos/image/{V21}.mkv", 0)),
+    "v2.1": V2_LOCATION,
+    "v2.0": V2_LOCATION,
 }
 
 
@@ -42,9 +44,9 @@ def read_all(root: Path) -> None:
                 lerobot.vectors(index, name)
 
 
-@pytest.fixture(params=["v3.0", "v2.1"])
+@pytest.fixture(params=["v3.0", "v2.1", "v2.0"])
 def root(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """A dataset of videos of either version."""
+    """A dataset of videos of each version."""
     return write_lerobot(tmp_path / "dataset", version=request.param, stored="video")
 
 
@@ -142,7 +144,7 @@ def test_invalid_paths(root: Path, which: str, path: str) -> None:
 
 
 INFO = {
-    "codebase_version": ("v2.0", ["v3.0"]),
+    "codebase_version": ("v1.6", ["v3.0"]),
     "features": (None, {"state": "float32"}),
     "fps": ("10", float("nan"), None, 1e-300, 1e300),
     "total_episodes": ("3", -1, 2, 10**12),
