@@ -14,7 +14,7 @@ from robomme_interference_data.cli.console import (
     print_status,
 )
 from robomme_interference_data.cli.options import AsJson, Yes, with_settings
-from robomme_interference_data.constants import DEMONSTRATIONS, MANIFESTS, REPORT_PATH
+from robomme_interference_data.constants import DEMONSTRATIONS, MANIFESTS, REPORT_PATH, STATE
 from robomme_interference_data.errors import MissingFileError, counted
 from robomme_interference_data.runtime.executor import WorkersConfig, make_executor
 
@@ -128,7 +128,9 @@ def _build_datasets(plans: "Mapping[str, DatasetPlan]", config: BuildConfig) -> 
 
 
 def _build_dataset(plan: "DatasetPlan", out: Path, workers: WorkersConfig) -> dict[str, Any]:
+    from robomme_interference_data.data.dataset import Dataset
     from robomme_interference_data.progress import WorkProgress
+    from robomme_interference_data.storage.files import LocalFiles
 
     from .dataset.build import build_dataset
 
@@ -137,6 +139,8 @@ def _build_dataset(plan: "DatasetPlan", out: Path, workers: WorkersConfig) -> di
     added = f"{result.added} added" if result.added else "nothing to add"
     episodes, frames = counted(result.episodes, "episode"), counted(result.frames, "frame")
     print_status(f"{out}: {added}; {episodes}, {frames}")
+    if Dataset(LocalFiles(out)).features[STATE] == (0,):
+        print_status("  without robot states: none are recorded, or they were left out")
     for name, reason in sorted(result.skipped.items())[:_MAX_SKIPPED]:
         print_status(f"  skipped {name}: {reason}")
     if len(result.skipped) > _MAX_SKIPPED:

@@ -79,7 +79,7 @@ def open_existing(out: Path, plan: DatasetPlan) -> ExistingDataset | None:
         )
     _check_recordings(out, dataset, plan)
     statistics = episode_statistics(LeRobotFiles(dataset.files, statistics=True).table)
-    vectors = {name: (name,) for name in (STATE, ACTION) if name in dataset.features}
+    vectors = {name: (name,) for name in (STATE, ACTION) if name in dataset.lerobot.features}
     robot = recorded_robot(dataset.lerobot, vectors)
     episodes = map(partial(_stored, dataset, robot), dataset.records(), statistics)
     report = read_header(out / REPORT_PATH, BuildReport)

@@ -83,10 +83,12 @@ def write_lerobot(
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
         robot, fps = episodes[0].robot, episodes[0].fps
+        # LeRobot has no features of no values: states that were not recorded are left out.
+        stored = {feature: shape for feature, shape in features.items() if shape != (0,)}
         dataset = LeRobotDataset.create(
             repo_id=name,
             fps=int(fps) if fps.is_integer() else fps,  # type: ignore[arg-type]
-            features=_declared(features, robot),
+            features=_declared(stored, robot),
             root=root,
             robot_type=robot.type,
             rgb_encoder=RGBEncoderConfig(
@@ -100,10 +102,10 @@ def write_lerobot(
         videos = _EncodedVideos()
         dataset.writer._streaming_encoder = videos
         # LeRobot checks shape and dtype of each image; the pixels are in the encoded videos.
-        blank = {n: np.zeros(s, np.uint8) for n, s in features.items() if len(s) == 3}
+        blank = {n: np.zeros(s, np.uint8) for n, s in stored.items() if len(s) == 3}
         for episode in episodes:
             videos.next = episode
-            vectors = {n: episode.vectors(n) for n, s in features.items() if len(s) == 1}
+            vectors = {n: episode.vectors(n) for n, s in stored.items() if len(s) == 1}
             for position in range(episode.record.length):
                 values = {name: array[position] for name, array in vectors.items()}
                 dataset.add_frame({**blank, **values, "task": episode.record.goal})

@@ -97,7 +97,7 @@ def _columns(dataset: Dataset, table: pa.Table) -> Iterator[tuple[str, str]]:
     lean |= {*records.names}
     for camera in dataset.cameras:
         lean |= {f"videos/{CAMERA_PREFIX}{camera}/{name}" for name in videos}
-    features = (*dataset.features, *_FRAME_COLUMNS)
+    features = (*_stored(dataset), *_FRAME_COLUMNS)
     statistics = {f"stats/{feature}/{name}" for feature in features for name in STATISTICS}
     copy = dataset.lerobot.table
     yield from _names(EPISODES_DIR, table.column_names, lean | statistics)
@@ -126,14 +126,14 @@ def _info(dataset: Dataset) -> Iterator[tuple[str, str]]:
     for name, value in expected.items():
         if info.get(name) != value:
             yield INFO_PATH, f"{name} is {info.get(name)}; expected {value}"
-    yield from _names(INFO_PATH, [*dataset.lerobot.features], {*dataset.features, *_FRAME_COLUMNS})
+    yield from _names(INFO_PATH, [*dataset.lerobot.features], {*_stored(dataset), *_FRAME_COLUMNS})
 
 
 def _rows(dataset: Dataset, index: int, first: int, task: int | None) -> Iterator[tuple[str, str]]:
     """Check the columns that LeRobot adds to every frame."""
     rows = dataset.lerobot.rows(index)
     path = dataset.lerobot.locate(index).data
-    vectors = {name for name in dataset.features if not name.startswith(CAMERA_PREFIX)}
+    vectors = {name for name in _stored(dataset) if not name.startswith(CAMERA_PREFIX)}
     yield from _names(path, rows.names, vectors | {*_FRAME_COLUMNS})
     count = len(rows)
     if not np.array_equal(rows.scalars("index"), first + np.arange(count)):
@@ -152,3 +152,8 @@ def _equal(stored: Any, expected: Any) -> bool:
     if isinstance(expected, float):
         return isinstance(stored, float) and abs(stored - expected) <= _TOLERANCE_S
     return bool(stored == expected)
+
+
+def _stored(dataset: Dataset) -> list[str]:
+    """Return the features that LeRobot's files have: not states of no values."""
+    return [name for name, shape in dataset.features.items() if shape != (0,)]

@@ -268,8 +268,9 @@ def _check_info(info: dict[str, Any], path: object) -> None:
         check(isinstance(shape, list) and len(shape) <= _MAX_SIDES, "features")
         check(all(is_count(side, 1, _MAX_VALUES) for side in shape), "features")
         check(math.prod(shape) <= _MAX_VALUES, "features")
+        pictures = feature["dtype"] in ("video", "image")
         for key in ("info", "video_info"):  # LeRobot's newer and older name
-            check(isinstance(feature.get(key), dict | None), "features")
+            check(isinstance(feature.get(key), dict | None) or not pictures, "features")
         check(feature["dtype"] != "video" or is_template(info.get("video_path")), "video_path")
 
 

@@ -158,6 +158,7 @@ def test_given_columns_that_are_wrong(given: dict[str, str], error: Any) -> None
         ({"axes": ["x", "y"]}, ("x", "y")),
         ({"groups": ["arm"], "motors": ["x", "y"]}, ("x", "y")),
         ({"y": 1, "x": 0}, ("x", "y")),
+        ([["x", "y"]], ("x", "y")),
         (None, None),
         (["x", "x"], None),
         (["position"], None),
