@@ -14,7 +14,8 @@ import pyarrow.compute as pc
 from robomme_interference_data.constants import ACTION, STATE
 from robomme_interference_data.errors import FormatError, InvalidIdError, SourceError, nearest
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.storage.parquet import RowSpan, is_listed
+from robomme_interference_data.storage.arrow_columns import is_listed
+from robomme_interference_data.storage.parquet import RowSpan
 
 from .base import demonstration_length
 

@@ -19,10 +19,11 @@ from robomme_interference_data.schema.codec import from_dict
 from robomme_interference_data.schema.evidence import spans_of_texts
 from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.simulators.episode import choose_cameras
+from robomme_interference_data.storage.arrow_columns import is_listed
 from robomme_interference_data.storage.encode import is_png
 from robomme_interference_data.storage.hub import HubFiles, locate
 from robomme_interference_data.storage.lerobot import LeRobotFiles
-from robomme_interference_data.storage.parquet import RowSpan, is_listed
+from robomme_interference_data.storage.parquet import RowSpan
 
 from .base import Recording, Robot, Source, SourceEpisode, compose, demonstration_length, file_state
 from .columns import camera_names, find_columns, recorded_robot
