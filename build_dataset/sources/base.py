@@ -1,13 +1,13 @@
 """The interface of a source of recorded episodes."""
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.errors import SourceError, named, nearest
@@ -15,6 +15,7 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EvidenceSpan
 
 from ..alike import same_rate
+from .flags import parse_flags
 
 
 @dataclass(frozen=True)
@@ -201,9 +202,12 @@ def file_state(path: Path) -> tuple[int, int] | None:
     return max((file.st_mtime_ns for file in files), default=0), sum(file.st_size for file in files)
 
 
-def demonstration_length(flags: ArrayLike, what: str) -> int:
+def demonstration_length(flags: Iterable[Any], what: str) -> int:
     """Return the number of demonstration frames from `what`, a flag for each frame."""
-    marked = np.asarray(flags, bool)
+    try:
+        marked = np.array(parse_flags(flags), bool)
+    except ValueError as error:
+        raise SourceError(f"{what} is {error}", "Correct the recording, or leave it out.") from None
     length = int(marked.sum())
     if marked[length:].any():
         raise SourceError(

@@ -3,8 +3,10 @@
 Read with pyarrow and PyAV alone; `docs/reference/sources.md` describes columns and families.
 """
 
-from collections.abc import Generator
-from dataclasses import dataclass, replace
+import unicodedata
+from collections.abc import Generator, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, override
@@ -13,13 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import ACTION, OFFICIAL, STATE, VALUE_NAMES
-from robomme_interference_data.errors import FormatError, SourceError, named
+from robomme_interference_data.errors import MissingFileError, SourceError, counted, named
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.schema.codec import from_dict
 from robomme_interference_data.schema.evidence import spans_of_texts
-from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.simulators.episode import choose_cameras
-from robomme_interference_data.storage.arrow_columns import is_listed
 from robomme_interference_data.storage.encode import is_png
 from robomme_interference_data.storage.hub import HubFiles, locate
 from robomme_interference_data.storage.lerobot import LeRobotFiles
@@ -27,7 +26,9 @@ from robomme_interference_data.storage.parquet import RowSpan
 
 from .base import Recording, Robot, Source, SourceEpisode, compose, demonstration_length, file_state
 from .columns import camera_names, find_columns, recorded_robot
+from .episode_columns import NAMING, EpisodeColumns, read_column, read_episode_columns
 from .families import ids_by_block, ids_by_columns, names_episodes, read_families, template
+from .goals import check_choice, goal_wordings
 from .images import decode_images, info_is_exact
 from .robomme_families import BLOCKS, ROBOMME, families_for_goal
 
@@ -35,30 +36,13 @@ _ROBOMME_REPOS = ("lerobot/robomme", "Yinpei/robomme_data_lerobot")
 _CORRECT = "Correct the dataset, or leave the episode out."
 
 
-@dataclass(frozen=True)
-class _Metadata:
-    """Per-episode columns of a dataset; None where it has none."""
-
-    tasks: tuple[str, ...] | None
-    goals: tuple[str, ...] | None
-    seed: int | None
-    difficulty: str | None
-    simulator: str | None
-    exact: bool | None
-    exec_start_idx: int | None
-    evidence: tuple[EvidenceSpan, ...] | None
-
-    @property
-    def wordings(self) -> tuple[str, ...]:
-        return self.goals or self.tasks or ()
-
-
 class LeRobotSource(Source):
     """Episodes of a LeRobot dataset, in a folder or on the Hub; see `hub.locate`.
 
     `columns` maps logical names (a camera, `state`, `action`, `is_demo`, `exec_start_idx`,
     `subgoal`) to columns without a usual name. `kept_families` is the families file of an earlier
-    build, for a dataset that does not name its families itself.
+    build, for a dataset that does not name its families itself. `several_tasks` is what the goal of
+    an episode with several tasks is, see `goals.SEVERAL_TASKS`.
     """
 
     def __init__(
@@ -67,10 +51,13 @@ class LeRobotSource(Source):
         columns: dict[str, str] | None = None,
         families_file: Path | None = None,
         kept_families: Path | None = None,
+        several_tasks: str | None = None,
     ):
+        check_choice(several_tasks)
         self._files = locate(location)
         self._given_columns = columns or {}
         self._given_families, self._kept_families = families_file, kept_families
+        self._several_tasks = several_tasks
         self.provenance = {"kind": "lerobot"}
         if isinstance(self._files, HubFiles):
             self.provenance |= {"repo": self._files.repo_id, "revision": self._files.commit}
@@ -78,23 +65,20 @@ class LeRobotSource(Source):
                 self.provenance["folder"] = self._files.folder.removesuffix("/")
 
     def __getstate__(self) -> dict[str, Any]:
-        lazy = ("_lerobot", "_columns", "_families")
+        lazy = ("_lerobot", "_columns", "_families", "_tasks")
         return {name: value for name, value in self.__dict__.items() if name not in lazy}
 
     @override
     def episodes(self) -> list[SourceEpisode]:
-        rows, tasks = self._lerobot.table.to_pylist(), self._lerobot.tasks
+        rows = self._lerobot.table.to_pylist()
         ids, simulator = self._ids(rows)
         listed = []
         for index, name in ids.items():
             metadata = self._metadata(index, rows[index])
-            for task in metadata.tasks or ():
-                if task not in tasks:
-                    what = f"episode {index}: unknown task {task!r}"
-                    raise FormatError.damaged(self._where, what)
+            goals = self._goals(index, self._tasks[index], metadata)
             played = simulator or metadata.simulator
             if played in (None, OFFICIAL):
-                self._check_goals(index, name, metadata.wordings)
+                self._check_goals(index, name, goals)
             marked = {"is_demo", "exec_start_idx"} & self._columns.keys()
             key = index, played, self._state(index)
             known = bool(marked) or metadata.exec_start_idx is not None
@@ -122,7 +106,7 @@ class LeRobotSource(Source):
         values = {feature: columns[name] for feature, name in vectors.items() if name in columns}
         streams = {camera: self._images(index, rows, columns[camera], exact) for camera in chosen}
         return Recording(
-            goals=metadata.wordings,
+            goals=self._goals(index, self._tasks_of_frames(index), metadata),
             seed=metadata.seed,
             difficulty=metadata.difficulty,
             simulator=simulator,
@@ -158,24 +142,54 @@ class LeRobotSource(Source):
                 raise SourceError(error.message, f"{error.hint}\n{more}") from None
             raise
 
-    @property
-    def _tasks(self) -> list[list[str]]:
-        """The tasks of each episode, as far as the dataset has them."""
-        table = self._lerobot.table
-        if "tasks" not in table.column_names or not is_listed(table.schema.field("tasks").type):
-            return [[]] * len(table)
-        return [
-            [text for text in texts or () if isinstance(text, str)]
-            for texts in table["tasks"].to_pylist()
-        ]
+    @cached_property
+    def _tasks(self) -> list[tuple[str, ...]]:
+        """The tasks of each episode: those that its row lists, or else those of its frames."""
+        table, texts = self._lerobot.table, self._lerobot.task_texts
+        given = table["tasks"].to_pylist() if "tasks" in table.column_names else [None] * len(table)
+        known = {unicodedata.normalize("NFC", text): text for text in texts.values()}
+        tasks = []
+        for index, value in enumerate(given):
+            where = f"{self._where}: episode {index}"
+            listed = read_column("tasks", value, where) or ()
+            found = [known.get(unicodedata.normalize("NFC", text)) for text in listed]
+            if None in found:
+                raise SourceError(
+                    f"{where} has the task {listed[found.index(None)]!r}, which the dataset's list "
+                    f"of {counted(len(texts), 'task')} does not have",
+                    "LeRobot's modify_tasks changes both.",
+                )
+            if not found:
+                with suppress(MissingFileError):  # an error when it is read
+                    found = [*self._lerobot.tasks_of(index)]
+            tasks.append(tuple(text for text in found if text is not None))
+        return tasks
+
+    def _tasks_of_frames(self, index: int) -> tuple[str, ...]:
+        """Return the tasks of an episode in the order of its frames, then further listed ones."""
+        listed, stored = self._tasks[index], self._lerobot.tasks_of(index)
+        if listed and not {*stored} <= {*listed}:
+            raise SourceError(
+                f"its frames have the task {' and '.join(map(repr, stored))}; meta/ lists "
+                f"{' and '.join(map(repr, listed))}",
+                "Correct one of them: LeRobot's modify_tasks changes both.",
+            )
+        return (*stored, *(text for text in listed if text not in stored))
+
+    def _goals(self, index: int, tasks: Sequence[str], metadata: EpisodeColumns) -> tuple[str, ...]:
+        """Return the wordings of an episode's goal."""
+        try:
+            return goal_wordings(tasks, metadata.goals or (), self._several_tasks)
+        except SourceError as error:
+            raise error.about(f"{self._where}: episode {index}") from None
 
     @property
     def _where(self) -> str:
         return self._files.describe()
 
-    def _metadata(self, index: int, row: dict[str, Any]) -> _Metadata:
+    def _metadata(self, index: int, row: dict[str, Any]) -> EpisodeColumns:
         row = row | self._families[index]
-        return from_dict(_Metadata, row, f"{self._where}: episode {index}")
+        return read_episode_columns(row, f"{self._where}: episode {index}")
 
     def _robot(self, columns: dict[str, str], *, official: bool) -> Robot:
         """Return the robot; RoboMME's values have known names, also where its datasets have none.
@@ -212,6 +226,8 @@ class LeRobotSource(Source):
         simulator = OFFICIAL if hub else None
         from_file = self._families_file is not None
         where = f"families file {self._families_file}" if from_file else self._where
+        if not from_file:
+            rows = [self._naming_columns(index, row) for index, row in enumerate(rows)]
         ids = ids_by_columns(self._families if from_file else rows, where)
         if ids is not None:
             return ids, simulator
@@ -225,6 +241,11 @@ class LeRobotSource(Source):
             f"Write a CSV file and give it with {named('families_file')}. Its lines, with the "
             f"names of families:\n{template(self._tasks)}",
         )
+
+    def _naming_columns(self, index: int, row: dict[str, Any]) -> dict[str, Any]:
+        """Return those per-episode columns of an episode that name it."""
+        where = f"{self._where}: episode {index}"
+        return {name: read_column(name, row[name], where) for name in NAMING if name in row}
 
     def _check_goals(self, index: int, name: EpisodeId, goals: tuple[str, ...]) -> None:
         for goal in goals:
@@ -254,7 +275,8 @@ def _lesson(rows: RowSpan, columns: dict[str, str], recorded: int | None) -> int
     lengths = {} if recorded is None else {"per-episode exec_start_idx": recorded}
     if "is_demo" in columns:
         name = columns["is_demo"]
-        lengths[name] = demonstration_length(rows.scalars(name), f"column {name!r}")
+        flags = rows.values(name).to_pylist()
+        lengths[name] = demonstration_length(flags, f"column {name!r}")
     if "exec_start_idx" in columns:
         name = columns["exec_start_idx"]
         values = np.unique(rows.scalars(name)).tolist()
