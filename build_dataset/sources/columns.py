@@ -113,11 +113,17 @@ def _unmet(name: str, feature: Mapping[str, Any]) -> str | None:
     """Return what the column of a logical name should hold, if it does not."""
     kind, shape = feature["dtype"], feature["shape"]
     if name in ("state", "action"):
-        fits, expected = len(shape) == 1 and kind.startswith("float"), "a vector of floats"
+        fits, expected = (
+            len(shape) == 1 and ("float" in kind or "int" in kind),
+            "a vector of numbers",
+        )
     elif name == "subgoal":
         fits, expected = kind == "string", "text"
-    elif name in ("is_demo", "exec_start_idx"):
-        fits, expected = kind == "bool" or "int" in kind, "booleans or whole numbers"
+    elif name == "is_demo":
+        fits = kind in ("bool", "string") or "int" in kind or "float" in kind
+        expected = "true or false"
+    elif name == "exec_start_idx":
+        fits, expected = "int" in kind or "float" in kind, "whole numbers"
     else:
         colors = len(shape) == 3 and 3 in (shape[0], shape[2])
         fits, expected = colors and kind in ("video", "image"), "images or video, three channels"

@@ -1,4 +1,4 @@
-"""The per-episode columns of a LeRobot dataset that describe an episode. Pure rules.
+"""Columns of tables that name and describe an episode. Pure rules.
 
 Other programs change how values are stored: pandas makes floats of whole numbers, and NaN of empty
 ones. What has one meaning is read; the rest is an error that names column and value.
@@ -24,7 +24,7 @@ _LARGEST = 1 << 53
 
 @dataclass(frozen=True)
 class EpisodeColumns:
-    """Per-episode columns of a dataset; None where it has none."""
+    """Per-episode columns of a LeRobot dataset; None where it has none."""
 
     goals: tuple[str, ...] | None
     seed: int | None
@@ -51,13 +51,26 @@ def read_column(name: str, value: Any, where: str) -> Any:
     Raises:
         SourceError: It has another meaning.
     """
+    try:
+        return parse_column(name, value)
+    except ValueError as error:
+        raise SourceError(
+            f"{where}: {error}", "Correct the per-episode column in meta/, or remove it."
+        ) from None
+
+
+def parse_column(name: str, value: Any) -> Any:
+    """Return the value of one of the columns in its own type; None if it is empty.
+
+    Raises:
+        ValueError: It has another meaning.
+    """
     parse, expected = _COLUMNS[name]
     try:
         return None if _is_empty(value) else parse(value)
     except (ValueError, OverflowError):
-        raise SourceError(
-            f"{where}: {name} is {repr(value)[:200]}; expected {expected}, or nothing",
-            "Correct the per-episode column in meta/, or remove it.",
+        raise ValueError(
+            f"{name} is {repr(value)[:200]}; expected {expected}, or nothing"
         ) from None
 
 

@@ -1,4 +1,4 @@
-"""The goals of LeRobot episodes: the tasks of their frames, and a choice where these are several."""
+"""The goals of LeRobot episodes: the tasks of their frames, and a choice if these are several."""
 
 import unicodedata
 from dataclasses import replace
