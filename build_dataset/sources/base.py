@@ -12,10 +12,13 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.errors import SourceError, named, nearest
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.schema.records import EvidenceSpan
+from robomme_interference_data.schema.records import MAX_GOAL, EvidenceSpan
+from robomme_interference_data.storage.limits import MAX_NAME, MAX_RATE, MIN_RATE
 
 from ..alike import same_rate
 from .flags import parse_flags
+
+_LARGEST_SEED = 1 << 63
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,13 @@ class Robot:
                 f"the recording states {self.fps:g} frames per second; {named('fps')} is {given:g}",
                 "Leave it out, or correct the recording.",
             )
-        return self.fps or given  # type: ignore[return-value]
+        rate = given if self.fps is None else self.fps
+        if rate is None or not MIN_RATE <= rate <= MAX_RATE:
+            raise SourceError(
+                f"{rate} frames per second; expected {MIN_RATE:g} to {MAX_RATE:,.0f}",
+                "Correct the rate of the recording.",
+            )
+        return rate
 
     def check_names(self, features: Mapping[str, Sequence[int]]) -> None:
         """Check that the known names are one for each value of a vector."""
@@ -95,6 +104,12 @@ class Robot:
                 raise SourceError(
                     f"{feature} has {size} values, and the names {', '.join(names)}",
                     "Give one name for each value.",
+                )
+            if longest := [name for name in names if len(name) > MAX_NAME]:
+                raise SourceError(
+                    f"a value of {feature} has a name of {len(longest[0])} characters; expected at "
+                    f"most {MAX_NAME}",
+                    "Shorten the name.",
                 )
 
 
@@ -134,6 +149,23 @@ class Recording:
             raise SourceError(
                 f"the goal is {' and '.join(map(repr, self.goals)) or 'missing'}",
                 "Describe the goal in words.",
+            )
+        if sum(map(len, self.goals)) > MAX_GOAL:
+            raise SourceError(
+                f"the goal has {sum(map(len, self.goals)):,} characters; expected at most "
+                f"{MAX_GOAL:,} in all wordings",
+                "Shorten the goal.",
+            )
+        for goal in self.goals:
+            if any("\ud800" <= character <= "\udfff" for character in goal):
+                raise SourceError(
+                    f"the goal is {goal!r}, with half of a character",
+                    "Decode the text as it was encoded.",
+                )
+        if self.seed is not None and not -_LARGEST_SEED <= self.seed < _LARGEST_SEED:
+            raise SourceError(
+                f"the seed is {self.seed}; expected a whole number of at most 63 bits",
+                "Leave the seed out.",
             )
         if self.difficulty not in (None, *DIFFICULTIES):
             raise SourceError(

@@ -21,6 +21,7 @@ from robomme_interference_data.errors import FormatError, MissingFileError, Unkn
 from . import video
 from .files import Files, read_json
 from .lerobot_tables import read_episode_lines, read_episodes, read_tasks
+from .limits import MAX_FRAME_VALUES, MAX_NAME, MAX_RATE, MIN_RATE
 from .parquet import RowSpan
 
 VERSIONS = ("v3.0", "v2.1")
@@ -28,14 +29,11 @@ VERSIONS = ("v3.0", "v2.1")
 _FIELD = re.compile(r"\{(\w+)(?::0(\d)d)?\}")
 
 # Upper bounds, checked before anything is allocated.
-_MAX_VALUES = 1 << 26  # values in a frame of a feature: twice an image of 3840 × 2160 pixels
 _MAX_SIDES = 8  # numbers in a shape
 _MAX_EPISODES = 10_000_000
 _MAX_FEATURES = 10_000
 _MAX_TEMPLATE = 1000  # characters of a path template
-_MAX_NAME = 200  # characters of a feature's name, which a template may repeat
 _MAX_FRAME = 1 << 40  # number of a frame in its file: a container's timestamp has 64 bits
-_FPS = (1e-3, 1e6)
 
 
 @dataclass(frozen=True)
@@ -51,10 +49,10 @@ class LeRobotFiles:
     """A LeRobot dataset: its metadata, and values and frames of its episodes.
 
     `tables` are the paths of its episode tables, if known: on the Hub, listing the files takes
-    longer than fetching these. Only with `statistics`, `table` has all of their columns.
+    longer than fetching these. `statistics` are the features whose statistics `table` has.
     """
 
-    def __init__(self, files: Files, tables: Sequence[str] = (), *, statistics: bool = False):
+    def __init__(self, files: Files, tables: Sequence[str] = (), statistics: Sequence[str] = ()):
         self.files = files
         self._tables, self._statistics = tables, statistics
         self._rows: dict[int, dict[str, Any]] = {}
@@ -107,7 +105,7 @@ class LeRobotFiles:
         """The per-episode columns by episode index."""
         where = self.files.describe()
         if self.version == "v3.0":
-            table = read_episodes(self.files, self._tables, statistics=self._statistics)
+            table = read_episodes(self.files, self._tables, self._statistics)
         else:
             table = read_episode_lines(self.files)
         for name in ("episode_index", "length"):
@@ -231,18 +229,18 @@ def _check_info(info: dict[str, Any], path: object) -> None:
         return isinstance(value, str) and len(value) <= _MAX_TEMPLATE
 
     fps, features = info.get("fps"), info.get("features")
-    check(isinstance(fps, int | float) and _FPS[0] <= fps <= _FPS[1], "fps")
+    check(isinstance(fps, int | float) and MIN_RATE <= fps <= MAX_RATE, "fps")
     check(is_count(info.get("total_episodes"), 0, _MAX_EPISODES), "total_episodes")
     check(is_count(info.get("chunks_size", 1000), 1, _MAX_EPISODES), "chunks_size")
     check(is_template(info.get("data_path")), "data_path")
     check(isinstance(features, dict) and 0 < len(features) <= _MAX_FEATURES, "features")
     for name, feature in features.items() if isinstance(features, dict) else ():
-        check(len(name) <= _MAX_NAME and isinstance(feature, dict), "features")
+        check(len(name) <= MAX_NAME and isinstance(feature, dict), "features")
         check(isinstance(feature.get("dtype"), str), "features")
         shape = feature.get("shape")
         check(isinstance(shape, list) and len(shape) <= _MAX_SIDES, "features")
-        check(all(is_count(side, 1, _MAX_VALUES) for side in shape), "features")
-        check(math.prod(shape) <= _MAX_VALUES, "features")
+        check(all(is_count(side, 1, MAX_FRAME_VALUES) for side in shape), "features")
+        check(math.prod(shape) <= MAX_FRAME_VALUES, "features")
         for key in ("info", "video_info"):  # LeRobot's newer and older name
             check(isinstance(feature.get(key), dict | None), "features")
         check(feature["dtype"] != "video" or is_template(info.get("video_path")), "video_path")

@@ -1,6 +1,7 @@
 """Read the tables of a LeRobot dataset's `meta/`: its episodes, and the texts of its tasks."""
 
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
@@ -32,29 +33,28 @@ _TASK_COLUMNS = ("task", "__index_level_0__")
 """LeRobot stores the texts as pandas' index, which pandas names so if it has no name."""
 
 
-def read_episodes(files: Files, names: Sequence[str] = (), *, statistics: bool) -> pa.Table:
+def read_episodes(
+    files: Files, names: Sequence[str] = (), statistics: Sequence[str] = ()
+) -> pa.Table:
     """Read the per-episode columns of a dataset v3.0, its rows in the order of the files.
 
     Args:
         files: The dataset's files.
         names: Its tables, if they are known; else those of `meta/episodes`.
-        statistics: Whether to read the statistics, too, and columns of any type.
+        statistics: Features whose statistics are read, too.
     """
-    paths = [files.path(name) for name in names or files.list(EPISODES_DIR, ".parquet")]
-    if not paths:
-        raise MissingFileError(
-            f"{EPISODES_DIR} holds no parquet file in {files.describe()}",
-            "The dataset is incomplete: download or build it again.",
-        )
+    paths = [files.path(name) for name in names] or _episode_tables(files)
+    wanted = tuple(f"{_STATISTICS}{feature}/" for feature in statistics)
     tables = []
     for path in paths:
         file = open_parquet(path)
         columns = [
             field.name
             for field in file.schema_arrow
-            if is_plain(field.type) and not field.name.startswith(_STATISTICS)
+            if is_plain(field.type)
+            and (not field.name.startswith(_STATISTICS) or field.name.startswith(wanted))
         ]
-        tables.append(read_table(file, path, None if statistics else columns))
+        tables.append(read_table(file, path, columns))
         if sum(table.nbytes for table in tables) > _MAX_TABLE_BYTES:
             what = f"the episode tables have over {_MAX_TABLE_BYTES:,} bytes"
             raise FormatError.damaged(path, what)
@@ -67,6 +67,22 @@ def read_episodes(files: Files, names: Sequence[str] = (), *, statistics: bool) 
             "Write the column with one type in all of them.",
         ) from None
     return _with_whole_numbers(table)
+
+
+def _episode_tables(files: Files) -> list[Path]:
+    paths = [files.path(name) for name in files.list(EPISODES_DIR, ".parquet")]
+    if not paths:
+        raise MissingFileError(
+            f"{EPISODES_DIR} holds no parquet file in {files.describe()}",
+            "The dataset is incomplete: download or build it again.",
+        )
+    return paths
+
+
+def episode_column_names(files: Files) -> list[str]:
+    """Return the names of all per-episode columns of a dataset v3.0, statistics among them."""
+    tables = (open_parquet(path).schema_arrow.names for path in _episode_tables(files))
+    return list(dict.fromkeys(name for names in tables for name in names))
 
 
 def _with_whole_numbers(table: pa.Table) -> pa.Table:

@@ -29,6 +29,7 @@ from .arrow_columns import (
     simplified,
 )
 from .files import atomic_path, reading
+from .limits import MAX_READ_VALUES
 from .parquet_pages import decoded_size
 
 # An image may be a PNG of some megabytes.
@@ -42,9 +43,6 @@ _MAGIC = b"PAR1"
 
 _MAX_LIST = 1 << 14
 """Length of a list in the metadata, such as row groups: pyarrow allocates memory for it first."""
-
-_MAX_VALUES = 1 << 26
-"""Values of a read: a million rows of a run have a third of them."""
 
 _MAX_BYTES = 2 << 30
 """Decoded bytes of a read, or of the images of a row group."""
@@ -132,8 +130,8 @@ def _check_size(
                 column = file.metadata.row_group(group).column(number)
                 values += column.num_values
                 size += decoded_size(raw, column, fixed_length, _MAX_BYTES)
-                if size > _MAX_BYTES or values > _MAX_VALUES:
-                    what = f"over {_MAX_BYTES:,} bytes or {_MAX_VALUES:,} values once decoded"
+                if size > _MAX_BYTES or values > MAX_READ_VALUES:
+                    what = f"over {_MAX_BYTES:,} bytes or {MAX_READ_VALUES:,} values once decoded"
                     raise ValueError(what)
 
 
