@@ -126,6 +126,13 @@ class BuildConfig(WorkersConfig):
         "of the buffer set use it too.",
         group="Sources",
     )
+    several_tasks: str | None = setting(
+        None,
+        metavar="CHOICE",
+        help="Source lerobot: what the tasks of an episode with several are: `wordings` of one "
+        "goal, steps that are `joined` to one goal, or of which the `first` or `last` is the goal.",
+        group="Sources",
+    )
     fps: float | None = setting(
         None, help="Frames per second of recordings that do not state them.", group="Sources"
     )

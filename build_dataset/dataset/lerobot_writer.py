@@ -1,9 +1,10 @@
 """Write stored episodes as one LeRobot v3 dataset: the only user of lerobot.
 
 LeRobot's own writer makes the parquet files and the metadata, with separate files for every
-episode. Only its streaming video encoder is replaced: that one drops frames when its queue is full
-and spends as long on image statistics as on encoding. The replacement hands over videos that are
-already encoded and checked.
+episode. Two parts are replaced. Its streaming video encoder drops frames when its queue is full
+and spends as long on image statistics as on encoding; the replacement hands over videos that are
+already encoded and checked. Its statistics of vectors overflow where a sensor reports "no reading"
+as the largest float32, and take minutes for thousands of values; ours do not.
 """
 
 import json
@@ -28,7 +29,7 @@ from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.encode import Codec
 from robomme_interference_data.storage.files import write_text
 
-from .image_stats import STATISTICS
+from .statistics import STATISTICS, vector_statistics
 
 _ONE_EPISODE_MB = 1e-6
 """Largest size of a file, 1 byte: no two episodes share one."""
@@ -78,7 +79,7 @@ def write_lerobot(
 
     `root` must not exist; `features` are those of the episodes that the dataset keeps.
     """
-    with _quiet():
+    with _quiet(), _own_statistics():
         from lerobot.configs.video import RGBEncoderConfig
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -175,6 +176,22 @@ class _EncodedVideos:
         """Do nothing: no encoder runs in the background."""
 
     close = cancel_episode
+
+
+@contextmanager
+def _own_statistics() -> Iterator[None]:
+    """Let LeRobot's writer store our statistics of vectors."""
+    from lerobot.datasets import dataset_writer
+
+    def statistics(values: dict[str, NDArray[Any]], features: Any) -> dict[str, Any]:
+        return {name: vector_statistics(array) for name, array in values.items()}
+
+    theirs = dataset_writer.compute_episode_stats
+    dataset_writer.compute_episode_stats = statistics
+    try:
+        yield
+    finally:
+        dataset_writer.compute_episode_stats = theirs
 
 
 @contextmanager

@@ -280,8 +280,11 @@ def _unmet(name: str, feature: Mapping[str, Any]) -> str | None:
     elif name == "subgoal":
         fits = kind in ("string", "language") or "int" in kind
         expected = "text, the number of a subtask, or LeRobot's language annotations"
-    elif name in ("is_demo", "exec_start_idx"):
-        fits, expected = kind == "bool" or "int" in kind, "booleans or whole numbers"
+    elif name == "is_demo":
+        fits = kind in ("bool", "string") or "int" in kind or "float" in kind
+        expected = "true or false"
+    elif name == "exec_start_idx":
+        fits, expected = "int" in kind or "float" in kind, "whole numbers"
     else:
         expected = "color images or video, with three channels, no depth maps"
         colors = len(shape) == 3 and 3 in (shape[0], shape[2])

@@ -3,8 +3,10 @@
 Read with pyarrow and PyAV alone; `docs/reference/sources.md` describes columns and families.
 """
 
+import unicodedata
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, override
@@ -13,21 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import OFFICIAL, VALUE_NAMES
-from robomme_interference_data.errors import FormatError, SourceError, named
+from robomme_interference_data.errors import MissingFileError, SourceError, counted, named
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.schema.codec import from_dict
 from robomme_interference_data.schema.evidence import spans_of_texts
-from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.simulators.episode import choose_cameras
 from robomme_interference_data.storage.encode import is_png
 from robomme_interference_data.storage.hub import HubFiles, locate
 from robomme_interference_data.storage.lerobot import LeRobotFiles
-from robomme_interference_data.storage.parquet import RowSpan, is_listed
+from robomme_interference_data.storage.parquet import RowSpan
 
 from .base import Recording, Robot, Source, SourceEpisode, compose, demonstration_length, file_state
 from .columns import Columns, find_columns, recorded_robot
+from .episode_columns import NAMING, EpisodeColumns, read_column, read_episode_columns
 from .families import ids_by_block, ids_by_columns
 from .families_file import TASK, template
+from .goals import check_choice, goal_wordings
 from .images import decode_images, info_is_exact
 from .naming import EpisodeNaming
 from .robomme_families import BLOCKS, ROBOMME, families_for_goal
@@ -38,31 +40,14 @@ _ROBOMME_REPOS = ("lerobot/robomme", "Yinpei/robomme_data_lerobot")
 _CORRECT = "Correct the dataset, or leave the episode out."
 
 
-@dataclass(frozen=True)
-class _Metadata:
-    """Per-episode columns of a dataset; None where it has none."""
-
-    tasks: tuple[str, ...] | None
-    goals: tuple[str, ...] | None
-    seed: int | None
-    difficulty: str | None
-    simulator: str | None
-    exact: bool | None
-    exec_start_idx: int | None
-    evidence: tuple[EvidenceSpan, ...] | None
-
-    @property
-    def wordings(self) -> tuple[str, ...]:
-        return self.goals or self.tasks or ()
-
-
 class LeRobotSource(Source):
     """Episodes of a LeRobot dataset, in a folder or on the Hub; see `hub.locate`.
 
     `columns` maps logical names (a camera, `state`, `action`, `is_demo`, `exec_start_idx`,
     `subgoal`) to columns without a usual name: see `find_columns`. `families_from` is `task`,
     `dataset`, or the path of a families file. `kept_families` is that of an earlier build, for a
-    dataset that does not name its families itself.
+    dataset that does not name its families itself. `several_tasks` is what the goal of an episode
+    with several tasks is, see `goals.SEVERAL_TASKS`.
     """
 
     def __init__(
@@ -71,10 +56,13 @@ class LeRobotSource(Source):
         columns: dict[str, str] | None = None,
         families_from: str | None = None,
         kept_families: Path | None = None,
+        several_tasks: str | None = None,
     ):
+        check_choice(several_tasks)
         self._files = locate(location)
         self._given_columns = columns or {}
         self._families_from, self._kept_families = families_from, kept_families
+        self._several_tasks = several_tasks
         self.provenance = {"kind": "lerobot"}
         if columns:
             self.provenance["columns"] = dict(columns)
@@ -84,23 +72,20 @@ class LeRobotSource(Source):
                 self.provenance["folder"] = self._files.folder.removesuffix("/")
 
     def __getstate__(self) -> dict[str, Any]:
-        lazy = ("_lerobot", "_columns", "naming")
+        lazy = ("_lerobot", "_columns", "_tasks", "naming")
         return {name: value for name, value in self.__dict__.items() if name not in lazy}
 
     @override
     def episodes(self) -> list[SourceEpisode]:
-        rows, tasks = self._lerobot.table.to_pylist(), self._lerobot.tasks
+        rows = self._lerobot.table.to_pylist()
         ids, simulator = self._ids(rows)
         listed = []
         for index, name in ids.items():
             metadata = self._metadata(index, rows[index])
-            for task in metadata.tasks or ():
-                if task not in tasks:
-                    what = f"episode {index}: unknown task {task!r}"
-                    raise FormatError.damaged(self._where, what)
+            goals = self._goals(index, self._tasks[index], metadata)
             played = simulator or metadata.simulator
             if played in (None, OFFICIAL):
-                self._check_goals(index, name, metadata.wordings)
+                self._check_goals(index, name, goals)
             self._trim(index)  # checks it
             marks = self._columns.is_demo, self._columns.exec_start_idx, metadata.exec_start_idx
             key = index, played, self._state(index)
@@ -130,7 +115,7 @@ class LeRobotSource(Source):
             for camera in chosen
         }
         return Recording(
-            goals=metadata.wordings,
+            goals=self._goals(index, self._tasks_of_frames(index), metadata),
             seed=metadata.seed,
             difficulty=metadata.difficulty,
             simulator=simulator,
@@ -168,24 +153,54 @@ class LeRobotSource(Source):
             return f"{self._files.repo_id.split('/')[-1]} {self._files.folder}".strip(" /")
         return Path(self._files.location).resolve().name
 
-    @property
-    def _tasks(self) -> list[list[str]]:
-        """The tasks of each episode, as far as the dataset has them."""
-        table = self._lerobot.table
-        if "tasks" not in table.column_names or not is_listed(table.schema.field("tasks").type):
-            return [[]] * len(table)
-        return [
-            [text for text in texts or () if isinstance(text, str)]
-            for texts in table["tasks"].to_pylist()
-        ]
+    @cached_property
+    def _tasks(self) -> list[tuple[str, ...]]:
+        """The tasks of each episode: those that its row lists, or else those of its frames."""
+        table, texts = self._lerobot.table, self._lerobot.task_texts
+        given = table["tasks"].to_pylist() if "tasks" in table.column_names else [None] * len(table)
+        known = {unicodedata.normalize("NFC", text): text for text in texts.values()}
+        tasks = []
+        for index, value in enumerate(given):
+            where = f"{self._where}: episode {index}"
+            listed = read_column("tasks", value, where) or ()
+            found = [known.get(unicodedata.normalize("NFC", text)) for text in listed]
+            if None in found:
+                raise SourceError(
+                    f"{where} has the task {listed[found.index(None)]!r}, which the dataset's list "
+                    f"of {counted(len(texts), 'task')} does not have",
+                    "LeRobot's modify_tasks changes both.",
+                )
+            if not found:
+                with suppress(MissingFileError):  # an error when it is read
+                    found = [*self._lerobot.tasks_of(index)]
+            tasks.append(tuple(text for text in found if text is not None))
+        return tasks
+
+    def _tasks_of_frames(self, index: int) -> tuple[str, ...]:
+        """Return the tasks of an episode in the order of its frames, then further listed ones."""
+        listed, stored = self._tasks[index], self._lerobot.tasks_of(index)
+        if listed and not {*stored} <= {*listed}:
+            raise SourceError(
+                f"its frames have the task {' and '.join(map(repr, stored))}; meta/ lists "
+                f"{' and '.join(map(repr, listed))}",
+                "Correct one of them: LeRobot's modify_tasks changes both.",
+            )
+        return (*stored, *(text for text in listed if text not in stored))
+
+    def _goals(self, index: int, tasks: Sequence[str], metadata: EpisodeColumns) -> tuple[str, ...]:
+        """Return the wordings of an episode's goal."""
+        try:
+            return goal_wordings(tasks, metadata.goals or (), self._several_tasks)
+        except SourceError as error:
+            raise error.about(f"{self._where}: episode {index}") from None
 
     @property
     def _where(self) -> str:
         return self._files.describe()
 
-    def _metadata(self, index: int, row: dict[str, Any]) -> _Metadata:
+    def _metadata(self, index: int, row: dict[str, Any]) -> EpisodeColumns:
         row = row | self.naming.row(index)
-        return from_dict(_Metadata, row, f"{self._where}: episode {index}")
+        return read_episode_columns(row, f"{self._where}: episode {index}")
 
     def _trim(self, index: int) -> Trim:
         try:
@@ -236,7 +251,10 @@ class LeRobotSource(Source):
         """Return the episodes' ids, and the simulator where it follows from the dataset."""
         hub = isinstance(self._files, HubFiles) and self._files.repo_id in _ROBOMME_REPOS
         simulator = OFFICIAL if hub else None
-        ids = ids_by_columns(self.naming.rows or rows, self.naming.where)
+        naming = self.naming.rows or [
+            self._naming_columns(index, row) for index, row in enumerate(rows)
+        ]
+        ids = ids_by_columns(naming, self.naming.where)
         if ids is not None:
             return ids, simulator
         blocks = ids_by_block()
@@ -250,6 +268,11 @@ class LeRobotSource(Source):
             f"and give it with {named('families_from')}. Its lines, with the names of families:\n"
             f"{template(self._tasks)}",
         )
+
+    def _naming_columns(self, index: int, row: dict[str, Any]) -> dict[str, Any]:
+        """Return those per-episode columns of an episode that name it."""
+        where = f"{self._where}: episode {index}"
+        return {name: read_column(name, row[name], where) for name in NAMING if name in row}
 
     def _check_goals(self, index: int, name: EpisodeId, goals: tuple[str, ...]) -> None:
         for goal in goals:
@@ -284,7 +307,8 @@ def _lesson(rows: RowSpan, columns: Columns, recorded: int | None) -> int | None
     lengths = {} if recorded is None else {"per-episode exec_start_idx": recorded}
     if columns.is_demo is not None:
         name = columns.is_demo
-        lengths[name] = demonstration_length(rows.scalars(name), f"column {name!r}")
+        flags = rows.values(name).to_pylist()
+        lengths[name] = demonstration_length(flags, f"column {name!r}")
     if columns.exec_start_idx is not None:
         name = columns.exec_start_idx
         values = np.unique(rows.scalars(name)).tolist()

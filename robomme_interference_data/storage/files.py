@@ -45,7 +45,10 @@ class Files(ABC):
 
     @abstractmethod
     def list(self, folder: str, suffix: str = "") -> list[str]:
-        """Return the sorted relative paths of all files under a folder; empty if none."""
+        """Return the sorted relative paths of all files under a folder; empty if none.
+
+        Hidden ones are left out, see `is_hidden`.
+        """
 
     @abstractmethod
     def fetch(self, paths: Iterable[str]) -> None:
@@ -108,7 +111,8 @@ class LocalFiles(Files):
     def list(self, folder: str, suffix: str = "") -> list[str]:
         """See `Files.list`."""
         matches = (self.root / folder).rglob(f"*{suffix}")
-        return sorted(p.relative_to(self.root).as_posix() for p in matches if p.is_file())
+        names = (p.relative_to(self.root).as_posix() for p in matches if p.is_file())
+        return sorted(name for name in names if not is_hidden(name))
 
     def fetch(self, paths: Iterable[str]) -> None:
         """Do nothing: the files are local."""
@@ -125,6 +129,14 @@ class LocalFiles(Files):
     def describe(self) -> str:
         """Return the folder."""
         return str(self.root)
+
+
+def is_hidden(relative: str) -> bool:
+    """Return whether a path is that of a file which other programs left, such as `._a.parquet`.
+
+    macOS, editors and interrupted downloads name them, or their folder, with a dot in front.
+    """
+    return any(part.startswith(".") for part in PurePosixPath(relative).parts)
 
 
 def all_files(root: Path) -> list[str]:

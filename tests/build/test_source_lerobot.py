@@ -61,7 +61,8 @@ def test_what_per_episode_columns_say(tmp_path: Path, version: str) -> None:
         "exec_start_idx": [2],
         "goals": [["fold the towel", "fold it"]],
     }
-    recording = read(write_lerobot(tmp_path, one(), version=version, marked=False, **columns))
+    folded = one(replace(FOUR, goal="fold the towel"))
+    recording = read(write_lerobot(tmp_path, folded, version=version, marked=False, **columns))
     assert (recording.simulator, recording.exact) == ("tabletop", False)
     assert recording.goals == ("fold the towel", "fold it")
     assert [frame.is_demonstration for frame in recording.frames] == [True, True, False, False]
@@ -219,6 +220,12 @@ def test_columns_that_do_not_fit(v21: Path, columns: Any, error: Any) -> None:
     ("columns", "lesson"),
     [
         ({"is_demo": [True, True, True, False], "exec_start_idx": [3] * 4}, 3),  # not as lists
+        ({"is_demo": ["True", "true", "False", "0"]}, 2),
+        ({"is_demo": [1.0, 1.0, 0.0, 0.0]}, 2),
+        ({"is_demo": [1, 1, 0, 0], "exec_start_idx": [2.0] * 4}, 2),
+        ({"is_demo": [1.0, 1.0, float("nan"), 0.0]}, "nan"),
+        ({"is_demo": [1, 2, 0, 0]}, "2"),
+        ({"is_demo": [True, None, False, False]}, "None"),
         ({"is_demo": [True, False, True, False]}, "true in 2 frames, not all of them at the"),
         ({"exec_start_idx": [2, 2, 3, 2]}, "'exec_start_idx' holds 2, 3; expected one number"),
         ({"exec_start_idx": [3] * 4}, "not clear: 2 by is_demo and 3 by exec_start_idx"),
@@ -261,7 +268,7 @@ def test_evidence_of_this_projects_datasets_goes_before_subgoals(tmp_path: Path)
     root = write_lerobot(tmp_path, one(), evidence=[spans])
     assert read(root).evidence == (EvidenceSpan(0, "hooks it", 0, 2),)
     other = write_lerobot(tmp_path / "other", one(), evidence=[[spans[0] | {"stop": 0}]])
-    with raises(FormatError):
+    with raises(SourceError):
         read(other)
 
 
@@ -271,19 +278,77 @@ def test_evidence_of_this_projects_datasets_goes_before_subgoals(tmp_path: Path)
 @pytest.mark.parametrize(
     "columns",
     [
-        {"seed": ["17"]},
+        {"seed": ["seventeen"]},
+        {"seed": [1e300]},
+        {"seed": [float("inf")]},
+        {"seed": [True]},
         {"difficulty": [3]},
+        {"difficulty": ["0"]},
+        {"exact": [0.5]},
+        {"exact": ["maybe"]},
         {"exec_start_idx": [2.5]},
         {"exec_start_idx": [3]},  # the rows say 2
-        {"goals": [MOVE]},
+        {"goals": [7]},
         {"tasks": [["something else"]]},
+        {"tasks": [7]},
         {"episode_id": [None]},
+        {"episode_id": [7]},
+        {"evidence": ["x"]},
     ],
 )
 def test_invalid_values(tmp_path: Path, columns: dict[str, Any]) -> None:
     root = write_lerobot(tmp_path, one(), **columns)
-    with pytest.raises((SourceError, FormatError)):
+    with raises(SourceError):
         read(root)
+
+
+@pytest.mark.parametrize(
+    ("columns", "expected"),
+    [
+        ({"seed": [7.0]}, {"seed": 7}),
+        ({"seed": ["7"]}, {"seed": 7}),
+        ({"seed": [float("nan")]}, {"seed": None}),
+        ({"seed": [""]}, {"seed": None}),
+        ({"seed": [-(2**62)]}, {"seed": -(2**62)}),
+        ({"difficulty": [float("nan")]}, {"difficulty": None}),
+        ({"difficulty": [""]}, {"difficulty": None}),
+        ({"exact": [1]}, {"exact": True}),
+        ({"exact": [0.0]}, {"exact": False}),
+        ({"exact": ["False"]}, {"exact": False}),
+        ({"exact": [float("nan")]}, {"exact": True}),  # by the images
+        ({"simulator": [float("nan")]}, {"simulator": None}),
+        ({"goals": [MOVE]}, {"goals": (MOVE,)}),
+        ({"goals": [float("nan")]}, {"goals": (MOVE,)}),
+        ({"tasks": [MOVE]}, {"goals": (MOVE,)}),
+        ({"evidence": [float("nan")]}, {"evidence": None}),
+    ],
+)
+def test_values_as_other_programs_store_them(
+    tmp_path: Path, columns: dict[str, Any], expected: dict[str, Any]
+) -> None:
+    recording = read(write_lerobot(tmp_path, one(), **columns))
+    assert {name: getattr(recording, name) for name in expected} == expected
+
+
+def test_pandas_makes_floats_of_the_columns_of_merged_datasets(tmp_path: Path) -> None:
+    """Episodes without a value have NaN, and the others floats."""
+    episodes = {"MoveCube/train/0": FOUR, "MoveCube/test/1": replace(FOUR)}
+    columns = {
+        "exec_start_idx": [2.0, float("nan")],
+        "family": ["MoveCube", "MoveCube"],
+        "split": ["train", "test"],
+        "index": [0.0, 1.0],
+        "episode_id": None,
+    }
+    root = write_lerobot(tmp_path, episodes, marked=False, **columns)
+    source = open_source(f"lerobot:{root}")
+    listed = source.episodes()
+    assert [(str(episode.id), episode.marked) for episode in listed] == [
+        ("MoveCube/train/0", True),
+        ("MoveCube/test/1", False),
+    ]
+    first = source.read(listed[0], None)
+    assert [frame.is_demonstration for frame in first.frames] == [True, True, False, False]
 
 
 def test_images_that_are_wrong(tmp_path: Path) -> None:
