@@ -3,9 +3,8 @@
 import math
 from typing import Any
 
-import pyarrow as pa
-
 from robomme_interference_data.errors import FormatError, MissingFileError, SourceError, named
+from robomme_interference_data.storage.arrow_columns import is_text
 from robomme_interference_data.storage.lerobot import LeRobotFiles
 from robomme_interference_data.storage.parquet import RowSpan
 
@@ -51,7 +50,7 @@ def _subtasks(lerobot: LeRobotFiles, column: str) -> dict[int, str]:
             f"Name a column of texts with {named('columns', 'subgoal=COLUMN')}, or leave it out.",
         ) from None
     table = RowSpan(path).table()
-    texts = [field.name for field in table.schema if _is_text(field.type)]
+    texts = [field.name for field in table.schema if is_text(field.type)]
     if len(texts) != 1:
         raise FormatError(
             f"{path} has the columns {', '.join(table.column_names)}; expected subtask_index and "
@@ -89,7 +88,3 @@ def _annotated(lerobot: LeRobotFiles, rows: RowSpan, column: str) -> list[str]:
         current = begin.get(frame, current)
         texts.append(current)
     return texts
-
-
-def _is_text(kind: pa.DataType) -> bool:
-    return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind))
