@@ -22,7 +22,6 @@ from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, LESSONS, 
 from robomme_interference_data.errors import (
     BuildError,
     InterferenceError,
-    InvalidOptionError,
     SourceError,
     named,
     naming_options,
@@ -287,11 +286,5 @@ class _Writer:
                 path, self._codec, self._fps, len(image), image.shape[1]
             )
             self.stats[name] = ImageStats()
-        if not images and not any(value.size for value in vectors.values()):
-            raise InvalidOptionError(
-                "there is nothing to store: the recording has no states, and no camera is chosen",
-                f"Choose {named('cameras')}.",
-                option="cameras",
-            )
         self._vectors = {name: [] for name in vectors}
         self.features = {name: value.shape for name, value in (images | vectors).items()}
