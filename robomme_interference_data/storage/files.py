@@ -81,6 +81,10 @@ class LocalFiles(Files):
     root: Path
     refetch: str | None = None
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Another process may have another working directory.
+        return LocalFiles, (self.root.absolute(), self.refetch)
+
     def path(self, relative: str) -> Path:
         """See `Files.path`."""
         path = self.root / check_relative(relative, self.describe())
