@@ -6,6 +6,7 @@ each episode or for each task.
 
 import csv
 import io
+import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -161,7 +162,8 @@ def _read_rows(path: Path, count: int) -> tuple[list[str], dict[Any, dict[str, A
 
 
 def _one_line(text: str) -> str:
-    return " ".join(text.split())
+    """Return a text in one line, and in one of Unicode's forms: "ö" may be one character or two."""
+    return unicodedata.normalize("NFC", " ".join(text.split()))
 
 
 def _lines(names: Sequence[object], header: Sequence[str]) -> str:
