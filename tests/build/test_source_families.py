@@ -1,6 +1,7 @@
 """How the episodes of a LeRobot dataset get their ids, and which goals fit which family."""
 
-from pathlib import unicodedata
+import unicodedata
+from pathlib import Path
 from typing import Any
 
 import numpy as np
