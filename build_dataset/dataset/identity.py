@@ -38,6 +38,7 @@ from robomme_interference_data.schema.records import Counts, DatasetIdentity, Ep
 from robomme_interference_data.storage.files import (
     all_files,
     format_sums,
+    is_hidden,
     sha256_file,
     write_json,
     write_text,
@@ -57,7 +58,7 @@ def listed_files(root: Path) -> list[str]:
     return [
         path
         for path in all_files(root)
-        if path.split("/")[0] in DATASET_FOLDERS and path not in unlisted
+        if path.split("/")[0] in DATASET_FOLDERS and path not in unlisted and not is_hidden(path)
     ]
 
 

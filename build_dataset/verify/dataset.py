@@ -44,6 +44,7 @@ from robomme_interference_data.storage.encode import CODECS
 from robomme_interference_data.storage.files import (
     all_files,
     digest_json,
+    is_hidden,
     read_header,
     read_json,
     sha256_file,
@@ -233,9 +234,11 @@ def index_violations(
     folders: set[str] = set()
     for path in all_files(root):
         folder, _, file = path.partition("/")
+        if is_hidden(path):  # such as an index that is being made
+            continue
         if not file:
             yield Violation(f"{name}/{INDEX_DIR}/{path}", UNLISTED)
-        elif not path.startswith("."):  # an index that is being made
+        else:
             folders.add(f"{INDEX_DIR}/{folder}")
             if not (root / path).is_file():
                 yield Violation(f"{name}/{INDEX_DIR}/{path}", "is a broken link, or no file")

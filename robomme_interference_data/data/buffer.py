@@ -4,7 +4,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,6 +69,10 @@ class Buffer:
         self.sessions = layout_sessions(manifest.sessions)
         self._datasets, self._check_rules = datasets, check_rules
         self._reader = FrameReader(self.sessions, datasets, cache, threads)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy in another process reads them again.
+        return {name: value for name, value in self.__dict__.items() if name != "_states"}
 
     def __repr__(self) -> str:
         return (

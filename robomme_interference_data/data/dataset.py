@@ -110,6 +110,9 @@ class Dataset:
         self._records: dict[int, EpisodeRecord] = {}
         self._checked = False
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _open_again, (self.files, self.revision)
+
     def __repr__(self) -> str:
         return f"Dataset({self.kind}, {self._name}, episodes={len(self)})"
 
@@ -349,3 +352,15 @@ class Dataset:
 
     def _feature(self, camera: str | None) -> str:
         return camera_feature(self.camera(camera))
+
+
+def _open_again(files: Files, revision: str) -> Dataset:
+    """Return an unpickled dataset, or a copy of one: open files cannot be pickled."""
+    dataset = Dataset(files)
+    if dataset.revision != revision:
+        raise HashMismatchError(
+            f"{files.describe()} has revision {dataset.revision[:12]}…; the dataset that was "
+            f"pickled had {revision[:12]}…",
+            "Open it again; do not change data that is in use.",
+        )
+    return dataset

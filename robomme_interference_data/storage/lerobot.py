@@ -65,7 +65,7 @@ class LeRobotFiles:
                 f"{files.describe()} is no LeRobot dataset: {INFO_PATH} is missing",
                 "Give the folder that holds meta/, data/ and videos/.",
             ) from error
-        self.info = read_json(path)
+        self.info = read_json(path, nan_as_none=True)
         self.version = self.info.get("codebase_version")
         if self.version not in VERSIONS:
             raise FormatError(

@@ -24,6 +24,7 @@ from robomme_interference_data.retrieval.stored_selector import StoredSelector
 from robomme_interference_data.schema.manifest import ManifestHeader
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.schema.shifts import NO_SHIFT, Shift, parse_shift
+from robomme_interference_data.storage.files import LocalFiles
 
 from .draws import Weights
 from .histories import DrawnHistory, Histories
@@ -204,8 +205,11 @@ class HistoryDataset:
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # type: ignore[no-untyped-call]
 
     def __reduce__(self) -> tuple[Any, ...]:
+        files = self.buffer_set.files
+        # Another process may have another working directory.
+        local = isinstance(files, LocalFiles)
         return _open_again, (
-            self.buffer_set.location,
+            str(files.root.absolute()) if local else files.location,
             self._arguments,
             self._epoch,
             self.buffer_set.header,
