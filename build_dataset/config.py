@@ -126,12 +126,6 @@ class BuildConfig(WorkersConfig):
     fps: float | None = setting(
         None, help="Frames per second of recordings that do not state them.", group="Sources"
     )
-    robomme_python: str | None = setting(
-        None,
-        help="Source robomme: Python interpreter with RoboMME.",
-        env="ROBOMME_PYTHON",
-        group="Sources",
-    )
     _: KW_ONLY
     workers: int = setting(_CPUS, help="Worker processes.", shown="all CPUs", group="Execution")
 

@@ -116,7 +116,6 @@ def _open_sources(kind: str, config: BuildConfig, unit: Unit) -> tuple[Source, .
             columns=columns,
             families_file=config.families_file,
             kept_families=kept if kept.is_file() else None,
-            robomme_python=config.robomme_python,
             # A simulator draws only the frames that a unit stores.
             every=unit.in_dataset(kind).stride if kind in UNITS else 1,
         )

@@ -32,7 +32,6 @@ from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import BuildError, InvalidOptionError, named
 from robomme_interference_data.runtime.executor import WorkersConfig
 from robomme_interference_data.schema.conditions import datasets_of
-from robomme_interference_data.schema.settings import SETTING
 from robomme_interference_data.storage.files import Files, LocalFiles
 from robomme_interference_data.storage.hub import locate
 
@@ -141,8 +140,7 @@ def _changed(config: BuildConfig | BuffersConfig, used: Iterable[str] = ()) -> l
     return [
         setting.name
         for setting in fields(config)
-        # An environment variable is set for other commands.
-        if setting.name not in used and setting.metadata[SETTING]["env"] is None
+        if setting.name not in used
         if getattr(config, setting.name) != setting.default
     ]
 

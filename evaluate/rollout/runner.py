@@ -112,7 +112,7 @@ def _describe_run(
         subgoals_identity = optional.subgoals_identity(config, writer)
         metadata |= writer
     identity = policy_identity(config.policy, config.policy_options, policy_metadata)
-    versions = simulator_versions(config.simulator, config.robomme_python)
+    versions = simulator_versions(config.simulator)
     facts = SystemFacts(
         policy=POLICIES.parse(config.policy).kind,
         policy_id=short_digest(identity),

@@ -41,7 +41,6 @@ SETTINGS = (
     "model_seed",
     # The simulator:
     "simulator",
-    "robomme_python",
     "shift",
     "check_lesson",
     # The retrieval step:

@@ -41,8 +41,7 @@ _ENVIRONMENT = {
 def _advice() -> str:
     return (
         "Install RoboMME (https://github.com/RoboMME/robomme_benchmark) into a separate "
-        f"environment and set {named('robomme_python')} to its Python, or export "
-        f"{PYTHON_VARIABLE}=PATH."
+        f"environment, and set the environment variable {PYTHON_VARIABLE} to the path of its Python."
     )
 
 
