@@ -99,17 +99,28 @@ class BuildConfig(WorkersConfig):
         help="Cameras to store, such as front, or none for states alone; default: all.",
         group="Encoding",
     )
+    resize: str | None = setting(
+        None,
+        metavar="WIDTHxHEIGHT[:crop|pad]",
+        help="Store frames in this size, such as 256x256:pad; frames of another aspect ratio are "
+        "cropped, or padded with black bars.",
+        shown="as recorded",
+        group="Encoding",
+    )
     codec: str = setting(
         "av1-lossless",
         help="av1-lossless (bit-exact) or lerobot-default (smaller, lossy).",
         group="Encoding",
     )
-    version: str = setting("1.0.0", help="Version of the datasets.", group="Encoding")
+    version: str = setting(
+        "1.0.0", help="Version of the datasets.", group="Encoding", rare=True
+    )
     time_limit_s: float | None = setting(
         None,
         help="Seconds for one episode; a slower one is retried once.",
         shown="300 on tabletop and sample, else 1800",
         group="Execution",
+        rare=True,
     )
     columns: tuple[str, ...] = setting(
         (),

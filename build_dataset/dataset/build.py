@@ -244,7 +244,7 @@ def _write(
     for _ in write_lerobot(made, plan.kind, ordered, features, get_codec(plan.codec)):
         progress.advance(1)
     records = [_numbered(episode.record, index, features) for index, episode in enumerate(ordered)]
-    provenances = [source.provenance for source in plan.sources]
+    provenances = plan.provenances
     provenances += existing.dataset.identity.sources if existing else ()
     sources = [source for _, source in sorted({canonical_json(p): p for p in provenances}.items())]
     info = read_json(made / INFO_PATH)

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +46,7 @@ from .frame_selection import NothingToStore, select_frames
 from .image_stats import ImageStats
 from .lerobot_writer import StoredEpisode
 from .plan import DatasetPlan, PlannedEpisode
+from .resize import Resize
 
 _RECORD = "record.json"
 _LAYOUT = 7
@@ -82,7 +84,7 @@ def staged_name(plan: DatasetPlan, planned: PlannedEpisode) -> str:
     codec = get_codec(plan.codec)
     content: dict[str, object] = {
         "kind": plan.kind,
-        "source": plan.sources[number].provenance,
+        "source": plan.provenance(number),
         "episode": [str(episode.id), repr(episode.key)],
         "cameras": plan.cameras,
         "codec": [codec.vcodec, codec.pix_fmt, dict(codec.options)],
@@ -134,7 +136,7 @@ class StageTask:
     def _write(self, episode: EpisodeId, recording: Recording, folder: Path) -> Staged:
         codec = get_codec(self.plan.codec)
         fps = recording.robot.at(self.plan.fps)
-        writer = _Writer(codec, folder, fps)
+        writer = _Writer(codec, folder, fps, self.plan.resize)
         try:
             for frame in select_frames(self.plan.kind, recording, self.plan.unit):
                 writer.add(frame)
@@ -166,7 +168,7 @@ class StageTask:
             difficulty=recording.difficulty,
             simulator=recording.simulator,
             exec_start_idx=start,
-            exact=recording.exact and codec.exact,
+            exact=recording.exact and codec.exact and not writer.resized,
             feature_sha256=session,
             span_sha256=SpanDigests(*map(combine, parts)) if parts else None,
             evidence=None if start is None else recording.evidence,
@@ -204,31 +206,46 @@ def read_staged(folder: Path) -> Staged | None:
 
 
 class _Writer:
-    """Writes the files of a staged episode; all maps are by feature."""
+    """Writes the files of a staged episode; all maps are by feature.
 
-    def __init__(self, codec: Codec, folder: Path, fps: float):
-        self._codec, self._folder, self._fps = codec, folder, fps
+    Attributes:
+        features: Shapes of the stored values.
+        stats: Statistics of the stored images.
+        digests: Digests of what was stored.
+        length: Number of frames.
+        resized: Whether a stored image is not the recorded one.
+    """
+
+    def __init__(self, codec: Codec, folder: Path, fps: float, resize: Resize | None):
+        self._codec, self._folder, self._fps, self._resize = codec, folder, fps, resize
+        self._recorded: dict[str, tuple[int, ...]] = {}  # shapes before images are resized
         self._encoders: dict[str, VideoEncoder] = {}
         self._vectors: dict[str, list[NDArray[np.float32]]] = {}
         self.features: dict[str, tuple[int, ...]] = {}
         self.stats: dict[str, ImageStats] = {}
         self.digests = FeatureDigests()
         self.length = 0
+        self.resized = False
 
     def add(self, frame: Frame) -> None:
         """Add the next frame, which must have the first one's shapes and finite numbers."""
         images = {CAMERA_PREFIX + camera: image for camera, image in frame.images.items()}
         vectors = {STATE: frame.state} | ({} if frame.action is None else {ACTION: frame.action})
-        if not self.length:
-            self._begin(images, vectors)
         shapes = {name: value.shape for name, value in (images | vectors).items()}
-        if shapes != self.features:
-            looks = Look(self.features, self._fps), Look(shapes, self._fps)
+        if not self.length:
+            _check_images(images)
+            self._recorded = shapes
+        if shapes != self._recorded:
+            looks = Look(self._recorded, self._fps), Look(shapes, self._fps)
             found = differences(("the first", looks[0]), (f"stored frame {self.length}", looks[1]))
             raise SourceError(
                 f"frames of different sizes: {'; '.join(found)}",
                 "All frames of an episode must have the same cameras and sizes.",
             )
+        if self._resize is not None:
+            images = {name: self._resize.apply(image) for name, image in images.items()}
+        if not self.length:
+            self._begin(images, vectors)
         for name, image in images.items():
             self._encoders[name].add(image)
             self.stats[name].add(image)
@@ -272,10 +289,6 @@ class _Writer:
         self, images: dict[str, NDArray[np.uint8]], vectors: dict[str, NDArray[np.float32]]
     ) -> None:
         for name, image in images.items():
-            if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-                raise SourceError(
-                    f"{name} holds images {image.shape} {image.dtype}; expected (H, W, 3) uint8"
-                )
             path = self._folder / f"{name}.mp4"
             self._encoders[name] = VideoEncoder(
                 path, self._codec, self._fps, len(image), image.shape[1]
@@ -283,3 +296,13 @@ class _Writer:
             self.stats[name] = ImageStats()
         self._vectors = {name: [] for name in vectors}
         self.features = {name: value.shape for name, value in (images | vectors).items()}
+        self.resized = self.features != self._recorded
+
+
+def _check_images(images: Mapping[str, NDArray[Any]]) -> None:
+    """Check that the images of a frame are RGB images."""
+    for name, image in images.items():
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+            raise SourceError(
+                f"{name} holds images {image.shape} {image.dtype}; expected (H, W, 3) uint8"
+            )

@@ -8,6 +8,7 @@ from collections.abc import Container, Sequence
 from robomme_interference_data.build_dataset.config import NO_CAMERAS, BuildConfig, parse_unit
 from robomme_interference_data.build_dataset.dataset.frame_selection import unmarked_error
 from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan, PlannedEpisode
+from robomme_interference_data.build_dataset.dataset.resize import Resize
 from robomme_interference_data.build_dataset.sources import Source, open_source, takes
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
@@ -66,6 +67,7 @@ def plan_dataset(
         time_limit_s=config.time_limit_s,
         unit=unit,
         fps=config.fps,
+        resize=None if config.resize is None else Resize.parse(config.resize),
     )
 
 
@@ -95,6 +97,14 @@ def _check_values(config: BuildConfig) -> None:
         raise InvalidOptionError.expected("version", config.version, "a version such as 1.0.0")
     if config.time_limit_s is not None and not config.time_limit_s > 0:
         raise InvalidOptionError.expected("time_limit_s", config.time_limit_s, "a positive number")
+    if config.resize is not None:
+        Resize.parse(config.resize)
+        if config.cameras == NO_CAMERAS:
+            raise InvalidOptionError(
+                f"{named('resize')} has no effect without cameras",
+                f"Leave it out, or choose {named('cameras')}.",
+                option="resize",
+            )
     if config.fps is not None and not 0 < config.fps < math.inf:
         raise InvalidOptionError.expected("fps", config.fps, "a positive number")
     make_executor(config)  # checks its settings
