@@ -112,9 +112,7 @@ class BuildConfig(WorkersConfig):
         help="av1-lossless (bit-exact) or lerobot-default (smaller, lossy).",
         group="Encoding",
     )
-    version: str = setting(
-        "1.0.0", help="Version of the datasets.", group="Encoding", rare=True
-    )
+    version: str = setting("1.0.0", help="Version of the datasets.", group="Encoding", rare=True)
     time_limit_s: float | None = setting(
         None,
         help="Seconds for one episode; a slower one is retried once.",

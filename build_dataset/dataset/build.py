@@ -17,6 +17,7 @@ from pathlib import Path
 from robomme_interference_data.build_dataset.alike import (
     Look,
     differ_in_cameras,
+    differ_in_image_sizes,
     differences,
     in_buffers,
 )
@@ -168,18 +169,20 @@ def _check_like(episode: StoredEpisode, plan: DatasetPlan) -> None:
     if plan.must_match is None:
         return
     name = str(episode.record.episode_id)
-    look = in_buffers(episode.features, episode.fps)
+    look = in_buffers(plan.kind, episode.features, episode.fps)
     shared = {
         feature: look.features[feature]
         for feature in plan.must_match.features
         if feature in look.features
     }
     if found := differences(("the demonstrations", plan.must_match), (name, look)):
+        hint = "Choose recordings that are alike, or build a separate buffer set of them."
+        if not differences(("", plan.must_match), ("", replace(look, features=shared))):
+            hint = f"Choose the {named('cameras')} of the demonstrations."
+        elif differ_in_image_sizes(plan.must_match, look):
+            hint = f"Store frames in the size of the demonstrations with {named('resize')}."
         raise SourceError(
-            f"{name} cannot be in a buffer with the demonstrations: {'; '.join(found)}",
-            "Choose recordings that are alike, or build a separate buffer set of them."
-            if differences(("", plan.must_match), ("", replace(look, features=shared)))
-            else f"Choose the {named('cameras')} of the demonstrations.",
+            f"{name} cannot be in a buffer with the demonstrations: {'; '.join(found)}", hint
         )
 
 

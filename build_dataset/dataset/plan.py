@@ -67,5 +67,5 @@ class DatasetPlan:
 
     def matching(self, demonstrations: Dataset) -> "DatasetPlan":
         """Return the plan with episodes that must look like those of the demonstrations."""
-        look = in_buffers(demonstrations.features, demonstrations.fps)
+        look = in_buffers(self.kind, demonstrations.features, demonstrations.fps)
         return dataclasses.replace(self, must_match=look)

@@ -81,9 +81,7 @@ class Resize:
         resized = resize_image(image, *scaled)
         if self.mode == CROP:
             left, top = (scaled[0] - self.width) // 2, (scaled[1] - self.height) // 2
-            return np.ascontiguousarray(
-                resized[top : top + self.height, left : left + self.width]
-            )
+            return np.ascontiguousarray(resized[top : top + self.height, left : left + self.width])
         left, top = (self.width - scaled[0]) // 2, (self.height - scaled[1]) // 2
         padded = np.zeros((self.height, self.width, 3), np.uint8)
         padded[top : top + scaled[1], left : left + scaled[0]] = resized

@@ -116,7 +116,11 @@ class RunConfig(WorkConfig):
         group=_SIMULATOR,
         help="Compare actions with those of the buffer set's executions, without a simulator.",
     )
-    simulator: str = setting("tabletop", group=_SIMULATOR, help="tabletop, robomme (its Python: ROBOMME_PYTHON) or module:name.")
+    simulator: str = setting(
+        "tabletop",
+        group=_SIMULATOR,
+        help="tabletop, robomme (its Python: ROBOMME_PYTHON) or module:name.",
+    )
     shift: str = setting(NO_SHIFT, group=_SIMULATOR, help=SHIFT_HELP)
     policies: int | None = setting(
         None,

@@ -41,12 +41,6 @@ def setting(
         rare: Whether it has no option of its own: a command sets it with `--set NAME=VALUE`.
     """
     declared = dict(
-        help=help,
-        name=name,
-        metavar=metavar,
-        shown=shown,
-        whole=whole,
-        group=group,
-        rare=rare,
+        help=help, name=name, metavar=metavar, shown=shown, whole=whole, group=group, rare=rare
     )
     return dataclasses.field(default=default, metadata={SETTING: declared})

@@ -71,9 +71,7 @@ def test_each_pixel_is_the_exact_mean(image: NDArray[np.uint8], width: int, heig
 
 
 @given(IMAGES, SIDES, SIDES, st.sampled_from(["crop", "pad"]))
-def test_any_frame_fits(
-    image: NDArray[np.uint8], width: int, height: int, mode: str
-) -> None:
+def test_any_frame_fits(image: NDArray[np.uint8], width: int, height: int, mode: str) -> None:
     resize = Resize(width, height, mode)
     made = resize.apply(image)
     assert made.shape == (height, width, 3) and made.flags.c_contiguous
@@ -117,22 +115,18 @@ def test_another_aspect_ratio_needs_a_mode() -> None:
 )
 def test_sizes_that_are_none(text: str, tmp_path: Path) -> None:
     with pytest.raises(InvalidOptionError) as caught:
-        plan_dataset(
-            DISTRACTORS, BuildConfig(source=("sample",), buffer_set=tmp_path, resize=text)
-        )
+        plan_dataset(DISTRACTORS, BuildConfig(source=("sample",), buffer_set=tmp_path, resize=text))
     assert caught.value.option == "resize"
 
 
 def test_no_cameras_have_no_size(tmp_path: Path) -> None:
-    config = BuildConfig(
-        source=("sample",), buffer_set=tmp_path, resize="8x8", cameras=("none",)
-    )
+    config = BuildConfig(source=("sample",), buffer_set=tmp_path, resize="8x8", cameras=("none",))
     with raises(InvalidOptionError) as caught:
         plan_dataset(DISTRACTORS, config)
     assert caught.value.option == "resize"
 
 
-# --- a dataset; the frames of these sources have 24x16 pixels ---------------------------------------
+# --- a dataset; the frames of these sources have 24x16 pixels ---------------------------------
 
 LENGTHS: dict[str, Any] = {f"{family}/train/0": (11, None) for family in ("Lift", "Stack")}
 
@@ -202,8 +196,13 @@ def test_frames_that_change_their_size_are_an_error_in_any_size() -> None:
     [name] = lengths = {"Lift/train/0": (11, None)}
     source = MadeUpSource(lengths)
     frame = source.frame(name, 3, None)
-    source.wrong = {name: {3: frame.__class__({"front": frame.images["front"][::2, ::2]},
-                                              frame.state, frame.action, None)}}
+    source.wrong = {
+        name: {
+            3: frame.__class__(
+                {"front": frame.images["front"][::2, ::2]}, frame.state, frame.action, None
+            )
+        }
+    }
     made = plan(source, "12x8")
     [outcome] = Serial().run(StageTask(made), made.episodes)
     assert isinstance(outcome.error, SourceError)

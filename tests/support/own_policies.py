@@ -21,6 +21,7 @@ class Still:
     wants_history = False
     privileged = False
     every_frame = False
+    other_states = "refuse"
     memory = None
 
     def __init__(self, gripper: float = 1.0, worker: int = 0):

@@ -25,11 +25,7 @@ def build(kind: str, config: BuildConfig) -> int:
 
 def config_of(out: Path, episodes: str) -> BuildConfig:
     return BuildConfig(
-        source=("robomme",),
-        buffer_set=out,
-        families=("MoveCube",),
-        split="test",
-        episodes=episodes,
+        source=("robomme",), buffer_set=out, families=("MoveCube",), split="test", episodes=episodes
     )
 
 

@@ -100,9 +100,9 @@ class RoboMMESimulator(Simulator):
 
     @classmethod
     def versions(cls) -> dict[str, str]:
-        """Return the versions in the interpreter `ROBOMME_PYTHON`: `robomme`, `robomme_mani_skill`, and so on.
+        """Return the versions in the interpreter `ROBOMME_PYTHON`.
 
-        They include Python, sapien, torch and numpy, and the commit of a package that was
+        They are of `robomme`, `robomme_mani_skill` and so on, and include Python, sapien, torch and numpy, and the commit of a package that was
         installed from one.
         """
         return installed_versions(find_python(None))
