@@ -52,6 +52,14 @@ class Watcher(Still):
         self.wants_history = True
 
 
+class OfTwoRobots(Watcher):
+    """Declares by an option what it gets of the states of units of another robot."""
+
+    def __init__(self, other_states: str = "refuse"):
+        super().__init__("front")
+        self.other_states: Any = other_states
+
+
 class Told(Still):
     """Keeps the subgoals that it was told."""
 

@@ -102,8 +102,8 @@ class RoboMMESimulator(Simulator):
     def versions(cls) -> dict[str, str]:
         """Return the versions in the interpreter `ROBOMME_PYTHON`.
 
-        They are of `robomme`, `robomme_mani_skill` and so on, and include Python, sapien, torch and numpy, and the commit of a package that was
-        installed from one.
+        They are of `robomme`, `robomme_mani_skill` and so on, and include Python, sapien, torch and
+        numpy, and the commit of a package that was installed from one.
         """
         return installed_versions(find_python(None))
 
