@@ -94,6 +94,12 @@ class BuildConfig(WorkersConfig):
         "unit than the paper's is for episodes that are shorter.",
         group="Episodes",
     )
+    units_per_episode: int = setting(
+        1,
+        metavar="N",
+        help="Most units of a recorded episode, evenly spaced; fewer where they would overlap.",
+        group="Episodes",
+    )
     cameras: tuple[str, ...] = setting(
         (),
         help="Cameras to store, such as front, or none for states alone; default: all.",
@@ -176,9 +182,11 @@ def parse_position_limit(text: str) -> int | None:
     return int(text)
 
 
-def parse_unit(text: str) -> Unit:
-    """Parse the size of a unit, such as `32x8`."""
+def parse_unit(text: str, per_episode: int = 1) -> Unit:
+    """Parse the size of a unit, such as `32x8`; the number of them is checked."""
     match = re.fullmatch(r"([1-9][0-9]*)x([1-9][0-9]*)", text, re.ASCII)
     if match is None:
         raise InvalidOptionError.expected("unit", text, "FRAMESxSTRIDE, such as 32x8")
-    return Unit(int(match[1]), int(match[2]))
+    if per_episode < 1:
+        raise InvalidOptionError.expected("units_per_episode", per_episode, "a number from 1")
+    return Unit(int(match[1]), int(match[2]), per_episode)

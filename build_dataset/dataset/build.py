@@ -108,16 +108,18 @@ def _stage(
         if staged.skipped is not None:
             skipped[str(staged.episode_id)] = staged.skipped
         else:
-            episode = staged.stored(folder(planned))
+            episodes = staged.stored(folder(planned))
             try:
-                _check_like(episode, plan)
-                for earlier in built:
-                    _check_alike(earlier, episode)
+                for episode in episodes:
+                    _check_like(episode, plan)
+                    for earlier in built:
+                        _check_alike(earlier, episode)
             except SourceError:
                 shutil.rmtree(folder(planned))  # no later attempt can use it
                 raise
-            stored.append(episode)
-            _check_alike(stored[0], episode)
+            for episode in episodes:
+                stored.append(episode)
+                _check_alike(stored[0], episode)
 
     missing, before = [], len(stored) + len(skipped)
     progress.start("Reading and encoding", len(todo))

@@ -8,7 +8,7 @@ import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.build_dataset.alike import Look, differences
 from robomme_interference_data.build_dataset.sources import Frame, Recording, Robot
-from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, LESSONS, PAPER_UNIT, STATE
+from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, LESSONS, PAPER_UNIT, STATE, UNITS
 from robomme_interference_data.errors import (
     BuildError,
     InterferenceError,
@@ -42,40 +42,61 @@ from robomme_interference_data.storage.encode import Codec, VideoEncoder, get_co
 from robomme_interference_data.storage.files import canonical_json, read_header, write_json
 from robomme_interference_data.storage.video import iter_frames
 
-from .frame_selection import NothingToStore, select_frames
+from .frame_selection import NothingToStore, select_episodes, too_short, unit_starts
 from .image_stats import ImageStats
 from .lerobot_writer import StoredEpisode
 from .plan import DatasetPlan, PlannedEpisode
 from .resize import Resize
 
 _RECORD = "record.json"
-_LAYOUT = 7
+_LAYOUT = 8
 """Version of a staged episode's folder."""
 
 
 @dataclass(frozen=True)
-class Staged:
-    """Metadata of a staged episode; `skipped` is the reason if it yields nothing."""
+class StagedEpisode:
+    """Metadata of an episode that a dataset stores, such as a unit."""
 
-    episode_id: EpisodeId
-    skipped: str | None = None
-    record: EpisodeRecord | None = None
-    features: dict[str, tuple[int, ...]] = field(default_factory=dict)
-    stats: dict[str, dict[str, tuple[float, ...]]] = field(default_factory=dict)
-    robot: Robot | None = None
+    record: EpisodeRecord
+    features: dict[str, tuple[int, ...]]
+    stats: dict[str, dict[str, tuple[float, ...]]]
+    robot: Robot
 
     def stored(self, folder: Path) -> StoredEpisode:
-        """Return the episode, which yields something, with its files in `folder`."""
-        assert self.record is not None and self.robot is not None
-        videos = {feature: folder / f"{feature}.mp4" for feature in self.stats}
+        """Return the episode with its files in `folder`."""
+        start = self.record.episode_id.start
         return StoredEpisode(
             self.record,
             self.features,
-            videos,
+            {feature: folder / _file(start, f"{feature}.mp4") for feature in self.stats},
             self.stats,
-            lambda name: np.load(folder / f"{name}.npy"),
+            lambda name: np.load(folder / _file(start, f"{name}.npy")),
             self.robot,
         )
+
+
+@dataclass(frozen=True)
+class Staged:
+    """What a recorded episode yields.
+
+    Attributes:
+        episode_id: Id of the recorded episode.
+        skipped: The reason if it yields nothing.
+        episodes: Metadata of the stored episodes: one, or several units.
+    """
+
+    episode_id: EpisodeId
+    skipped: str | None = None
+    episodes: tuple[StagedEpisode, ...] = ()
+
+    def stored(self, folder: Path) -> list[StoredEpisode]:
+        """Return the stored episodes with their files in `folder`."""
+        return [episode.stored(folder) for episode in self.episodes]
+
+
+def _file(start: int, name: str) -> str:
+    """Return the name of a file of the stored episode that begins at a raw frame."""
+    return f"{start}.{name}"
 
 
 def staged_name(plan: DatasetPlan, planned: PlannedEpisode) -> str:
@@ -115,34 +136,57 @@ class StageTask:
 
     def _stage(self, planned: PlannedEpisode, worker: Worker) -> Staged:
         number, episode = planned
-        with tempfile.TemporaryDirectory(dir=worker.folder) as name:
-            folder = Path(name)
-            try:
-                recording = self.plan.sources[number].read(episode, self.plan.cameras)
-                with closing(recording.frames):
-                    staged = self._write(episode.id, recording, folder)
-            except InterferenceError as error:
-                raise error.about(episode.id) from error
-            if staged.skipped is None:
-                for path in sorted(folder.iterdir()):
-                    worker.send_file(path.name, path.read_bytes())
-        return staged
+        episodes = []
+        try:
+            starts = self._starts(planned)
+            recording = self.plan.sources[number].read(episode, self.plan.cameras)
+            with closing(recording.frames):
+                for start, frames in select_episodes(
+                    self.plan.kind, recording, self.plan.unit, starts
+                ):
+                    with tempfile.TemporaryDirectory(dir=worker.folder) as name:
+                        folder, stored = Path(name), replace(episode.id, start=start)
+                        episodes.append(self._write(stored, recording, frames, folder))
+                        for path in sorted(folder.iterdir()):
+                            worker.send_file(_file(start, path.name), path.read_bytes())
+        except NothingToStore as reason:
+            if episodes:
+                raise SourceError(f"it became shorter while it was read: {reason}") from None
+            return Staged(episode.id, str(reason))
+        except InterferenceError as error:
+            raise error.about(episode.id) from error
+        return Staged(episode.id, None, tuple(episodes))
+
+    def _starts(self, planned: PlannedEpisode) -> Sequence[int]:
+        """Return the first raw frames of what is stored of an episode."""
+        number, episode = planned
+        unit = self.plan.unit
+        if self.plan.kind not in UNITS or unit.per_episode == 1:
+            return (0,)
+        # How long it is shows at its end: its frames are counted first, without images.
+        counted = self.plan.sources[number].read(episode, ())
+        with closing(counted.frames):
+            length = sum(1 for _ in counted.frames)
+        starts = unit_starts(length, unit)
+        if not starts:
+            raise too_short(length, unit)
+        return starts
 
     def close(self) -> None:
         """Close the sources."""
         for source in self.plan.sources:
             source.close()
 
-    def _write(self, episode: EpisodeId, recording: Recording, folder: Path) -> Staged:
+    def _write(
+        self, episode: EpisodeId, recording: Recording, frames: Iterator[Frame], folder: Path
+    ) -> StagedEpisode:
+        """Write the files of a stored episode; return its metadata."""
         codec = get_codec(self.plan.codec)
         fps = recording.robot.at(self.plan.fps)
         writer = _Writer(codec, folder, fps, self.plan.resize)
         try:
-            for frame in select_frames(self.plan.kind, recording, self.plan.unit):
+            for frame in frames:
                 writer.add(frame)
-        except NothingToStore as reason:
-            writer.abandon()
-            return Staged(episode, str(reason))
         except BaseException:
             writer.abandon()
             raise
@@ -180,7 +224,7 @@ class StageTask:
         }
         recording.robot.check_names(writer.features)
         robot = replace(recording.robot, fps=fps)
-        return Staged(episode, None, record, writer.features, stats, robot)
+        return StagedEpisode(record, writer.features, stats, robot)
 
 
 def keep_staged(folder: Path, staged: Staged, files: Mapping[str, bytes]) -> None:

@@ -34,7 +34,7 @@ def plan_dataset(
     """Open the sources and plan one dataset, of `queries` or of the episodes that are chosen."""
     check_root(config.buffer_set)
     _check_values(config)
-    unit = parse_unit(config.unit)
+    unit = parse_unit(config.unit, config.units_per_episode)
     split = config.split
     if kind in UNITS:
         _check_split_of_units(config)
@@ -119,6 +119,8 @@ def _check_values(config: BuildConfig) -> None:
 
 def _open_sources(kind: str, config: BuildConfig, unit: Unit) -> tuple[Source, ...]:
     columns, kept = _columns(config.columns), config.buffer_set / FAMILIES_PATH
+    # A simulator draws only the frames that a unit stores, if the first one is frame 0.
+    one_unit = kind in UNITS and unit.per_episode == 1
     return tuple(
         open_source(
             text,
@@ -126,8 +128,7 @@ def _open_sources(kind: str, config: BuildConfig, unit: Unit) -> tuple[Source, .
             columns=columns,
             families_file=config.families_file,
             kept_families=kept if kept.is_file() else None,
-            # A simulator draws only the frames that a unit stores.
-            every=unit.in_dataset(kind).stride if kind in UNITS else 1,
+            every=unit.in_dataset(kind).stride if one_unit else 1,
         )
         for text in config.source
     )

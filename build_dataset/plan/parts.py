@@ -206,10 +206,13 @@ def plan_alone(kind: str, config: BuildConfig) -> DatasetPlan:
 
     It has their cameras, unless others are chosen, and that of query episodes also their episodes.
     """
-    if kind not in UNITS and parse_unit(config.unit) != PAPER_UNIT:
-        raise InvalidOptionError(
-            f"{named('unit')} has no effect on {kind}", "Leave it out.", option="unit"
-        )
+    if kind not in UNITS:
+        unit = parse_unit(config.unit, config.units_per_episode)
+        if unit != PAPER_UNIT:
+            option = "unit" if unit.per_episode == 1 else "units_per_episode"
+            raise InvalidOptionError(
+                f"{named(option)} has no effect on {kind}", "Leave it out.", option=option
+            )
     if kind in UNITS:
         config = _settings_of_units(config, alone=True)
     elif config.unit_episodes is not None:
