@@ -44,7 +44,8 @@ from .existing import ExistingDataset, open_existing
 from .identity import complete_dataset, identity_of
 from .lerobot_writer import StoredEpisode, load_lerobot, require_lerobot, write_lerobot
 from .plan import DatasetPlan, PlannedEpisode
-from .stage import Staged, StageTask, keep_staged, read_staged, staged_name
+from .stage import StageTask
+from .staged import Staged, keep_staged, read_staged, staged_name
 
 
 @dataclass(frozen=True)

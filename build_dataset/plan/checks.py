@@ -8,7 +8,13 @@ from robomme_interference_data.build_dataset.config import BuffersConfig
 from robomme_interference_data.build_dataset.dataset.existing import ExistingDataset, open_existing
 from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan
 from robomme_interference_data.build_dataset.manifests import check_manifests_folder
-from robomme_interference_data.constants import DATASETS, DEMONSTRATIONS, DISTRACTORS, MANIFESTS, MAX_K
+from robomme_interference_data.constants import (
+    DATASETS,
+    DEMONSTRATIONS,
+    DISTRACTORS,
+    MANIFESTS,
+    MAX_K,
+)
 from robomme_interference_data.errors import BuildError, named
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.draw import UnitPool, check_units

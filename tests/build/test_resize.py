@@ -17,7 +17,8 @@ from robomme_interference_data.build_dataset.config import BuildConfig
 from robomme_interference_data.build_dataset.dataset.build import build_dataset
 from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan, PlannedEpisode
 from robomme_interference_data.build_dataset.dataset.resize import Resize
-from robomme_interference_data.build_dataset.dataset.stage import StageTask, staged_name
+from robomme_interference_data.build_dataset.dataset.stage import StageTask
+from robomme_interference_data.build_dataset.dataset.staged import staged_name
 from robomme_interference_data.build_dataset.plan.datasets import plan_dataset
 from robomme_interference_data.constants import DISTRACTORS, FRONT, Unit
 from robomme_interference_data.data.dataset import Dataset

@@ -28,9 +28,9 @@ from robomme_interference_data.build_dataset.dataset.frame_selection import (
 from robomme_interference_data.build_dataset.dataset.image_stats import ImageStats
 from robomme_interference_data.build_dataset.dataset.lerobot_writer import StoredEpisode
 from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan
-from robomme_interference_data.build_dataset.dataset.stage import (
+from robomme_interference_data.build_dataset.dataset.stage import StageTask
+from robomme_interference_data.build_dataset.dataset.staged import (
     Staged,
-    StageTask,
     keep_staged,
     read_staged,
     staged_name,

@@ -1,5 +1,6 @@
 """Several units of one long recording: where they begin, their ids, and buffers of them."""
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -76,12 +77,12 @@ def test_starts(length: int, frames: int, stride: int, most: int) -> None:
     starts = unit_starts(length, unit)
     assert len(starts) <= most and (not starts) == (length < unit.raw_frames)
     span = frames * stride
-    assert all(after - before >= span for before, after in zip(starts, starts[1:], strict=False))
+    assert all(after - before >= span for before, after in itertools.pairwise(starts))
     if starts:
         assert starts[0] == 0 and starts[-1] + unit.raw_frames <= length
         # As many as fit, and evenly spaced: gaps differ by one at most.
         assert len(starts) == min(most, 1 + (length - unit.raw_frames) // span)
-        gaps = {after - before for before, after in zip(starts, starts[1:], strict=False)}
+        gaps = {after - before for before, after in itertools.pairwise(starts)}
         assert not gaps or max(gaps) - min(gaps) <= 1
         assert len(starts) == 1 or starts[-1] + unit.raw_frames == length
 
@@ -174,7 +175,10 @@ def test_a_dataset_is_extended_with_as_many_units(buffers: Path, tmp_path: Path)
     for other in (THREE._replace(per_episode=2), THREE._replace(per_episode=1)):
         with raises(BuildError):
             build(tmp_path, DISTRACTORS, TRAIN, other)
-    extended, whole = build(tmp_path, DISTRACTORS, TRAIN), Dataset(LocalFiles(buffers / DISTRACTORS))
+    extended, whole = (
+        build(tmp_path, DISTRACTORS, TRAIN),
+        Dataset(LocalFiles(buffers / DISTRACTORS)),
+    )
     assert extended.revision == whole.revision
     assert extended.identity.sums == whole.identity.sums
 
