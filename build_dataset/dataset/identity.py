@@ -87,7 +87,7 @@ def identity_of(
         exact=all(record.exact for record in records),
         codec=codec,
         cameras=tuple(name.removeprefix(CAMERA_PREFIX) for name in cameras),
-        unit=unit.in_dataset(kind)._asdict() if kind in UNITS else None,
+        unit=unit.in_dataset(kind).recorded() if kind in UNITS else None,
         simulators=tuple(sorted({record.simulator for record in records if record.simulator})),
         sources=tuple(sources),
         counts=Counts(len(records), sum(record.length for record in records), dict(families)),

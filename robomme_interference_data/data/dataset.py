@@ -132,7 +132,9 @@ class Dataset:
             FormatError: The identity records no valid one.
         """
         stored = self.identity.unit
-        if stored is None or {*stored} != {*Unit._fields} or min(stored.values()) < 1:
+        known = {*Unit._fields}
+        needed = known - {*Unit._field_defaults}
+        if stored is None or not needed <= {*stored} <= known or min(stored.values()) < 1:
             raise FormatError.damaged(self._name, f"{IDENTITY_PATH}: unit is {stored}")
         return Unit(**stored)
 
