@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 import pyarrow as pa
@@ -262,7 +262,7 @@ class RowSpan:
         At most one row group is held in memory, and less if the file's pages are smaller.
         """
         kind = self._type(name)
-        stored = simple_type(kind)
+        stored: Any = simple_type(kind)
         in_structs = stored is not None and pa.types.is_struct(stored)
         if in_structs and stored.get_field_index("bytes") >= 0:
             stored = stored.field("bytes").type

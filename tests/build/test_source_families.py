@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
