@@ -129,7 +129,10 @@ def _check_size(
             for number, fixed_length in chosen:
                 column = file.metadata.row_group(group).column(number)
                 values += column.num_values
-                size += decoded_size(raw, column, fixed_length, _MAX_BYTES)
+                try:
+                    size += decoded_size(raw, column, fixed_length, _MAX_BYTES)
+                except FormatError as error:
+                    raise error.about(path) from None
                 if size > _MAX_BYTES or values > MAX_READ_VALUES:
                     what = f"over {_MAX_BYTES:,} bytes or {MAX_READ_VALUES:,} values once decoded"
                     raise ValueError(what)
@@ -237,7 +240,10 @@ class RowSpan:
         # LeRobot stores vectors of one value as the value.
         flat = pc.list_flatten(column) if is_listed(column.type) else column
         if not is_number(flat.type):
-            raise FormatError(f"{what} is of type {stored}; expected lists of numbers")
+            raise FormatError(
+                f"{what} is of type {stored}; expected lists of numbers",
+                "Store the values of each row as a list of numbers, always in the same order.",
+            )
         lengths = [1]
         if is_listed(column.type):
             lengths = pc.unique(pc.list_value_length(column)).drop_null().to_pylist()
@@ -269,7 +275,8 @@ class RowSpan:
         if stored != pa.binary():
             raise FormatError(
                 f"{self.path}: column {name!r} is of type {kind}; expected images as PNG or JPEG, "
-                "in struct<bytes, path>"
+                "in struct<bytes, path>",
+                "Encode the images as PNG, which is lossless.",
             )
         groups, row = self._row_groups()
         with reading(self.path):
