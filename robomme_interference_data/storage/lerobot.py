@@ -191,11 +191,11 @@ class LeRobotFiles:
         rows = self.rows(index)
         values = rows.vectors(column)
         if values.shape[1:] != self.shape(column):
-            what = (
-                f"{column} of episode {index} has {values.shape[1]} values a frame; info.json has "
-                f"{self.shape(column)}"
+            raise FormatError(
+                f"{rows.path}: {column} of episode {index} has {values.shape[1]} values in each "
+                f"frame; {INFO_PATH} has the shape {self.shape(column)}",
+                "Correct the one that is wrong.",
             )
-            raise FormatError.damaged(rows.path, what)
         return values
 
     def iter_frames(
