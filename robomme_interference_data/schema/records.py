@@ -55,8 +55,11 @@ class EpisodeRecord:
     """An episode of a dataset, with the metadata of its source."""
 
     episode_index: Annotated[int, "Number of the episode in the dataset, from 0."]
-    episode_id: Annotated[EpisodeId, "Id of the recorded episode; of a unit with its first raw frame, as in "
-        "`Lift/train/7@1000`, if that is not 0."]
+    episode_id: Annotated[
+        EpisodeId,
+        "Id of the recorded episode; of a unit with its first raw frame, as in "
+        "`Lift/train/7@1000`, if that is not 0.",
+    ]
     length: Annotated[int, "Stored frames. A demonstration's last one is the query frame."]
     goals: Annotated[
         tuple[str, ...], "Wordings of the goal, at least one; the first is LeRobot's task."
