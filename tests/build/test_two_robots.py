@@ -76,6 +76,7 @@ def build(recordings: dict[str, str], root: Path, run: Any) -> None:
     assert planned[0] == 0, planned[2]
 
 
+@pytest.mark.slow
 def test_buffers_of_two_robots(recordings: dict[str, str], tmp_path: Path, run: Any) -> None:
     buffers = tmp_path / "set"
     build(recordings, buffers, run)
