@@ -32,8 +32,8 @@ class EpisodeId:
     played with answer 2. A start, as in `VideoRepick/train/7@1000`, denotes a distractor unit that
     begins at raw frame 1000 of the episode; one that begins at frame 0 has the episode's id.
 
-    Ids sort by family (see `family_order`), split, index, answer and start. This is the canonical order of all
-    stored data.
+    Ids sort by family (see `family_order`), split, index, answer and start. This is the canonical
+    order of all stored data.
 
     Args:
         family: Task family: a letter, then letters, digits, `_`, `.` or `-`; not `all` or a
