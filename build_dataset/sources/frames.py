@@ -12,6 +12,7 @@ from typing import Any, override
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, SourceError, named
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators.episode import choose_cameras
+from robomme_interference_data.storage.files import is_hidden
 from robomme_interference_data.storage.parquet import RowSpan
 from robomme_interference_data.storage.video import iter_frames
 
@@ -130,7 +131,7 @@ class FramesSource(Source):
         """Yield each video file and folder of images, its camera, and the episode's id."""
         for kind in ("videos", "images"):
             for path in sorted((self._folder / kind).glob("*/*/*/*")):
-                if path.name.startswith("."):
+                if is_hidden(path.relative_to(self._folder).as_posix()):
                     continue
                 video = kind == "videos"
                 fits = path.suffix.lower() in _VIDEO_SUFFIXES if video else path.is_dir()

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError, SourceError
 from robomme_interference_data.storage.encode import decode_image, is_png
-from robomme_interference_data.storage.video import RATES, read_times
+from robomme_interference_data.storage.limits import MAX_RATE, MIN_RATE
+from robomme_interference_data.storage.video import read_times
 from robomme_interference_data.storage.video_file import open_video
 
 _RGB_FORMATS = (
@@ -71,7 +72,7 @@ def probe_video(path: Path, rate: float | None = None) -> ProbedVideo:
     if rate is None:
         # Containers store durations in whole ns or ms: 1001 is the denominator of NTSC rates.
         rates = [float(Fraction(one).limit_denominator(1001)) for one in stated if one]
-        rates = [one for one in dict.fromkeys(rates) if RATES[0] <= one <= RATES[1]]
+        rates = [one for one in dict.fromkeys(rates) if MIN_RATE <= one <= MAX_RATE]
     else:
         rates = [rate]
     times = read_times(path)

@@ -10,9 +10,11 @@ from typing import Annotated, Any
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.ids import EpisodeId
 
+MAX_GOAL = 1 << 16
+"""Characters of all wordings of a goal."""
+
 # Upper bounds, so that an untrusted file cannot exhaust memory.
 _MAX_FRAMES = 1 << 22  # of an episode: days at the recorded rate
-_MAX_GOAL = 1 << 16  # characters of all wordings of a goal
 _MAX_PARTS = 1 << 10  # of an answer; the embedded suite has at most six
 _MAX_SPANS = 1 << 12  # of evidence in a lesson
 _MAX_SCENE = 1 << 16  # characters
@@ -55,7 +57,11 @@ class EpisodeRecord:
     """An episode of a dataset, with the metadata of its source."""
 
     episode_index: Annotated[int, "Number of the episode in the dataset, from 0."]
-    episode_id: Annotated[EpisodeId, "Id of the recorded episode; of a unit, of its source."]
+    episode_id: Annotated[
+        EpisodeId,
+        "Id of the recorded episode; of a unit with its first raw frame, as in "
+        "`Lift/train/7@1000`, if that is not 0.",
+    ]
     length: Annotated[int, "Stored frames. A demonstration's last one is the query frame."]
     goals: Annotated[
         tuple[str, ...], "Wordings of the goal, at least one; the first is LeRobot's task."
@@ -85,8 +91,8 @@ class EpisodeRecord:
 
     def __post_init__(self) -> None:
         name, start, spans = self.episode_id, self.exec_start_idx, self.evidence or ()
-        if not self.goals or sum(map(len, self.goals)) > _MAX_GOAL:
-            raise FormatError(f"{name} has no goal, or one of over {_MAX_GOAL} characters")
+        if not self.goals or sum(map(len, self.goals)) > MAX_GOAL:
+            raise FormatError(f"{name} has no goal, or one of over {MAX_GOAL} characters")
         fits = start is None or 0 < start < self.length
         if not 0 < self.length <= _MAX_FRAMES or not fits:
             raise FormatError(f"{name} has length {self.length} and exec_start_idx {start}")
@@ -163,7 +169,9 @@ class DatasetIdentity:
     codec: Annotated[str, "Name of the video settings."]
     cameras: Annotated[tuple[str, ...], "Names of the cameras, sorted."]
     unit: Annotated[
-        dict[str, int] | None, "`frames` and `stride` of a unit; None for other datasets."
+        dict[str, int] | None,
+        "`frames` and `stride` of a unit, and `per_episode`, the most units of a recorded episode, "
+        "if that is not 1; None for other datasets.",
     ]
     simulators: Annotated[tuple[str, ...], "Simulators of the episodes."]
     sources: Annotated[tuple[dict[str, Any], ...], "Metadata of the sources."]

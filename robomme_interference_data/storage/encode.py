@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import KEY_FRAMES
 from robomme_interference_data.errors import BuildError, FormatError, InvalidOptionError
 
-from .video import RATES, rate_fraction
+from .limits import MAX_RATE, MIN_RATE
+from .video import rate_fraction
 from .video_file import MAX_PIXELS, file_url, reason
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
@@ -38,7 +39,7 @@ class Codec:
     options: Mapping[str, str]
     exact: bool
     sides: tuple[int, int] = (1, (1 << 16) - 1)  # MP4 has 16 bits for a side
-    rates: tuple[float, float] = RATES
+    rates: tuple[float, float] = (MIN_RATE, MAX_RATE)
     interpolation: str | None = None
 
 

@@ -45,7 +45,10 @@ class Files(ABC):
 
     @abstractmethod
     def list(self, folder: str, suffix: str = "") -> list[str]:
-        """Return the sorted relative paths of all files under a folder; empty if none."""
+        """Return the sorted relative paths of all files under a folder; empty if none.
+
+        Hidden ones are left out, see `is_hidden`.
+        """
 
     @abstractmethod
     def fetch(self, paths: Iterable[str]) -> None:
@@ -78,6 +81,10 @@ class LocalFiles(Files):
     root: Path
     refetch: str | None = None
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Another process may have another working directory.
+        return LocalFiles, (self.root.absolute(), self.refetch)
+
     def path(self, relative: str) -> Path:
         """See `Files.path`."""
         path = self.root / check_relative(relative, self.describe())
@@ -108,7 +115,8 @@ class LocalFiles(Files):
     def list(self, folder: str, suffix: str = "") -> list[str]:
         """See `Files.list`."""
         matches = (self.root / folder).rglob(f"*{suffix}")
-        return sorted(p.relative_to(self.root).as_posix() for p in matches if p.is_file())
+        names = (p.relative_to(self.root).as_posix() for p in matches if p.is_file())
+        return sorted(name for name in names if not is_hidden(name))
 
     def fetch(self, paths: Iterable[str]) -> None:
         """Do nothing: the files are local."""
@@ -125,6 +133,14 @@ class LocalFiles(Files):
     def describe(self) -> str:
         """Return the folder."""
         return str(self.root)
+
+
+def is_hidden(relative: str) -> bool:
+    """Return whether a path is that of a file which other programs left, such as `._a.parquet`.
+
+    macOS, editors and interrupted downloads name them, or their folder, with a dot in front.
+    """
+    return any(part.startswith(".") for part in PurePosixPath(relative).parts)
 
 
 def all_files(root: Path) -> list[str]:
@@ -181,15 +197,20 @@ def read_bytes(path: Path, most: int) -> bytes:
         return file.read()
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file that holds an object."""
-    return parse_json(read_bytes(path, _MAX_JSON_BYTES), path)
+def read_json(path: Path, *, nan_as_none: bool = False) -> dict[str, Any]:
+    """Read a JSON file that holds an object; see `parse_json`."""
+    return parse_json(read_bytes(path, _MAX_JSON_BYTES), path, nan_as_none=nan_as_none)
 
 
-def parse_json(data: bytes, where: object) -> dict[str, Any]:
-    """Parse a JSON object in UTF-8, in which keys are unique and numbers are finite."""
+def parse_json(data: bytes, where: object, *, nan_as_none: bool = False) -> dict[str, Any]:
+    """Parse a JSON object in UTF-8, in which keys are unique and numbers are finite.
+
+    With `nan_as_none`, for files of other programs, NaN and infinities are read as None: Python and
+    pandas write NaN for values that are missing.
+    """
+    decoder = _JSON_WITH_NAN if nan_as_none else _JSON
     try:
-        value = _JSON.decode(data.decode())
+        value = decoder.decode(data.decode())
         # The number of brackets bounds the depth, and is quickly counted.
         if data.count(b"[") + data.count(b"{") > _MAX_DEPTH and _is_deep(value):
             raise ValueError(f"over {_MAX_DEPTH} nested arrays and objects")
@@ -220,6 +241,9 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 _JSON = json.JSONDecoder(object_pairs_hook=_unique, parse_float=_finite, parse_constant=_not_finite)
+_JSON_WITH_NAN = json.JSONDecoder(
+    object_pairs_hook=_unique, parse_float=_finite, parse_constant=lambda text: None
+)
 
 
 def _is_deep(value: Any) -> bool:

@@ -21,9 +21,6 @@ from robomme_interference_data.errors import FormatError
 from .pixels import to_rgb
 from .video_file import REWRITE, open_video, reason
 
-RATES = (1e-3, 1e4)
-"""Smallest and largest number of frames per second that is written."""
-
 _LATEST = 1 << 62
 """Upper bound on the ticks of a container to which FFmpeg can seek."""
 
