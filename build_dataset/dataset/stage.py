@@ -49,8 +49,8 @@ from .plan import DatasetPlan, PlannedEpisode
 from .statistics import ImageStats
 
 _RECORD = "record.json"
-_LAYOUT = 7
-"""Version of a staged episode's folder."""
+_LAYOUT = 8
+"""Version of a staged episode's folder, and of how recordings are decoded."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import ACTION, OFFICIAL, STATE, VALUE_NAMES
-from robomme_interference_data.errors import MissingFileError, SourceError, counted, named
+from robomme_interference_data.errors import (
+    FormatError,
+    MissingFileError,
+    SourceError,
+    counted,
+    named,
+)
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.evidence import spans_of_texts
 from robomme_interference_data.simulators.episode import choose_cameras
@@ -104,6 +110,10 @@ class LeRobotSource(Source):
             )
         vectors = {STATE: "state", ACTION: "action"}
         values = {feature: columns[name] for feature, name in vectors.items() if name in columns}
+        videos = self._lerobot.video_features
+        for column in (columns[camera] for camera in chosen):
+            if column in videos:
+                self._lerobot.check_video(index, column)
         streams = {camera: self._images(index, rows, columns[camera], exact) for camera in chosen}
         return Recording(
             goals=self._goals(index, self._tasks_of_frames(index), metadata),
@@ -263,11 +273,14 @@ class LeRobotSource(Source):
         """Return what changes when the episode's files do; on the Hub, the commit is pinned."""
         if isinstance(self._files, HubFiles):
             return ()
-        location = self._lerobot.locate(index)
+        paths = [self._lerobot.locate(index).data]
         used = self._columns.values()
-        videos = [path for name, (path, _) in location.videos.items() if name in used]
-        # Part of a dataset suffices: a missing file is an error only when it is read.
-        return tuple(file_state(self._files.root / path) for path in (location.data, *videos))
+        for name in self._lerobot.video_features:
+            # Part of a dataset suffices: what cannot be read is an error only when it is read.
+            if name in used:
+                with suppress(FormatError):
+                    paths.append(self._lerobot.locate_video(index, name).path)
+        return tuple(file_state(self._files.root / path) for path in paths)
 
 
 def _lesson(rows: RowSpan, columns: dict[str, str], recorded: int | None) -> int | None:
