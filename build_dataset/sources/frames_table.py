@@ -1,6 +1,5 @@
 """The table of a frames folder: `frames.parquet`, one row per frame."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -15,6 +14,7 @@ from robomme_interference_data.constants import ACTION, STATE
 from robomme_interference_data.errors import FormatError, InvalidIdError, SourceError, nearest
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.storage.parquet import RowSpan, is_listed
+from robomme_interference_data.storage.video import RATES
 
 from .base import demonstration_length
 
@@ -152,8 +152,12 @@ def _episode(where: str, rows: pa.Table, start: int) -> EpisodeRows:
                 "An episode has one: make two episodes of it.",
             )
         values[column] = distinct[0]
-    if values["fps"] is not None and not 0 < values["fps"] < math.inf:
-        raise SourceError(f"{where}: fps is {values['fps']}; expected a positive number")
+    if values["fps"] is not None and not RATES[0] <= values["fps"] <= RATES[1]:
+        raise SourceError(
+            f"{where}: fps is {values['fps']:g}; expected {RATES[0]:g} to {RATES[1]:g} frames per "
+            "second",
+            "Correct the column fps.",
+        )
     marked = "is_demo" in rows.column_names
     lesson = demonstration_length(rows["is_demo"], f"{where}: is_demo") if marked else None
     return EpisodeRows(start, len(rows), lesson, **values)

@@ -4,6 +4,7 @@ Read with pyarrow and PyAV alone; `docs/reference/sources.md` describes columns 
 """
 
 from collections.abc import Generator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -119,6 +120,10 @@ class LeRobotSource(Source):
             )
         vectors = {STATE: "state", ACTION: "action"}
         values = {feature: columns[name] for feature, name in vectors.items() if name in columns}
+        videos = self._lerobot.video_features
+        for column in (columns[camera] for camera in chosen):
+            if column in videos:
+                self._lerobot.check_video(index, column)
         streams = {camera: self._images(index, rows, columns[camera], exact) for camera in chosen}
         return Recording(
             goals=metadata.wordings,
@@ -241,11 +246,14 @@ class LeRobotSource(Source):
         """Return what changes when the episode's files do; on the Hub, the commit is pinned."""
         if isinstance(self._files, HubFiles):
             return ()
-        location = self._lerobot.locate(index)
+        paths = [self._lerobot.locate(index).data]
         used = self._columns.values()
-        videos = [path for name, (path, _) in location.videos.items() if name in used]
-        # Part of a dataset suffices: a missing file is an error only when it is read.
-        return tuple(file_state(self._files.root / path) for path in (location.data, *videos))
+        for name in self._lerobot.video_features:
+            # Part of a dataset suffices: what cannot be read is an error only when it is read.
+            if name in used:
+                with suppress(FormatError):
+                    paths.append(self._lerobot.locate_video(index, name).path)
+        return tuple(file_state(self._files.root / path) for path in paths)
 
 
 def _lesson(rows: RowSpan, columns: dict[str, str], recorded: int | None) -> int | None:
