@@ -42,7 +42,6 @@ from .frame_selection import NothingToStore, select_episodes, too_short, unit_st
 from .plan import DatasetPlan, PlannedEpisode
 from .resize import Resize
 from .staged import Staged, StagedEpisode, staged_file
-from .statistics import ImageStats
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,8 @@ from .lerobot_writer import StoredEpisode
 from .plan import DatasetPlan, PlannedEpisode
 
 _RECORD = "record.json"
-_LAYOUT = 8
-"""Version of a staged episode's folder."""
+_LAYOUT = 9
+"""Version of a staged episode's folder, and of how recordings are decoded."""
 
 
 @dataclass(frozen=True)

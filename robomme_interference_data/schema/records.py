@@ -58,9 +58,7 @@ class EpisodeRecord:
 
     episode_index: Annotated[int, "Number of the episode in the dataset, from 0."]
     episode_id: Annotated[
-        EpisodeId,
-        "Id of the recorded episode; of a unit with its first raw frame, as in "
-        "`Lift/train/7@1000`, if that is not 0.",
+        EpisodeId, "Id of the recorded episode; of a unit from within it, with the first raw frame."
     ]
     length: Annotated[int, "Stored frames. A demonstration's last one is the query frame."]
     goals: Annotated[
