@@ -159,7 +159,10 @@ _EXPECTED: dict[Any, tuple[Callable[[Any], bool], str]] = {
         _is_names,
         "a tuple of names of cameras, such as ('front', 'wrist'), or an empty one",
     ),
-    OtherStates: (lambda value: value in OTHER_STATES, ", ".join(OTHER_STATES[:-1]) + f" or {OTHER_STATES[-1]}"),
+    OtherStates: (
+        lambda value: value in OTHER_STATES,
+        ", ".join(OTHER_STATES[:-1]) + f" or {OTHER_STATES[-1]}",
+    ),
     str | None: (_is_memory, f"{MEMORY_FORM}, or None"),
 }
 """Type of an attribute of `Policy` to the check of its value, and what that expects."""
