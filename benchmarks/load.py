@@ -169,9 +169,9 @@ def spans_of(buffer: Buffer, buffer_set: BufferSet, camera: str = FRONT) -> list
     spans = []
     for session in buffer.sessions:
         entry, lerobot = session.entry, buffer_set.datasets[session.entry.dataset].lerobot
-        path, first = lerobot.locate(entry.episode_index).videos[camera]
-        start, stop = first + entry.start, first + entry.stop
-        spans.append(Span(lerobot.files.path(path), start, stop, lerobot.fps))
+        location = lerobot.locate_video(entry.episode_index, camera)
+        start, stop = location.first + entry.start, location.first + entry.stop
+        spans.append(Span(lerobot.files.path(location.path), start, stop, lerobot.fps))
     return spans
 
 

@@ -136,13 +136,16 @@ def _check_recordings(out: Path, dataset: Dataset, plan: DatasetPlan) -> None:
 def _stored(
     dataset: Dataset, robot: Robot, record: EpisodeRecord, statistics: Statistics
 ) -> StoredEpisode:
-    location = dataset.lerobot.locate(record.episode_index)
+    lerobot, index = dataset.lerobot, record.episode_index
     stats = {
         feature: {
             name: before_scaling(name, values) for name, values in statistics[feature].items()
         }
-        for feature in location.videos
+        for feature in lerobot.video_features
     }
-    videos = {feature: dataset.files.path(path) for feature, (path, _) in location.videos.items()}
-    vectors = partial(dataset.lerobot.vectors, record.episode_index)
+    videos = {
+        feature: dataset.files.path(lerobot.locate_video(index, feature).path)
+        for feature in lerobot.video_features
+    }
+    vectors = partial(lerobot.vectors, index)
     return StoredEpisode(record, dataset.features, videos, stats, vectors, robot)

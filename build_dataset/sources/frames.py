@@ -4,13 +4,10 @@
 folder of PNG images; see `docs/how-to/your-own-recordings.md`.
 """
 
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, override
-
-import numpy as np
-from numpy.typing import NDArray
 
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, SourceError, named
 from robomme_interference_data.ids import EpisodeId
@@ -19,6 +16,7 @@ from robomme_interference_data.storage.files import is_hidden
 from robomme_interference_data.storage.parquet import RowSpan
 from robomme_interference_data.storage.video import iter_frames
 
+from ..alike import same_rate
 from .base import Recording, Robot, Source, SourceEpisode, compose, file_state
 from .frames_table import LAYOUT, TABLE, EpisodeRows, read_frames_table
 from .images import decode_images, probe_video
@@ -28,9 +26,10 @@ _VIDEO_SUFFIXES = (".mkv", ".mp4", ".avi", ".mov", ".webm")
 
 @dataclass(frozen=True)
 class _Key:
-    """An episode's rows, its images by camera, and the state of all these files."""
+    """An episode's rows, all cameras of the folder, its own images, and the state of its files."""
 
     rows: EpisodeRows
+    cameras: tuple[str, ...]
     images: dict[str, Path]
     state: tuple[Any, ...]
 
@@ -61,20 +60,11 @@ class FramesSource(Source):
                     f"camera {camera!r} of {episode} has two recordings: {other} and {path}",
                     "Keep one of them.",
                 )
-        cameras = {camera for paths in images.values() for camera in paths}
-        for episode, paths in images.items():
-            if missing := cameras - paths.keys():
-                camera = min(missing)
-                raise SourceError(
-                    f"{episode} has no images of camera {camera!r}",
-                    "All episodes of a folder need the same cameras: add "
-                    f"{self._folder}/videos/{camera}/{episode}.mkv or "
-                    f"{self._folder}/images/{camera}/{episode}/000000.png and so on.",
-                )
+        cameras = tuple(sorted({camera for paths in images.values() for camera in paths}))
         return [
             SourceEpisode(
                 name,
-                _Key(table[name], paths, self._state(paths)),
+                _Key(table[name], cameras, paths, self._state(paths)),
                 marked=table[name].lesson is not None,
             )
             for name, paths in images.items()
@@ -83,18 +73,26 @@ class FramesSource(Source):
     @override
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
         key: _Key = episode.key
-        if not key.images and cameras != ():
+        if not key.cameras and cameras != ():
             raise InvalidOptionError(
                 f"{self._folder} has neither videos nor images",
                 f"Add {self._folder}/videos/CAMERA/{episode.id}.mkv or "
                 f"{self._folder}/images/CAMERA/{episode.id}/000000.png and so on, with the name of "
                 f"the camera, or set {named('cameras')} to none, to store states alone.",
             )
-        chosen = choose_cameras(cameras, tuple(key.images))
+        chosen = choose_cameras(cameras, key.cameras)
+        for camera in chosen:
+            if camera not in key.images:
+                raise SourceError(
+                    f"it has no images of camera {camera!r}",
+                    f"Add {self._folder}/videos/{camera}/{episode.id}.mkv or "
+                    f"{self._folder}/images/{camera}/{episode.id}/000000.png and so on, or leave "
+                    f"the camera out with {named('cameras')}.",
+                )
         if self._state(key.images) != key.state:
             raise SourceError("its files have changed since they were listed", "Start again.")
         streams, exact = {}, True
-        rates = set() if key.rows.fps is None else {key.rows.fps}
+        rates: set[float] = set()
         for camera in chosen:
             path, length = key.images[camera], key.rows.length
             if path.is_dir():
@@ -102,15 +100,20 @@ class FramesSource(Source):
                 files = [path / _image_name(number) for number in range(length)]
                 streams[camera] = decode_images(((f, f.read_bytes()) for f in files), exact=True)
             else:
-                rate, lossless = probe_video(path)
-                rates.add(rate)
-                streams[camera] = _iter_video(path, rate, length)
-                exact = exact and lossless
-        if len(rates) > 1:
+                video = probe_video(path, key.rows.fps)
+                if video.count != length:
+                    raise SourceError(
+                        f"{path} holds {video.count} frames; {TABLE} has {length} rows",
+                        "Write a row for each frame, and no others.",
+                    )
+                rates.add(video.rate)
+                streams[camera] = iter_frames(path, 0, length, video.rate, first_s=video.first_s)
+                exact = exact and video.exact
+        if rates and not same_rate(min(rates), max(rates)):
             raise SourceError(
-                f"its videos and {TABLE} state different frame rates: "
+                "its videos state different frame rates: "
                 + ", ".join(f"{rate:g}" for rate in sorted(rates)),
-                "Write all videos of an episode at one rate, the one of the column fps.",
+                "Write all videos of an episode at one rate, or give that in a column fps.",
             )
         rows = RowSpan(self._folder / TABLE, key.rows.start, key.rows.start + key.rows.length)
         actions = rows.vectors("action") if "action" in rows.names else None
@@ -121,7 +124,7 @@ class FramesSource(Source):
             simulator=key.rows.simulator,
             exact=exact if key.rows.exact is None else key.rows.exact,
             frames=compose(streams, rows.vectors("state"), actions, key.rows.lesson),
-            robot=Robot(rates.pop() if rates else None, names=key.rows.names),
+            robot=Robot(key.rows.fps or min(rates, default=None), names=key.rows.names),
         )
 
     def _image_paths(self) -> Iterator[tuple[Path, str, str]]:
@@ -152,15 +155,6 @@ def _check_names(path: Path, length: int) -> None:
             f"{path} {what}; {TABLE} has {length} rows, so it must hold {_image_name(0)} to "
             f"{_image_name(length - 1)} and nothing else"
         )
-
-
-def _iter_video(path: Path, rate: float, length: int) -> Generator[NDArray[np.uint8]]:
-    count = 0
-    for count, image in enumerate(iter_frames(path, 0, None, rate), 1):
-        if count <= length:
-            yield image
-    if count != length:
-        raise SourceError(f"{path} holds {count} frames; {TABLE} has {length} rows")
 
 
 def _image_name(number: int) -> str:

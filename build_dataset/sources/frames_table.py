@@ -1,6 +1,5 @@
 """The table of a frames folder: `frames.parquet`, one row per frame."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -22,6 +21,7 @@ from robomme_interference_data.storage.arrow_columns import (
 )
 from robomme_interference_data.storage.files import reading
 from robomme_interference_data.storage.parquet import RowSpan
+from robomme_interference_data.storage.video import RATES
 
 from .base import demonstration_length
 from .episode_columns import parse_column
@@ -183,8 +183,12 @@ def _episode(where: str, rows: pa.Table, start: int) -> EpisodeRows:
                 "An episode has one: make two episodes of it.",
             )
         values[column] = distinct[0]
-    if values["fps"] is not None and not 0 < values["fps"] < math.inf:
-        raise SourceError(f"{where}: fps is {values['fps']}; expected a positive number")
+    if values["fps"] is not None and not RATES[0] <= values["fps"] <= RATES[1]:
+        raise SourceError(
+            f"{where}: fps is {values['fps']:g}; expected {RATES[0]:g} to {RATES[1]:g} frames per "
+            "second",
+            "Correct the column fps.",
+        )
     marked = "is_demo" in rows.column_names
     lesson = None
     if marked:

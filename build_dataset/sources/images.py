@@ -5,6 +5,7 @@ lossless codec or lossless options. Converting to YUV alone already changes 8-bi
 """
 
 from collections.abc import Generator, Iterable
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import FormatError, InterferenceError, SourceError
+from robomme_interference_data.errors import FormatError, SourceError
 from robomme_interference_data.storage.encode import decode_image, is_png
-from robomme_interference_data.storage.video import open_video
+from robomme_interference_data.storage.video import RATES, read_times
+from robomme_interference_data.storage.video_file import open_video
 
 _RGB_FORMATS = (
     "rgb24",
@@ -35,20 +37,60 @@ _LOSSLESS_CODECS = ("ffv1", "png", "rawvideo", "huffyuv", "ffvhuff", "utvideo", 
 _TRUE = ("1", "true", "yes")
 
 
-def probe_video(path: Path) -> tuple[float, bool]:
-    """Return a video's frame rate, and whether codec and pixel format alone make it exact."""
-    hint = "Write it again with a constant frame rate, for example with codec ffv1 in a .mkv file."
-    try:
-        with open_video(path) as (_, stream):
-            rate = stream.average_rate or stream.base_rate
-            lossless = stream.codec.canonical_name in _LOSSLESS_CODECS
-            exact = lossless and stream.pix_fmt in _RGB_FORMATS
-    except InterferenceError as error:
-        raise SourceError(error.message, hint) from None
-    if not rate:
-        raise SourceError(f"{path} has no frame rate", hint)
-    # Containers store a frame's duration in whole ns or ms: 1001 is the denominator of NTSC rates.
-    return float(Fraction(rate).limit_denominator(1001)), exact
+@dataclass(frozen=True)
+class ProbedVideo:
+    """What a video file states, without decoding.
+
+    Attributes:
+        rate: Frames per second.
+        count: Its frames.
+        first_s: Presentation time of the first frame in seconds.
+        exact: Whether codec and pixel format alone make it exact.
+    """
+
+    rate: float
+    count: int
+    first_s: float
+    exact: bool
+
+
+def probe_video(path: Path, rate: float | None = None) -> ProbedVideo:
+    """Return what a video file states; `rate` is its frame rate, if that is known.
+
+    Else the rate is one that its container states, and that its frames have.
+
+    Raises:
+        MissingFileError, FormatError: It cannot be read.
+        SourceError: Its frames are not evenly spaced in time, at any of these rates.
+    """
+    with open_video(path) as (_, stream):
+        # The basic rate is exact where containers round; of uneven frames it is far too high.
+        stated = [stream.base_rate, stream.average_rate]
+        lossless = stream.codec.canonical_name in _LOSSLESS_CODECS
+        exact = lossless and stream.pix_fmt in _RGB_FORMATS
+    if rate is None:
+        # Containers store durations in whole ns or ms: 1001 is the denominator of NTSC rates.
+        rates = [float(Fraction(one).limit_denominator(1001)) for one in stated if one]
+        rates = [one for one in dict.fromkeys(rates) if RATES[0] <= one <= RATES[1]]
+    else:
+        rates = [rate]
+    times = read_times(path)
+    problem = None
+    for tried in rates:
+        try:
+            times.first_number(tried, times.first_s)
+        except FormatError as error:
+            problem = error
+        else:
+            return ProbedVideo(tried, len(times), times.first_s, exact)
+    if problem is None:
+        raise SourceError(f"{path} has no frame rate", "Give it in a column fps of the table.")
+    raise SourceError(
+        f"{problem.message} (of {len(times)} frames, the last comes "
+        f"{times.last_s - times.first_s:.4g} s after the first)",
+        f"{problem.hint}\nIf they have even times already, their rate in a column fps of the table "
+        "corrects the one stated.",
+    )
 
 
 def info_is_exact(info: dict[str, Any]) -> bool:

@@ -15,7 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import OFFICIAL, VALUE_NAMES
-from robomme_interference_data.errors import MissingFileError, SourceError, counted, named
+from robomme_interference_data.errors import (
+    FormatError,
+    MissingFileError,
+    SourceError,
+    counted,
+    named,
+)
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.evidence import spans_of_texts
 from robomme_interference_data.simulators.episode import choose_cameras
@@ -110,6 +116,9 @@ class LeRobotSource(Source):
         if evidence is None and lesson is not None and columns.subgoal is not None:
             texts = subgoal_texts(self._lerobot, whole, columns.subgoal)
             evidence = spans_of_texts(texts[trim.start : trim.start + lesson])
+        for camera in chosen:
+            if columns.cameras[camera] in self._lerobot.video_features:
+                self._lerobot.check_video(index, columns.cameras[camera])
         streams = {
             camera: self._images(index, rows, columns.cameras[camera], trim, exact)
             for camera in chosen
@@ -294,12 +303,13 @@ class LeRobotSource(Source):
         used = [self.naming.row(index).get(name) for name in ("start", "stop", "exec_start_idx")]
         if isinstance(self._files, HubFiles):
             return tuple(used)
-        location = self._lerobot.locate(index)
-        cameras = self._columns.cameras.values()
-        videos = [path for name, (path, _) in location.videos.items() if name in cameras]
-        # Part of a dataset suffices: a missing file is an error only when it is read.
-        states = (file_state(self._files.root / path) for path in (location.data, *videos))
-        return (*states, *used)
+        paths, cameras = [self._lerobot.locate(index).data], self._columns.cameras.values()
+        for name in self._lerobot.video_features:
+            # Part of a dataset suffices: what cannot be read is an error only when it is read.
+            if name in cameras:
+                with suppress(FormatError):
+                    paths.append(self._lerobot.locate_video(index, name).path)
+        return (*(file_state(self._files.root / path) for path in paths), *used)
 
 
 def _lesson(rows: RowSpan, columns: Columns, recorded: int | None) -> int | None:

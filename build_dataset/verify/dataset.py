@@ -51,7 +51,7 @@ from robomme_interference_data.storage.files import (
     read_json,
     sha256_file,
 )
-from robomme_interference_data.storage.video import open_video
+from robomme_interference_data.storage.video_file import open_video
 
 from .lerobot_files import lerobot_violations
 
@@ -241,8 +241,9 @@ def _episode(where: str, dataset: Dataset, record: EpisodeRecord) -> Iterator[Vi
 def _pixel_formats(dataset: Dataset, record: EpisodeRecord) -> set[str]:
     """Return the pixel formats of an episode's videos."""
     formats = set()
-    for path, _ in dataset.lerobot.locate(record.episode_index).videos.values():
-        with open_video(dataset.files.path(path)) as (_, stream):
+    for feature in dataset.lerobot.video_features:
+        location = dataset.lerobot.locate_video(record.episode_index, feature)
+        with open_video(dataset.files.path(location.path)) as (_, stream):
             formats.add(str(stream.codec_context.pix_fmt))
     return formats
 

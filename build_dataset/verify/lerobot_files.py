@@ -66,18 +66,20 @@ def lerobot_violations(dataset: Dataset, copy: FetchedCopy | None) -> Iterator[t
             if not _equal(row.get(name), value):
                 what = f"{name} of {record.episode_id} is {row.get(name)}; expected {value}"
                 yield EPISODES_DIR, what
-        location = dataset.lerobot.locate(record.episode_index)
-        for path in [location.data, *(path for path, _ in location.videos.values())]:
+        path_of_rows = dataset.lerobot.locate(record.episode_index).data
+        videos = dataset.lerobot.video_features
+        located = [dataset.lerobot.locate_video(record.episode_index, name) for name in videos]
+        for path in [path_of_rows, *(location.path for location in located)]:
             user = users.setdefault(path, record.episode_index)
             if user != record.episode_index:
                 yield path, f"is shared by episodes {user} and {record.episode_index}"
         if copy is None or copy.holds_all(dataset, record.episode_index):
             try:
-                for path, _ in location.videos.values():
-                    dataset.files.path(path)
+                for name in videos:
+                    dataset.lerobot.check_video(record.episode_index, name)
                 yield from _rows(dataset, record.episode_index, first, tasks.get(record.goal))
             except InterferenceError as error:
-                yield location.data, error.message
+                yield path_of_rows, error.message
         first += record.length
 
 

@@ -58,7 +58,7 @@ def mp4(video: Video) -> bytes:
         path = Path(folder) / "video.mp4"
         # The published systems' codec varies from run to run with other sizes, see `CLIP`.
         codec = CLIP if height % 16 or width % 16 else MODEL_VIDEO
-        encoder = VideoEncoder(path, codec, max(1, round(video.fps)), height, width)
+        encoder = VideoEncoder(path, codec, video.fps, height, width)
         for frame in video.frames:
             encoder.add(np.ascontiguousarray(frame[:height, :width]))
         encoder.close()

@@ -62,7 +62,7 @@ class Clip:
         self.problem: str | None = None
         self._heading = (system, str(item.episode), f"condition {item.condition}")
         self._goal = ""
-        self._fps = 1
+        self._fps = 1.0
         self._history = "no history"  # heading of its picture
         self._history_picture: NDArray[np.uint8] | None = None
         self._lesson: Iterator[NDArray[np.uint8]] = iter(())
@@ -86,7 +86,7 @@ class Clip:
         info: EpisodeInfo,
     ) -> None:
         """Draw the first picture, with the history frames that were received."""
-        self._goal, self._fps = info.goal, max(1, round(buffer.query.dataset.fps))
+        self._goal, self._fps = info.goal, buffer.query.dataset.fps
         if received:
             self._history = f"history given: {counted(len(received), 'frame')}"
         self._history_picture = history_picture(buffer, received)
@@ -118,7 +118,7 @@ class Clip:
     def close(self, status: Status, error: str | None = None) -> None:
         """Show the end for a second, and close the clip, if it began."""
         if self._video is not None:
-            for _ in range(self._fps):
+            for _ in range(max(1, round(self._fps))):
                 self._draw(status, error)
             self._video.close()
             self.data = self._path.read_bytes()

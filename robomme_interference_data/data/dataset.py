@@ -274,8 +274,9 @@ class Dataset:
 
     def files_of(self, episode_index: int, cameras: Iterable[str]) -> list[str]:
         """Return the paths of the files that hold an episode's vectors and the given cameras."""
-        stored = self.lerobot.locate(episode_index)
-        return [stored.data, *(stored.videos[self._feature(camera)][0] for camera in cameras)]
+        data = self.lerobot.locate(episode_index).data
+        features = [self._feature(camera) for camera in cameras]
+        return [data, *(self.lerobot.locate_video(episode_index, name).path for name in features)]
 
     def video_of(self, episode_index: int, camera: str) -> tuple[Path, int]:
         """Return the video file of an episode, and the number of its first frame there.
@@ -284,8 +285,8 @@ class Dataset:
             UnknownNameError: There is no such camera.
             MissingFileError: The file is missing.
         """
-        path, first = self.lerobot.locate(episode_index).videos[self._feature(camera)]
-        return self.files.path(path), first
+        location = self.lerobot.locate_video(episode_index, self._feature(camera))
+        return self.files.path(location.path), location.first
 
     def iter_frames(
         self, episode_index: int, camera: str | None, start: int, stop: int

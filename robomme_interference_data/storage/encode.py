@@ -4,7 +4,6 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,8 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import KEY_FRAMES
 from robomme_interference_data.errors import BuildError, FormatError, InvalidOptionError
 
-from .video import MAX_PIXELS
+from .video import RATES, rate_fraction
+from .video_file import MAX_PIXELS, file_url, reason
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 
@@ -26,8 +26,9 @@ class Codec:
     """Video settings, in the terms of LeRobot's `RGBEncoderConfig`.
 
     `settings` are further arguments of `RGBEncoderConfig`, and `options` the same for FFmpeg; a
-    test compares them. `exact` codecs are lossless. `min_side` is the smallest height and width in
-    pixels; `interpolation` is that of subsampled colors, None for PyAV's.
+    test compares them. `exact` codecs are lossless. `sides` are the smallest and the largest height
+    and width in pixels, `rates` the smallest and the largest number of frames per second;
+    `interpolation` is that of subsampled colors, None for PyAV's.
     """
 
     name: str
@@ -36,9 +37,12 @@ class Codec:
     settings: Mapping[str, Any]
     options: Mapping[str, str]
     exact: bool
-    min_side: int = 1
+    sides: tuple[int, int] = (1, (1 << 16) - 1)  # MP4 has 16 bits for a side
+    rates: tuple[float, float] = RATES
     interpolation: str | None = None
 
+
+_LOSSLESS = "av1-lossless"
 
 # The encoder's fastest mode: without loss, more effort saves bytes but changes no pixel.
 _AOM_LOSSLESS = {"usage": 1, "cpu-used": 8, "row-mt": 1, "aom-params": "lossless=1"}
@@ -49,7 +53,7 @@ CODECS = {
         # Lossless in PyAV, torchcodec and browsers. Key frames are close and nothing is reordered,
         # so seeking is safe.
         Codec(
-            name="av1-lossless",
+            name=_LOSSLESS,
             vcodec="libaom-av1",
             pix_fmt="gbrp",
             settings={"g": KEY_FRAMES, "crf": None, "extra_options": _AOM_LOSSLESS},
@@ -64,7 +68,8 @@ CODECS = {
             settings={"g": 2, "crf": 30, "preset": 12},
             options={"g": "2", "crf": "30", "preset": "12", "svtav1-params": "fast-decode=0"},
             exact=False,
-            min_side=64,  # SVT-AV1 crashes on some smaller frames
+            sides=(64, 8704),  # SVT-AV1 crashes on some smaller frames
+            rates=(1e-2, 240),
         ),
     )
 }
@@ -97,6 +102,22 @@ def get_codec(name: str) -> Codec:
     return CODECS[name]
 
 
+def _misfit(codec: Codec, fps: float, height: int, width: int) -> str | None:
+    """Return why a codec cannot hold frames, or why they could not be read again; None if not."""
+    least, most = codec.sides
+    slowest, fastest = codec.rates
+    size = f"frames of {width}×{height} pixels"
+    if min(height, width) < least:
+        return f"{size} are too small for {codec.name}, which needs at least {least}×{least}"
+    if max(height, width) > most:
+        return f"{size} are too large for {codec.name}, which holds at most {most}×{most}"
+    if height * width > MAX_PIXELS:
+        return f"{size} are too large; a frame has at most {MAX_PIXELS:,} pixels"
+    if not slowest <= fps <= fastest:
+        return f"{fps:g} frames per second do not fit {codec.name}: {slowest:g} to {fastest:g} do"
+    return None
+
+
 class VideoEncoder:
     """Writes frames to one video file in the calling thread, so that none is dropped.
 
@@ -112,20 +133,19 @@ class VideoEncoder:
         width: int,
         container: str | None = None,
     ):
-        if min(height, width) < codec.min_side:
-            raise BuildError(
-                f"{path.stem}: frames of {width}×{height} pixels are too small for {codec.name}, "
-                f"which needs at least {codec.min_side}×{codec.min_side}",
-                "Use the codec 'av1-lossless'.",
-            )
+        if problem := _misfit(codec, fps, height, width):
+            hint = "Make the images smaller, or correct the frame rate."
+            if _misfit(CODECS[_LOSSLESS], fps, height, width) is None:
+                hint = f"Use the codec {_LOSSLESS!r}."
+            raise BuildError(f"{path.stem}: {problem}", hint)
         self._path, self._codec = path, codec
         self._container: Any = None
         os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 prints its settings otherwise
-        rate = Fraction(fps).limit_denominator(1001)  # exact for NTSC rates such as 29.97
+        rate = rate_fraction(fps)
         with self._errors():
             # Omits FFmpeg's version.
             self._container = av.open(
-                str(path), "w", format=container, container_options={"fflags": "+bitexact"}
+                file_url(path), "w", format=container, container_options={"fflags": "+bitexact"}
             )
             self._stream = self._container.add_stream(
                 codec.vcodec, rate=rate, options=dict(codec.options)
@@ -171,7 +191,8 @@ class VideoEncoder:
             if self._container is not None:
                 self.abandon()
             hint = "Check the free disk space." if isinstance(error, OSError) else None
-            raise BuildError(f"{self._path}: the video cannot be written: {error}", hint) from error
+            what = f"the video cannot be written: {reason(error)}"
+            raise BuildError(f"{self._path}: {what}", hint) from error
 
 
 def png(image: NDArray[np.uint8]) -> bytes:

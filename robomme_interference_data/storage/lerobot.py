@@ -7,14 +7,13 @@ with lerobot's own reader.
 """
 
 import math
-import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import INFO_PATH
@@ -22,29 +21,25 @@ from robomme_interference_data.errors import FormatError, MissingFileError, Unkn
 
 from . import video
 from .files import Files, read_json
+from .lerobot_location import (
+    EpisodeLocation,
+    VideoLocation,
+    VideoSpan,
+    locate_episode,
+    locate_video,
+    span_problems,
+)
 from .lerobot_tables import read_episode_lines, read_episodes, read_tasks
 from .limits import MAX_FRAME_VALUES, MAX_NAME, MAX_RATE, MIN_RATE
 from .parquet import RowSpan
 
 VERSIONS = ("v3.0", "v2.1", "v2.0")
 
-_FIELD = re.compile(r"\{(\w+)(?::0(\d)d)?\}")
-
 # Upper bounds, checked before anything is allocated.
 _MAX_SIDES = 8  # numbers in a shape
 _MAX_EPISODES = 10_000_000
 _MAX_FEATURES = 10_000
 _MAX_TEMPLATE = 1000  # characters of a path template
-_MAX_FRAME = 1 << 40  # number of a frame in its file: a container's timestamp has 64 bits
-
-
-@dataclass(frozen=True)
-class EpisodeLocation:
-    """Frames of an episode, its rows' file, and each camera's `(file, number of first frame)`."""
-
-    length: int
-    data: str
-    videos: dict[str, tuple[str, int]]
 
 
 class LeRobotFiles:
@@ -58,6 +53,8 @@ class LeRobotFiles:
         self.files = files
         self._tables, self._statistics = tables, statistics
         self._rows: dict[int, dict[str, Any]] = {}
+        # By camera and video file, the problems of each episode.
+        self._video_problems: dict[tuple[str, str], dict[int, str]] = {}
         try:
             path = files.path(INFO_PATH)
         except MissingFileError as error:
@@ -164,9 +161,19 @@ class LeRobotFiles:
             row = self._rows[index] = self.table.slice(index, 1).to_pylist()[0]
         return row
 
+    @property
+    def video_features(self) -> list[str]:
+        """The cameras whose frames are in video files."""
+        features = self.info["features"]
+        return [name for name, feature in features.items() if feature["dtype"] == "video"]
+
     def locate(self, index: int) -> EpisodeLocation:
-        """Return where an episode lies."""
-        return _locate_episode(self.info, index, self.row(index), self.files.describe())
+        """Return where the rows of an episode lie."""
+        return locate_episode(self.info, index, self.row(index), self.files.describe())
+
+    def locate_video(self, index: int, column: str) -> VideoLocation:
+        """Return where the frames of an episode lie, for a camera in video files."""
+        return locate_video(self.info, column, index, self.row(index), self.files.describe())
 
     def rows(self, index: int) -> RowSpan:
         """Return the rows of an episode in its data file."""
@@ -202,10 +209,51 @@ class LeRobotFiles:
         self, index: int, column: str, start: int, stop: int
     ) -> Iterator[NDArray[np.uint8]]:
         """Decode frames `start` to `stop` (excluded) of an episode, `(H, W, 3) uint8`, in order."""
-        relative, first = self.locate(index).videos[column]
         self.check_span(index, start, stop)
-        path, shape = self.files.path(relative), self.shape(column)
-        return video.iter_frames(path, first + start, first + stop, self.fps, shape)
+        location = self.locate_video(index, column)
+        path, first = self.files.path(location.path), location.first
+        return video.iter_frames(path, first + start, first + stop, self.fps, self.shape(column))
+
+    def check_video(self, index: int, column: str) -> None:
+        """Check that an episode's video file has the frames that the episode table states.
+
+        The times of all frames of the file are read, without decoding, once for each file.
+
+        Raises:
+            FormatError: It has not, or its frames are not evenly spaced in time.
+        """
+        relative = self.locate_video(index, column).path
+        path, key = self.files.path(relative), (column, relative)
+        if key not in self._video_problems:
+            times = video.read_times(path)
+            spans = self._spans_in_file(index, column)
+            first = times.first_number(self.fps)
+            self._video_problems[key] = span_problems(spans, first, len(times))
+        problem = self._video_problems[key].get(index)
+        if problem is not None:
+            raise FormatError(
+                f"{path}: {problem}",
+                "Write the dataset again, or correct from_timestamp in its episode table, or leave "
+                "the episode out.",
+            )
+
+    def _spans_in_file(self, index: int, column: str) -> list[VideoSpan]:
+        """Return the episodes in the video file that holds an episode, by number."""
+        row, fps, key = self.row(index), self.fps, f"videos/{column}"
+        if self.version != "v3.0":
+            return [VideoSpan(index, row["length"], 0.0, math.nan)]
+        names = [f"{key}/chunk_index", f"{key}/file_index"]
+        here = [pc.equal(self.table[name], row[name]) for name in names]
+        rows = self.table.filter(pc.and_(*here)).to_pylist()
+        return [
+            VideoSpan(
+                other["episode_index"],
+                other["length"],
+                _seconds(other.get(f"{key}/from_timestamp")) * fps,
+                _seconds(other.get(f"{key}/to_timestamp")) * fps,
+            )
+            for other in rows
+        ]
 
     def check_span(self, index: int, start: int, stop: int) -> None:
         """Check that an episode has frames `start` to `stop` (excluded)."""
@@ -249,57 +297,6 @@ def _check_info(info: dict[str, Any], path: object) -> None:
         check(feature["dtype"] != "video" or is_template(info.get("video_path")), "video_path")
 
 
-def fill_template(template: str, where: object, **values: str | int) -> str:
-    """Fill in a path template of `info.json`: `{name}` and `{name:03d}`, nothing else."""
-    invalid = FormatError.damaged(where, f"the path template {template!r} cannot be filled in")
-
-    def fill(match: re.Match[str]) -> str:
-        value = values.get(match[1])
-        if value is None or (match[2] and not isinstance(value, int)):
-            raise invalid
-        return f"{value:0{match[2]}d}" if match[2] else str(value)
-
-    # Not by `str.format`, with which a template can reach attributes of the values.
-    filled = _FIELD.sub(fill, template)
-    if "{" in filled or "}" in filled:
-        raise invalid
-    return filled
-
-
-def _locate_episode(
-    info: dict[str, Any], index: int, row: dict[str, Any], where: str
-) -> EpisodeLocation:
-    """Return where an episode lies, given its per-episode columns."""
-    old = info["codebase_version"] != "v3.0"
-
-    def whole(name: str) -> int:
-        value = row.get(name)
-        if not isinstance(value, int) or not 0 <= value <= _MAX_FRAME:
-            raise FormatError.damaged(where, f"{name} of episode {index} is {value!r}")
-        return value
-
-    def path(template: str, key: str, **more: str) -> str:
-        if old:
-            chunk = index // info.get("chunks_size", 1000)
-            return fill_template(template, where, episode_chunk=chunk, episode_index=index, **more)
-        chunk, file = whole(f"{key}/chunk_index"), whole(f"{key}/file_index")
-        return fill_template(template, where, chunk_index=chunk, file_index=file, **more)
-
-    def first_frame(key: str) -> int:
-        name, fps = f"{key}/from_timestamp", info["fps"]
-        start: Any = 0.0 if old else row.get(name)
-        valid = isinstance(start, int | float) and 0 <= start < 1e9
-        if not valid or (frame := round(start * fps)) > _MAX_FRAME:
-            raise FormatError.damaged(where, f"{name} is {start!r}")
-        # Rounded seconds miss a frame by far less than a tenth of its duration.
-        if abs(frame - start * fps) > 0.1:
-            raise FormatError.damaged(where, f"{name} {start!r} lies between two frames")
-        return frame
-
-    videos = {
-        name: (path(info["video_path"], key, video_key=name), first_frame(key))
-        for name, feature in info["features"].items()
-        if feature["dtype"] == "video"
-        for key in (f"videos/{name}",)
-    }
-    return EpisodeLocation(whole("length"), path(info["data_path"], "data"), videos)
+def _seconds(value: Any) -> float:
+    """Return a time of the episode table, NaN if it is none."""
+    return float(value) if isinstance(value, int | float) else math.nan

@@ -235,8 +235,9 @@ class RowSpan:
         """Return a column of lists of numbers, or of numbers, as `(T, D) float32`."""
         column, what = self.table([name])[name], f"{self.path}: column {name!r}"
         stored = column.type
-        with reading(self.path):
-            column = simplified(column)
+        if not (is_listed(stored) and pa.types.is_floating(stored.value_type)):
+            with reading(self.path):
+                column = simplified(column)
         # LeRobot stores vectors of one value as the value.
         flat = pc.list_flatten(column) if is_listed(column.type) else column
         if not is_number(flat.type):

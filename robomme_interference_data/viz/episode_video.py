@@ -45,7 +45,7 @@ class EpisodeVideo:
         views: Number of views side by side.
     """
 
-    def __init__(self, path: Path, fps: int, views: int):
+    def __init__(self, path: Path, fps: float, views: int):
         check_pillow("a video")
         self._views = views
         width = (views + 1) * VIEW  # and the text

@@ -155,7 +155,7 @@ def test_a_dataset_is_of_one_robot_and_keeps_what_it_is(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fps", [12.5, 30000 / 1001, 15.0])
+@pytest.mark.parametrize("fps", [12.5, 30000 / 1001, 15.0, 0.5])
 def test_a_frame_rate_is_kept_as_it_is(tmp_path: Path, fps: float) -> None:
     """LeRobot's files have it, LeRobot opens them, and the frames are the recorded ones."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset

@@ -26,7 +26,7 @@ from support.recordings import (
 
 from robomme_interference_data.build_dataset.sources import Recording, Robot
 from robomme_interference_data.build_dataset.sources.frames import FramesSource
-from robomme_interference_data.errors import InterferenceError, SourceError
+from robomme_interference_data.errors import FormatError, InterferenceError, SourceError
 
 DRAWER, MOVE = "OpenDrawer/train/0", "MoveCube/val/2"
 FOUR = make_episode(4, 4, "open it", cameras=("front",))
@@ -153,6 +153,7 @@ TABLES: list[tuple[Callable[[], Rows], str]] = [
     (lambda: four()[:2] + rows_of(MOVE, FOUR)[:1] + four()[2:], "not together: row 3"),
     (lambda: rows_of("OpenDrawer", FOUR), "row 0: 'OpenDrawer' is not an episode id"),
     (lambda: changed(3, goal="shut it"), f"{DRAWER} has several values of 'goal'"),
+    (lambda: four(fps=1e-9), f"{DRAWER}: fps is 1e-09; expected 0.001 to 10000"),
     (lambda: four(is_demo=[False, True, True, False]), f"{DRAWER}: is_demo is true in 2 frames"),
 ]
 
@@ -335,7 +336,7 @@ HARMS: list[tuple[Callable[[Path], Any], str]] = [
         lambda f: shutil.rmtree(f / "images"),
         f"neither videos nor images(.|\n)*videos/CAMERA/{DRAWER}.mkv(.|\n)*`cameras` to none",
     ),
-    (misplaced(f"videos/wrist/{DRAWER}.mkv"), "0.mkv is not a readable video"),
+    (misplaced(f"videos/wrist/{DRAWER}.mkv"), "0.mkv: the file is empty"),
     (misplaced("videos/front/A/train/3.mkv"), "3.mkv belongs to A/train/3, which frames.parq"),
     (misplaced("images/front/A/train/1"), "train/1 is not an episode's image folder"),
 ]
@@ -360,4 +361,97 @@ def test_cameras_that_differ(tmp_path: Path) -> None:
     write(tmp_path, four() + rows_of(MOVE, FOUR))
     write_images(place(tmp_path, MOVE), FRONT)
     write_images(place(tmp_path, MOVE, camera="wrist"), FRONT)
-    assert f"{DRAWER} has no images of camera 'wrist'" in refused(tmp_path)
+    source = FramesSource(tmp_path)
+    drawer = next(episode for episode in source.episodes() if str(episode.id) == DRAWER)
+    with raises(SourceError):
+        source.read(drawer, None)
+    assert len(list(source.read(drawer, ("front",)).frames)) == 4
+
+
+# --- times of videos -----------------------------------------------------------------------------
+
+
+def write_timed(path: Path, milliseconds: list[int], rate: Fraction | int = 10) -> None:
+    """Write the four frames at given times, in a container that states a rate."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", Fraction(rate), width=24, height=16, pix_fmt="bgr0")
+        stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
+        for image, time in zip(FRONT, milliseconds, strict=False):
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+            frame.pts, frame.time_base = time, Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+
+
+@pytest.mark.parametrize(
+    ("times", "stated", "column", "expected"),
+    [
+        ([0, 100, 200, 300], 10, None, 10),
+        ([1500, 1600, 1700, 1800], 10, None, 10),  # from its first frame on
+        ([0, 33, 67, 100], 30, None, 30),
+        ([0, 80, 160, 240], Fraction(25, 2), None, 12.5),
+        ([0, 2000, 4000, 6000], Fraction(1, 2), None, 0.5),
+        ([0, 130, 180, 340], 10, None, 10),  # each nearest to its own number
+        ([0, 33, 67, 100], 24, 30, 30),  # the container states another rate
+        ([0, 33, 67, 100], 24, None, None),
+        ([0, 100, 160, 300], 10, None, 10),
+        ([0, 100, 300, 400], 10, None, None),
+        ([0, 40, 200, 300], 10, None, None),
+        ([0, 100, 200, 300], 10, 30, None),
+        ([0, 0, 0, 0], 10, None, None),
+    ],
+)
+def test_times_of_frames(
+    tmp_path: Path,
+    times: list[int],
+    stated: Fraction | int,
+    column: int | None,
+    expected: float | None,
+) -> None:
+    write_timed(place(tmp_path, kind="videos"), times, stated)
+    write_table(tmp_path, four() if column is None else four(fps=column))
+    if expected is None:
+        with raises(SourceError) as caught:
+            read_one(tmp_path)
+        assert "variable frame rate" in str(caught.value.hint)
+        assert "ffmpeg -i OLD" in str(caught.value.hint)
+        return
+    recording = read_one(tmp_path)
+    assert recording.robot.fps == expected
+    check_recording(recording, FOUR, marked=False)
+
+
+@pytest.mark.parametrize("frames", [3, 5])
+def test_a_video_of_another_length_is_an_error_before_it_is_decoded(
+    tmp_path: Path, frames: int
+) -> None:
+    """Distractor units do not decode the end of an episode."""
+    write_table(tmp_path, four())
+    replace_by_video(tmp_path, frames)
+    with raises(SourceError):
+        read_one(tmp_path)
+
+
+def test_a_camera_that_is_not_used_may_be_broken(tmp_path: Path) -> None:
+    write(tmp_path)
+    place(tmp_path, kind="videos", camera="wrist").parent.mkdir(parents=True)
+    place(tmp_path, kind="videos", camera="wrist").write_bytes(b"none")
+    source = FramesSource(tmp_path)
+    [episode] = source.episodes()
+    assert len(list(source.read(episode, ("front",)).frames)) == 4
+    for cameras in (("wrist",), None):
+        with raises(FormatError):
+            source.read(episode, cameras)
+
+
+def test_a_folder_named_after_a_time_of_day(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a relative path, FFmpeg takes what precedes the colon for a protocol."""
+    folder = Path("run 12:30?#%d é")
+    write_table(tmp_path / folder, four())
+    write_video(place(tmp_path, kind="videos"), FRONT)
+    (tmp_path / "videos").rename(tmp_path / folder / "videos")
+    monkeypatch.chdir(tmp_path)
+    check_recording(read_one(folder), FOUR, marked=False)

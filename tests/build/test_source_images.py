@@ -9,7 +9,11 @@ from PIL import Image
 from support.messages import raises
 from support.recordings import encode_image, make_episode, write_video
 
-from robomme_interference_data.build_dataset.sources.images import info_is_exact, probe_video
+from robomme_interference_data.build_dataset.sources.images import (
+    ProbedVideo,
+    info_is_exact,
+    probe_video,
+)
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.storage.encode import CODECS, decode_image, is_png
 from robomme_interference_data.storage.video import iter_frames
@@ -55,7 +59,7 @@ def test_a_video_that_counts_as_exact_is(
     tmp_path: Path, codec: str, pix_fmt: str, suffix: str, counts: bool
 ) -> None:
     path = write_video(tmp_path / f"video{suffix}", FRAMES, codec, pix_fmt)
-    assert probe_video(path) == (10, counts)
+    assert probe_video(path) == ProbedVideo(rate=10, count=5, first_s=0, exact=counts)
     assert np.array_equal(np.stack(list(iter_frames(path, 0, None, 10))), FRAMES) is counts
 
 

@@ -16,12 +16,14 @@ from support.damage import HEADER, ROWS, edit, put, renew_header
 from support.messages import raises
 from support.mutations import Place, mutate, renew
 from support.retrieval import make_index
-from support.verifying import DATA, EPISODES, FRONT, RECORDS, expect, first_changed
+from support.verifying import DATA, EPISODES, FRONT, RECORDS, VIDEO, expect, first_changed
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.data.dataset import Dataset, revision_of
 from robomme_interference_data.errors import FormatError, HashMismatchError, InterferenceError
+from robomme_interference_data.storage.encode import CODECS, VideoEncoder
 from robomme_interference_data.storage.files import LocalFiles
+from robomme_interference_data.storage.video import iter_frames
 
 
 def as_text(name: str) -> Callable[[pa.Table], pa.Table]:
@@ -115,6 +117,18 @@ def test_inconsistent_content(
     if path.startswith("distractors"):
         renew_sums(own_buffers / "distractors")
     expect(own_buffers, message)
+
+
+def test_a_frame_that_no_row_has(own_buffers: Path) -> None:
+    """No buffer reads it, so that all hashes of frames are right."""
+    path = own_buffers / VIDEO
+    frames = list(iter_frames(path, 0, None, 10))
+    encoder = VideoEncoder(path, CODECS["av1-lossless"], 10, *frames[0].shape[:2])
+    for frame in [*frames, frames[0]]:
+        encoder.add(frame)
+    encoder.close()
+    renew_sums(own_buffers / "distractors")
+    expect(own_buffers, f"{VIDEO}: episode 3: the video holds 33 frames, 0 to 32, but the table")
 
 
 def test_statistics_that_are_not_those_of_the_build(own_buffers: Path) -> None:

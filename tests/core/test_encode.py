@@ -3,6 +3,7 @@
 import dataclasses
 import gc
 import tempfile
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -18,7 +19,7 @@ from support.messages import raises
 
 from robomme_interference_data.errors import BuildError
 from robomme_interference_data.storage.encode import CLIP, CODECS, Codec, VideoEncoder
-from robomme_interference_data.storage.video import iter_frames
+from robomme_interference_data.storage.video import iter_frames, read_times
 
 LOSSLESS, LOSSY = CODECS["av1-lossless"], CODECS["lerobot-default"]
 
@@ -27,13 +28,15 @@ def noise(seed: int, *shape: int) -> NDArray[np.uint8]:
     return np.random.default_rng(seed).integers(0, 256, (*shape, 3), dtype=np.uint8)
 
 
-def write(path: Path, images: NDArray[np.uint8], codec: Codec = LOSSLESS) -> NDArray[np.uint8]:
+def write(
+    path: Path, images: NDArray[np.uint8], codec: Codec = LOSSLESS, fps: float = 10
+) -> NDArray[np.uint8]:
     """Encode images, and return what the file decodes to."""
-    encoder = VideoEncoder(path, codec, 10, *images.shape[1:3])
+    encoder = VideoEncoder(path, codec, fps, *images.shape[1:3])
     for image in images:
         encoder.add(image)
     encoder.close()
-    return np.stack(list(iter_frames(path, 0, None, 10)))
+    return np.stack(list(iter_frames(path, 0, None, fps)))
 
 
 # --- lossless ------------------------------------------------------------------------------------
@@ -105,11 +108,82 @@ def test_clips_are_the_same_whatever_memory_held_before(
 # --- what cannot be encoded ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("height", "width"), [(63, 64), (64, 63)])
-def test_too_small_for_the_lossy_codec(tmp_path: Path, height: int, width: int) -> None:
+@pytest.mark.parametrize(
+    ("codec", "fps", "height", "width", "advice"),
+    [
+        (LOSSY, 10, 63, 64, "av1-lossless"),
+        (LOSSY, 10, 64, 63, "av1-lossless"),
+        (LOSSY, 10, 64, 8705, "av1-lossless"),
+        (LOSSY, 241, 64, 64, "av1-lossless"),
+        (LOSSY, 0.001, 64, 64, "av1-lossless"),
+        (LOSSY, 10, 70_000, 64, "smaller"),
+        (LOSSLESS, 10, 1, 1 << 16, "smaller"),
+        (LOSSLESS, 10, 4097, 4096, "smaller"),  # more than are read
+        (LOSSLESS, 1e-4, 8, 8, "frame rate"),
+        (LOSSLESS, 20_000, 8, 8, "frame rate"),
+    ],
+)
+def test_what_does_not_fit_a_codec(
+    tmp_path: Path, codec: Codec, fps: float, height: int, width: int, advice: str
+) -> None:
     with raises(BuildError) as raised:
-        VideoEncoder(tmp_path / "video.mp4", LOSSY, 10, height, width)
-    assert "av1-lossless" in str(raised.value.hint)
+        VideoEncoder(tmp_path / "video.mp4", codec, fps, height, width)
+    assert advice in str(raised.value.hint)
+    assert not (tmp_path / "video.mp4").exists()
+
+
+@pytest.mark.parametrize(
+    ("codec", "fps", "height", "width"),
+    [
+        (LOSSLESS, 10, 1, 1),
+        (LOSSLESS, 1e-3, 2, (1 << 16) - 1),
+        (LOSSLESS, 9999.99, 3, 5),
+        (LOSSY, 240, 65, 67),
+        (LOSSY, 1e-2, 64, 8704),
+    ],
+)
+def test_what_just_fits_a_codec(
+    tmp_path: Path, codec: Codec, fps: float, height: int, width: int
+) -> None:
+    images = np.zeros((2, height, width, 3), np.uint8)
+    assert write(tmp_path / "video.mp4", images, codec, fps).shape == images.shape
+
+
+RATES = st.one_of(
+    st.sampled_from([12.5, 0.5, 30000 / 1001, 29.97, 1 / 3, 15, 240]),
+    st.floats(0.01, 240),
+    st.fractions(Fraction(1, 100), 240).map(float),
+)
+
+
+@given(
+    st.sampled_from([LOSSLESS, LOSSLESS, LOSSLESS, LOSSY]),
+    RATES,
+    st.integers(1, 40),
+    st.tuples(st.integers(0, 20), st.integers(0, 20)),
+    st.data(),
+)
+@settings(max_examples=25)
+def test_what_is_written_is_read(
+    codec: Codec, fps: float, length: int, beyond: tuple[int, int], data: st.DataObject
+) -> None:
+    """Sizes from the smallest one on, odd ones, too, any number of frames, at any rate."""
+    height, width = (codec.sides[0] + more for more in beyond)
+    images = noise(length, length, height, width)
+    start = data.draw(st.integers(0, length - 1))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "v.mp4"
+        found = write(path, images, codec, fps)
+        assert len(found) == length
+        if codec.exact:
+            np.testing.assert_array_equal(found, images)
+        rest = np.stack(list(iter_frames(path, start, length, fps, found.shape[1:])))
+        np.testing.assert_array_equal(rest, found[start:])
+        times = read_times(path)
+        assert (len(times), times.first_number(fps)) == (length, 0)
+        # LeRobot looks for times within 0.1 ms.
+        expected = np.arange(length) / fps
+        np.testing.assert_allclose(times.ticks * float(times.tick_s), expected, 1e-6, 1e-4)
 
 
 @pytest.mark.slow

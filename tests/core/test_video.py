@@ -13,7 +13,7 @@ from support.messages import raises
 
 from robomme_interference_data.errors import FormatError, InterferenceError, MissingFileError
 from robomme_interference_data.storage.encode import CODECS
-from robomme_interference_data.storage.video import iter_frames
+from robomme_interference_data.storage.video import iter_frames, read_times
 
 COUNT, SIZE, FPS = 60, (64, 80), 10
 pytestmark = pytest.mark.timeout(120)
@@ -136,18 +136,96 @@ def test_another_rate(videos: dict[str, Video], fps: float) -> None:
         list(iter_frames(videos["lossless.mp4"].path, 0, 20, fps))
 
 
-def test_times_with_a_gap_or_off_the_grid(tmp_path: Path) -> None:
-    """Time bases in milliseconds cannot hold every frame time exactly."""
+def test_a_gap(tmp_path: Path) -> None:
     path = write(tmp_path / "gap.mkv", times=[0, 1, 2, 3, 6, 7, 8])
     assert len(list(iter_frames(path, 6, 9, FPS))) == 3
     with raises(FormatError):
         list(iter_frames(path, 2, 8, FPS))
-    base = Fraction(1, 1000)
-    path = write(tmp_path / "rounded.mkv", times=[0, 101, 199, 300, 408], time_base=base)
-    assert len(list(iter_frames(path, 0, 5, FPS))) == 5
-    path = write(tmp_path / "uneven.mkv", times=[0, 100, 200, 340, 400], time_base=base)
+    assert len(read_times(path)) == 7
+    with raises(FormatError):
+        read_times(path).first_number(FPS)
+
+
+MILLISECONDS = Fraction(1, 1000)
+
+
+@pytest.mark.parametrize(
+    ("times", "even"),
+    [
+        ([0, 101, 199, 300, 408], True),  # rounded
+        ([0, 100, 249, 251, 400], True),  # each within half a frame of its number
+        ([40, 140, 200, 340, 440], True),
+        ([0, 100, 260, 300, 400], False),  # no frame 2, and two frames 3
+        ([0, 100, 200, 200 + 51, 400], True),
+        ([0, 40, 200, 300, 400], False),  # two frames 0
+        ([60, 160, 260, 360, 460], False),  # begins with frame 1
+    ],
+)
+def test_the_nearest_number_must_have_one_frame(
+    tmp_path: Path, times: list[int], even: bool
+) -> None:
+    path = write(tmp_path / "uneven.mkv", times=times, time_base=MILLISECONDS)
+    if even:
+        assert read_times(path).first_number(FPS) == 0
+        np.testing.assert_array_equal(list(iter_frames(path, 0, 5, FPS)), SOURCE[:5])
+        return
     with raises(FormatError):
         list(iter_frames(path, 0, 5, FPS))
+
+
+@pytest.mark.parametrize("fps", [Fraction(25, 2), Fraction(1, 2), Fraction(30000, 1001), 30, 60])
+@pytest.mark.parametrize("name", ["a.mkv", "a.mp4"])
+def test_fractional_rates_in_milliseconds(tmp_path: Path, name: str, fps: Fraction) -> None:
+    """Containers round times; 100 s later a rate rounded to whole frames would be far off."""
+    times = [round(1000 * number / fps) for number in (*range(10), 3000)]
+    codec = ("ffv1", "bgr0") if name == "a.mkv" else ("libx264rgb", "rgb24", {"qp": "0"})
+    path = write(tmp_path / name, *codec, times=times, time_base=MILLISECONDS)
+    np.testing.assert_array_equal(list(iter_frames(path, 0, 10, float(fps))), SOURCE[:10])
+    [last] = iter_frames(path, 3000, 3001, float(fps))
+    np.testing.assert_array_equal(last, SOURCE[10])
+
+
+def test_avi_is_counted(tmp_path: Path) -> None:
+    """It has no times: FFmpeg invents them, and for frames in another order than decoded, wrongly.
+
+    What it has is a number of each piece of data, which shows frames that were dropped.
+    """
+    path = write(tmp_path / "a.avi", "libx264", "yuv444p", {"bf": "3", "qp": "0"})
+    times = read_times(path)
+    assert (len(times), times.first_number(FPS)) == (COUNT, 0)
+    found = np.stack(list(iter_frames(path, 0, None, FPS))).astype(int)
+    assert np.abs(found - SOURCE).max() <= 4  # of the colors
+    np.testing.assert_array_equal(list(iter_frames(path, 41, 44, FPS)), found[41:44])
+    dropped = write(tmp_path / "b.avi", "ffv1", "bgr0", times=[0, 1, 2, 5, 6])
+    with raises(FormatError):
+        read_times(dropped).first_number(FPS)
+
+
+def test_a_video_that_begins_later(tmp_path: Path) -> None:
+    """Its frames have the numbers of their times, unless the time of the first one is given."""
+    times = [number + 15 for number in range(10)]
+    for name in ("a.mkv", "a.mp4"):
+        path = write(tmp_path / name, "libx264rgb", "rgb24", {"qp": "0"}, times=times)
+        found = read_times(path)
+        assert (found.first_s, found.last_s, found.first_number(FPS)) == (1.5, 2.4, 15)
+        for start, first_s in ((15, 0), (0, 1.5)):
+            frames = iter_frames(path, start, start + 10, FPS, first_s=first_s)
+            np.testing.assert_array_equal(list(frames), SOURCE[:10])
+        [ninth] = iter_frames(path, 9, 10, FPS, first_s=1.5)
+        np.testing.assert_array_equal(ninth, SOURCE[9])
+        with raises(FormatError):
+            list(iter_frames(path, 0, 10, FPS))
+
+
+@pytest.mark.parametrize("name", ["at 12:30.mkv", "-i.mkv", "%d.mkv", "a?b#c&d.mkv", "é日本.mkv"])
+def test_any_name_of_a_file(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also as a relative path, in which FFmpeg sees a protocol before a colon."""
+    write(tmp_path / "a.mkv", times=[0, 1]).rename(tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    for path in (Path(name), tmp_path / name):
+        assert len(list(iter_frames(path, 0, None, FPS))) == len(read_times(path)) == 2
+    with raises(MissingFileError):
+        next(iter_frames(Path("http://a.mkv"), 0, 1, FPS))
 
 
 # --- damaged files -------------------------------------------------------------------------------

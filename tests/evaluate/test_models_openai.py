@@ -84,12 +84,13 @@ def test_a_video_becomes_evenly_spread_images_within_the_budget(server: ChatServ
         assert np.array_equal(found, NOISE[number])
 
 
-def test_a_video_as_mp4(server: ChatServer) -> None:
-    model_of(server, "video=mp4").reply([Message("user", ("look", Video(NOISE, 5.0)))])
+@pytest.mark.parametrize("fps", [5.0, 12.5, 0.5])
+def test_a_video_as_mp4(server: ChatServer, fps: float) -> None:
+    model_of(server, "video=mp4").reply([Message("user", ("look", Video(NOISE, fps)))])
     [data] = server.seen[0].videos
     with av.open(io.BytesIO(data)) as container:
         stream = container.streams.video[0]
-        assert (stream.height, stream.width, stream.average_rate) == (32, 20, 5)
+        assert (stream.height, stream.width, stream.average_rate) == (32, 20, fps)
         assert sum(1 for _ in container.decode(video=0)) == 20
 
 

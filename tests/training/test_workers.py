@@ -1,5 +1,6 @@
 """Draws of `HistoryDataset`, the same in all processes, and what other processes find."""
 
+import copy
 import pickle
 from collections import Counter
 from collections.abc import Callable
@@ -14,6 +15,7 @@ from support.buffer_sets import GOLDEN, copy_buffer_set, plan_again
 from support.hub import BUFFER_SET, push_buffer_set
 from support.hub_server import HubServer
 from support.messages import raises
+from support.own_dataset import BuffersDataset
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.errors import HashMismatchError
@@ -104,10 +106,22 @@ def test_a_buffer_set_that_changed_is_an_error_of_its_items(
     root = copy_buffer_set(tmp_path / "buffers", executed_buffers)
     data = HistoryDataset(root, ["k0"], chunk=0, cache=tmp_path / "cache", quiet=True)
     same = pickle.dumps(data)
-    assert pickle.loads(same)[0]["episode_id"] == data[0]["episode_id"]
+    for copied in (pickle.loads(same), copy.deepcopy(data)):
+        assert copied[0]["episode_id"] == data[0]["episode_id"]
     plan_again(root, ["k0", "k1"])
     with raises(HashMismatchError):
         pickle.loads(same)[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["fork", "spawn", "forkserver"])
+def test_a_users_own_dataset_in_workers(method: str) -> None:
+    data = BuffersDataset(GOLDEN)
+    loader = torch.utils.data.DataLoader(
+        data, batch_size=None, num_workers=1, multiprocessing_context=method
+    )
+    for index, states in enumerate(loader):
+        assert torch.equal(states, data[index])
 
 
 @pytest.mark.slow
