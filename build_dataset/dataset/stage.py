@@ -42,6 +42,7 @@ from .frame_selection import NothingToStore, select_episodes, too_short, unit_st
 from .plan import DatasetPlan, PlannedEpisode
 from .resize import Resize
 from .staged import Staged, StagedEpisode, staged_file
+from .statistics import ImageStats
 
 
 @dataclass(frozen=True)

@@ -124,7 +124,7 @@ def test_a_task_in_another_form_of_unicode(tmp_path: Path) -> None:
     path = tmp_path / "families.csv"
     for written, recorded in ((one, two), (two, one)):
         path.write_text(f"task,family\n{written},Drawer\n", encoding="utf-8")
-        assert read_families(path, [[recorded]]) == [{"family": "Drawer"}]
+        assert read_families(path, [[recorded]], "set") == [{"family": "Drawer"}]
 
 
 def test_lines_that_a_file_lacks_are_offered(tmp_path: Path) -> None:
