@@ -15,12 +15,16 @@ from numpy.typing import NDArray
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, SourceError, named
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators.episode import choose_cameras
+from robomme_interference_data.storage.files import read_bytes
 from robomme_interference_data.storage.parquet import RowSpan
 from robomme_interference_data.storage.video import iter_frames
 
 from .base import Recording, Robot, Source, SourceEpisode, compose, file_state
 from .frames_table import LAYOUT, TABLE, EpisodeRows, read_frames_table
 from .images import decode_images, probe_video
+
+_MAX_IMAGE_BYTES = 256 << 20
+"""Four times the bytes of the largest image that is decoded."""
 
 _VIDEO_SUFFIXES = (".mkv", ".mp4", ".avi", ".mov", ".webm")
 
@@ -99,7 +103,9 @@ class FramesSource(Source):
             if path.is_dir():
                 _check_names(path, length)
                 files = [path / _image_name(number) for number in range(length)]
-                streams[camera] = decode_images(((f, f.read_bytes()) for f in files), exact=True)
+                streams[camera] = decode_images(
+                    ((f, read_bytes(f, _MAX_IMAGE_BYTES)) for f in files), exact=True
+                )
             else:
                 rate, lossless = probe_video(path)
                 rates.add(rate)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import FormatError, InterferenceError, SourceError
+from robomme_interference_data.errors import FormatError, SourceError
 from robomme_interference_data.storage.encode import decode_image, is_png
 from robomme_interference_data.storage.video import open_video
 
@@ -43,7 +43,7 @@ def probe_video(path: Path) -> tuple[float, bool]:
             rate = stream.average_rate or stream.base_rate
             lossless = stream.codec.canonical_name in _LOSSLESS_CODECS
             exact = lossless and stream.pix_fmt in _RGB_FORMATS
-    except InterferenceError as error:
+    except FormatError as error:
         raise SourceError(error.message, hint) from None
     if not rate:
         raise SourceError(f"{path} has no frame rate", hint)

@@ -1,5 +1,6 @@
-"""Access the files of a dataset, read JSON within bounds, and write files atomically."""
+"""Access the files of a dataset, read text and JSON within bounds, and write files atomically."""
 
+import codecs
 import errno
 import hashlib
 import json
@@ -19,8 +20,14 @@ from robomme_interference_data.errors import FormatError, InterferenceError, Mis
 _MAX_JSON_BYTES = 16 << 20
 """Our files have some thousand bytes, and Python takes forty times as many for some values."""
 
+_MAX_TEXT_BYTES = 64 << 20
+"""A CSV file with a line for each of half a million episodes."""
+
 _MAX_SUMS_BYTES = 64 << 20
 """A list of the SHA-256 of half a million files."""
+
+_POINTER = b"version https://git-lfs.github.com/spec/"
+"""First bytes of the text that stands for a file which Git LFS has not downloaded."""
 
 _MAX_DEPTH = 64
 """Nesting of JSON: Python can read more than it can always print, compare or write."""
@@ -171,8 +178,59 @@ def indented_json(value: Any) -> str:
     return text + "\n"
 
 
+def check_not_pointer(path: Path) -> None:
+    """Check that a file holds its content: a clone without Git LFS has short texts instead.
+
+    Raises:
+        MissingFileError: The file is a pointer of Git LFS.
+    """
+    with path.open("rb") as file:
+        start = file.read(len(_POINTER))
+    if start == _POINTER:
+        clones = (folder for folder in path.resolve().parents if (folder / ".git").exists())
+        raise MissingFileError(
+            f"{path} is a Git LFS pointer, not the file",
+            f"Install Git LFS, then run `git lfs pull` in {next(clones, path.parent)}",
+        )
+
+
+def read_text(path: Path, most: int = _MAX_TEXT_BYTES) -> str:
+    """Read text that people or their programs wrote, of at most `most` bytes: see `decode_text`."""
+    return decode_text(read_bytes(path, most), path)
+
+
+def decode_text(data: bytes, where: object) -> str:
+    """Decode text in UTF-8, or in UTF-16 or UTF-8 with the mark that programs of Windows write.
+
+    Raises:
+        FormatError: It has another encoding; nothing in the data tells which, so none is guessed.
+    """
+    first = [byte != 0 for byte in data[:2]]
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        encoding, shown = "utf-16", "UTF-16"
+    elif first in ([True, False], [False, True]):  # of two bytes for a letter, one is zero
+        name = "UTF-16LE" if first[0] else "UTF-16BE"
+        raise FormatError(
+            f"{where} is not text in UTF-8, but in {name} without its mark",
+            f"Save it as UTF-8, such as with iconv -f {name} -t UTF-8 OLD > NEW.",
+        )
+    else:
+        encoding, shown = "utf-8-sig", "UTF-8"
+    try:
+        return data.decode(encoding)
+    except UnicodeDecodeError as error:
+        before = data[: error.start].decode(encoding).rpartition("\n")[2][-40:]
+        place = f"after {before!r}" if before else "at the beginning of a line"
+        raise FormatError(
+            f"{where} is not text in {shown}: byte 0x{data[error.start]:02x} {place}",
+            "Save it as UTF-8. Text in Latin-1 or Windows-1252 is converted by iconv "
+            "-f WINDOWS-1252 -t UTF-8 OLD > NEW; a downloaded file may be damaged.",
+        ) from None
+
+
 def read_bytes(path: Path, most: int) -> bytes:
     """Return the bytes of a file that has at most `most`."""
+    check_not_pointer(path)
     with path.open("rb") as file:
         # Of the open file: by now, another one may have the path.
         size = os.fstat(file.fileno()).st_size
@@ -187,9 +245,10 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def parse_json(data: bytes, where: object) -> dict[str, Any]:
-    """Parse a JSON object in UTF-8, in which keys are unique and numbers are finite."""
+    """Parse a JSON object, in which keys are unique and numbers are finite; see `decode_text`."""
+    text = decode_text(data, where)
     try:
-        value = _JSON.decode(data.decode())
+        value = _JSON.decode(text)
         # The number of brackets bounds the depth, and is quickly counted.
         if data.count(b"[") + data.count(b"{") > _MAX_DEPTH and _is_deep(value):
             raise ValueError(f"over {_MAX_DEPTH} nested arrays and objects")
@@ -323,11 +382,7 @@ def digest_folder(folder: Path, patterns: Iterable[str]) -> str:
 def read_sums(path: Path) -> dict[str, str]:
     """Read a file in the format of `format_sums`: SHA-256 by path."""
     sums = {}
-    try:
-        lines = read_bytes(path, _MAX_SUMS_BYTES).decode().splitlines()
-    except UnicodeDecodeError as error:
-        raise FormatError.damaged(path, error) from None
-    for line in lines:
+    for line in read_text(path, _MAX_SUMS_BYTES).splitlines():
         digest, gap, name = line.partition("  ")
         if not gap or len(digest) != 64 or not name:
             raise FormatError.damaged(path, f"{line[:80]!r} is not a SHA-256 and a path")

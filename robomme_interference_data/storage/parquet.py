@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError
 
-from .files import atomic_path, reading
+from .files import atomic_path, check_not_pointer, reading
 from .parquet_pages import decoded_size
 
 # An image may be a PNG of some megabytes.
@@ -44,6 +44,7 @@ _MAX_BYTES = 2 << 30
 def open_parquet(path: Path) -> pq.ParquetFile:
     """Open a parquet file for reading piece by piece."""
     with reading(path):
+        check_not_pointer(path)
         _check_metadata_size(path)
         file = pq.ParquetFile(
             pa.OSFile(os.fsencode(path)),  # as pyarrow cannot encode names that are not UTF-8

@@ -21,7 +21,9 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import FormatError, MissingFileError
+from robomme_interference_data.errors import FormatError, InterferenceError, MissingFileError
+
+from .files import check_not_pointer
 
 MAX_PIXELS = 1 << 24
 """Upper bound on the pixels of a frame: twice 3840 × 2160."""
@@ -125,14 +127,15 @@ def open_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.Vid
     limits = {"max_pixels": str(MAX_PIXELS)}
     allowed = {"protocol_whitelist": "file", "codec_whitelist": ",".join(_DECODERS)}
     try:
+        check_not_pointer(path)
         kind = find_container(path)
         if kind == "mp4":
             check_samples(path)
         container = av.open(str(path), format=kind, options=limits, container_options=allowed)
+    except InterferenceError:
+        raise
     except FileNotFoundError:
         raise MissingFileError(f"{path} does not exist") from None
-    except FormatError:
-        raise
     except (av.error.FFmpegError, OSError, ValueError) as error:  # ValueError: a damaged header
         raise _unreadable(path, error) from error
     with container:

@@ -19,6 +19,7 @@ from robomme_interference_data.storage.files import (
     parse_json,
     read_json,
     read_sums,
+    read_text,
     write_json,
 )
 
@@ -89,6 +90,34 @@ def test_invalid_json_objects(tmp_path: Path, data: bytes) -> None:
     with raises(FormatError) as caught:
         read_json(path)
     assert caught.value.hint
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_text_in_the_encodings_that_say_which_they_are(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "rows.csv"
+    path.write_bytes("task,family\nschließ die Tür,CloseDoor\n".encode(encoding))
+    assert read_text(path) == "task,family\nschließ die Tür,CloseDoor\n"
+    path.write_bytes('{"a": "ä"}'.encode(encoding))
+    assert read_json(path) == {"a": "ä"}
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b"task,family\nschlie\xdf,Close\n", "0xdf after 'schlie'"),
+        (b"\xe9", "0xe9 at the beginning"),
+        ("task,family\n".encode("utf-16-le"), "UTF-16LE"),
+        ("task,family\n".encode("utf-16-be"), "UTF-16BE"),
+        (b"\xff\xfea\0b", "UTF-16"),
+    ],
+)
+def test_text_in_other_encodings(tmp_path: Path, data: bytes, said: str) -> None:
+    path = tmp_path / "rows.csv"
+    path.write_bytes(data)
+    with raises(FormatError) as caught:
+        read_text(path)
+    assert said in caught.value.message
+    assert "iconv" in str(caught.value.hint)
 
 
 @pytest.mark.parametrize("relative", ["../x", "a/../../x", "/etc/passwd", "..", "meta/\0x"])
