@@ -4,7 +4,7 @@ import hashlib
 from pathlib import Path
 
 import pytest
-from support.buffer_sets import copy_buffer_set, violations
+from support.buffer_sets import copy_buffer_set
 from support.lerobot_layouts import write_lerobot
 from support.messages import raises
 from support.recordings import EPISODES, write_frames, write_h5
