@@ -29,6 +29,9 @@ _MAX_SUMS_BYTES = 64 << 20
 _POINTER = b"version https://git-lfs.github.com/spec/"
 """First bytes of the text that stands for a file which Git LFS has not downloaded."""
 
+_SHARED_BLOBS = ".huggingface-shared-blobs"
+"""File with which the Hub's client marks the blobs that repositories in its cache share."""
+
 _MAX_DEPTH = 64
 """Nesting of JSON: Python can read more than it can always print, compare or write."""
 
@@ -88,13 +91,8 @@ class LocalFiles(Files):
     def path(self, relative: str) -> Path:
         """See `Files.path`."""
         path = self.root / check_relative(relative, self.describe())
-        # A link may lead inside the folder. In a snapshot of the Hub's cache, or a folder of one,
-        # it may also lead to the cache's `blobs`.
-        root = self.root.resolve()
-        snapshots = (path for path in (root, root.parent) if path.parent.name == "snapshots")
-        blobs = next((path.parent.parent / "blobs" for path in snapshots), root)
         target = Path(os.path.realpath(path))  # unlike `Path.resolve`, it accepts circular links
-        if not (target.is_relative_to(root) or target.is_relative_to(blobs)):
+        if not any(target.is_relative_to(folder) for folder in _linked_folders(self.root)):
             raise FormatError(
                 f"{relative} in {self.root} is a link that leads out of the folder",
                 "Replace the link by the file.",
@@ -132,6 +130,23 @@ class LocalFiles(Files):
     def describe(self) -> str:
         """Return the folder."""
         return str(self.root)
+
+
+def _linked_folders(root: Path) -> list[Path]:
+    """Return the folders into which links of a folder may lead: itself, and the Hub's blobs.
+
+    In the cache of the Hub's client, `CACHE/REPOSITORY/snapshots/COMMIT/…` has links to
+    `CACHE/REPOSITORY/blobs`, which may lead on to the blobs that repositories share.
+    """
+    root = root.resolve()
+    folders = [root]
+    snapshots = (path.parent for path in (root, *root.parents) if path.parent.name == "snapshots")
+    if (snapshot := next(snapshots, None)) is not None:
+        repository = snapshot.parent
+        folders.append(repository / "blobs")
+        if (repository.parent / "blobs" / _SHARED_BLOBS).is_file():
+            folders.append(repository.parent / "blobs")
+    return folders
 
 
 def all_files(root: Path) -> list[str]:

@@ -158,13 +158,32 @@ def test_snapshots_of_the_hubs_cache_link_to_its_blobs(tmp_path: Path) -> None:
     (tmp_path / "blobs" / "abc").write_text("data")
     (tmp_path / "refs").mkdir()
     (tmp_path / "refs" / "main").write_text("no data")
-    root = tmp_path / "snapshots" / "0123"
+    for folder in (".", "v1", "v1/pick_cube", "sim/v1/pick_cube"):
+        root = tmp_path / "snapshots" / "0123" / folder
+        root.mkdir(parents=True, exist_ok=True)
+        up = "../" * (2 + len(Path(folder).parts))
+        (root / "info.json").symlink_to(f"{up}blobs/abc")
+        (root / "other").symlink_to(f"{up}refs/main")
+        assert LocalFiles(root).path("info.json").read_text() == "data"
+        with raises(FormatError):
+            LocalFiles(root).path("other")
+
+
+def test_blobs_that_repositories_share(tmp_path: Path) -> None:
+    """The client's cache may hold a file once for all repositories."""
+    store = tmp_path / "blobs" / "ab"
+    store.mkdir(parents=True)
+    (store / "abcd").write_text("data")
+    blobs = tmp_path / "datasets--a--b" / "blobs"
+    blobs.mkdir(parents=True)
+    (blobs / "sha").symlink_to("../../blobs/ab/abcd")
+    root = tmp_path / "datasets--a--b" / "snapshots" / "0123"
     root.mkdir(parents=True)
-    (root / "info.json").symlink_to("../../blobs/abc")
-    (root / "other").symlink_to("../../refs/main")
-    assert LocalFiles(root).path("info.json").read_text() == "data"
+    (root / "info.json").symlink_to("../../blobs/sha")
     with raises(FormatError):
-        LocalFiles(root).path("other")
+        LocalFiles(root).path("info.json")
+    (tmp_path / "blobs" / ".huggingface-shared-blobs").touch()
+    assert LocalFiles(root).path("info.json").read_text() == "data"
 
 
 def test_sums_equal_those_of_sha256sum(tmp_path: Path) -> None:
