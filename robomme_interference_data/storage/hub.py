@@ -224,7 +224,7 @@ class HubFiles(Files):
     def _digest(self, relative: str, path: Path) -> str:
         """Return the Hub's digest of a downloaded file, its entity tag."""
         if path.is_symlink():  # to a blob, whose name is the digest
-            return Path(os.readlink(path)).name
+            return path.readlink().name
         # Without links, as on Windows, the cache does not hold the digest.
         from huggingface_hub import get_hf_file_metadata, hf_hub_url
 
@@ -248,7 +248,7 @@ class HubFiles(Files):
 def _links(path: Path) -> Iterator[Path]:
     """Yield a path and those that its links lead to, as far as they are links."""
     while path.is_symlink():
-        following = path.parent / os.readlink(path)
+        following = path.parent / path.readlink()
         yield path
         path = following
 

@@ -1,6 +1,5 @@
 """Folders for sockets below a long folder for temporary files."""
 
-import os
 import socket
 import tempfile
 from pathlib import Path
@@ -31,7 +30,7 @@ def test_a_socket_fits_or_the_error_says_what_to_set(
             with pytest.raises(WorkerError) as caught:
                 socket_folder("p" * 15)
             assert "TMPDIR" in str(caught.value.hint)
-            assert os.listdir(folder) == []
+            assert not any(folder.iterdir())
     finally:
         folder.rmdir()
         base.rmdir()
