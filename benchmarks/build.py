@@ -20,13 +20,13 @@ from common import Times, interleave, positive, print_machine, print_table, run
 
 from robomme_interference_data.build_dataset.dataset.build import build_dataset
 from robomme_interference_data.build_dataset.dataset.frame_selection import select_demonstration
-from robomme_interference_data.build_dataset.dataset.image_stats import ImageStats
 from robomme_interference_data.build_dataset.dataset.lerobot_writer import (
     load_lerobot,
     require_lerobot,
 )
 from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan, PlannedEpisode
 from robomme_interference_data.build_dataset.dataset.stage import StageTask
+from robomme_interference_data.build_dataset.dataset.statistics import ImageStats
 from robomme_interference_data.build_dataset.plan.episodes import choose_episodes
 from robomme_interference_data.build_dataset.sources import (
     Frame,

@@ -15,11 +15,11 @@ from manifests import made_up, written
 from numpy.typing import NDArray
 
 from robomme_interference_data.build_dataset.dataset.identity import complete_dataset, identity_of
-from robomme_interference_data.build_dataset.dataset.image_stats import STATISTICS
 from robomme_interference_data.build_dataset.dataset.lerobot_writer import (
     StoredEpisode,
     write_lerobot,
 )
+from robomme_interference_data.build_dataset.dataset.statistics import STATISTICS
 from robomme_interference_data.build_dataset.sources import Robot
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,

@@ -14,7 +14,7 @@ from robomme_interference_data.cli.console import (
     print_status,
 )
 from robomme_interference_data.cli.options import AsJson, Yes, with_settings
-from robomme_interference_data.constants import DEMONSTRATIONS, MANIFESTS, REPORT_PATH
+from robomme_interference_data.constants import DEMONSTRATIONS, MANIFESTS, REPORT_PATH, STATE
 from robomme_interference_data.errors import MissingFileError, counted
 from robomme_interference_data.runtime.executor import WorkersConfig, make_executor
 
@@ -108,7 +108,8 @@ def _build_datasets(plans: "Mapping[str, DatasetPlan]", config: BuildConfig) -> 
     from robomme_interference_data.data.dataset import Dataset
     from robomme_interference_data.storage.files import LocalFiles
 
-    from .sources.families import keep_families
+    from .sources.families_file import keep_families
+    from .sources.lerobot import LeRobotSource
 
     root, results = config.buffer_set, {}
     for kind, planned in plans.items():
@@ -117,13 +118,19 @@ def _build_datasets(plans: "Mapping[str, DatasetPlan]", config: BuildConfig) -> 
             # They are built first, so that other sizes and rates are found early.
             dataset = planned.matching(Dataset(LocalFiles(root / DEMONSTRATIONS)))
         results[kind] = _build_dataset(dataset, root / kind, config)
-    if config.families_file is not None:
-        keep_families(config.families_file, root)
+    if config.families_from is not None:
+        sources = next(iter(plans.values())).sources
+        families = (
+            source.naming.families for source in sources if isinstance(source, LeRobotSource)
+        )
+        keep_families(config.families_from, families, root)
     return results
 
 
 def _build_dataset(plan: "DatasetPlan", out: Path, workers: WorkersConfig) -> dict[str, Any]:
+    from robomme_interference_data.data.dataset import Dataset
     from robomme_interference_data.progress import WorkProgress
+    from robomme_interference_data.storage.files import LocalFiles
 
     from .dataset.build import build_dataset
 
@@ -132,6 +139,8 @@ def _build_dataset(plan: "DatasetPlan", out: Path, workers: WorkersConfig) -> di
     added = f"{result.added} added" if result.added else "nothing to add"
     episodes, frames = counted(result.episodes, "episode"), counted(result.frames, "frame")
     print_status(f"{out}: {added}; {episodes}, {frames}")
+    if Dataset(LocalFiles(out)).features[STATE] == (0,):
+        print_status("  without robot states: none are recorded, or they were left out")
     for name, reason in sorted(result.skipped.items())[:_MAX_SKIPPED]:
         print_status(f"  skipped {name}: {reason}")
     if len(result.skipped) > _MAX_SKIPPED:

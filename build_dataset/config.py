@@ -114,13 +114,23 @@ class BuildConfig(WorkersConfig):
     columns: tuple[str, ...] = setting(
         (),
         metavar="NAME=COLUMN,…",
-        help="Source lerobot: columns without a usual name, such as front=top_image.",
+        help="Source lerobot: columns without a usual name, such as front=top_image or "
+        "state=arm+gripper; none for none.",
         group="Sources",
     )
-    families_file: Path | None = setting(
+    families_from: str | None = setting(
         None,
-        help="Source lerobot: CSV file with the family of each task or episode and, if needed, "
-        "exec_start_idx; later builds of the buffer set use it too.",
+        metavar="task|dataset|FILE",
+        help="Source lerobot: make the families from the tasks, or one of each dataset; or a CSV "
+        "file with the family of each task or episode and, if needed, exec_start_idx. Later builds "
+        "of the buffer set use it too.",
+        group="Sources",
+    )
+    several_tasks: str | None = setting(
+        None,
+        metavar="CHOICE",
+        help="Source lerobot: what the tasks of an episode with several are: `wordings` of one "
+        "goal, steps that are `joined` to one goal, or of which the `first` or `last` is the goal.",
         group="Sources",
     )
     fps: float | None = setting(

@@ -18,6 +18,7 @@ from robomme_interference_data.constants import (
     RECORDS_PATH,
     REPORT_PATH,
     SHIFTED,
+    STATE,
     UNITS,
 )
 from robomme_interference_data.data.buffer import Buffer
@@ -178,6 +179,11 @@ def _facts(
     simulators = {record.simulator for dataset in datasets.values() for record in dataset.records()}
     named = sorted(filter(None, simulators))
     sources = {name: list(dataset.identity.sources) for name, dataset in datasets.items()}
+    stateless = [
+        f"The {name or DEMONSTRATIONS} have no robot states: states have length 0."
+        for name, dataset in datasets.items()
+        if dataset.features[STATE] == (0,)
+    ]
 
     @cache
     def pictures() -> dict[str, bytes]:
@@ -189,7 +195,7 @@ def _facts(
     return Facts(
         simulators=named,
         simulated=None not in simulators,
-        limits=data_limits(queries, named, limits),
+        limits=data_limits(queries, named, [*limits, *stateless]),
         pictures=pictures,
         values={
             "strip": STRIP,

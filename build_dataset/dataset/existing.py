@@ -8,7 +8,14 @@ from robomme_interference_data.build_dataset.alike import same_rate, unequal
 from robomme_interference_data.build_dataset.sources.base import Robot
 from robomme_interference_data.build_dataset.sources.columns import recorded_robot
 from robomme_interference_data.build_dataset.sources.simulator import SimulatorSource
-from robomme_interference_data.constants import ACTION, IDENTITY_PATH, REPORT_PATH, STATE, UNITS
+from robomme_interference_data.constants import (
+    ACTION,
+    CAMERA_PREFIX,
+    IDENTITY_PATH,
+    REPORT_PATH,
+    STATE,
+    UNITS,
+)
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError, named
 from robomme_interference_data.ids import EpisodeId
@@ -17,9 +24,9 @@ from robomme_interference_data.storage.files import LocalFiles, read_header
 from robomme_interference_data.storage.lerobot import LeRobotFiles
 
 from .identity import BuildReport
-from .image_stats import Statistics, before_scaling, episode_statistics
 from .lerobot_writer import StoredEpisode
 from .plan import DatasetPlan
+from .statistics import Statistics, before_scaling, episode_statistics
 
 
 def _advice() -> str:
@@ -78,8 +85,9 @@ def open_existing(out: Path, plan: DatasetPlan) -> ExistingDataset | None:
             option="fps",
         )
     _check_recordings(out, dataset, plan)
-    statistics = episode_statistics(LeRobotFiles(dataset.files, statistics=True).table)
-    vectors = {name: name for name in (STATE, ACTION) if name in dataset.features}
+    cameras = [CAMERA_PREFIX + camera for camera in dataset.cameras]
+    statistics = episode_statistics(LeRobotFiles(dataset.files, statistics=cameras).table)
+    vectors = {name: (name,) for name in (STATE, ACTION) if name in dataset.lerobot.features}
     robot = recorded_robot(dataset.lerobot, vectors)
     episodes = map(partial(_stored, dataset, robot), dataset.records(), statistics)
     report = read_header(out / REPORT_PATH, BuildReport)

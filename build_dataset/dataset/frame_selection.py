@@ -27,7 +27,7 @@ def unmarked_error() -> SourceError:
         "the source does not mark which frames are the demonstration",
         "Demonstrations and executions need it. Source frames: the column is_demo. Source lerobot: "
         f"a column is_demo, or another one with {named('columns', 'is_demo=NAME')}, or "
-        f"exec_start_idx in {named('families_file')}. Distractor units can be built without.",
+        f"exec_start_idx in {named('families_from')}. Distractor units can be built without.",
     )
 
 

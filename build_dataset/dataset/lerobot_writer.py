@@ -1,9 +1,10 @@
 """Write stored episodes as one LeRobot v3 dataset: the only user of lerobot.
 
 LeRobot's own writer makes the parquet files and the metadata, with separate files for every
-episode. Only its streaming video encoder is replaced: that one drops frames when its queue is full
-and spends as long on image statistics as on encoding. The replacement hands over videos that are
-already encoded and checked.
+episode. Two parts are replaced. Its streaming video encoder drops frames when its queue is full
+and spends as long on image statistics as on encoding; the replacement hands over videos that are
+already encoded and checked. Its statistics of vectors overflow where a sensor reports "no reading"
+as the largest float32, and take minutes for thousands of values; ours do not.
 """
 
 import json
@@ -28,7 +29,7 @@ from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.encode import Codec
 from robomme_interference_data.storage.files import write_text
 
-from .image_stats import STATISTICS
+from .statistics import STATISTICS, vector_statistics
 
 _ONE_EPISODE_MB = 1e-6
 """Largest size of a file, 1 byte: no two episodes share one."""
@@ -78,15 +79,17 @@ def write_lerobot(
 
     `root` must not exist; `features` are those of the episodes that the dataset keeps.
     """
-    with _quiet():
+    with _quiet(), _own_statistics():
         from lerobot.configs.video import RGBEncoderConfig
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
         robot, fps = episodes[0].robot, episodes[0].fps
+        # LeRobot has no features of no values: states that were not recorded are left out.
+        stored = {feature: shape for feature, shape in features.items() if shape != (0,)}
         dataset = LeRobotDataset.create(
             repo_id=name,
             fps=int(fps) if fps.is_integer() else fps,  # type: ignore[arg-type]
-            features=_declared(features, robot),
+            features=_declared(stored, robot),
             root=root,
             robot_type=robot.type,
             rgb_encoder=RGBEncoderConfig(
@@ -100,10 +103,10 @@ def write_lerobot(
         videos = _EncodedVideos()
         dataset.writer._streaming_encoder = videos
         # LeRobot checks shape and dtype of each image; the pixels are in the encoded videos.
-        blank = {n: np.zeros(s, np.uint8) for n, s in features.items() if len(s) == 3}
+        blank = {n: np.zeros(s, np.uint8) for n, s in stored.items() if len(s) == 3}
         for episode in episodes:
             videos.next = episode
-            vectors = {n: episode.vectors(n) for n, s in features.items() if len(s) == 1}
+            vectors = {n: episode.vectors(n) for n, s in stored.items() if len(s) == 1}
             for position in range(episode.record.length):
                 values = {name: array[position] for name, array in vectors.items()}
                 dataset.add_frame({**blank, **values, "task": episode.record.goal})
@@ -173,6 +176,22 @@ class _EncodedVideos:
         """Do nothing: no encoder runs in the background."""
 
     close = cancel_episode
+
+
+@contextmanager
+def _own_statistics() -> Iterator[None]:
+    """Let LeRobot's writer store our statistics of vectors."""
+    from lerobot.datasets import dataset_writer
+
+    def statistics(values: dict[str, NDArray[Any]], features: Any) -> dict[str, Any]:
+        return {name: vector_statistics(array) for name, array in values.items()}
+
+    theirs = dataset_writer.compute_episode_stats
+    dataset_writer.compute_episode_stats = statistics
+    try:
+        yield
+    finally:
+        dataset_writer.compute_episode_stats = theirs
 
 
 @contextmanager

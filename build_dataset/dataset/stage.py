@@ -22,6 +22,7 @@ from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, LESSONS, 
 from robomme_interference_data.errors import (
     BuildError,
     InterferenceError,
+    InvalidOptionError,
     SourceError,
     named,
     naming_options,
@@ -39,12 +40,14 @@ from robomme_interference_data.storage.arrays import (
 )
 from robomme_interference_data.storage.encode import Codec, VideoEncoder, get_codec
 from robomme_interference_data.storage.files import canonical_json, read_header, write_json
+from robomme_interference_data.storage.limits import MAX_READ_VALUES
 from robomme_interference_data.storage.video import iter_frames
 
+from .frame_checks import check_shapes
 from .frame_selection import NothingToStore, select_frames
-from .image_stats import ImageStats
 from .lerobot_writer import StoredEpisode
 from .plan import DatasetPlan, PlannedEpisode
+from .statistics import ImageStats
 
 _RECORD = "record.json"
 _LAYOUT = 7
@@ -241,6 +244,12 @@ class _Writer:
                     "Correct the recording, or leave it out of the source. "
                     f"{named('episodes')} chooses indices in all families alike.",
                 )
+            if (self.length + 1) * value.size > MAX_READ_VALUES:
+                raise SourceError(
+                    f"{name} has {value.size} values in over {self.length} stored frames; expected "
+                    f"at most {MAX_READ_VALUES:,} values in an episode",
+                    "Leave the episode out, or record fewer values.",
+                )
             self._vectors[name].append(value)
             self.digests.update(name, value)
         self.length += 1
@@ -271,15 +280,18 @@ class _Writer:
     def _begin(
         self, images: dict[str, NDArray[np.uint8]], vectors: dict[str, NDArray[np.float32]]
     ) -> None:
+        check_shapes(images, vectors)
         for name, image in images.items():
-            if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-                raise SourceError(
-                    f"{name} holds images {image.shape} {image.dtype}; expected (H, W, 3) uint8"
-                )
             path = self._folder / f"{name}.mp4"
             self._encoders[name] = VideoEncoder(
                 path, self._codec, self._fps, len(image), image.shape[1]
             )
             self.stats[name] = ImageStats()
+        if not images and not any(value.size for value in vectors.values()):
+            raise InvalidOptionError(
+                "there is nothing to store: the recording has no states, and no camera is chosen",
+                f"Choose {named('cameras')}.",
+                option="cameras",
+            )
         self._vectors = {name: [] for name in vectors}
         self.features = {name: value.shape for name, value in (images | vectors).items()}

@@ -98,7 +98,7 @@ def _check_values(config: BuildConfig) -> None:
     if config.fps is not None and not 0 < config.fps < math.inf:
         raise InvalidOptionError.expected("fps", config.fps, "a positive number")
     make_executor(config)  # checks its settings
-    for name in ("columns", "families_file"):
+    for name in ("columns", "families_from", "several_tasks"):
         if getattr(config, name) and not any(takes(text, name) for text in config.source):
             raise InvalidOptionError(
                 f"{named(name)} has no effect on {', '.join(config.source)}",
@@ -114,7 +114,8 @@ def _open_sources(kind: str, config: BuildConfig, unit: Unit) -> tuple[Source, .
             text,
             shifted=kind == SHIFTED,
             columns=columns,
-            families_file=config.families_file,
+            families_from=config.families_from,
+            several_tasks=config.several_tasks,
             kept_families=kept if kept.is_file() else None,
             robomme_python=config.robomme_python,
             # A simulator draws only the frames that a unit stores.

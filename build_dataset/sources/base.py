@@ -1,20 +1,24 @@
 """The interface of a source of recorded episodes."""
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.errors import SourceError, named, nearest
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.schema.records import EvidenceSpan
+from robomme_interference_data.schema.records import MAX_GOAL, EvidenceSpan
+from robomme_interference_data.storage.limits import MAX_NAME, MAX_RATE, MIN_RATE
 
 from ..alike import same_rate
+from .flags import parse_flags
+
+_LARGEST_SEED = 1 << 63
 
 
 @dataclass(frozen=True)
@@ -84,7 +88,13 @@ class Robot:
                 f"the recording states {self.fps:g} frames per second; {named('fps')} is {given:g}",
                 "Leave it out, or correct the recording.",
             )
-        return self.fps or given  # type: ignore[return-value]
+        rate = given if self.fps is None else self.fps
+        if rate is None or not MIN_RATE <= rate <= MAX_RATE:
+            raise SourceError(
+                f"{rate} frames per second; expected {MIN_RATE:g} to {MAX_RATE:,.0f}",
+                "Correct the rate of the recording.",
+            )
+        return rate
 
     def check_names(self, features: Mapping[str, Sequence[int]]) -> None:
         """Check that the known names are one for each value of a vector."""
@@ -94,6 +104,12 @@ class Robot:
                 raise SourceError(
                     f"{feature} has {size} values, and the names {', '.join(names)}",
                     "Give one name for each value.",
+                )
+            if longest := [name for name in names if len(name) > MAX_NAME]:
+                raise SourceError(
+                    f"a value of {feature} has a name of {len(longest[0])} characters; expected at "
+                    f"most {MAX_NAME}",
+                    "Shorten the name.",
                 )
 
 
@@ -133,6 +149,23 @@ class Recording:
             raise SourceError(
                 f"the goal is {' and '.join(map(repr, self.goals)) or 'missing'}",
                 "Describe the goal in words.",
+            )
+        if sum(map(len, self.goals)) > MAX_GOAL:
+            raise SourceError(
+                f"the goal has {sum(map(len, self.goals)):,} characters; expected at most "
+                f"{MAX_GOAL:,} in all wordings",
+                "Shorten the goal.",
+            )
+        for goal in self.goals:
+            if any("\ud800" <= character <= "\udfff" for character in goal):
+                raise SourceError(
+                    f"the goal is {goal!r}, with half of a character",
+                    "Decode the text as it was encoded.",
+                )
+        if self.seed is not None and not -_LARGEST_SEED <= self.seed < _LARGEST_SEED:
+            raise SourceError(
+                f"the seed is {self.seed}; expected a whole number of at most 63 bits",
+                "Leave the seed out.",
             )
         if self.difficulty not in (None, *DIFFICULTIES):
             raise SourceError(
@@ -201,9 +234,12 @@ def file_state(path: Path) -> tuple[int, int] | None:
     return max((file.st_mtime_ns for file in files), default=0), sum(file.st_size for file in files)
 
 
-def demonstration_length(flags: ArrayLike, what: str) -> int:
+def demonstration_length(flags: Iterable[Any], what: str) -> int:
     """Return the number of demonstration frames from `what`, a flag for each frame."""
-    marked = np.asarray(flags, bool)
+    try:
+        marked = np.array(parse_flags(flags), bool)
+    except ValueError as error:
+        raise SourceError(f"{what} is {error}", "Correct the recording, or leave it out.") from None
     length = int(marked.sum())
     if marked[length:].any():
         raise SourceError(

@@ -1,38 +1,23 @@
 """The family, split and index of each episode of a LeRobot dataset.
 
-They are per-episode columns: in the dataset itself, or in a CSV file beside it, with a line for
-each episode or for each task.
+They are per-episode columns: of the dataset itself, of a families file, or made from tasks.
 """
 
-import csv
-import io
+import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.constants import FAMILIES_PATH
-from robomme_interference_data.errors import InvalidIdError, SourceError
+from robomme_interference_data.constants import SPLITS
+from robomme_interference_data.errors import InvalidIdError, SourceError, named
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.storage.files import atomic_path
 
+from .families_file import one_line
+from .family_names import families_of
 from .robomme_families import BLOCKS
 
 _BLOCK = 100
-_KEYS = ("episode_index", "task")
-_NUMBERS = ("episode_index", "index", "exec_start_idx")
-_KNOWN = {
-    "task": {"task", "family", "split", "exec_start_idx"},
-    "episode_index": {"episode_index", "family", "split", "index", "exec_start_idx"},
-}
-"""Columns of a file by its first one, which says what has a line of its own."""
-_FORM = (
-    "Expected CSV with the first line task,family and a line for every task; or with the first "
-    "line episode_index,family and a line such as 0,MoveCube for every episode. Further columns: "
-    "split, exec_start_idx and, for episodes, index."
-)
-_LISTED = 40
-"""Most lines that an error offers to paste."""
+_RANGE = re.compile(r"(\d{1,9}):(\d{1,9})", re.ASCII)
 
 
 def ids_by_block() -> dict[int, EpisodeId]:
@@ -77,111 +62,48 @@ def ids_by_columns(rows: Sequence[Mapping[str, Any]], where: str) -> dict[int, E
     return {episode: name for name, episode in ids.items()}
 
 
-def read_families(path: Path, tasks: Sequence[Sequence[str]]) -> list[dict[str, Any]]:
-    """Read the per-episode columns of a CSV file that lists a dataset's episodes, or its tasks.
-
-    Args:
-        path: The file.
-        tasks: The tasks of each episode of the dataset.
+def families_by_task(tasks: Sequence[Sequence[str]], where: str) -> dict[str, str]:
+    """Return the family of each task of the episodes; see `family_of`.
 
     Raises:
-        SourceError: The file is invalid, or lacks a line: the hint has the missing ones.
+        SourceError: An episode has no task, or several of different families.
     """
-    try:
-        header, rows = _read_rows(path, len(tasks))
-    except OSError as error:
-        raise SourceError(f"families file {path}: {error.strerror}", _FORM) from None
-    except (ValueError, csv.Error) as error:
-        raise SourceError(f"families file {path}: {error}", _FORM) from None
-    wanted: dict[int, list[Any]] = {episode: [episode] for episode in range(len(tasks))}
-    if header[0] == "task":
-        wanted = {episode: [*map(_one_line, texts)] for episode, texts in enumerate(tasks)}
-    names = dict.fromkeys(name for keys in wanted.values() for name in keys)
-    if missing := [name for name in names if name not in rows]:
-        what = "tasks" if header[0] == "task" else "episodes"
+    hint = f"Name the families in a CSV file: {named('families_from', 'FILE.csv')}."
+    if without := [episode for episode, texts in enumerate(tasks) if not texts]:
         raise SourceError(
-            f"families file {path} names {len(names) - len(missing)} of {len(names)} {what}",
-            f"Add these lines, with the names of families:\n{_lines(missing, header)}",
+            f"{where}: {len(without)} of {len(tasks)} episodes have no task, the first of them "
+            f"episode {without[0]}",
+            hint,
         )
-    found = []
-    for episode, keys in wanted.items():
-        first, *others = [rows[name] for name in keys] or [{}]
-        if any(other != first for other in others):
-            raise SourceError(
-                f"families file {path}: the tasks of episode {episode} differ: "
-                f"{', '.join(map(repr, keys))}",
-                "Give them the same values, or write a line for every episode, with the column "
-                "episode_index.",
-            )
-        found.append(first)
-    return found
+    families = families_of(dict.fromkeys(one_line(text) for texts in tasks for text in texts))
+    for episode, texts in enumerate(tasks):
+        if len({families[one_line(text)] for text in texts}) > 1:
+            listed = ", ".join(map(repr, texts))
+            raise SourceError(f"{where}: episode {episode} has several tasks: {listed}", hint)
+    return families
 
 
-def keep_families(path: Path, root: Path) -> None:
-    """Keep a families file in the folder of a buffer set, so that later builds need not name it."""
-    data = path.read_bytes()
-    with atomic_path(root / FAMILIES_PATH) as partial:
-        partial.write_bytes(data)
+def recorded_splits(given: Any, count: int, where: str) -> list[str]:
+    """Return the split of each episode by `splits` of `info.json`, such as `{"train": "0:50"}`.
 
+    Episodes that it does not list are `train`, as all are in datasets of LeRobot's recorder.
 
-def template(tasks: Sequence[Sequence[str]]) -> str:
-    """Return the text of a families file for episodes of these tasks, with names to fill in."""
-    names = dict.fromkeys(_one_line(text) for texts in tasks for text in texts)
-    if names:
-        return f"task,family\n{_lines([*names], ['task', 'family'])}"
-    return f"episode_index,family\n{_lines(range(len(tasks)), ['episode_index', 'family'])}"
-
-
-def _read_rows(path: Path, count: int) -> tuple[list[str], dict[Any, dict[str, Any]]]:
-    """Return the columns of a file, its key first, and its rows by that key."""
-    lines = csv.reader(io.StringIO(path.read_text(encoding="utf-8-sig"), newline=""))
-    header = [name.strip() for name in next(lines, [])]
-    keys = [name for name in _KEYS if name in header]
-    known = len(keys) == 1 and {*header} <= _KNOWN[keys[0]]
-    if not known or len({*header}) != len(header) or "family" not in header:
-        raise ValueError(f"its first line is {','.join(header)!r}")
-    [key] = keys
-    rows: dict[Any, dict[str, Any]] = {}
-    for cells in lines:
-        where = f"line {lines.line_num}"
-        if not any(cell.strip() for cell in cells):
+    Raises:
+        SourceError: It lists episodes in another split, or in two.
+    """
+    splits: list[str | None] = [None] * count
+    for name, text in given.items() if isinstance(given, dict) else ():
+        match = _RANGE.fullmatch(text) if isinstance(text, str) else None
+        numbers = range(int(match[1]), min(int(match[2]), count)) if match else range(0)
+        if not numbers or name == "train":
             continue
-        if len(cells) != len(header):
-            raise ValueError(f"{where} has {len(cells)} values; expected {len(header)}")
-        row: dict[str, Any] = dict(zip(header, map(_one_line, cells), strict=True))
-        for name in (column for column in _NUMBERS if column in row):
-            row[name] = _number(where, name, row[name])
-        name = row.pop(key)
-        if name in rows:
-            raise ValueError(f"{where} is a second line of {key} {name!r}")
-        if key == "episode_index" and name >= count:
-            raise ValueError(f"{where}: the dataset has {count} episodes, no {name}")
-        rows[name] = row
-    return sorted(header, key=lambda name: name != key), rows
-
-
-def _one_line(text: str) -> str:
-    return " ".join(text.split())
-
-
-def _lines(names: Sequence[object], header: Sequence[str]) -> str:
-    """Return lines of CSV for some values of the key, with the other columns to fill in."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    for name in names[:_LISTED]:
-        # Not a name that a family may have: a line that is pasted as it is must be an error.
-        writer.writerow([name, *(f"<{column}>" for column in header[1:])])
-    if len(names) > _LISTED:
-        text.write(f"and {len(names) - _LISTED} more")
-    return text.getvalue().rstrip()
-
-
-def _number(where: str, name: str, text: str) -> int:
-    if name == "exec_start_idx" and not text:
-        raise ValueError(
-            f"{where}: exec_start_idx is empty; write the number of demonstration frames, or 0 if "
-            "the episode has none"
-        )
-    if not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise ValueError(f"{where}: {name} is {text[:80]!r}; expected a whole number")
-    return int(text)
+        if name not in SPLITS or any(splits[number] is not None for number in numbers):
+            raise SourceError(
+                f"{where}: info.json has the split {name!r} of the episodes {text}; expected "
+                f"{', '.join(SPLITS)}, none of them with an episode of another",
+                f"Write the splits in a CSV file, {named('families_from', 'FILE.csv')}, with the "
+                "columns episode_index, family and split.",
+            )
+        for number in numbers:
+            splits[number] = name
+    return [split or "train" for split in splits]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, SourceError, named
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators.episode import choose_cameras
-from robomme_interference_data.storage.files import read_bytes
+from robomme_interference_data.storage.files import is_hidden, read_bytes
 from robomme_interference_data.storage.parquet import RowSpan
 from robomme_interference_data.storage.video import iter_frames
 
@@ -133,7 +133,7 @@ class FramesSource(Source):
         """Yield each video file and folder of images, its camera, and the episode's id."""
         for kind in ("videos", "images"):
             for path in sorted((self._folder / kind).glob("*/*/*/*")):
-                if path.name.startswith("."):
+                if is_hidden(path.relative_to(self._folder).as_posix()):
                     continue
                 video = kind == "videos"
                 fits = path.suffix.lower() in _VIDEO_SUFFIXES if video else path.is_dir()

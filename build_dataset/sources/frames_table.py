@@ -14,9 +14,17 @@ import pyarrow.compute as pc
 from robomme_interference_data.constants import ACTION, STATE
 from robomme_interference_data.errors import FormatError, InvalidIdError, SourceError, nearest
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.storage.parquet import RowSpan, is_listed
+from robomme_interference_data.storage.arrow_columns import (
+    is_listed,
+    is_number,
+    is_text,
+    simplified,
+)
+from robomme_interference_data.storage.files import reading
+from robomme_interference_data.storage.parquet import RowSpan
 
 from .base import demonstration_length
+from .episode_columns import parse_column
 
 TABLE = "frames.parquet"
 LAYOUT = "docs/how-to/your-own-recordings.md describes the layout, with an example that writes it."
@@ -45,45 +53,53 @@ class EpisodeRows:
         return {feature: names for feature, names in named.items() if names is not None}
 
 
-def _is_text(kind: pa.DataType) -> bool:
-    if pa.types.is_dictionary(kind):
-        kind = kind.value_type
-    return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind))
-
-
 def _is_vector(kind: pa.DataType) -> bool:
-    return is_listed(kind) and bool(pa.types.is_floating(kind.value_type))
+    return is_number(kind.value_type if is_listed(kind) else kind)
 
 
 def _is_names(kind: pa.DataType) -> bool:
-    return is_listed(kind) and _is_text(kind.value_type)
+    return is_listed(kind) and is_text(kind.value_type)
 
 
-def _is_number(kind: pa.DataType) -> bool:
-    return bool(pa.types.is_floating(kind) or pa.types.is_integer(kind))
+def _is_flag(kind: pa.DataType) -> bool:
+    return pa.types.is_boolean(kind) or is_number(kind) or is_text(kind)
 
 
-_TEXT = _is_text, "text"
+def _is_whole(kind: pa.DataType) -> bool:
+    return is_number(kind) or is_text(kind) or pa.types.is_null(kind)
+
+
+def _is_text_or_none(kind: pa.DataType) -> bool:
+    return is_text(kind) or pa.types.is_null(kind)
+
+
+_TEXT = is_text, "text"
+_TEXT_OR_NONE = _is_text_or_none, "text"
 _NAMES = _is_names, "lists of text"
-_RATE = _is_number, "numbers"
-_VECTOR = _is_vector, "lists of floats"
-_NUMBER = pa.types.is_integer, "whole numbers"
-_FLAG = pa.types.is_boolean, "true or false"
+_RATE = is_number, "numbers"
+_VECTOR = _is_vector, "lists of numbers"
+_COUNT = is_number, "whole numbers"
+# Text and floats are read where they have one meaning: "7" and 7.0.
+_NUMBER = _is_whole, "whole numbers"
+_FLAG = _is_flag, "true or false"
 _REQUIRED: dict[str, tuple[Callable[[pa.DataType], bool], str]] = {
     "episode_id": _TEXT,
-    "frame_index": _NUMBER,
+    "frame_index": _COUNT,
     "state": _VECTOR,
     "goal": _TEXT,
 }
 _NULLABLE = {
     "seed": _NUMBER,
-    "difficulty": _TEXT,
-    "simulator": _TEXT,
+    "difficulty": _TEXT_OR_NONE,
+    "simulator": _TEXT_OR_NONE,
     "exact": _FLAG,
     "fps": _RATE,
     "state_names": _NAMES,
     "action_names": _NAMES,
 }
+_PANDAS_INDEX = "__index_level_0__"
+_PARSED = ("seed", "difficulty", "simulator", "exact")
+"""Columns whose values may be stored in several types, see `episode_columns`."""
 _COLUMNS = {**_REQUIRED, "action": _VECTOR, "is_demo": _FLAG, **_NULLABLE}
 
 
@@ -91,6 +107,8 @@ def read_frames_table(path: Path) -> dict[EpisodeId, EpisodeRows]:
     """Read and check the table of a frames folder."""
     try:
         table = RowSpan(path).table()
+        with reading(path):
+            table = _simplified(table)
     except FormatError as error:
         raise SourceError(error.message, LAYOUT) from None
     if not table.num_rows:
@@ -114,9 +132,20 @@ def read_frames_table(path: Path) -> dict[EpisodeId, EpisodeRows]:
     return episodes
 
 
+def _simplified(table: pa.Table) -> pa.Table:
+    """Return the table with columns of simple types, but for the vectors, which are large."""
+    columns = {
+        name: table[name] if name in ("state", "action") else simplified(table[name])
+        for name in table.column_names
+    }
+    return pa.table(columns)
+
+
 def _column_problem(table: pa.Table) -> str | None:
     """Return what is wrong with the columns of a table, if anything."""
     for name in table.column_names:
+        if name == _PANDAS_INDEX:
+            return f"column {name!r} is the index of a pandas table: write it with index=False"
         if name not in _COLUMNS:
             guess = nearest(name, _COLUMNS, more="")
             return f"unknown column {name!r}; known are {', '.join(_COLUMNS)}. {guess}"
@@ -145,7 +174,9 @@ def _episode(where: str, rows: pa.Table, start: int) -> EpisodeRows:
         )
     values: dict[str, Any] = {}
     for column in ("goal", *_NULLABLE):
-        distinct = _distinct(rows[column]) if column in rows.column_names else [None]
+        distinct = [None]
+        if column in rows.column_names:
+            distinct = _distinct(where, column, rows[column])
         if len(distinct) != 1:
             raise SourceError(
                 f"{where} has several values of {column!r}: {', '.join(map(repr, distinct[:3]))}",
@@ -155,13 +186,21 @@ def _episode(where: str, rows: pa.Table, start: int) -> EpisodeRows:
     if values["fps"] is not None and not 0 < values["fps"] < math.inf:
         raise SourceError(f"{where}: fps is {values['fps']}; expected a positive number")
     marked = "is_demo" in rows.column_names
-    lesson = demonstration_length(rows["is_demo"], f"{where}: is_demo") if marked else None
+    lesson = None
+    if marked:
+        lesson = demonstration_length(rows["is_demo"].to_pylist(), f"{where}: is_demo")
     return EpisodeRows(start, len(rows), lesson, **values)
 
 
-def _distinct(column: pa.ChunkedArray) -> list[Any]:
+def _distinct(where: str, name: str, column: pa.ChunkedArray) -> list[Any]:
     """Return the distinct values of a column; lists, which pyarrow cannot compare, as tuples."""
-    if not is_listed(column.type):
-        return list(pc.unique(column).to_pylist())
-    values = (None if value is None else tuple(value) for value in column.to_pylist())
+    if is_listed(column.type):
+        values = [None if value is None else tuple(value) for value in column.to_pylist()]
+    else:
+        values = pc.unique(column).to_pylist()
+    if name in _PARSED:
+        try:
+            values = [parse_column(name, value) for value in values]
+        except ValueError as error:
+            raise SourceError(f"{where}: {error}", LAYOUT) from None
     return list(dict.fromkeys(values))

@@ -16,19 +16,25 @@ import h5py
 import numpy as np
 
 from robomme_interference_data.constants import OFFICIAL
-from robomme_interference_data.errors import InterferenceError, SourceError
+from robomme_interference_data.errors import InterferenceError, InvalidIdError, SourceError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.evidence import spans_of_texts
 from robomme_interference_data.simulators.episode import choose_cameras
 from robomme_interference_data.storage.files import check_not_pointer
 
 from .base import Frame, Recording, Robot, Source, SourceEpisode, demonstration_length, file_state
+from .episode_columns import parse_column
 from .robomme_families import ROBOMME, ROBOT
 
 _FILE = re.compile(r"record_dataset_(?P<family>.+)\.h5")
 _CAMERAS = {"front": "front_rgb", "wrist": "wrist_rgb"}
 _SUBGOALS = ("simple_subgoal", "grounded_subgoal")
 _AGAIN = "Record or download the file again, or move it out of the folder."
+_LOCKED = "unable to lock file"
+_UNLOCK = (
+    "Close the program that writes the file. If there is none, the disk, such as a network drive, "
+    "may not support locks: set the environment variable HDF5_USE_FILE_LOCKING=FALSE."
+)
 _OTHER_ROBOT = (
     "Write recordings of another robot as a frames folder: docs/how-to/your-own-recordings.md."
 )
@@ -68,6 +74,15 @@ class H5Source(Source):
         self._files = {
             match["family"]: path for path in candidates if (match := _FILE.fullmatch(path.name))
         }
+        for family, path in self._files.items():
+            try:
+                EpisodeId(family, "train", 0)
+            except InvalidIdError as error:
+                raise InvalidIdError(
+                    f"{path}: {error.message}",
+                    "If it is a second download of a file, remove it; else name it after its "
+                    "family: record_dataset_<Family>.h5.",
+                ) from None
         if not self._files:
             raise SourceError(
                 f"{folder} holds no record_dataset_<Family>.h5 file",
@@ -99,7 +114,7 @@ class H5Source(Source):
             steps = _numbers(group, "timestep_")
             if not steps or steps != list(range(steps[0], steps[0] + len(steps))):
                 raise SourceError(f"{where} does not hold consecutive timestep_<T> groups", _AGAIN)
-            flags = [bool(group[f"timestep_{step}/info/is_video_demo"][()]) for step in steps]
+            flags = [group[f"timestep_{step}/info/is_video_demo"][()] for step in steps]
             lesson = demonstration_length(flags, f"is_video_demo in {where}")
             setup, first = group["setup"], group[f"timestep_{steps[0]}/obs"]
             available = tuple(camera for camera, name in _CAMERAS.items() if name in first)
@@ -129,6 +144,8 @@ def _complete(where: object) -> Iterator[None]:
     except InterferenceError:
         raise
     except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+        if _LOCKED in str(error):
+            raise SourceError(f"{where} is locked by another program: {error}", _UNLOCK) from None
         raise SourceError(f"{where} is not a complete RoboMME recording: {error}", _AGAIN) from None
 
 
@@ -167,7 +184,11 @@ def _numbers(group: h5py.Group, prefix: str) -> list[int]:
 
 
 def _seed(group: h5py.Group) -> int | None:
-    return int(group["setup/seed"][()]) if "setup/seed" in group else None
+    if "setup/seed" not in group:
+        return None
+    value = np.asarray(group["setup/seed"][()]).item()
+    seed: int | None = parse_column("seed", _text(value) if isinstance(value, bytes) else value)
+    return seed
 
 
 def _subgoal(info: h5py.Group) -> str:

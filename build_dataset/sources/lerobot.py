@@ -1,10 +1,12 @@
-"""Source `lerobot`: a LeRobot dataset, v3.0 or v2.1, in a folder or on the Hub.
+"""Source `lerobot`: a LeRobot dataset, v3.0, v2.1 or v2.0, in a folder or on the Hub.
 
 Read with pyarrow and PyAV alone; `docs/reference/sources.md` describes columns and families.
 """
 
-from collections.abc import Generator
-from dataclasses import dataclass, replace
+import unicodedata
+from collections.abc import Generator, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, override
@@ -12,91 +14,82 @@ from typing import Any, override
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import ACTION, OFFICIAL, STATE, VALUE_NAMES
-from robomme_interference_data.errors import FormatError, SourceError, named
+from robomme_interference_data.constants import OFFICIAL, VALUE_NAMES
+from robomme_interference_data.errors import MissingFileError, SourceError, counted, named
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.schema.codec import from_dict
 from robomme_interference_data.schema.evidence import spans_of_texts
-from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.simulators.episode import choose_cameras
 from robomme_interference_data.storage.encode import is_png
 from robomme_interference_data.storage.hub import HubFiles, locate
 from robomme_interference_data.storage.lerobot import LeRobotFiles
-from robomme_interference_data.storage.parquet import RowSpan, is_listed
+from robomme_interference_data.storage.parquet import RowSpan
 
 from .base import Recording, Robot, Source, SourceEpisode, compose, demonstration_length, file_state
-from .columns import camera_names, find_columns, recorded_robot
-from .families import ids_by_block, ids_by_columns, names_episodes, read_families, template
+from .columns import Columns, find_columns, recorded_robot
+from .episode_columns import NAMING, EpisodeColumns, read_column, read_episode_columns
+from .families import ids_by_block, ids_by_columns
+from .families_file import TASK, template
+from .goals import check_choice, goal_wordings
 from .images import decode_images, info_is_exact
+from .naming import EpisodeNaming
 from .robomme_families import BLOCKS, ROBOMME, families_for_goal
+from .subgoals import subgoal_texts
+from .trim import Trim
 
 _ROBOMME_REPOS = ("lerobot/robomme", "Yinpei/robomme_data_lerobot")
 _CORRECT = "Correct the dataset, or leave the episode out."
-
-
-@dataclass(frozen=True)
-class _Metadata:
-    """Per-episode columns of a dataset; None where it has none."""
-
-    tasks: tuple[str, ...] | None
-    goals: tuple[str, ...] | None
-    seed: int | None
-    difficulty: str | None
-    simulator: str | None
-    exact: bool | None
-    exec_start_idx: int | None
-    evidence: tuple[EvidenceSpan, ...] | None
-
-    @property
-    def wordings(self) -> tuple[str, ...]:
-        return self.goals or self.tasks or ()
 
 
 class LeRobotSource(Source):
     """Episodes of a LeRobot dataset, in a folder or on the Hub; see `hub.locate`.
 
     `columns` maps logical names (a camera, `state`, `action`, `is_demo`, `exec_start_idx`,
-    `subgoal`) to columns without a usual name. `kept_families` is the families file of an earlier
-    build, for a dataset that does not name its families itself.
+    `subgoal`) to columns without a usual name: see `find_columns`. `families_from` is `task`,
+    `dataset`, or the path of a families file. `kept_families` is that of an earlier build, for a
+    dataset that does not name its families itself. `several_tasks` is what the goal of an episode
+    with several tasks is, see `goals.SEVERAL_TASKS`.
     """
 
     def __init__(
         self,
         location: str,
         columns: dict[str, str] | None = None,
-        families_file: Path | None = None,
+        families_from: str | None = None,
         kept_families: Path | None = None,
+        several_tasks: str | None = None,
     ):
+        check_choice(several_tasks)
         self._files = locate(location)
         self._given_columns = columns or {}
-        self._given_families, self._kept_families = families_file, kept_families
+        self._families_from, self._kept_families = families_from, kept_families
+        self._several_tasks = several_tasks
         self.provenance = {"kind": "lerobot"}
+        if columns:
+            self.provenance["columns"] = dict(columns)
         if isinstance(self._files, HubFiles):
             self.provenance |= {"repo": self._files.repo_id, "revision": self._files.commit}
             if self._files.folder:
                 self.provenance["folder"] = self._files.folder.removesuffix("/")
 
     def __getstate__(self) -> dict[str, Any]:
-        lazy = ("_lerobot", "_columns", "_families")
+        lazy = ("_lerobot", "_columns", "_tasks", "naming")
         return {name: value for name, value in self.__dict__.items() if name not in lazy}
 
     @override
     def episodes(self) -> list[SourceEpisode]:
-        rows, tasks = self._lerobot.table.to_pylist(), self._lerobot.tasks
+        rows = self._lerobot.table.to_pylist()
         ids, simulator = self._ids(rows)
         listed = []
         for index, name in ids.items():
             metadata = self._metadata(index, rows[index])
-            for task in metadata.tasks or ():
-                if task not in tasks:
-                    what = f"episode {index}: unknown task {task!r}"
-                    raise FormatError.damaged(self._where, what)
+            goals = self._goals(index, self._tasks[index], metadata)
             played = simulator or metadata.simulator
             if played in (None, OFFICIAL):
-                self._check_goals(index, name, metadata.wordings)
-            marked = {"is_demo", "exec_start_idx"} & self._columns.keys()
+                self._check_goals(index, name, goals)
+            self._trim(index)  # checks it
+            marks = self._columns.is_demo, self._columns.exec_start_idx, metadata.exec_start_idx
             key = index, played, self._state(index)
-            known = bool(marked) or metadata.exec_start_idx is not None
+            known = any(mark is not None for mark in marks)
             listed.append(SourceEpisode(name, key, marked=known))
         return sorted(listed, key=lambda episode: episode.id)
 
@@ -104,31 +97,32 @@ class LeRobotSource(Source):
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
         index, simulator, _ = episode.key
         columns, metadata = self._columns, self._metadata(index, self._lerobot.row(index))
-        chosen = choose_cameras(cameras, camera_names(columns))
-        rows = self._lerobot.rows(index)
-        states = self._lerobot.vectors(index, columns["state"])
-        actions = self._lerobot.vectors(index, columns["action"]) if "action" in columns else None
-        lesson = _lesson(rows, columns, metadata.exec_start_idx)
+        chosen = choose_cameras(cameras, tuple(columns.cameras))
+        whole, trim = self._lerobot.rows(index), self._trim(index)
+        lesson = trim.lesson(_lesson(whole, columns, metadata.exec_start_idx))
+        rows = whole.part(whole.start + trim.start, whole.start + trim.stop)
+        states = self._vectors(index, columns.state, trim)
+        actions = self._vectors(index, columns.action, trim) if columns.action else None
         exact = metadata.exact
         if exact is None:
-            exact = all(self._is_exact(rows, columns[camera]) for camera in chosen)
-        evidence = metadata.evidence
-        if evidence is None and lesson is not None and "subgoal" in columns:
-            evidence = spans_of_texts(
-                rows.part(rows.start, rows.start + lesson).texts(columns["subgoal"])
-            )
-        vectors = {STATE: "state", ACTION: "action"}
-        values = {feature: columns[name] for feature, name in vectors.items() if name in columns}
-        streams = {camera: self._images(index, rows, columns[camera], exact) for camera in chosen}
+            exact = all(self._is_exact(rows, columns.cameras[camera]) for camera in chosen)
+        evidence = None if metadata.evidence is None else trim.evidence(metadata.evidence)
+        if evidence is None and lesson is not None and columns.subgoal is not None:
+            texts = subgoal_texts(self._lerobot, whole, columns.subgoal)
+            evidence = spans_of_texts(texts[trim.start : trim.start + lesson])
+        streams = {
+            camera: self._images(index, rows, columns.cameras[camera], trim, exact)
+            for camera in chosen
+        }
         return Recording(
-            goals=metadata.wordings,
+            goals=self._goals(index, self._tasks_of_frames(index), metadata),
             seed=metadata.seed,
             difficulty=metadata.difficulty,
             simulator=simulator,
             exact=exact,
             frames=compose(streams, states, actions, lesson),
             evidence=evidence,
-            robot=self._robot(values, official=simulator == OFFICIAL),
+            robot=self._robot(official=simulator == OFFICIAL),
         )
 
     @cached_property
@@ -136,65 +130,113 @@ class LeRobotSource(Source):
         return LeRobotFiles(self._files)
 
     @cached_property
-    def _columns(self) -> dict[str, str]:
+    def _columns(self) -> Columns:
         return find_columns(self._lerobot.features, self._given_columns, self._where)
 
+    @cached_property
+    def naming(self) -> EpisodeNaming:
+        """How the episodes get their names."""
+        return EpisodeNaming(
+            table=self._lerobot.table.column_names,
+            tasks=self._tasks,
+            splits=self._lerobot.info.get("splits"),
+            dataset=self._name,
+            families_from=self._families_from,
+            kept=self._kept_families,
+            dataset_where=self._where,
+        )
+
     @property
-    def _families_file(self) -> Path | None:
-        if self._given_families is None and not names_episodes(self._lerobot.table.column_names):
-            return self._kept_families
-        return self._given_families
+    def _name(self) -> str:
+        """The name of the dataset: of its folder, or of its repository and the folder there."""
+        if isinstance(self._files, HubFiles):
+            return f"{self._files.repo_id.split('/')[-1]} {self._files.folder}".strip(" /")
+        return Path(self._files.location).resolve().name
 
     @cached_property
-    def _families(self) -> list[dict[str, Any]]:
-        if self._families_file is None:
-            return [{}] * len(self._lerobot)
-        try:
-            return read_families(self._families_file, self._tasks)
-        except SourceError as error:
-            if self._given_families is None:
-                more = f"It is of an earlier build: give another with {named('families_file')}."
-                raise SourceError(error.message, f"{error.hint}\n{more}") from None
-            raise
+    def _tasks(self) -> list[tuple[str, ...]]:
+        """The tasks of each episode: those that its row lists, or else those of its frames."""
+        table, texts = self._lerobot.table, self._lerobot.task_texts
+        given = table["tasks"].to_pylist() if "tasks" in table.column_names else [None] * len(table)
+        known = {unicodedata.normalize("NFC", text): text for text in texts.values()}
+        tasks = []
+        for index, value in enumerate(given):
+            where = f"{self._where}: episode {index}"
+            listed = read_column("tasks", value, where) or ()
+            found = [known.get(unicodedata.normalize("NFC", text)) for text in listed]
+            if None in found:
+                raise SourceError(
+                    f"{where} has the task {listed[found.index(None)]!r}, which the dataset's list "
+                    f"of {counted(len(texts), 'task')} does not have",
+                    "LeRobot's modify_tasks changes both.",
+                )
+            if not found:
+                with suppress(MissingFileError):  # an error when it is read
+                    found = [*self._lerobot.tasks_of(index)]
+            tasks.append(tuple(text for text in found if text is not None))
+        return tasks
 
-    @property
-    def _tasks(self) -> list[list[str]]:
-        """The tasks of each episode, as far as the dataset has them."""
-        table = self._lerobot.table
-        if "tasks" not in table.column_names or not is_listed(table.schema.field("tasks").type):
-            return [[]] * len(table)
-        return [
-            [text for text in texts or () if isinstance(text, str)]
-            for texts in table["tasks"].to_pylist()
-        ]
+    def _tasks_of_frames(self, index: int) -> tuple[str, ...]:
+        """Return the tasks of an episode in the order of its frames, then further listed ones."""
+        listed, stored = self._tasks[index], self._lerobot.tasks_of(index)
+        if listed and not {*stored} <= {*listed}:
+            raise SourceError(
+                f"its frames have the task {' and '.join(map(repr, stored))}; meta/ lists "
+                f"{' and '.join(map(repr, listed))}",
+                "Correct one of them: LeRobot's modify_tasks changes both.",
+            )
+        return (*stored, *(text for text in listed if text not in stored))
+
+    def _goals(self, index: int, tasks: Sequence[str], metadata: EpisodeColumns) -> tuple[str, ...]:
+        """Return the wordings of an episode's goal."""
+        try:
+            return goal_wordings(tasks, metadata.goals or (), self._several_tasks)
+        except SourceError as error:
+            raise error.about(f"{self._where}: episode {index}") from None
 
     @property
     def _where(self) -> str:
         return self._files.describe()
 
-    def _metadata(self, index: int, row: dict[str, Any]) -> _Metadata:
-        row = row | self._families[index]
-        return from_dict(_Metadata, row, f"{self._where}: episode {index}")
+    def _metadata(self, index: int, row: dict[str, Any]) -> EpisodeColumns:
+        row = row | self.naming.row(index)
+        return read_episode_columns(row, f"{self._where}: episode {index}")
 
-    def _robot(self, columns: dict[str, str], *, official: bool) -> Robot:
+    def _trim(self, index: int) -> Trim:
+        try:
+            return Trim.of(self.naming.row(index), self._lerobot.row(index)["length"])
+        except SourceError as error:
+            raise error.about(f"{self.naming.where}: episode {index}") from None
+
+    def _vectors(self, index: int, columns: Sequence[str], trim: Trim) -> NDArray[np.float32]:
+        """Return the joined values of columns, `(T, D) float32`; D is 0 without columns."""
+        empty = np.empty((trim.stop - trim.start, 0), np.float32)
+        read = (self._lerobot.vectors(index, name)[trim.start : trim.stop] for name in columns)
+        return np.concatenate([empty, *read], axis=1)
+
+    def _robot(self, *, official: bool) -> Robot:
         """Return the robot; RoboMME's values have known names, also where its datasets have none.
 
-        `columns` maps features to columns.
+        `official` is whether it is RoboMME's.
         """
-        robot = recorded_robot(self._lerobot, columns)
-        size = (len(VALUE_NAMES),)
+        vectors = self._columns.vectors
+        robot = recorded_robot(self._lerobot, vectors)
         if not official:
             return robot
-        known = {f: VALUE_NAMES for f, name in columns.items() if self._lerobot.shape(name) == size}
+        sizes = {
+            feature: sum(self._lerobot.shape(column)[0] for column in columns)
+            for feature, columns in vectors.items()
+        }
+        known = {f: VALUE_NAMES for f, size in sizes.items() if size == len(VALUE_NAMES)}
         return replace(robot, names=known | robot.names)
 
     def _images(
-        self, index: int, rows: RowSpan, column: str, exact: bool
+        self, index: int, rows: RowSpan, column: str, trim: Trim, exact: bool
     ) -> Generator[NDArray[np.uint8]]:
         if self._lerobot.features[column]["dtype"] == "video":
-            yield from self._lerobot.iter_frames(index, column, 0, len(rows))
+            yield from self._lerobot.iter_frames(index, column, trim.start, trim.stop)
             return
-        cells = enumerate(rows.images(column))
+        cells = enumerate(rows.images(column), trim.start)
         where = f"of column {column!r}"
         yield from decode_images(((f"frame {n} {where}", data) for n, data in cells), exact)
 
@@ -209,9 +251,10 @@ class LeRobotSource(Source):
         """Return the episodes' ids, and the simulator where it follows from the dataset."""
         hub = isinstance(self._files, HubFiles) and self._files.repo_id in _ROBOMME_REPOS
         simulator = OFFICIAL if hub else None
-        from_file = self._families_file is not None
-        where = f"families file {self._families_file}" if from_file else self._where
-        ids = ids_by_columns(self._families if from_file else rows, where)
+        naming = self.naming.rows or [
+            self._naming_columns(index, row) for index, row in enumerate(rows)
+        ]
+        ids = ids_by_columns(naming, self.naming.where)
         if ids is not None:
             return ids, simulator
         blocks = ids_by_block()
@@ -221,9 +264,15 @@ class LeRobotSource(Source):
             f"the families of the {len(rows)} episodes of {self._where} are unknown: it has no "
             "per-episode column episode_id or family, and is not RoboMME's with "
             f"{len(blocks):,} episodes of {len(BLOCKS)} families",
-            f"Write a CSV file and give it with {named('families_file')}. Its lines, with the "
-            f"names of families:\n{template(self._tasks)}",
+            f"Make them from the tasks, with {named('families_from', TASK)}; or write a CSV file "
+            f"and give it with {named('families_from')}. Its lines, with the names of families:\n"
+            f"{template(self._tasks)}",
         )
+
+    def _naming_columns(self, index: int, row: dict[str, Any]) -> dict[str, Any]:
+        """Return those per-episode columns of an episode that name it."""
+        where = f"{self._where}: episode {index}"
+        return {name: read_column(name, row[name], where) for name in NAMING if name in row}
 
     def _check_goals(self, index: int, name: EpisodeId, goals: tuple[str, ...]) -> None:
         for goal in goals:
@@ -233,29 +282,35 @@ class LeRobotSource(Source):
                 raise SourceError(
                     f"{self._where}: episode {index} would be {name}, but its goal {goal!r} "
                     f"cannot be one of {name.family}; it fits {others}",
-                    f"Name the families in a CSV file, {named('families_file')}: see "
+                    f"Name the families in a CSV file, {named('families_from')}: see "
                     "docs/reference/sources.md.",
                 )
 
     def _state(self, index: int) -> tuple[Any, ...]:
-        """Return what changes when the episode's files do; on the Hub, the commit is pinned."""
+        """Return what changes when an episode's files do, or what the families file says of it.
+
+        On the Hub, the commit is pinned.
+        """
+        used = [self.naming.row(index).get(name) for name in ("start", "stop", "exec_start_idx")]
         if isinstance(self._files, HubFiles):
-            return ()
+            return tuple(used)
         location = self._lerobot.locate(index)
-        used = self._columns.values()
-        videos = [path for name, (path, _) in location.videos.items() if name in used]
+        cameras = self._columns.cameras.values()
+        videos = [path for name, (path, _) in location.videos.items() if name in cameras]
         # Part of a dataset suffices: a missing file is an error only when it is read.
-        return tuple(file_state(self._files.root / path) for path in (location.data, *videos))
+        states = (file_state(self._files.root / path) for path in (location.data, *videos))
+        return (*states, *used)
 
 
-def _lesson(rows: RowSpan, columns: dict[str, str], recorded: int | None) -> int | None:
+def _lesson(rows: RowSpan, columns: Columns, recorded: int | None) -> int | None:
     """Return the number of demonstration frames, on which all columns must agree, if known."""
     lengths = {} if recorded is None else {"per-episode exec_start_idx": recorded}
-    if "is_demo" in columns:
-        name = columns["is_demo"]
-        lengths[name] = demonstration_length(rows.scalars(name), f"column {name!r}")
-    if "exec_start_idx" in columns:
-        name = columns["exec_start_idx"]
+    if columns.is_demo is not None:
+        name = columns.is_demo
+        flags = rows.values(name).to_pylist()
+        lengths[name] = demonstration_length(flags, f"column {name!r}")
+    if columns.exec_start_idx is not None:
+        name = columns.exec_start_idx
         values = np.unique(rows.scalars(name)).tolist()
         if len(values) != 1 or not 0 <= values[0] <= len(rows):
             raise SourceError(

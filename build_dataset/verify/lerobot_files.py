@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from robomme_interference_data.build_dataset.dataset.image_stats import STATISTICS
+from robomme_interference_data.build_dataset.dataset.statistics import STATISTICS
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     EPISODES_DIR,
@@ -24,6 +24,7 @@ from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.schema.codec import arrow_schema
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.lerobot import LeRobotFiles
+from robomme_interference_data.storage.lerobot_tables import episode_column_names
 
 _TOLERANCE_S = 1e-4
 """LeRobot's own tolerance of timestamps, in seconds."""
@@ -38,8 +39,7 @@ def lerobot_violations(dataset: Dataset, copy: FetchedCopy | None) -> Iterator[t
     In a partial copy only the files that are there are read.
     """
     yield from _info(dataset)
-    table = LeRobotFiles(dataset.files, statistics=True).table
-    yield from _columns(dataset, table)
+    yield from _columns(dataset)
     tasks = dataset.lerobot.tasks
     if list(tasks.values()) != list(range(len(tasks))):
         yield TASKS_PATH, f"task_index is {list(tasks.values())[:5]}; expected 0, 1, …"
@@ -81,8 +81,9 @@ def lerobot_violations(dataset: Dataset, copy: FetchedCopy | None) -> Iterator[t
         first += record.length
 
 
-def _columns(dataset: Dataset, table: pa.Table) -> Iterator[tuple[str, str]]:
+def _columns(dataset: Dataset) -> Iterator[tuple[str, str]]:
     """Check that both episode tables have the declared columns, and the same values."""
+    table, names = LeRobotFiles(dataset.files).table, episode_column_names(dataset.files)
     videos = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
     records = arrow_schema(EpisodeRecord, sorted(dataset.features))
     lean = {
@@ -97,10 +98,10 @@ def _columns(dataset: Dataset, table: pa.Table) -> Iterator[tuple[str, str]]:
     lean |= {*records.names}
     for camera in dataset.cameras:
         lean |= {f"videos/{CAMERA_PREFIX}{camera}/{name}" for name in videos}
-    features = (*dataset.features, *_FRAME_COLUMNS)
+    features = (*_stored(dataset), *_FRAME_COLUMNS)
     statistics = {f"stats/{feature}/{name}" for feature in features for name in STATISTICS}
     copy = dataset.lerobot.table
-    yield from _names(EPISODES_DIR, table.column_names, lean | statistics)
+    yield from _names(EPISODES_DIR, names, lean | statistics)
     yield from _names(RECORDS_PATH, copy.column_names, lean)
     for name in sorted(lean & {*copy.column_names} & {*table.column_names}):
         if copy[name] != table[name]:
@@ -126,14 +127,14 @@ def _info(dataset: Dataset) -> Iterator[tuple[str, str]]:
     for name, value in expected.items():
         if info.get(name) != value:
             yield INFO_PATH, f"{name} is {info.get(name)}; expected {value}"
-    yield from _names(INFO_PATH, [*dataset.lerobot.features], {*dataset.features, *_FRAME_COLUMNS})
+    yield from _names(INFO_PATH, [*dataset.lerobot.features], {*_stored(dataset), *_FRAME_COLUMNS})
 
 
 def _rows(dataset: Dataset, index: int, first: int, task: int | None) -> Iterator[tuple[str, str]]:
     """Check the columns that LeRobot adds to every frame."""
     rows = dataset.lerobot.rows(index)
     path = dataset.lerobot.locate(index).data
-    vectors = {name for name in dataset.features if not name.startswith(CAMERA_PREFIX)}
+    vectors = {name for name in _stored(dataset) if not name.startswith(CAMERA_PREFIX)}
     yield from _names(path, rows.names, vectors | {*_FRAME_COLUMNS})
     count = len(rows)
     if not np.array_equal(rows.scalars("index"), first + np.arange(count)):
@@ -152,3 +153,8 @@ def _equal(stored: Any, expected: Any) -> bool:
     if isinstance(expected, float):
         return isinstance(stored, float) and abs(stored - expected) <= _TOLERANCE_S
     return bool(stored == expected)
+
+
+def _stored(dataset: Dataset) -> list[str]:
+    """Return the features that LeRobot's files have: not states of no values."""
+    return [name for name, shape in dataset.features.items() if shape != (0,)]

@@ -267,7 +267,7 @@ def check_episode(
         for name, (recorded, played_value) in compared.items()
         if recorded is not None and recorded != played_value
     ]
-    distance = float(np.abs(query.state() - first.state).max())
+    distance = float(np.abs(query.state() - first.state).max(initial=0.0))
     if not distance <= STATE_TOLERANCE:
         wrong.append(
             f"the first live state is {distance:.4f} away from the recorded one; expected at most "

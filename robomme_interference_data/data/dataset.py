@@ -36,7 +36,7 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import from_dict, to_dict
 from robomme_interference_data.schema.manifest import SessionEntry
 from robomme_interference_data.schema.records import DatasetIdentity, EpisodeRecord
-from robomme_interference_data.storage.arrays import combine, digest_spans
+from robomme_interference_data.storage.arrays import EMPTY_SHA256, combine, digest_spans
 from robomme_interference_data.storage.files import (
     Files,
     digest_json,
@@ -142,14 +142,19 @@ class Dataset:
     def features(self) -> dict[str, tuple[int, ...]]:
         """Shape of one value by feature name: cameras `(H, W, 3)`, vectors `(D,)`.
 
+        States of recordings without any are `(0,)`: LeRobot cannot store them, so `info.json` lacks
+        them, and their digest is that of no bytes.
+
         Raises:
-            FormatError: `info.json` has other shapes, or no states.
+            FormatError: `info.json` has other shapes, or no states although some are recorded.
         """
         shapes = {
             name: self.lerobot.shape(name)
             for name, feature in self.lerobot.features.items()
             if feature["dtype"] == "video" or name in (STATE, ACTION)
         }
+        if STATE not in shapes and self._is_stateless():
+            shapes[STATE] = (0,)
         for name in (STATE, *({ACTION} & shapes.keys())):
             if len(shapes.get(name, ())) != 1:
                 what = f"{INFO_PATH}: {name} has shape {shapes.get(name)}; expected (D,)"
@@ -312,6 +317,8 @@ class Dataset:
         if feature not in vectors:
             raise UnknownNameError.among("feature", feature, self._name, vectors)
         self.lerobot.check_span(episode_index, start, stop)
+        if self.features[feature] == (0,):
+            return np.empty((stop - start, 0), np.float32)
         return self.lerobot.vectors(episode_index, feature)[start:stop]
 
     def digests(self, episode_index: int, spans: Sequence[tuple[int, int]]) -> list[dict[str, str]]:
@@ -335,6 +342,10 @@ class Dataset:
         if sha256_file(path) != self.identity.sums:
             raise FormatError.damaged(path, f"not the SHA-256 in {IDENTITY_PATH}")
         return read_sums(path)
+
+    def _is_stateless(self) -> bool:
+        """Return whether the records are of episodes that were recorded without states."""
+        return len(self) > 0 and self.record(0).feature_sha256.get(STATE) == EMPTY_SHA256
 
     def _feature(self, camera: str | None) -> str:
         return camera_feature(self.camera(camera))

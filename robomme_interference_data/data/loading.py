@@ -198,7 +198,7 @@ def open_dataset(buffer_set: BufferSet, name: str, more: str = "") -> Dataset:
     elif buffer_set.is_own:
         hint = (
             "Build them from the source of its demonstrations, with the same options as then, such "
-            f"as {named('families_file')}; then plan the buffers again."
+            f"as {named('families_from')}; then plan the buffers again."
         )
         command = f"build {shlex.quote(buffer_set.location)} --only {name} --source KIND:PATH"
     raise MissingFileError(

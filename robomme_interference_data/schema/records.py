@@ -10,9 +10,11 @@ from typing import Annotated, Any
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.ids import EpisodeId
 
+MAX_GOAL = 1 << 16
+"""Characters of all wordings of a goal."""
+
 # Upper bounds, so that an untrusted file cannot exhaust memory.
 _MAX_FRAMES = 1 << 22  # of an episode: days at the recorded rate
-_MAX_GOAL = 1 << 16  # characters of all wordings of a goal
 _MAX_PARTS = 1 << 10  # of an answer; the embedded suite has at most six
 _MAX_SPANS = 1 << 12  # of evidence in a lesson
 _MAX_SCENE = 1 << 16  # characters
@@ -85,8 +87,8 @@ class EpisodeRecord:
 
     def __post_init__(self) -> None:
         name, start, spans = self.episode_id, self.exec_start_idx, self.evidence or ()
-        if not self.goals or sum(map(len, self.goals)) > _MAX_GOAL:
-            raise FormatError(f"{name} has no goal, or one of over {_MAX_GOAL} characters")
+        if not self.goals or sum(map(len, self.goals)) > MAX_GOAL:
+            raise FormatError(f"{name} has no goal, or one of over {MAX_GOAL} characters")
         fits = start is None or 0 < start < self.length
         if not 0 < self.length <= _MAX_FRAMES or not fits:
             raise FormatError(f"{name} has length {self.length} and exec_start_idx {start}")

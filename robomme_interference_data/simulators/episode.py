@@ -173,7 +173,7 @@ def check_begun(begun: Any, name: str, cameras: Sequence[str], action_size: int)
     lesson, first, _ = parts
     state, states, actions = map(np.asarray, (first.state, lesson.states, lesson.actions))
     wrong: list[str] = []
-    if state.ndim != 1 or not len(state) or state.dtype != np.float32:
+    if state.ndim != 1 or state.dtype != np.float32:  # of no values, if none were recorded
         wrong.append(f"the first live state is {state.dtype} {state.shape}")
     elif states.shape != (len(states), *state.shape) or states.dtype != np.float32:
         wrong.append(

@@ -28,6 +28,9 @@ _FILE = re.compile(
 )
 """The header. numpy parses it as Python, which raises any error or warning if it is damaged."""
 
+EMPTY_SHA256 = hashlib.sha256().hexdigest()
+"""The digest of a feature without any values, such as the states of a robot that records none."""
+
 _MAX_HEADER_BYTES = 1024  # `np.save` writes 128 for the arrays of this package
 
 

@@ -55,7 +55,10 @@ class Files(ABC):
 
     @abstractmethod
     def list(self, folder: str, suffix: str = "") -> list[str]:
-        """Return the sorted relative paths of all files under a folder; empty if none."""
+        """Return the sorted relative paths of all files under a folder; empty if none.
+
+        Hidden ones are left out, see `is_hidden`.
+        """
 
     @abstractmethod
     def fetch(self, paths: Iterable[str]) -> None:
@@ -113,7 +116,8 @@ class LocalFiles(Files):
     def list(self, folder: str, suffix: str = "") -> list[str]:
         """See `Files.list`."""
         matches = (self.root / folder).rglob(f"*{suffix}")
-        return sorted(p.relative_to(self.root).as_posix() for p in matches if p.is_file())
+        names = (p.relative_to(self.root).as_posix() for p in matches if p.is_file())
+        return sorted(name for name in names if not is_hidden(name))
 
     def fetch(self, paths: Iterable[str]) -> None:
         """Do nothing: the files are local."""
@@ -147,6 +151,14 @@ def _linked_folders(root: Path) -> list[Path]:
         if (repository.parent / "blobs" / _SHARED_BLOBS).is_file():
             folders.append(repository.parent / "blobs")
     return folders
+
+
+def is_hidden(relative: str) -> bool:
+    """Return whether a path is that of a file which other programs left, such as `._a.parquet`.
+
+    macOS, editors and interrupted downloads name them, or their folder, with a dot in front.
+    """
+    return any(part.startswith(".") for part in PurePosixPath(relative).parts)
 
 
 def all_files(root: Path) -> list[str]:

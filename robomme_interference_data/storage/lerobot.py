@@ -1,4 +1,6 @@
-"""Read LeRobot datasets with pyarrow and PyAV alone: v3.0, and v2.1 as its variant.
+"""Read LeRobot datasets with pyarrow and PyAV alone: v3.0, v2.1 and v2.0.
+
+The older two differ from each other in their statistics only, which are not read.
 
 The only reader of that layout, for datasets of this package and for recordings. Tests compare it
 with lerobot's own reader.
@@ -15,32 +17,25 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import EPISODES_DIR, INFO_PATH, TASKS_PATH
+from robomme_interference_data.constants import INFO_PATH
 from robomme_interference_data.errors import FormatError, MissingFileError, UnknownNameError
 
 from . import video
-from .files import Files, parse_json, read_bytes, read_json, reading
-from .parquet import RowSpan, is_plain, open_parquet, read_table
+from .files import Files, read_json
+from .lerobot_tables import read_episode_lines, read_episodes, read_tasks
+from .limits import MAX_FRAME_VALUES, MAX_NAME, MAX_RATE, MIN_RATE
+from .parquet import RowSpan
 
-VERSIONS = ("v3.0", "v2.1")
+VERSIONS = ("v3.0", "v2.1", "v2.0")
 
-_V21_EPISODES = "meta/episodes.jsonl"
-_V21_TASKS = "meta/tasks.jsonl"
 _FIELD = re.compile(r"\{(\w+)(?::0(\d)d)?\}")
 
 # Upper bounds, checked before anything is allocated.
-_MAX_LINES_BYTES = 64 << 20  # of v2.1's per-episode columns: those of half a million episodes
-_MAX_COLUMNS = 1000  # of v2.1's per-episode columns: each row may name others
-_MAX_TABLE_BYTES = 1 << 30  # of the per-episode columns in all: a million episodes have less
-_MAX_VECTOR = 4096  # numbers in a vector of a frame
-_MAX_VALUES = 1 << 26  # values in a frame of a feature: twice an image of 3840 × 2160 pixels
 _MAX_SIDES = 8  # numbers in a shape
 _MAX_EPISODES = 10_000_000
 _MAX_FEATURES = 10_000
 _MAX_TEMPLATE = 1000  # characters of a path template
-_MAX_NAME = 200  # characters of a feature's name, which a template may repeat
 _MAX_FRAME = 1 << 40  # number of a frame in its file: a container's timestamp has 64 bits
-_FPS = (1e-3, 1e6)
 
 
 @dataclass(frozen=True)
@@ -56,10 +51,10 @@ class LeRobotFiles:
     """A LeRobot dataset: its metadata, and values and frames of its episodes.
 
     `tables` are the paths of its episode tables, if known: on the Hub, listing the files takes
-    longer than fetching these. Only with `statistics`, `table` has all of their columns.
+    longer than fetching these. `statistics` are the features whose statistics `table` has.
     """
 
-    def __init__(self, files: Files, tables: Sequence[str] = (), *, statistics: bool = False):
+    def __init__(self, files: Files, tables: Sequence[str] = (), statistics: Sequence[str] = ()):
         self.files = files
         self._tables, self._statistics = tables, statistics
         self._rows: dict[int, dict[str, Any]] = {}
@@ -75,7 +70,7 @@ class LeRobotFiles:
         if self.version not in VERSIONS:
             raise FormatError(
                 f"{files.describe()} is a LeRobot dataset of version {self.version!r}; this "
-                f"package reads {' and '.join(VERSIONS)}",
+                f"package reads {', '.join(VERSIONS)}",
                 "Convert it with LeRobot's own scripts (lerobot.scripts."
                 "convert_dataset_v21_to_v30 and its predecessors).",
             )
@@ -110,14 +105,17 @@ class LeRobotFiles:
     @cached_property
     def table(self) -> pa.Table:
         """The per-episode columns by episode index."""
-        table = self._v30_table() if self.version == "v3.0" else self._v21_table()
         where = self.files.describe()
+        if self.version == "v3.0":
+            table = read_episodes(self.files, self._tables, self._statistics)
+        else:
+            table = read_episode_lines(self.files)
         for name in ("episode_index", "length"):
             column = table[name] if name in table.column_names else pa.nulls(1)
             if column.null_count or not pa.types.is_integer(column.type):
                 raise FormatError.damaged(where, f"its episodes have no whole numbers {name!r}")
         # Its lines may come in any order, since they are found by number.
-        if self.version == "v2.1":
+        if self.version != "v3.0":
             table = table.sort_by("episode_index")
         # LeRobot finds an episode of v3.0 by its place, not by its number.
         if not np.array_equal(table["episode_index"].to_numpy(), np.arange(len(self))):
@@ -128,15 +126,32 @@ class LeRobotFiles:
         return table.combine_chunks()
 
     @cached_property
-    def tasks(self) -> dict[str, Any]:
+    def task_texts(self) -> dict[int, str]:
+        """The task texts that the dataset lists, by their index."""
+        return read_tasks(self.files, lines=self.version != "v3.0")
+
+    @property
+    def tasks(self) -> dict[str, int]:
         """The index of each task text that the dataset lists."""
-        if self.version == "v2.1":
-            rows = list(self._json_lines(_V21_TASKS))
-        else:
-            rows = RowSpan(self.files.path(TASKS_PATH)).table().to_pylist()
-        # LeRobot stores the texts as pandas' index, which pandas names so if it has no name.
-        texts = (str(row.get("task", row.get("__index_level_0__"))) for row in rows)
-        return {text: row.get("task_index") for text, row in zip(texts, rows, strict=True)}
+        return {text: index for index, text in self.task_texts.items()}
+
+    def tasks_of(self, index: int) -> tuple[str, ...]:
+        """Return the tasks of an episode's frames, in the order in which they begin.
+
+        These are what LeRobot returns with each frame. None, if the frames have no task index.
+        """
+        rows = self.rows(index)
+        if "task_index" not in rows.names:
+            return ()
+        numbers = dict.fromkeys(rows.scalars("task_index").tolist())
+        for number in numbers:
+            if number not in self.task_texts:
+                raise FormatError(
+                    f"{rows.path}: frames of episode {index} have the task_index {number}, which "
+                    f"meta/ does not list; it lists {len(self.task_texts)} tasks",
+                    "Add the task's text to the list of tasks, or correct the frames.",
+                )
+        return tuple(self.task_texts[number] for number in numbers)
 
     def row(self, index: int) -> dict[str, Any]:
         """Return the per-episode columns of an episode as plain values."""
@@ -175,7 +190,7 @@ class LeRobotFiles:
         """Read a column of vectors of an episode, `(T, D) float32`."""
         rows = self.rows(index)
         values = rows.vectors(column)
-        if values.shape[1:] != self.shape(column) or values.shape[1] > _MAX_VECTOR:
+        if values.shape[1:] != self.shape(column):
             what = (
                 f"{column} of episode {index} has {values.shape[1]} values a frame; info.json has "
                 f"{self.shape(column)}"
@@ -201,44 +216,6 @@ class LeRobotFiles:
                 f"{start} to {stop - 1} were requested"
             )
 
-    def _v30_table(self) -> pa.Table:
-        names = self._tables or self.files.list(EPISODES_DIR, ".parquet")
-        paths = [self.files.path(name) for name in names]
-        if not paths:
-            raise MissingFileError(
-                f"{EPISODES_DIR} holds no parquet file in {self.files.describe()}",
-                "The dataset is incomplete: download or build it again.",
-            )
-        tables = []
-        for path in paths:
-            file = open_parquet(path)
-            columns = [
-                field.name
-                for field in file.schema_arrow
-                if is_plain(field.type) and not field.name.startswith("stats/")
-            ]
-            tables.append(read_table(file, path, None if self._statistics else columns))
-            if sum(table.nbytes for table in tables) > _MAX_TABLE_BYTES:
-                what = f"the episode tables have over {_MAX_TABLE_BYTES:,} bytes"
-                raise FormatError.damaged(path, what)
-        with reading(paths[0]):  # files with columns of different types
-            return pa.concat_tables(tables)
-
-    def _v21_table(self) -> pa.Table:
-        rows = list(self._json_lines(_V21_EPISODES))
-        names = dict.fromkeys(name for row in rows for name in row)
-        path = self.files.path(_V21_EPISODES)
-        if len(names) > _MAX_COLUMNS:
-            raise FormatError.damaged(path, f"{len(names)} columns")
-        with reading(path):
-            return pa.table({name: [row.get(name) for row in rows] for name in names})
-
-    def _json_lines(self, relative: str) -> Iterator[dict[str, Any]]:
-        path = self.files.path(relative)
-        for number, line in enumerate(read_bytes(path, _MAX_LINES_BYTES).splitlines(), 1):
-            if line.strip():
-                yield parse_json(line, f"{path}, line {number}")
-
 
 def _check_info(info: dict[str, Any], path: object) -> None:
     """Check types and sizes of what is read from `info.json`."""
@@ -254,20 +231,21 @@ def _check_info(info: dict[str, Any], path: object) -> None:
         return isinstance(value, str) and len(value) <= _MAX_TEMPLATE
 
     fps, features = info.get("fps"), info.get("features")
-    check(isinstance(fps, int | float) and _FPS[0] <= fps <= _FPS[1], "fps")
+    check(isinstance(fps, int | float) and MIN_RATE <= fps <= MAX_RATE, "fps")
     check(is_count(info.get("total_episodes"), 0, _MAX_EPISODES), "total_episodes")
     check(is_count(info.get("chunks_size", 1000), 1, _MAX_EPISODES), "chunks_size")
     check(is_template(info.get("data_path")), "data_path")
     check(isinstance(features, dict) and 0 < len(features) <= _MAX_FEATURES, "features")
     for name, feature in features.items() if isinstance(features, dict) else ():
-        check(len(name) <= _MAX_NAME and isinstance(feature, dict), "features")
+        check(len(name) <= MAX_NAME and isinstance(feature, dict), "features")
         check(isinstance(feature.get("dtype"), str), "features")
         shape = feature.get("shape")
         check(isinstance(shape, list) and len(shape) <= _MAX_SIDES, "features")
-        check(all(is_count(side, 1, _MAX_VALUES) for side in shape), "features")
-        check(math.prod(shape) <= _MAX_VALUES, "features")
+        check(all(is_count(side, 1, MAX_FRAME_VALUES) for side in shape), "features")
+        check(math.prod(shape) <= MAX_FRAME_VALUES, "features")
+        pictures = feature["dtype"] in ("video", "image")
         for key in ("info", "video_info"):  # LeRobot's newer and older name
-            check(isinstance(feature.get(key), dict | None), "features")
+            check(isinstance(feature.get(key), dict | None) or not pictures, "features")
         check(feature["dtype"] != "video" or is_template(info.get("video_path")), "video_path")
 
 
@@ -292,7 +270,7 @@ def _locate_episode(
     info: dict[str, Any], index: int, row: dict[str, Any], where: str
 ) -> EpisodeLocation:
     """Return where an episode lies, given its per-episode columns."""
-    old = info["codebase_version"] == "v2.1"
+    old = info["codebase_version"] != "v3.0"
 
     def whole(name: str) -> int:
         value = row.get(name)

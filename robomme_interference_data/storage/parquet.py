@@ -19,7 +19,17 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError
 
+from .arrow_columns import (
+    is_listed,
+    is_number,
+    is_plain,
+    is_text,
+    is_whole,
+    simple_type,
+    simplified,
+)
 from .files import atomic_path, check_not_pointer, reading
+from .limits import MAX_READ_VALUES
 from .parquet_pages import decoded_size
 
 # An image may be a PNG of some megabytes.
@@ -33,9 +43,6 @@ _MAGIC = b"PAR1"
 
 _MAX_LIST = 1 << 14
 """Length of a list in the metadata, such as row groups: pyarrow allocates memory for it first."""
-
-_MAX_VALUES = 1 << 26
-"""Values of a read: a million rows of a run have a third of them."""
 
 _MAX_BYTES = 2 << 30
 """Decoded bytes of a read, or of the images of a row group."""
@@ -88,7 +95,11 @@ def read_table(
     with reading(path):
         for field in file.schema_arrow:
             if (names is None or field.name in names) and not is_plain(field.type):
-                raise ValueError(f"column {field.name!r} is of type {field.type}")
+                raise FormatError(
+                    f"{path}: column {field.name!r} is of type {field.type}; expected text, "
+                    "numbers, true or false, or lists or structs of these",
+                    "Write the column with another type, or leave it out.",
+                )
         _check_size(file, path, names, chosen)
         table = file.read_row_groups(list(chosen), columns=names)
         table.validate(full=True)
@@ -120,8 +131,8 @@ def _check_size(
                 column = file.metadata.row_group(group).column(number)
                 values += column.num_values
                 size += decoded_size(raw, column, fixed_length, _MAX_BYTES)
-                if size > _MAX_BYTES or values > _MAX_VALUES:
-                    what = f"over {_MAX_BYTES:,} bytes or {_MAX_VALUES:,} values once decoded"
+                if size > _MAX_BYTES or values > MAX_READ_VALUES:
+                    what = f"over {_MAX_BYTES:,} bytes or {MAX_READ_VALUES:,} values once decoded"
                     raise ValueError(what)
 
 
@@ -132,28 +143,8 @@ def writing(path: Path) -> Iterator[BinaryIO]:
         yield file
 
 
-_NUMBERS = (pa.int8(), pa.int16(), pa.int32(), pa.int64(), pa.float16(), pa.float32(), pa.float64())
-_UNSIGNED = (pa.uint8(), pa.uint16(), pa.uint32(), pa.uint64())
-_TEXTS = (pa.string(), pa.large_string(), pa.binary(), pa.large_binary())
-_PLAIN = {pa.null(), pa.bool_(), *_NUMBERS, *_UNSIGNED, *_TEXTS}
-
-
-def is_listed(kind: pa.DataType) -> bool:
-    """Return whether a type is one of Arrow's lists."""
-    return bool(
-        pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
-    )
-
-
-def is_plain(kind: pa.DataType) -> bool:
-    """Return whether a type is text, bytes, number, bool, or a list or struct of these."""
-    if pa.types.is_dictionary(kind) or is_listed(kind):
-        return is_plain(kind.value_type)
-    if pa.types.is_struct(kind):
-        # Two fields of one name cannot become a dict.
-        unique = len({field.name for field in kind}) == kind.num_fields
-        return unique and all(is_plain(field.type) for field in kind)
-    return kind in _PLAIN
+_EXACT_FLOAT32 = 1 << 24
+"""Whole numbers up to this one are exact as float32."""
 
 
 class RowSpan:
@@ -195,26 +186,43 @@ class RowSpan:
             raise FormatError.damaged(self.path, what)
         return rows
 
-    def scalars(self, name: str) -> NDArray[np.int64]:
-        """Return a column of booleans or integers, or of lists of one such value, `(T,) int64`."""
+    def values(self, name: str) -> pa.ChunkedArray:
+        """Return a column in its simple type, and of lists of one value the values."""
         column = self.table([name])[name]
-        kind = column.type
-        if is_listed(kind):
-            column, kind = pc.list_flatten(column), kind.value_type
-            if len(column) != len(self):
+        with reading(self.path):
+            column = simplified(column)
+        if is_listed(column.type):
+            flat = pc.list_flatten(column)
+            lengths = pc.unique(pc.list_value_length(column)).to_pylist()
+            if len(flat) != len(self) or lengths not in ([1], []):
                 raise FormatError.damaged(self.path, f"column {name!r} has lists of several values")
-        if not (pa.types.is_boolean(kind) or pa.types.is_integer(kind)) or column.null_count:
+            return flat
+        return column
+
+    def scalars(self, name: str) -> NDArray[np.int64]:
+        """Return a column of booleans or whole numbers, or of lists of one, `(T,) int64`."""
+        column = self.values(name)
+        kind = column.type
+        if not (pa.types.is_boolean(kind) or is_number(kind)) or column.null_count:
             raise FormatError(
                 f"{self.path}: column {name!r} is of type {kind} with {column.null_count} empty "
-                "values; expected booleans or integers, none empty"
+                "values; expected booleans or whole numbers, none empty"
             )
-        with reading(self.path):  # a number too large
-            return np.asarray(pc.cast(column, pa.int64()).to_numpy())
+        values = np.asarray(column.to_numpy())
+        # pandas makes floats of whole numbers where rows were empty for a time.
+        with np.errstate(invalid="ignore"):
+            whole = values.astype(np.int64)
+        if wrong := np.flatnonzero(whole != values).tolist():
+            raise FormatError(
+                f"{self.path}: column {name!r} is {values[wrong[0]]} in row "
+                f"{self.start + wrong[0]}; expected whole numbers"
+            )
+        return whole
 
     def texts(self, name: str) -> list[str]:
         """Return a column of texts, with empty ones for nulls."""
         column = self.table([name])[name]
-        if not (pa.types.is_string(column.type) or pa.types.is_large_string(column.type)):
+        if not is_text(column.type):
             raise FormatError(
                 f"{self.path}: column {name!r} is of type {column.type}; expected texts"
             )
@@ -222,20 +230,30 @@ class RowSpan:
             return [text or "" for text in column.to_pylist()]
 
     def vectors(self, name: str) -> NDArray[np.float32]:
-        """Return a column of lists of numbers as `(T, D) float32`."""
+        """Return a column of lists of numbers, or of numbers, as `(T, D) float32`."""
         column, what = self.table([name])[name], f"{self.path}: column {name!r}"
-        kind = column.type
-        if not is_listed(kind) or not pa.types.is_floating(kind.value_type):
-            raise FormatError(f"{what} is of type {kind}; expected lists of floats")
-        lengths = pc.unique(pc.list_value_length(column))
-        flat = pc.list_flatten(column)
+        stored = column.type
+        with reading(self.path):
+            column = simplified(column)
+        # LeRobot stores vectors of one value as the value.
+        flat = pc.list_flatten(column) if is_listed(column.type) else column
+        if not is_number(flat.type):
+            raise FormatError(f"{what} is of type {stored}; expected lists of numbers")
+        lengths = [1]
+        if is_listed(column.type):
+            lengths = pc.unique(pc.list_value_length(column)).drop_null().to_pylist()
         if column.null_count or flat.null_count or len(lengths) != 1:
             raise FormatError(
-                f"{what} has empty values or vectors of several lengths: "
-                f"{sorted(lengths.drop_null().to_pylist())}",
+                f"{what} has empty values or vectors of several lengths: {sorted(lengths)}",
                 "Every row needs a vector of the same length.",
             )
-        values = flat.to_numpy().reshape(len(column), lengths[0].as_py())
+        values = flat.to_numpy().reshape(len(column), lengths[0])
+        if is_whole(flat.type) and not (np.abs(values.astype(float)) <= _EXACT_FLOAT32).all():
+            raise FormatError(
+                f"{what} has whole numbers from {values.min():,} to {values.max():,}; states and "
+                f"actions are stored as float32, which is exact up to {_EXACT_FLOAT32:,}",
+                "Scale them, for example from ticks to radians.",
+            )
         with np.errstate(over="ignore"):  # what is too large becomes infinite; callers refuse it
             return np.ascontiguousarray(values, dtype=np.float32)
 
@@ -245,11 +263,14 @@ class RowSpan:
         At most one row group is held in memory, and less if the file's pages are smaller.
         """
         kind = self._type(name)
-        stored = pa.types.is_struct(kind) and kind.get_field_index("bytes") >= 0
-        if not stored or not pa.types.is_binary(kind.field("bytes").type):
+        stored = simple_type(kind)
+        in_structs = stored is not None and pa.types.is_struct(stored)
+        if in_structs and stored.get_field_index("bytes") >= 0:
+            stored = stored.field("bytes").type
+        if stored != pa.binary():
             raise FormatError(
-                f"{self.path}: column {name!r} is of type {kind}; expected images as "
-                "struct<bytes, path>"
+                f"{self.path}: column {name!r} is of type {kind}; expected images as PNG or JPEG, "
+                "in struct<bytes, path>"
             )
         groups, row = self._row_groups()
         with reading(self.path):
@@ -260,7 +281,8 @@ class RowSpan:
             for batch in batches:
                 for cell in batch.column(name):
                     if self.start <= row < self.stop:
-                        data = cell["bytes"].as_py()
+                        value = cell.as_py()
+                        data = value["bytes"] if in_structs and value else value
                         if data is None:
                             raise FormatError(
                                 f"{self.path}: the image in row {row} of column {name!r} is not "

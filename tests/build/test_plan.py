@@ -118,7 +118,7 @@ def test_what_goes_with_demonstrations_has_their_episodes_and_cameras(
         ({"fps": 0.0}, {}, InvalidOptionError),
         ({"columns": ("front=a", "front=b")}, {}, InvalidOptionError),
         ({"columns": ("front=a",)}, {}, InvalidOptionError),
-        ({"families_file": Path("no.csv")}, {}, InvalidOptionError),
+        ({"families_from": "no.csv"}, {}, InvalidOptionError),
         ({}, {"conditions": ("k0", "k0")}, InvalidOptionError),
         ({}, {"conditions": ("x3",)}, InvalidIdError),
         ({}, {"position_limit": "many"}, InvalidOptionError),

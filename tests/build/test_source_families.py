@@ -10,12 +10,8 @@ from hypothesis import strategies as st
 from support.goal_texts import GOALS, UNMASK
 from support.messages import raises
 
-from robomme_interference_data.build_dataset.sources.families import (
-    ids_by_block,
-    ids_by_columns,
-    read_families,
-    template,
-)
+from robomme_interference_data.build_dataset.sources.families import ids_by_block, ids_by_columns
+from robomme_interference_data.build_dataset.sources.families_file import read_families, template
 from robomme_interference_data.build_dataset.sources.robomme_families import (
     ROBOMME,
     families_for_goal,
@@ -30,7 +26,7 @@ def written(folder: Path, text: str, name: str = "families.csv") -> Path:
 
 
 def ids_by_file(path: Path, count: int) -> dict:
-    return ids_by_columns(read_families(path, [()] * count), str(path)) or {}
+    return ids_by_columns(read_families(path, [()] * count, "set"), str(path)) or {}
 
 
 def names(ids: dict | None) -> dict[int, str]:
@@ -114,34 +110,34 @@ def test_a_line_for_each_task(tmp_path: Path) -> None:
     lines = path.read_text().splitlines()
     assert lines[0] == "task,family" and len(lines) == 4
     with raises(SourceError):  # the families are not filled in
-        ids_by_columns(read_families(path, TASKS), "here")
+        ids_by_columns(read_families(path, TASKS, "set"), "here")
     for name in ("Open", "Stack", "Push"):
         path.write_text(path.read_text().replace("<family>", name, 1))
-    ids = names(ids_by_columns(read_families(path, TASKS), "here"))
+    ids = names(ids_by_columns(read_families(path, TASKS, "set"), "here"))
     assert ids == dict(enumerate(["Open/train/0", "Stack/train/0", "Open/train/1", "Push/train/0"]))
 
 
 def test_lines_that_a_file_lacks_are_offered(tmp_path: Path) -> None:
     path = written(tmp_path, "family,task,split\nOpen,open the drawer,test\n")
     with raises(SourceError) as caught:
-        read_families(path, TASKS)
+        read_families(path, TASKS, "set")
     *_, stack, push = (caught.value.hint or "").splitlines()
     assert (stack, push) == ('"stack, then ""wait""",<family>,<split>', "push,<family>,<split>")
     path = written(tmp_path, f"{HEADER}\n0,A\n")
     with raises(SourceError) as caught:
-        read_families(path, [()] * 60)
+        read_families(path, [()] * 60, "set")
     hint = (caught.value.hint or "").splitlines()
     assert hint[1:3] == ["1,<family>", "2,<family>"] and hint[-1] == "and 19 more"
 
 
 def test_an_episode_of_several_tasks(tmp_path: Path) -> None:
     path = written(tmp_path, "task,family\nopen,Drawer\nclose,Drawer\npush,Push\n")
-    assert read_families(path, [["open", "close"], ["push"]]) == [
+    assert read_families(path, [["open", "close"], ["push"]], "set") == [
         {"family": "Drawer"},
         {"family": "Push"},
     ]
     with raises(SourceError):
-        read_families(path, [["open", "push"]])
+        read_families(path, [["open", "push"]], "set")
 
 
 ROWS: list[tuple[list[dict[str, Any]], list[str] | str]] = [

@@ -9,6 +9,7 @@ from typing import Any
 
 import av
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.messages import raises
@@ -162,6 +163,132 @@ def test_broken_tables(tmp_path: Path, rows: Callable[[], Rows], message: str) -
     text = refused(tmp_path)
     assert re.search(message, text)
     assert "\n" in text  # says what to do
+
+
+def retyped(**kinds: Any) -> Callable[[pa.Table], pa.Table]:
+    """Return a change of the types of columns."""
+
+    def change(table: pa.Table) -> pa.Table:
+        for name, kind in kinds.items():
+            column = table[name].cast(kind)
+            table = table.set_column(table.column_names.index(name), name, column)
+        return table
+
+    return change
+
+
+def with_column(name: str, values: list[Any]) -> Callable[[pa.Table], pa.Table]:
+    return lambda table: table.append_column(name, pa.array(values))
+
+
+CATEGORY = pa.dictionary(pa.int8(), pa.string())
+AS_OTHERS_WRITE = [
+    retyped(episode_id=CATEGORY, goal=pa.large_string()),
+    retyped(episode_id=pa.large_string(), goal=CATEGORY, frame_index=pa.uint8()),
+    retyped(episode_id=pa.string_view(), frame_index=pa.float64()),
+    retyped(state=pa.large_list(pa.float64()), action=pa.list_(pa.float32(), 8)),
+]
+
+
+@pytest.mark.parametrize("change", AS_OTHERS_WRITE)
+def test_tables_of_other_programs(tmp_path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
+    write(tmp_path)
+    path = tmp_path / "frames.parquet"
+    pq.write_table(change(pq.read_table(path)), path)
+    check_recording(read_one(tmp_path), FOUR, marked=False)
+
+
+@pytest.mark.parametrize("kind", [pa.float16(), pa.float64(), pa.int8(), pa.decimal128(23, 2)])
+@pytest.mark.parametrize("size", [1, 3])
+def test_states_of_any_number_type(tmp_path: Path, kind: pa.DataType, size: int) -> None:
+    write(tmp_path)
+    path = tmp_path / "frames.parquet"
+    values = np.arange(4 * size).reshape(4, size) - 5
+    flat = pa.array(values.ravel()).cast(kind)
+    column = flat if size == 1 else pa.FixedSizeListArray.from_arrays(flat, size)
+    table = pq.read_table(path).drop_columns("state").append_column("state", column)
+    pq.write_table(table, path)
+    states = [frame.state for frame in read_one(tmp_path).frames]
+    np.testing.assert_array_equal(states, values.astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ({"seed": [7.0] * 4}, {"seed": 7}),
+        ({"seed": ["7"] * 4}, {"seed": 7}),
+        ({"seed": [float("nan")] * 4}, {"seed": None}),
+        ({"seed": [None] * 4, "difficulty": [None] * 4}, {"seed": None, "difficulty": None}),
+        ({"difficulty": [""] * 4, "simulator": [""] * 4}, {"difficulty": None, "simulator": None}),
+        ({"exact": [0] * 4}, {"exact": False}),
+        ({"exact": ["False"] * 4}, {"exact": False}),
+        ({"exact": [1.0] * 4}, {"exact": True}),
+    ],
+)
+def test_values_as_other_programs_store_them(
+    tmp_path: Path, values: dict[str, list[Any]], expected: dict[str, Any]
+) -> None:
+    write(tmp_path)
+    for name, column in values.items():
+        table = with_column(name, column)(pq.read_table(tmp_path / "frames.parquet"))
+        pq.write_table(table, tmp_path / "frames.parquet")
+    recording = read_one(tmp_path)
+    assert {name: getattr(recording, name) for name in expected} == expected
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        [True, True, False, False],
+        [1, 1, 0, 0],
+        [1.0, 1.0, 0.0, 0.0],
+        ["True", "true", "False", "FALSE"],
+        ["1", "1", "0", "0"],
+    ],
+)
+def test_marks_of_any_type(tmp_path: Path, flags: list[Any]) -> None:
+    write(tmp_path, four(is_demo=flags))
+    shown = [frame.is_demonstration for frame in read_one(tmp_path).frames]
+    assert shown == [True, True, False, False]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        with_column("is_demo", ["yes", "no", "no", "no"]),
+        with_column("is_demo", [1.0, float("nan"), 0.0, 0.0]),
+        with_column("is_demo", [2, 1, 0, 0]),
+        with_column("is_demo", [True, None, False, False]),
+        with_column("seed", [7.5] * 4),
+        with_column("seed", ["x"] * 4),
+        with_column("exact", ["maybe"] * 4),
+        with_column("difficulty", [0] * 4),
+        with_column("__index_level_0__", [0, 1, 2, 3]),
+        with_column("frame_index_2", [0, 1, 2, 3]),
+    ],
+)
+def test_values_without_one_meaning(tmp_path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
+    write(tmp_path)
+    path = tmp_path / "frames.parquet"
+    pq.write_table(change(pq.read_table(path)), path)
+    with raises(SourceError):
+        read_one(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "file",
+    [
+        f"videos/front/{DRAWER.rpartition('/')[0]}/._0.mkv",
+        "videos/.ipynb_checkpoints/OpenDrawer/train/0.mkv",
+        "images/front/.ipynb_checkpoints/train/0/000000.png",
+        f"images/front/{DRAWER}/._000000.png",
+        "._frames.parquet",
+    ],
+)
+def test_hidden_files_are_no_recordings(tmp_path: Path, file: str) -> None:
+    write(tmp_path)
+    misplaced(file)(tmp_path)
+    check_recording(read_one(tmp_path), FOUR, marked=False)
 
 
 def replace_by_video(folder: Path, frames: int) -> None:

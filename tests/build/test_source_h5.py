@@ -88,6 +88,14 @@ def test_seed_difficulty_and_a_camera_may_be_missing(path: Path) -> None:
     assert {tuple(frame.images) for frame in recording.frames} == {("front",)}
 
 
+@pytest.mark.parametrize(
+    ("seed", "expected"), [("7", 7), (7.0, 7), (np.array([7]), 7), (np.nan, None)]
+)
+def test_seeds_of_any_type(path: Path, seed: Any, expected: int | None) -> None:
+    put(path, "setup/seed", seed)
+    assert read(path).seed == expected
+
+
 def test_subgoals_of_the_demonstration_are_evidence(path: Path) -> None:
     assert read(path).evidence is None  # there are none
     subgoals = ["static", "pick up the peg", "pick up the peg", "hook it", "hook it", "hook it"]
@@ -109,6 +117,7 @@ def test_subgoals_of_the_demonstration_are_evidence(path: Path) -> None:
         ("setup/task_goal", None),
         ("setup/task_goal", np.bytes_(b"\xff\xfe")),
         ("setup/seed", "seven"),
+        ("setup/seed", 7.5),
         ("timestep_7/info/is_video_demo", None),
         ("timestep_7/obs/joint_state", "text"),
     ],
@@ -137,6 +146,47 @@ def test_files_that_are_not_whole(path: Path, keep: int) -> None:
     path.write_bytes(path.read_bytes()[:keep])
     with raises(SourceError):
         read(path)
+
+
+@pytest.mark.parametrize(
+    ("of", "flag"),
+    [
+        (str, "False"),
+        (lambda shown: np.bytes_(str(int(shown))), "0"),
+        (float, 0.0),
+        (lambda shown: np.array([shown]), [False]),
+        (np.uint8, 0),
+    ],
+)
+def test_marks_of_any_type(path: Path, of: Any, flag: Any) -> None:
+    """The text "False" is false."""
+    for step in range(len(EPISODE)):
+        put(path, f"timestep_{step}/info/is_video_demo", of(step < EPISODE.lesson))
+    check_recording(read(path), EPISODE)
+
+
+@pytest.mark.parametrize("value", ["maybe", "", 2, np.nan, np.array([True, False])])
+def test_marks_without_one_meaning(path: Path, value: Any) -> None:
+    put(path, "timestep_3/info/is_video_demo", value)
+    with raises(SourceError):
+        read(path)
+
+
+def test_a_file_that_another_program_writes(path: Path) -> None:
+    fcntl = pytest.importorskip("fcntl")
+    with path.open("rb+") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with raises(SourceError) as raised:
+            read(path)
+    assert "HDF5_USE_FILE_LOCKING" in str(raised.value.hint)
+
+
+@pytest.mark.parametrize("name", ["MoveCube (1)", "MoveCube - Copy", "MoveCube(2)"])
+def test_a_second_download_of_a_file(path: Path, name: str) -> None:
+    shutil.copyfile(path, path.with_stem(f"record_dataset_{name}"))
+    with raises(InvalidIdError) as raised:
+        read(path.parent)
+    assert "remove it" in str(raised.value.hint)
 
 
 def test_nothing_to_read(path: Path) -> None:

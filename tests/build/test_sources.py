@@ -45,6 +45,7 @@ LAYOUTS: dict[str, Callable[..., Any]] = {
     "lerobot v3.0 video": partial(write_lerobot, stored="video", **TOLD),
     "lerobot v2.1": partial(write_lerobot, version="v2.1", **TOLD),
     "lerobot v2.1 video": partial(write_lerobot, version="v2.1", stored="video", **TOLD),
+    "lerobot v2.0 video": partial(write_lerobot, version="v2.0", stored="video", **TOLD),
 }
 
 

@@ -25,7 +25,6 @@ from robomme_interference_data.build_dataset.dataset.frame_selection import (
     select_demonstration,
     select_unit,
 )
-from robomme_interference_data.build_dataset.dataset.image_stats import ImageStats
 from robomme_interference_data.build_dataset.dataset.lerobot_writer import StoredEpisode
 from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan
 from robomme_interference_data.build_dataset.dataset.stage import (
@@ -35,6 +34,7 @@ from robomme_interference_data.build_dataset.dataset.stage import (
     read_staged,
     staged_name,
 )
+from robomme_interference_data.build_dataset.dataset.statistics import ImageStats
 from robomme_interference_data.build_dataset.sources import Frame
 from robomme_interference_data.constants import DISTRACTORS
 from robomme_interference_data.errors import BuildError, SourceError

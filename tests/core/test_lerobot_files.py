@@ -1,6 +1,7 @@
-"""The one reader of LeRobot datasets: both layouts, and what may be wrong with them."""
+"""The one reader of LeRobot datasets: all layouts, and what may be wrong with them."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +13,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.lerobot_layouts import DATA, NAMES, TABLE, edit_columns, edit_info, write_lerobot
 from support.messages import raises
-from support.recordings import EPISODES
+from support.recordings import EPISODES, MOVE, PEG
 
 from robomme_interference_data.errors import FormatError, MissingFileError, UnknownNameError
 from robomme_interference_data.storage.files import LocalFiles
 from robomme_interference_data.storage.lerobot import LeRobotFiles, fill_template
 
 VIDEO = "videos/observation.images.front/"
-V21 = "chunk-000/episode_000002"
+V2 = "chunk-000/episode_000002"
+V2_LOCATION = (9, f"data/{V2}.parquet", (f"videos/image/{V2}.mkv", 0))
 LOCATIONS = {  # of the third episode, which begins with frame 19 of the common files of v3.0
     "v3.0": (9, DATA, (VIDEO + "chunk-000/file-000.mkv", 19)),
-    "v2.1": (9, f"data/{V21}.parquet", (f"videos/image/{V21}.mkv", 0)),
+    "v2.1": V2_LOCATION,
+    "v2.0": V2_LOCATION,
 }
 
 
@@ -42,9 +45,9 @@ def read_all(root: Path) -> None:
                 lerobot.vectors(index, name)
 
 
-@pytest.fixture(params=["v3.0", "v2.1"])
+@pytest.fixture(params=["v3.0", "v2.1", "v2.0"])
 def root(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """A dataset of videos of either version."""
+    """A dataset of videos of each version."""
     return write_lerobot(tmp_path / "dataset", version=request.param, stored="video")
 
 
@@ -85,6 +88,103 @@ def test_several_files_statistics_and_tasks_as_pandas_writes_them(v30: Path) -> 
     assert lerobot.table["episode_index"].to_pylist() == [0, 1, 2]
     assert "stats/state/mean" not in lerobot.row(2)  # statistics are never read
     assert set(lerobot.tasks) == {"one", "two"}
+
+
+def _retype(name: str, kind: pa.DataType) -> Callable[[pa.Table], pa.Table]:
+    """Return a change of a column's type."""
+
+    def change(table: pa.Table) -> pa.Table:
+        place = table.column_names.index(name)
+        return table.set_column(place, name, table[name].cast(kind))
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda table: table.select(table.column_names[::-1]),
+        lambda table: table.cast(pa.schema([f.with_nullable(False) for f in table.schema])),
+        lambda table: table.append_column("operator", pa.array(["x"] * len(table))),
+        _retype("length", pa.int16()),
+        _retype("length", pa.float64()),
+        _retype("data/file_index", pa.uint32()),
+        _retype("episode_id", pa.large_string()),
+        _retype("episode_id", pa.dictionary(pa.int8(), pa.string())),
+        _retype("tasks", pa.large_list(pa.large_string())),
+        _retype("tasks", pa.list_(pa.string(), 1)),
+        _retype(VIDEO + "from_timestamp", pa.float32()),
+    ],
+)
+def test_episode_tables_that_differ(v30: Path, change: Callable[[pa.Table], pa.Table]) -> None:
+    """As merged datasets have them; the types of one table are those of another program."""
+    expected = opened(v30)
+    whole = pq.read_table(v30 / TABLE)
+    pq.write_table(whole.slice(0, 1), v30 / TABLE)
+    pq.write_table(change(whole.slice(1)), (v30 / TABLE).with_name("file-001.parquet"))
+    found = opened(v30)
+    for index in range(3):
+        assert found.row(index).items() >= expected.row(index).items()
+        assert found.locate(index) == expected.locate(index)
+
+
+def test_a_column_that_only_one_table_has(v30: Path) -> None:
+    whole = pq.read_table(v30 / TABLE)
+    pq.write_table(whole.slice(0, 2), v30 / TABLE)
+    other = (v30 / TABLE).with_name("file-001.parquet")
+    pq.write_table(whole.slice(2).drop_columns("episode_id"), other)
+    ids = [row["episode_id"] for row in opened(v30).table.to_pylist()]
+    assert ids == ["MoveCube/train/0", "MoveCube/train/1", None]
+
+
+def test_a_column_that_is_text_in_one_table_and_a_number_in_another(v30: Path) -> None:
+    whole = pq.read_table(v30 / TABLE)
+    pq.write_table(whole.slice(0, 1).append_column("seed", pa.array(["x"])), v30 / TABLE)
+    other = (v30 / TABLE).with_name("file-001.parquet")
+    pq.write_table(whole.slice(1).append_column("seed", pa.array([1, 2])), other)
+    with raises(FormatError):
+        _ = opened(v30).table
+
+
+@pytest.mark.parametrize("folder", [".ipynb_checkpoints/", ""])
+def test_hidden_files_are_no_tables(v30: Path, folder: str) -> None:
+    """macOS, editors and interrupted downloads leave them beside the tables."""
+    hidden = v30 / "meta/episodes/chunk-000" / folder / "._file-000.parquet"
+    hidden.parent.mkdir(exist_ok=True)
+    hidden.write_bytes(b"Mac OS X")
+    assert opened(v30).table["length"].to_pylist() == [12, 7, 9]
+
+
+@pytest.mark.parametrize(
+    "tasks",
+    [
+        {"task_index": [1, 0], "task": ["b", "a"]},
+        {"task_index": [0, 2], "task": ["a", "b"]},
+        {"task_index": [0, 0], "task": ["a", "b"]},
+        {"task_index": [0, None], "task": ["a", "b"]},
+        {"task_index": [0, 1], "task": ["a", None]},
+        {"task_index": [0, 1], "text": ["a", "b"]},
+    ],
+)
+def test_tasks_that_are_not_clear(v30: Path, tasks: dict[str, Any]) -> None:
+    pq.write_table(pa.table(tasks), v30 / "meta/tasks.parquet")
+    with raises(FormatError):
+        _ = opened(v30).tasks
+
+
+def test_tasks_of_the_frames(root: Path) -> None:
+    lerobot = opened(root)
+    assert [lerobot.tasks_of(index) for index in range(3)] == [(MOVE,), (MOVE,), (PEG,)]
+
+
+def test_several_tasks_of_frames_come_in_their_order(v30: Path) -> None:
+    edit_columns(v30 / DATA, task_index=[1] * 5 + [0] * 7 + [0] * 7 + [1] * 9)
+    assert opened(v30).tasks_of(0) == (PEG, MOVE)
+    edit_columns(v30 / DATA, task_index=[2] * 12 + [0] * 16)
+    with raises(FormatError):
+        opened(v30).tasks_of(0)
+    edit_columns(v30 / DATA, task_index=None)
+    assert opened(v30).tasks_of(0) == ()
 
 
 def test_episodes_out_of_order(v30: Path) -> None:
@@ -142,7 +242,7 @@ def test_invalid_paths(root: Path, which: str, path: str) -> None:
 
 
 INFO = {
-    "codebase_version": ("v2.0", ["v3.0"]),
+    "codebase_version": ("v1.6", ["v3.0"]),
     "features": (None, {"state": "float32"}),
     "fps": ("10", float("nan"), None, 1e-300, 1e300),
     "total_episodes": ("3", -1, 2, 10**12),
@@ -213,7 +313,7 @@ def test_lines_that_are_wrong(tmp_path: Path, text: str) -> None:
         {"length": None},
         {"length": [12, None, 9]},
         {"length": [12, 8, 9]},
-        {"length": pa.array([12.0, 7.0, 9.0])},
+        {"length": pa.array([12.0, 7.5, 9.0])},
         {"episode_index": [0, 1, 1]},
         {"data/chunk_index": None},
         {"data/file_index": [0, -1, 0]},

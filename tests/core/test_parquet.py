@@ -1,6 +1,7 @@
 """Reading parquet files: spans of rows, nothing else of the file, and one error for damage."""
 
 import io
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,14 @@ def test_groups_without_such_rows_are_not_read(tmp_path: Path) -> None:
         ([1, None], "scalars"),
         ([[1], [1, 2]], "scalars"),
         (pa.array([2**63, 1], pa.uint64()), "scalars"),
-        ([1.0, 2.0], "vectors"),
+        (["1.0", "2.0"], "vectors"),
+        ([[True]], "vectors"),
+        ([[(1 << 24) + 1]], "vectors"),
+        ([1.0, 2.5], "scalars"),
+        ([1.0, float("nan")], "scalars"),
+        ([1.0, None], "vectors"),
+        ([[1], []], "scalars"),
+        ([[[1]]], "vectors"),
         ([[1.0], [1.0, 2.0]], "vectors"),
         ([[1.0], [None]], "vectors"),
         ([{"bytes": "a"}], "images"),
@@ -74,6 +82,47 @@ def test_columns_of_another_kind(tmp_path: Path, values: Any, method: str) -> No
     span = RowSpan(write(tmp_path / "t", v=values))
     with raises(FormatError):
         list(span.scalars("no") if method == "no" else getattr(span, method)("v"))
+
+
+TWO = [[1.0, 2.0], [3.0, -4.0]]
+TEXTS = ["a", None, "a"]
+PICTURES = [b"one", b"two"]
+
+
+@pytest.mark.parametrize(
+    ("column", "method", "expected"),
+    [
+        # vectors: lists of any kind and width, tensors, and single values
+        (pa.array(TWO, pa.list_(pa.float64())), "vectors", TWO),
+        (pa.array(TWO, pa.list_(pa.float32(), 2)), "vectors", TWO),
+        (pa.array(TWO, pa.large_list(pa.float16())), "vectors", TWO),
+        (pa.array([[1, 2], [3, -4]], pa.list_(pa.int8(), 2)), "vectors", TWO),
+        (pa.array([[Decimal("0.5")]], pa.list_(pa.decimal128(4, 2))), "vectors", [[0.5]]),
+        (pa.FixedShapeTensorArray.from_numpy_ndarray(np.array(TWO)), "vectors", TWO),
+        (pa.array([1.5, -2.0], pa.float32()), "vectors", [[1.5], [-2.0]]),
+        (pa.array([3, 4], pa.uint16()), "vectors", [[3.0], [4.0]]),
+        (pa.array([[1 << 24]]), "vectors", [[16_777_216.0]]),
+        # whole numbers
+        (pa.array([1, 2], pa.uint8()), "scalars", [1, 2]),
+        (pa.array([294.0, -1.0]), "scalars", [294, -1]),
+        (pa.array([[True], [False]], pa.list_(pa.bool_(), 1)), "scalars", [1, 0]),
+        (pa.array([7, 7, 9]).dictionary_encode(), "scalars", [7, 7, 9]),
+        # texts
+        (pa.array(TEXTS, pa.large_string()), "texts", ["a", "", "a"]),
+        (pa.array(TEXTS, pa.string_view()), "texts", ["a", "", "a"]),
+        (pa.array(TEXTS).dictionary_encode(), "texts", ["a", "", "a"]),
+        # images: in structs of LeRobot and others, or as plain bytes
+        (pa.array([{"bytes": data, "path": "x"} for data in PICTURES], IMAGE), "images", PICTURES),
+        (pa.array([{"path": None, "bytes": data} for data in PICTURES]), "images", PICTURES),
+        (pa.array(PICTURES), "images", PICTURES),
+        (pa.array(PICTURES, pa.large_binary()), "images", PICTURES),
+    ],
+)
+def test_columns_as_other_programs_write_them(
+    tmp_path: Path, column: pa.Array, method: str, expected: list[Any]
+) -> None:
+    found = getattr(RowSpan(write(tmp_path / "t", v=column)), method)("v")
+    assert (found.tolist() if isinstance(found, np.ndarray) else list(found)) == expected
 
 
 def test_no_parquet_file(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Small LeRobot datasets, v3.0 and v2.1, written without lerobot: importing it takes 10 s."""
+"""Small LeRobot datasets, v3.0, v2.1 and v2.0, written without lerobot: importing it takes 10 s."""
 
 import json
 from collections.abc import Callable
@@ -11,8 +11,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from support.recordings import EPISODES, SIZE, Episode, encode_image, write_video
 
+_OLDER = {"front": "image", "wrist": "wrist_image", "state": "state", "action": "actions"}
 NAMES = {
-    "v2.1": {"front": "image", "wrist": "wrist_image", "state": "state", "action": "actions"},
+    "v2.0": _OLDER,
+    "v2.1": _OLDER,
     "v3.0": {
         "front": "observation.images.front",
         "wrist": "observation.images.wrist",
@@ -36,12 +38,14 @@ def write_lerobot(
     rows_a_group: int = 4,
     **columns: list[Any] | None,
 ) -> Path:
-    """Write a dataset; in v3.0 all episodes share their files, in v2.1 each has its own.
+    """Write a dataset; in v3.0 all episodes share their files, in v2 each has its own.
+
+    That of v2.0 declares its images with the channels first.
 
     Args:
         root: The folder.
         episodes: What it holds, by id.
-        version: `v3.0` or `v2.1`.
+        version: `v3.0`, `v2.1` or `v2.0`.
         stored: Images as `png` or `jpg` in parquet, or as `video` files (FFV1); None for
             metadata alone.
         marked: Write the columns `is_demo` and `exec_start_idx`.
@@ -59,7 +63,7 @@ def write_lerobot(
         "episode_id": list(episodes),
     }
     groups = [range(len(listed))]
-    if version == "v2.1":
+    if version != "v3.0":
         groups = [range(index, index + 1) for index in range(len(listed))]
     else:
         per_episode |= {"data/chunk_index": zeros, "data/file_index": zeros}
@@ -78,9 +82,14 @@ def write_lerobot(
             write_video(root / f"videos/{names[camera]}/chunk-000/{file}.mkv", frames)
     table = {name: values for name, values in (per_episode | columns).items() if values is not None}
     _write_metadata(root / "meta", version, tasks, table)
-    v21 = version == "v2.1"
-    file = "episode_{episode_index:06d}" if v21 else "file-{file_index:03d}"
-    chunk = "chunk-{episode_chunk:03d}" if v21 else "chunk-{chunk_index:03d}"
+    v2 = version != "v3.0"
+    file = "episode_{episode_index:06d}" if v2 else "file-{file_index:03d}"
+    chunk = "chunk-{episode_chunk:03d}" if v2 else "chunk-{chunk_index:03d}"
+    features = _features(listed[0], names, stored, marked)
+    if version == "v2.0":
+        for feature in features.values():
+            if len(feature["shape"]) == 3:
+                feature |= {"shape": [3, *SIZE], "names": ["channel", "height", "width"]}
     info = {
         "codebase_version": version,
         "fps": 10,
@@ -88,7 +97,7 @@ def write_lerobot(
         "chunks_size": 1000,
         "data_path": f"data/{chunk}/{file}.parquet",
         "video_path": f"videos/{{video_key}}/{chunk}/{file}.mkv",
-        "features": _features(listed[0], names, stored, marked),
+        "features": features,
     }
     (root / "meta/info.json").write_text(json.dumps(info))
     return root
@@ -152,7 +161,7 @@ def _features(
     if stored == "video":
         described = {"video.codec": "ffv1", "video.pix_fmt": "bgr0"}
         image |= {"dtype": "video", "info": described}
-    features = {names[camera]: image for camera in episode.images}
+    features = {names[camera]: dict(image) for camera in episode.images}
     for name in ("state", "action") if episode.action is not None else ("state",):
         features[names[name]] = {"dtype": "float32", "shape": [8]}
     if marked:
@@ -174,3 +183,5 @@ def _write_metadata(
     for name, lines in (("episodes", rows), ("tasks", numbered)):
         text = "".join(json.dumps(line) + "\n" for line in lines)
         (meta / f"{name}.jsonl").write_text(text)
+    statistics = "stats.json" if version == "v2.0" else "episodes_stats.jsonl"
+    (meta / statistics).write_text("{}\n")

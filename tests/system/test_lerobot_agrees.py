@@ -82,7 +82,7 @@ def test_a_dataset_of_lerobots_is_read_as_lerobot_does(
     root, names = tmp_path / "dataset", tmp_path / "families.csv"
     write(root, stored)
     names.write_text("episode_index,family\n0,MoveCube\n1,MoveCube\n")
-    source = LeRobotSource(str(root), families_file=names)
+    source = LeRobotSource(str(root), families_from=str(names))
     theirs = lerobot.LeRobotDataset("test/small", root=root, video_backend="pyav")
     row = 0
     for episode in source.episodes():

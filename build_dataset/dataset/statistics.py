@@ -1,4 +1,4 @@
-"""Statistics of images, as LeRobot stores them."""
+"""Statistics of images and vectors, in the form in which LeRobot stores them."""
 
 import math
 from typing import Any
@@ -56,6 +56,30 @@ class ImageStats:
             "count": np.array([int(total[0])]),
             **quantiles,
         }
+
+
+def vector_statistics(values: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """Return the statistics of an episode's vectors or numbers, `(T, D)` or `(T,)`.
+
+    They are computed in float64, which the squares of float32 values cannot exceed, and quantiles
+    are values that occur.
+
+    Returns:
+        Statistic name to one value per dimension, `(D,)` or `(1,)`; `count` is `(1,)`.
+    """
+    columns = values.reshape(len(values), -1).astype(np.float64)
+    ordered = np.sort(columns, axis=0)
+    ranks = {
+        name: max(math.ceil(quantile * len(columns)) - 1, 0) for name, quantile in QUANTILES.items()
+    }
+    return {
+        "min": ordered[0],
+        "max": ordered[-1],
+        "mean": columns.mean(axis=0),
+        "std": columns.std(axis=0),
+        "count": np.array([len(columns)]),
+        **{name: ordered[rank] for name, rank in ranks.items()},
+    }
 
 
 def episode_statistics(table: pa.Table) -> list[Statistics]:

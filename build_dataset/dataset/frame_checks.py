@@ -1,0 +1,57 @@
+"""Check that every reader accepts the frames of an episode, before one is stored. Pure rules."""
+
+import re
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import CAMERA_PREFIX
+from robomme_interference_data.errors import SourceError
+from robomme_interference_data.storage.limits import MAX_FRAME_VALUES, MAX_NAME, MAX_VECTOR
+
+_CAMERA = re.compile(r"\w[\w .-]*")
+_MAX_CAMERA = MAX_NAME - len(CAMERA_PREFIX)
+
+
+def check_shapes(
+    images: Mapping[str, NDArray[np.uint8]], vectors: Mapping[str, NDArray[np.float32]]
+) -> None:
+    """Check names and shapes of an episode's first frame, which the others must have, too.
+
+    Args:
+        images: Features of cameras to their images.
+        vectors: State and action.
+
+    Raises:
+        SourceError: A camera's name, or the shape of a value, cannot be stored.
+    """
+    for feature, image in images.items():
+        _check_camera(feature.removeprefix(CAMERA_PREFIX))
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+            raise SourceError(
+                f"{feature} holds images {image.shape} {image.dtype}; expected (H, W, 3) uint8"
+            )
+        if image.size > MAX_FRAME_VALUES:
+            height, width, _ = image.shape
+            raise SourceError(
+                f"{feature} has images of {width} × {height} pixels; expected at most "
+                f"{MAX_FRAME_VALUES // 3:,} pixels",
+                "Scale the images down.",
+            )
+    for feature, vector in vectors.items():
+        if vector.ndim != 1 or not 0 < vector.size <= MAX_VECTOR:
+            raise SourceError(
+                f"{feature} has the shape {vector.shape}; expected one row of 1 to "
+                f"{MAX_VECTOR:,} values",
+                "Flatten it, or record fewer values.",
+            )
+
+
+def _check_camera(name: str) -> None:
+    if len(name) > _MAX_CAMERA or not _CAMERA.fullmatch(name) or name.endswith((" ", ".")):
+        raise SourceError(
+            f"the camera {name[:300]!r}; expected a name of letters, digits, spaces, _, . and -, "
+            f"with at most {_MAX_CAMERA} characters",
+            "Rename the camera in the recordings.",
+        )

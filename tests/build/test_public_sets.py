@@ -1,0 +1,117 @@
+"""Real robots' recordings in the layouts of public sets, all the way to a policy."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.public_sets import SETS, STATELESS, write_public_set
+
+from robomme_interference_data import load_buffer, load_buffer_set
+from robomme_interference_data.training import HistoryDataset
+
+LENGTHS = (14, 9)
+TASKS = ("Open the drawer.", "stack the cups")
+NAMES = "episode_index,family,split,exec_start_idx\n0,OpenDrawer,test,8\n1,StackCups,train,0\n"
+SMALL = ("--unit", "4x2", "--workers", "1")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("hsr", marks=pytest.mark.slow),
+        pytest.param("droid", marks=pytest.mark.slow),
+        pytest.param("agibot", marks=pytest.mark.slow),
+        pytest.param("bridge", marks=pytest.mark.slow),
+        pytest.param("robomme", marks=pytest.mark.slow),
+    ],
+)
+def test_from_recordings_to_a_policy(name: str, tmp_path: Path, run: Any) -> None:
+    layout = SETS[name]
+    source = write_public_set(tmp_path / name, layout, LENGTHS, TASKS)
+    names, root = tmp_path / "names.csv", tmp_path / "buffers"
+    names.write_text(NAMES)
+    given = [f"{logical}={column}" for logical, column in layout.columns.items()]
+    options = ["--columns", ",".join(given)] if given else []
+    code, _, err = run(
+        *("build", root, "--source", f"lerobot:{source}", "--families-from", names),
+        *("--split", "test", "--conditions", "no-history,k0,k1", "--with", "executions"),
+        *(*SMALL, *options),
+    )
+    assert code == 0, err
+    code, out, err = run("verify", root)
+    assert code == 0, out + err
+    buffer = load_buffer("OpenDrawer/test/0", "k1", buffer_set=root)
+    assert buffer.states.shape == (8 + 4, layout.state)
+    assert tuple(buffer.cameras) == layout.cameras
+    opened = load_buffer_set(root)
+    assert opened.datasets["demonstrations"].fps == layout.fps
+    assert not buffer.manifest.exact
+    code, _, err = run(
+        *("evaluate", root, "--offline", "--policy", "hold", "--conditions", "no-history"),
+        *("--out", tmp_path / "run", "--workers", "1"),
+    )
+    assert code == 0, err
+
+
+def test_recordings_without_states(tmp_path: Path, run: Any) -> None:
+    source = write_public_set(tmp_path / "top", STATELESS, LENGTHS, TASKS)
+    names, root = tmp_path / "names.csv", tmp_path / "buffers"
+    names.write_text(NAMES)
+    options = ("--source", f"lerobot:{source}", "--families-from", names, "--split", "test")
+    options += ("--conditions", "no-history,k0,k1", "--with", "executions", *SMALL)
+    code, _, err = run("build", root, *options)
+    assert code == 0 and err.count("without robot states") == 3, err
+    for check in ((), ("--audit",)):
+        code, out, err = run("verify", root, *check)
+        assert code == 0, out + err
+    buffer = load_buffer("OpenDrawer/test/0", "k1", buffer_set=root, verify=True)
+    assert buffer.states.shape == (12, 0) and buffer.states.dtype == np.float32
+    assert buffer.query.state().shape == (0,)
+    assert buffer.frames("top").shape == (12, 64, 96, 3)
+    units = load_buffer_set(root).datasets["distractors"]
+    assert "observation.state" not in units.lerobot.features
+    code, _, err = run("build", root, *options)  # again: nothing to add
+    assert code == 0, err
+    offline = ("evaluate", root, "--offline", "--policy", "hold", "--workers", "1")
+    code, _, err = run(*offline, "--out", tmp_path / "run")
+    assert code == 0, err
+    code, out, err = run("card", root)
+    assert code == 0 and "no robot states" in out, err
+    history = HistoryDataset(root, ["k1"], memory="framesamp:4", chunk=2, cache=tmp_path / "cache")
+    item = history[0]
+    assert item["observation.state"].shape == (0,)
+    assert item["memory.state"].shape == (3, 0)
+
+
+def test_units_by_task_for_other_demonstrations(tmp_path: Path, run: Any) -> None:
+    """Families from the tasks are kept, and a further part needs no option."""
+    source = write_public_set(tmp_path / "set", STATELESS, (9, 9, 9), ("a", "Stack cups.", "a"))
+    root, options = tmp_path / "buffers", ("--source", f"lerobot:{source}", *SMALL)
+    only = ("--only", "distractors")
+    code, _, err = run("build", root, *only, *options, "--families-from", "task")
+    assert code == 0, err
+    assert (root / "families.csv").read_text() == "task,family\na,A\nStack cups.,StackCups\n"
+    assert run("build", root, "--only", "distractors-raw", *options)[0] == 0
+    ids = [str(one.episode_id) for one in load_dataset(root / "distractors-raw").records()]
+    assert ids == ["A/train/0", "A/train/1", "StackCups/train/0"]
+
+
+def test_one_family_for_a_dataset(tmp_path: Path, run: Any) -> None:
+    source = write_public_set(tmp_path / "so100_pick", STATELESS, (9, 9), ("a", "b"))
+    root, options = tmp_path / "buffers", ("--source", f"lerobot:{source}", *SMALL)
+    code, _, err = run(
+        "build", root, "--only", "distractors", *options, "--families-from", "dataset"
+    )
+    assert code == 0, err
+    assert (root / "families.csv").read_text() == "dataset,family\nso100_pick,So100Pick\n"
+    assert run("build", root, "--only", "distractors-raw", *options)[0] == 0
+    ids = [str(one.episode_id) for one in load_dataset(root / "distractors-raw").records()]
+    assert ids == ["So100Pick/train/0", "So100Pick/train/1"]
+
+
+def load_dataset(folder: Path) -> Any:
+    from robomme_interference_data.data.dataset import Dataset
+    from robomme_interference_data.storage.files import LocalFiles
+
+    return Dataset(LocalFiles(folder))
