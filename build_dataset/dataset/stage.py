@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.build_dataset.alike import Look, differences
 from robomme_interference_data.build_dataset.sources import Frame, Recording, Robot
 from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, LESSONS, PAPER_UNIT, STATE
 from robomme_interference_data.errors import (
@@ -43,7 +42,7 @@ from robomme_interference_data.storage.files import canonical_json, read_header,
 from robomme_interference_data.storage.limits import MAX_READ_VALUES
 from robomme_interference_data.storage.video import iter_frames
 
-from .frame_checks import check_shapes
+from .frame_checks import check_numbers, check_same_shapes, check_shapes
 from .frame_selection import NothingToStore, select_frames
 from .lerobot_writer import StoredEpisode
 from .plan import DatasetPlan, PlannedEpisode
@@ -225,25 +224,13 @@ class _Writer:
         if not self.length:
             self._begin(images, vectors)
         shapes = {name: value.shape for name, value in (images | vectors).items()}
-        if shapes != self.features:
-            looks = Look(self.features, self._fps), Look(shapes, self._fps)
-            found = differences(("the first", looks[0]), (f"stored frame {self.length}", looks[1]))
-            raise SourceError(
-                f"frames of different sizes: {'; '.join(found)}",
-                "All frames of an episode must have the same cameras and sizes.",
-            )
+        check_same_shapes(shapes, self.features, f"stored frame {self.length}")
         for name, image in images.items():
             self._encoders[name].add(image)
             self.stats[name].add(image)
             self.digests.update(name, image)
         for name, value in vectors.items():
-            if value.dtype != np.float32 or not np.isfinite(value).all():
-                raise SourceError(
-                    f"{name} of stored frame {self.length} is {value.tolist()}; expected finite "
-                    "float32 numbers",
-                    "Correct the recording, or leave it out of the source. "
-                    f"{named('episodes')} chooses indices in all families alike.",
-                )
+            check_numbers(name, value, f"stored frame {self.length}")
             if (self.length + 1) * value.size > MAX_READ_VALUES:
                 raise SourceError(
                     f"{name} has {value.size} values in over {self.length} stored frames; expected "

@@ -74,17 +74,19 @@ class FramesSource(Source):
                     f"{self._folder}/videos/{camera}/{episode}.mkv or "
                     f"{self._folder}/images/{camera}/{episode}/000000.png and so on.",
                 )
-        return [
-            SourceEpisode(
-                name,
-                _Key(table[name], paths, self._state(paths)),
-                marked=table[name].lesson is not None,
-            )
-            for name, paths in images.items()
-        ]
+        return [self._listed(name, table[name], paths) for name, paths in images.items()]
+
+    def _listed(
+        self, name: EpisodeId, rows: EpisodeRows | SourceError, paths: dict[str, Path]
+    ) -> SourceEpisode:
+        if isinstance(rows, SourceError):
+            return SourceEpisode(name, problem=rows)
+        key = _Key(rows, paths, self._state(paths))
+        return SourceEpisode(name, key, marked=rows.lesson is not None)
 
     @override
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
+        episode.check()
         key: _Key = episode.key
         if not key.images and cameras != ():
             raise InvalidOptionError(
