@@ -37,14 +37,16 @@ def verify_sources(config: "SourceConfig", root: Path, *, as_json: bool) -> None
     """
     from robomme_interference_data.build_dataset.verify.source import CheckTask, check_sources
     from robomme_interference_data.progress import WorkProgress
-    from robomme_interference_data.runtime.executor import make_executor
+    from robomme_interference_data.runtime.executor import Serial, make_executor
 
     with graceful_interrupt("Nothing is kept"):
         names, sources, episodes, problems = _listed(config, root)
         task = CheckTask(sources, _cameras(config), config.fps)
         with WorkProgress(unit="episodes") as progress:
             progress.start("Reading", len(episodes))
-            executor = make_executor(config)
+            # One worker needs no process of its own: there is nothing to write.
+            one = config.workers == 1 and not config.on_cluster
+            executor = Serial() if one else make_executor(config)
             report = check_sources(names, task, episodes, executor, progress.advance)
     report = dataclasses.replace(report, problems=[*problems, *report.problems])
     command = _build_command(config, root, report)
