@@ -148,7 +148,7 @@ def _read_csv(path: Path) -> dict[WorkItem, Rollout]:
     try:
         table = pa_csv.read_csv(io.BytesIO(text.encode()), convert_options=options)
     except pa.ArrowInvalid as error:
-        raise FormatError.damaged(path, first_line(error)) from None
+        raise FormatError(f"{path}: {first_line(error)}", _ASK) from None
     if len({*table.column_names}) < len(table.column_names):
         raise FormatError.damaged(path, "a column occurs twice")
     rows = [*from_table(Rollout, table, path)]

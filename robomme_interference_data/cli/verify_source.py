@@ -123,11 +123,16 @@ def given_settings(config: "SourceConfig") -> list[str]:
 
 def _build_command(config: "SourceConfig", root: Path, report: "SourceReport") -> str:
     """Return the command that builds the sources with the same settings."""
+    from robomme_interference_data.runtime.executor import WorkersConfig
+
     words = ["robomme-interference", "build", str(root)]
     if not report.marked:  # no episode can be a query
         words += ["--only", DISTRACTORS]
+    workers = {field.name for field in dataclasses.fields(WorkersConfig)}
     # The sources first, and then how they are read.
-    for name in sorted(given_settings(config), key=lambda name: name != "source"):
+    for name in sorted(
+        {*given_settings(config)} - workers, key=lambda name: (name != "source", name)
+    ):
         value = getattr(config, name)
         if name == "source":
             for source in value:

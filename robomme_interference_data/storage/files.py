@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 import os
+import shlex
 import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
@@ -34,6 +35,10 @@ _SHARED_BLOBS = ".huggingface-shared-blobs"
 
 _MAX_DEPTH = 64
 """Nesting of JSON: Python can read more than it can always print, compare or write."""
+
+
+_CORRECT = "Correct it, restore it from a copy, or download or build it again."
+"""What to do about text that may have been edited."""
 
 
 class Files(ABC):
@@ -98,7 +103,8 @@ class LocalFiles(Files):
         if not any(target.is_relative_to(folder) for folder in _linked_folders(self.root)):
             raise FormatError(
                 f"{relative} in {self.root} is a link that leads out of the folder",
-                "Replace the link by the file.",
+                "Replace the link by the file, or copy the folder with its files: "
+                f"cp -rL {shlex.quote(str(self.root))} NEW",
             )
         try:
             exists = target.is_file()
@@ -280,9 +286,9 @@ def parse_json(data: bytes, where: object) -> dict[str, Any]:
         if data.count(b"[") + data.count(b"{") > _MAX_DEPTH and _is_deep(value):
             raise ValueError(f"over {_MAX_DEPTH} nested arrays and objects")
     except (ValueError, RecursionError) as error:
-        raise FormatError.damaged(where, f"not valid JSON: {error}") from None
+        raise FormatError(f"{where}: not valid JSON: {error}", _CORRECT) from None
     if not isinstance(value, dict):
-        raise FormatError.damaged(where, "not a JSON object")
+        raise FormatError(f"{where}: not a JSON object", _CORRECT)
     return value
 
 
@@ -418,8 +424,13 @@ def read_sums(path: Path) -> dict[str, str]:
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """Turn pyarrow's errors on a damaged file into `FormatError`."""
+def reading(path: Path, hint: str | None = None) -> Iterator[None]:
+    """Turn pyarrow's errors on a damaged file into `FormatError`.
+
+    Args:
+        path: The file.
+        hint: What to do about a file that people may have written; None for that it is damaged.
+    """
     import pyarrow as pa  # not to load or list a file
 
     try:
@@ -427,5 +438,7 @@ def reading(path: Path) -> Iterator[None]:
     except (InterferenceError, MemoryError):  # of pyarrow's, one is an `ArrowException`, too
         raise
     except (pa.ArrowException, OSError, ValueError, OverflowError, RecursionError) as error:
-        text = str(error).partition("\n")[0]
-        raise FormatError.damaged(path, f"cannot be read: {text}") from None
+        what = f"cannot be read: {str(error).partition('\n')[0]}"
+        if hint is None:
+            raise FormatError.damaged(path, what) from None
+        raise FormatError(f"{path}: {what}", hint) from None
