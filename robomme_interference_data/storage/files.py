@@ -218,8 +218,11 @@ def check_not_pointer(path: Path) -> None:
         MissingFileError: The file is a pointer of Git LFS.
     """
     with path.open("rb") as file:
-        start = file.read(len(_POINTER))
-    if start == _POINTER:
+        _check_start(path, file.read(len(_POINTER)))
+
+
+def _check_start(path: Path, data: bytes) -> None:
+    if data.startswith(_POINTER):
         clones = (folder for folder in path.resolve().parents if (folder / ".git").exists())
         raise MissingFileError(
             f"{path} is a Git LFS pointer, not the file",
@@ -263,13 +266,14 @@ def decode_text(data: bytes, where: object) -> str:
 
 def read_bytes(path: Path, most: int) -> bytes:
     """Return the bytes of a file that has at most `most`."""
-    check_not_pointer(path)
     with path.open("rb") as file:
         # Of the open file: by now, another one may have the path.
         size = os.fstat(file.fileno()).st_size
         if size > most:
-            raise FormatError.damaged(path, f"{size:,} bytes; expected at most {most:,}")
-        return file.read()
+            raise FormatError(f"{path}: {size:,} bytes; expected at most {most:,}", _CORRECT)
+        data = file.read()
+    _check_start(path, data)  # not by opening it again: it may be a pipe
+    return data
 
 
 def read_json(path: Path) -> dict[str, Any]:
