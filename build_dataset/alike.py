@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from robomme_interference_data.constants import ACTION, CAMERA_PREFIX
+from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, STATE, UNITS
 
 MISSING = "missing"
 _UNKNOWN = "unknown"
@@ -28,9 +28,19 @@ class Look:
     names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
-def in_buffers(features: Mapping[str, tuple[int, ...]], fps: float) -> Look:
-    """Return what must be alike in the datasets of a buffer set: buffers have no actions."""
-    return Look({name: shape for name, shape in features.items() if name != ACTION}, fps)
+def in_buffers(kind: str, features: Mapping[str, tuple[int, ...]], fps: float) -> Look:
+    """Return what must be alike in the demonstrations and another dataset of a buffer set.
+
+    Buffers have no actions, and units may be of another robot: their states are stored with their
+    own number of values.
+
+    Args:
+        kind: Name of the other dataset.
+        features: Features of one of the two.
+        fps: Its frames per second.
+    """
+    without = {ACTION, STATE} if kind in UNITS else {ACTION}
+    return Look({name: shape for name, shape in features.items() if name not in without}, fps)
 
 
 def differences(left: tuple[str, Look], right: tuple[str, Look]) -> list[str]:
@@ -70,6 +80,19 @@ def differ_in_cameras(left: Look, right: Look) -> bool:
         return replace(look, features=shared)
 
     return not differences(("", without_others(left)), ("", without_others(right)))
+
+
+def differ_in_image_sizes(left: Look, right: Look) -> bool:
+    """Return whether two looks with the same cameras differ in sizes of images alone."""
+
+    def without_sizes(look: Look) -> Look:
+        features = {
+            name: () if name.startswith(CAMERA_PREFIX) else shape
+            for name, shape in look.features.items()
+        }
+        return replace(look, features=features)
+
+    return without_sizes(left) == without_sizes(right)
 
 
 def unequal(left: tuple[str, Mapping[str, Any]], right: tuple[str, Mapping[str, Any]]) -> list[str]:

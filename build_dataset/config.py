@@ -96,9 +96,23 @@ class BuildConfig(WorkersConfig):
         "unit than the paper's is for episodes that are shorter.",
         group="Episodes",
     )
+    units_per_episode: int = setting(
+        1,
+        metavar="N",
+        help="Most units of a recorded episode, evenly spaced; fewer where they would overlap.",
+        group="Episodes",
+    )
     cameras: tuple[str, ...] = setting(
         (),
         help="Cameras to store, such as front, or none for states alone; default: all.",
+        group="Encoding",
+    )
+    resize: str | None = setting(
+        None,
+        metavar="WIDTHxHEIGHT[:crop|pad]",
+        help="Store frames in this size, such as 256x256:pad; frames of another aspect ratio are "
+        "cropped, or padded with black bars.",
+        shown="as recorded",
         group="Encoding",
     )
     codec: str = setting(
@@ -106,12 +120,13 @@ class BuildConfig(WorkersConfig):
         help="av1-lossless (bit-exact) or lerobot-default (smaller, lossy).",
         group="Encoding",
     )
-    version: str = setting("1.0.0", help="Version of the datasets.", group="Encoding")
+    version: str = setting("1.0.0", help="Version of the datasets.", group="Encoding", rare=True)
     time_limit_s: float | None = setting(
         None,
         help="Seconds for one episode; a slower one is retried once.",
         shown="300 on tabletop and sample, else 1800",
         group="Execution",
+        rare=True,
     )
     columns: tuple[str, ...] = setting(
         (),
@@ -137,12 +152,6 @@ class BuildConfig(WorkersConfig):
     )
     fps: float | None = setting(
         None, help="Frames per second of recordings that do not state them.", group="Sources"
-    )
-    robomme_python: str | None = setting(
-        None,
-        help="Source robomme: Python interpreter with RoboMME.",
-        env="ROBOMME_PYTHON",
-        group="Sources",
     )
     _: KW_ONLY
     workers: int = setting(_CPUS, help="Worker processes.", shown="all CPUs", group="Execution")
@@ -212,9 +221,11 @@ def parse_position_limit(text: str) -> int | None:
     return int(text)
 
 
-def parse_unit(text: str) -> Unit:
-    """Parse the size of a unit, such as `32x8`."""
+def parse_unit(text: str, per_episode: int = 1) -> Unit:
+    """Parse the size of a unit, such as `32x8`; the number of them is checked."""
     match = re.fullmatch(r"([1-9][0-9]*)x([1-9][0-9]*)", text, re.ASCII)
     if match is None:
         raise InvalidOptionError.expected("unit", text, "FRAMESxSTRIDE, such as 32x8")
-    return Unit(int(match[1]), int(match[2]))
+    if per_episode < 1:
+        raise InvalidOptionError.expected("units_per_episode", per_episode, "a number from 1")
+    return Unit(int(match[1]), int(match[2]), per_episode)

@@ -4,7 +4,14 @@ import shlex
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
-from robomme_interference_data.constants import DEMONSTRATIONS, EXECUTIONS, SHIFTED
+from robomme_interference_data.constants import (
+    DEMONSTRATIONS,
+    DISTRACTORS,
+    EXECUTIONS,
+    RAW_DISTRACTORS,
+    SHIFTED,
+    STATE,
+)
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import SourceError, named
 from robomme_interference_data.ids import EpisodeId
@@ -30,15 +37,23 @@ def check_needs(
 
 def check_features(datasets: Mapping[str, Dataset]) -> None:
     """Check that sessions of all datasets can follow one another in a buffer."""
-    looks = {name: in_buffers(dataset.features, dataset.fps) for name, dataset in datasets.items()}
-    base = (f"the {DEMONSTRATIONS}", looks[DEMONSTRATIONS])
-    for name, look in looks.items():
-        if found := differences(base, (f"the {name}", look)):
+    base = datasets[DEMONSTRATIONS]
+    for name, dataset in datasets.items():
+        expected, found = (in_buffers(name, one.features, one.fps) for one in (base, dataset))
+        if clauses := differences((f"the {DEMONSTRATIONS}", expected), (f"the {name}", found)):
             raise SourceError(
                 "sessions of the datasets cannot follow one another in a buffer: "
-                + "; ".join(found),
-                f"Build all with the same {named('cameras')}, from sources with the same rates and "
-                "sizes.",
+                + "; ".join(clauses),
+                f"Build all with the same {named('cameras')} and {named('resize')}, from sources "
+                "with the same rates.",
+            )
+    if RAW_DISTRACTORS in datasets and DISTRACTORS in datasets:
+        sizes = [datasets[name].features[STATE] for name in (DISTRACTORS, RAW_DISTRACTORS)]
+        if sizes[0] != sizes[1]:
+            raise SourceError(
+                f"the {DISTRACTORS} have {sizes[0][0]} state values, the {RAW_DISTRACTORS} "
+                f"{sizes[1][0]}",
+                "Build both from the same sources.",
             )
 
 

@@ -117,18 +117,21 @@ LESSONS = (DEMONSTRATIONS, CONTRADICTIONS)
 
 
 class Unit(NamedTuple):
-    """Size of a distractor unit: raw frames 0, stride, and so on.
+    """Size of a distractor unit, raw frames 0, stride and so on, and how many an episode yields.
 
     Attributes:
         frames: Stored frames; fewer at full rate if the episode is shorter.
         stride: Raw frames between stored frames.
+        per_episode: Most units of a recorded episode, as far as they do not overlap.
     """
 
     frames: int
     stride: int
+    per_episode: int = 1
 
     def __str__(self) -> str:
-        return f"{self.frames} frames at stride {self.stride}"
+        text = f"{self.frames} frames at stride {self.stride}"
+        return text if self.per_episode == 1 else f"{text}, up to {self.per_episode} of an episode"
 
     @property
     def raw_frames(self) -> int:
@@ -138,8 +141,15 @@ class Unit(NamedTuple):
     def in_dataset(self, name: str) -> "Unit":
         """Return the unit in another dataset of the buffer set; this is that of the distractors."""
         if name == RAW_DISTRACTORS:  # the same raw frames, all of them
-            return Unit(self.frames * self.stride, 1)
+            return Unit(self.frames * self.stride, 1, self.per_episode)
         return self
+
+    def recorded(self) -> dict[str, int]:
+        """Return the unit as a dataset records it; one of an episode is not mentioned."""
+        values = self._asdict()
+        if self.per_episode == 1:
+            del values["per_episode"]
+        return values
 
 
 PAPER_UNIT = Unit(UNIT_FRAMES, UNIT_STRIDE)

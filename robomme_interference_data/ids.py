@@ -11,6 +11,7 @@ from robomme_interference_data.errors import InvalidIdError, InvalidOptionError,
 
 _FAMILY = re.compile(r"[A-Za-z][A-Za-z0-9_.-]*")
 _INDEX = re.compile(r"0|[1-9][0-9]{0,17}")  # fits the int64 of the tables
+_START = re.compile(r"[1-9][0-9]{0,17}")
 _SPAN = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")
 _MAX_NUMBERS = 1_000_000
 _FAMILY_RANK = {family: rank for rank, family in enumerate(FAMILIES)}
@@ -28,10 +29,11 @@ class EpisodeId:
     """The name of an episode, `<Family>/<split>/<index>`, e.g. `VideoRepick/test/7`.
 
     A fourth part, as in `VideoRepick/test/7/2`, denotes a contradicting lesson: the same scene
-    played with answer 2.
+    played with answer 2. A start, as in `VideoRepick/train/7@1000`, denotes a distractor unit that
+    begins at raw frame 1000 of the episode; one that begins at frame 0 has the episode's id.
 
-    Ids sort by family (see `family_order`), split and index. This is the canonical order of all
-    stored data.
+    Ids sort by family (see `family_order`), split, index, answer and start. This is the canonical
+    order of all stored data.
 
     Args:
         family: Task family: a letter, then letters, digits, `_`, `.` or `-`; not `all` or a
@@ -39,6 +41,7 @@ class EpisodeId:
         split: `train`, `val` or `test`.
         index: Number of the episode within family and split, from 0.
         answer: Number of the played answer, from 0; None for the scene's correct answer.
+        start: First raw frame of a distractor unit in the episode, from 0.
 
     Raises:
         InvalidIdError: A part is invalid.
@@ -48,6 +51,7 @@ class EpisodeId:
     split: str
     index: int
     answer: int | None = None
+    start: int = 0
 
     def __post_init__(self) -> None:
         if not isinstance(self.family, str) or not _FAMILY.fullmatch(self.family):
@@ -66,9 +70,14 @@ class EpisodeId:
                 nearest(str(self.split), SPLITS),
             )
         answer = 0 if self.answer is None else self.answer
-        for what, number in (("episode index", self.index), ("answer", answer)):
+        numbers = {"episode index": self.index, "answer": answer, "start": self.start}
+        for what, number in numbers.items():
             if type(number) is not int or not 0 <= number < 10**18:
-                raise InvalidIdError(f"{number!r} is not an {what}", "Expected an integer from 0.")
+                raise InvalidIdError(f"{what} {number!r} is invalid", "Expected an integer from 0.")
+        if self.start and self.answer is not None:
+            raise InvalidIdError(
+                f"{self}: a contradicting lesson has no start", "Only distractor units have one."
+            )
 
     @classmethod
     def parse(cls, text: "str | EpisodeId") -> Self:
@@ -79,28 +88,34 @@ class EpisodeId:
         """
         if isinstance(text, cls):
             return text
-        parts = text.split("/") if isinstance(text, str) else []
-        if len(parts) not in (3, 4) or not all(map(_INDEX.fullmatch, parts[2:])):
+        name, at, start = text.partition("@") if isinstance(text, str) else ("", "", "")
+        parts = name.split("/")
+        numbers = len(parts) in (3, 4) and all(map(_INDEX.fullmatch, parts[2:]))
+        if not numbers or (at and not _START.fullmatch(start)):
             raise InvalidIdError(
                 f"{text!r} is not an episode id",
                 "Expected <Family>/<split>/<index>, for example VideoRepick/test/7.",
             )
-        return cls(parts[0], parts[1], *map(int, parts[2:]))
+        answer = int(parts[3]) if len(parts) == 4 else None
+        return cls(parts[0], parts[1], int(parts[2]), answer, int(start or 0))
 
     def __str__(self) -> str:
         text = f"{self.family}/{self.split}/{self.index}"
-        return text if self.answer is None else f"{text}/{self.answer}"
+        if self.answer is not None:
+            text += f"/{self.answer}"
+        return f"{text}@{self.start}" if self.start else text
 
     @property
     def scene(self) -> "EpisodeId":
-        """Id of the same scene with the correct answer."""
+        """Id of the recorded episode: the same scene with the correct answer, from its start."""
         return EpisodeId(self.family, self.split, self.index)
 
     @property
-    def sort_key(self) -> tuple[int, str, int, int, int]:
+    def sort_key(self) -> tuple[int, str, int, int, int, int]:
         """Key of the canonical order."""
         answer = -1 if self.answer is None else self.answer
-        return (*family_order(self.family), SPLITS.index(self.split), self.index, answer)
+        split = SPLITS.index(self.split)
+        return (*family_order(self.family), split, self.index, answer, self.start)
 
     def __lt__(self, other: "EpisodeId") -> bool:
         return self.sort_key < other.sort_key

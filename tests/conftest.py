@@ -199,6 +199,7 @@ def robomme_python(bare_python: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     It behaves badly, or ends an episode, where the episode's index asks for it.
     """
     monkeypatch.setenv("PYTHONPATH", str(ROOT / "tests" / "support" / "robomme_stand_in"))
+    monkeypatch.setenv("ROBOMME_PYTHON", str(bare_python))
     return bare_python
 
 

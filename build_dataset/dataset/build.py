@@ -17,6 +17,7 @@ from pathlib import Path
 from robomme_interference_data.build_dataset.alike import (
     Look,
     differ_in_cameras,
+    differ_in_image_sizes,
     differences,
     in_buffers,
 )
@@ -43,7 +44,8 @@ from .existing import ExistingDataset, open_existing
 from .identity import complete_dataset, identity_of
 from .lerobot_writer import StoredEpisode, load_lerobot, require_lerobot, write_lerobot
 from .plan import DatasetPlan, PlannedEpisode
-from .stage import Staged, StageTask, keep_staged, read_staged, staged_name
+from .stage import StageTask
+from .staged import Staged, keep_staged, read_staged, staged_name
 
 
 @dataclass(frozen=True)
@@ -107,16 +109,18 @@ def _stage(
         if staged.skipped is not None:
             skipped[str(staged.episode_id)] = staged.skipped
         else:
-            episode = staged.stored(folder(planned))
+            episodes = staged.stored(folder(planned))
             try:
-                _check_like(episode, plan)
-                for earlier in built:
-                    _check_alike(earlier, episode)
+                for episode in episodes:
+                    _check_like(episode, plan)
+                    for earlier in built:
+                        _check_alike(earlier, episode)
             except SourceError:
                 shutil.rmtree(folder(planned))  # no later attempt can use it
                 raise
-            stored.append(episode)
-            _check_alike(stored[0], episode)
+            for episode in episodes:
+                stored.append(episode)
+                _check_alike(stored[0], episode)
 
     missing, before = [], len(stored) + len(skipped)
     progress.start("Reading and encoding", len(todo))
@@ -168,18 +172,20 @@ def _check_like(episode: StoredEpisode, plan: DatasetPlan) -> None:
     if plan.must_match is None:
         return
     name = str(episode.record.episode_id)
-    look = in_buffers(episode.features, episode.fps)
+    look = in_buffers(plan.kind, episode.features, episode.fps)
     shared = {
         feature: look.features[feature]
         for feature in plan.must_match.features
         if feature in look.features
     }
     if found := differences(("the demonstrations", plan.must_match), (name, look)):
+        hint = "Choose recordings that are alike, or build a separate buffer set of them."
+        if not differences(("", plan.must_match), ("", replace(look, features=shared))):
+            hint = f"Choose the {named('cameras')} of the demonstrations."
+        elif differ_in_image_sizes(plan.must_match, look):
+            hint = f"Store frames in the size of the demonstrations with {named('resize')}."
         raise SourceError(
-            f"{name} cannot be in a buffer with the demonstrations: {'; '.join(found)}",
-            "Choose recordings that are alike, or build a separate buffer set of them."
-            if differences(("", plan.must_match), ("", replace(look, features=shared)))
-            else f"Choose the {named('cameras')} of the demonstrations.",
+            f"{name} cannot be in a buffer with the demonstrations: {'; '.join(found)}", hint
         )
 
 
@@ -244,7 +250,7 @@ def _write(
     for _ in write_lerobot(made, plan.kind, ordered, features, get_codec(plan.codec)):
         progress.advance(1)
     records = [_numbered(episode.record, index, features) for index, episode in enumerate(ordered)]
-    provenances = [source.provenance for source in plan.sources]
+    provenances = plan.provenances
     provenances += existing.dataset.identity.sources if existing else ()
     sources = [source for _, source in sorted({canonical_json(p): p for p in provenances}.items())]
     info = read_json(made / INFO_PATH)

@@ -60,10 +60,12 @@ def open_existing(out: Path, plan: DatasetPlan) -> ExistingDataset | None:
         "version": identity.version,
         "codec": identity.codec,
         "cameras": ", ".join(identity.cameras) or "none",
+        "resize": _resize_of(dataset),
     }
     planned = {"kind": plan.kind, "version": plan.version, "codec": plan.codec}
     cameras = identity.cameras if plan.cameras is None else plan.cameras
     planned["cameras"] = ", ".join(cameras) or "none"
+    planned["resize"] = "none" if plan.resize is None else str(plan.resize)
     if found := unequal(("it", existing), ("this build", planned)):
         raise BuildError(f"{out} exists with other settings: {'; '.join(found)}", _advice())
     if plan.kind in UNITS and dataset.unit != plan.unit.in_dataset(plan.kind):
@@ -73,10 +75,10 @@ def open_existing(out: Path, plan: DatasetPlan) -> ExistingDataset | None:
         )
     # Another version of a simulator has other episodes under the same ids.
     recorded = {source.get("kind"): source for source in identity.sources}
-    for source in plan.sources:
-        before = recorded.get(source.provenance["kind"], source.provenance)
-        if "suite_version" in before and before != source.provenance:
-            found = unequal(("it", before), ("this source", source.provenance))
+    for provenance in plan.provenances:
+        before = recorded.get(provenance["kind"], provenance)
+        if "suite_version" in before and before != provenance:
+            found = unequal(("it", before), ("this source", provenance))
             raise BuildError(f"{out} exists, of another source: {'; '.join(found)}", _advice())
     if plan.fps is not None and not same_rate(plan.fps, dataset.fps):
         raise InvalidOptionError(
@@ -94,6 +96,12 @@ def open_existing(out: Path, plan: DatasetPlan) -> ExistingDataset | None:
     return ExistingDataset(dataset, tuple(episodes), report.reasons)
 
 
+def _resize_of(dataset: Dataset) -> str:
+    """Return how the frames of a dataset were resized: the same for all of its sources."""
+    sizes = {str(source.get("resize", "none")) for source in dataset.identity.sources}
+    return ", ".join(sorted(sizes)) or "none"
+
+
 def _check_recordings(out: Path, dataset: Dataset, plan: DatasetPlan) -> None:
     """Check that recordings are those that the dataset was built from: one of each source.
 
@@ -106,7 +114,8 @@ def _check_recordings(out: Path, dataset: Dataset, plan: DatasetPlan) -> None:
         ]
         if not again or isinstance(source, SimulatorSource):
             continue
-        if "revision" in source.provenance and source.provenance in dataset.identity.sources:
+        provenance = plan.provenance(number)
+        if "revision" in provenance and provenance in dataset.identity.sources:
             continue
         recording, record = source.read(again[0], plan.cameras), known[again[0].id]
         recording.frames.close()

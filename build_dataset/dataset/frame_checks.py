@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.build_dataset.alike import Look, differences
-from robomme_interference_data.constants import CAMERA_PREFIX
-from robomme_interference_data.errors import SourceError, named
+from robomme_interference_data.constants import CAMERA_PREFIX, STATE
+from robomme_interference_data.errors import InvalidOptionError, SourceError, named
 from robomme_interference_data.storage.limits import MAX_FRAME_VALUES, MAX_NAME, MAX_VECTOR
 
 _CAMERA = re.compile(r"\w[\w .-]*")
@@ -22,10 +22,11 @@ def check_shapes(
 
     Args:
         images: Features of cameras to their images.
-        vectors: State and action.
+        vectors: State and action; the state has no values if none are recorded.
 
     Raises:
         SourceError: A camera's name, or the shape of a value, cannot be stored.
+        InvalidOptionError: There is nothing to store.
     """
     for feature, image in images.items():
         _check_camera(feature.removeprefix(CAMERA_PREFIX))
@@ -41,12 +42,19 @@ def check_shapes(
                 "Scale the images down.",
             )
     for feature, vector in vectors.items():
-        if vector.ndim != 1 or not 0 < vector.size <= MAX_VECTOR:
+        least = 0 if feature == STATE else 1
+        if vector.ndim != 1 or not least <= vector.size <= MAX_VECTOR:
             raise SourceError(
                 f"{feature} has the shape {vector.shape}; expected one row of 1 to "
                 f"{MAX_VECTOR:,} values",
                 "Flatten it, or record fewer values.",
             )
+    if not images and not any(vector.size for vector in vectors.values()):
+        raise InvalidOptionError(
+            "there is nothing to store: the recording has no states, and no camera is chosen",
+            f"Choose {named('cameras')}.",
+            option="cameras",
+        )
 
 
 def check_same_shapes(

@@ -38,6 +38,7 @@ from robomme_interference_data.schema.records import Counts, DatasetIdentity, Ep
 from robomme_interference_data.storage.files import (
     all_files,
     format_sums,
+    is_hidden,
     sha256_file,
     write_json,
     write_text,
@@ -57,7 +58,7 @@ def listed_files(root: Path) -> list[str]:
     return [
         path
         for path in all_files(root)
-        if path.split("/")[0] in DATASET_FOLDERS and path not in unlisted
+        if path.split("/")[0] in DATASET_FOLDERS and path not in unlisted and not is_hidden(path)
     ]
 
 
@@ -86,7 +87,7 @@ def identity_of(
         exact=all(record.exact for record in records),
         codec=codec,
         cameras=tuple(name.removeprefix(CAMERA_PREFIX) for name in cameras),
-        unit=unit.in_dataset(kind)._asdict() if kind in UNITS else None,
+        unit=unit.in_dataset(kind).recorded() if kind in UNITS else None,
         simulators=tuple(sorted({record.simulator for record in records if record.simulator})),
         sources=tuple(sources),
         counts=Counts(len(records), sum(record.length for record in records), dict(families)),

@@ -2,12 +2,14 @@
 
 import dataclasses
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from robomme_interference_data.build_dataset.alike import Look, in_buffers
 from robomme_interference_data.build_dataset.sources import Source, SourceEpisode
 from robomme_interference_data.constants import PAPER_UNIT, Unit
 from robomme_interference_data.data.dataset import Dataset
+
+from .resize import Resize
 
 
 class PlannedEpisode(NamedTuple):
@@ -36,6 +38,7 @@ class DatasetPlan:
         time_limit_s: Limit in seconds for one episode; None for the sources' defaults.
         unit: Size of the units in the distractors, which those of the raw ones follow from.
         fps: Frames per second of recordings that do not state them; None if all do.
+        resize: Size of the stored frames; None for the recorded one.
         must_match: What the episodes must look like, those of the demonstrations; None for
             anything.
     """
@@ -49,9 +52,20 @@ class DatasetPlan:
     time_limit_s: float | None = None
     unit: Unit = PAPER_UNIT
     fps: float | None = None
+    resize: Resize | None = None
     must_match: Look | None = None
+
+    def provenance(self, number: int) -> dict[str, Any]:
+        """Return what the dataset records about a source, and how its frames are resized."""
+        recorded = self.sources[number].provenance
+        return recorded if self.resize is None else recorded | {"resize": str(self.resize)}
+
+    @property
+    def provenances(self) -> list[dict[str, Any]]:
+        """What the dataset records about each source."""
+        return [self.provenance(number) for number in range(len(self.sources))]
 
     def matching(self, demonstrations: Dataset) -> "DatasetPlan":
         """Return the plan with episodes that must look like those of the demonstrations."""
-        look = in_buffers(demonstrations.features, demonstrations.fps)
+        look = in_buffers(self.kind, demonstrations.features, demonstrations.fps)
         return dataclasses.replace(self, must_match=look)

@@ -1,35 +1,29 @@
 """Stage one episode: select and encode its frames while it is read, decode them again, hash them.
 
-The build keeps a staged episode in a folder, which gets its final name only when it is complete:
-an interrupted build resumes from these folders.
+`staged.py` keeps its files in a folder.
 """
 
-import hashlib
-import os
-import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.build_dataset.sources import Frame, Recording, Robot
-from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, LESSONS, PAPER_UNIT, STATE
+from robomme_interference_data.build_dataset.sources import Frame, Recording
+from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, LESSONS, STATE, UNITS
 from robomme_interference_data.errors import (
     BuildError,
     InterferenceError,
-    InvalidOptionError,
     SourceError,
-    named,
     naming_options,
     option_names,
 )
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
-from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.records import EpisodeRecord, SpanDigests, lesson_spans
 from robomme_interference_data.storage.arrays import (
     FeatureDigests,
@@ -38,62 +32,15 @@ from robomme_interference_data.storage.arrays import (
     write_array,
 )
 from robomme_interference_data.storage.encode import Codec, VideoEncoder, get_codec
-from robomme_interference_data.storage.files import canonical_json, read_header, write_json
 from robomme_interference_data.storage.limits import MAX_READ_VALUES
 from robomme_interference_data.storage.video import iter_frames
 
 from .frame_checks import check_numbers, check_same_shapes, check_shapes
-from .frame_selection import NothingToStore, select_frames
-from .lerobot_writer import StoredEpisode
+from .frame_selection import NothingToStore, select_episodes, too_short, unit_starts
 from .plan import DatasetPlan, PlannedEpisode
+from .resize import Resize
+from .staged import Staged, StagedEpisode, staged_file
 from .statistics import ImageStats
-
-_RECORD = "record.json"
-_LAYOUT = 7
-"""Version of a staged episode's folder."""
-
-
-@dataclass(frozen=True)
-class Staged:
-    """Metadata of a staged episode; `skipped` is the reason if it yields nothing."""
-
-    episode_id: EpisodeId
-    skipped: str | None = None
-    record: EpisodeRecord | None = None
-    features: dict[str, tuple[int, ...]] = field(default_factory=dict)
-    stats: dict[str, dict[str, tuple[float, ...]]] = field(default_factory=dict)
-    robot: Robot | None = None
-
-    def stored(self, folder: Path) -> StoredEpisode:
-        """Return the episode, which yields something, with its files in `folder`."""
-        assert self.record is not None and self.robot is not None
-        videos = {feature: folder / f"{feature}.mp4" for feature in self.stats}
-        return StoredEpisode(
-            self.record,
-            self.features,
-            videos,
-            self.stats,
-            lambda name: np.load(folder / f"{name}.npy"),
-            self.robot,
-        )
-
-
-def staged_name(plan: DatasetPlan, planned: PlannedEpisode) -> str:
-    """Return the name of a staged episode's folder: a hash of all that decides its content."""
-    number, episode = planned
-    codec = get_codec(plan.codec)
-    content: dict[str, object] = {
-        "kind": plan.kind,
-        "source": plan.sources[number].provenance,
-        "episode": [str(episode.id), repr(episode.key)],
-        "cameras": plan.cameras,
-        "codec": [codec.vcodec, codec.pix_fmt, dict(codec.options)],
-        "layout": _LAYOUT,
-        "fps": plan.fps,
-    }
-    if plan.unit != PAPER_UNIT:
-        content["unit"] = plan.unit
-    return hashlib.sha256(canonical_json(content).encode()).hexdigest()[:24]
 
 
 @dataclass(frozen=True)
@@ -115,34 +62,57 @@ class StageTask:
 
     def _stage(self, planned: PlannedEpisode, worker: Worker) -> Staged:
         number, episode = planned
-        with tempfile.TemporaryDirectory(dir=worker.folder) as name:
-            folder = Path(name)
-            try:
-                recording = self.plan.sources[number].read(episode, self.plan.cameras)
-                with closing(recording.frames):
-                    staged = self._write(episode.id, recording, folder)
-            except InterferenceError as error:
-                raise error.about(episode.id) from error
-            if staged.skipped is None:
-                for path in sorted(folder.iterdir()):
-                    worker.send_file(path.name, path.read_bytes())
-        return staged
+        episodes = []
+        try:
+            starts = self._starts(planned)
+            recording = self.plan.sources[number].read(episode, self.plan.cameras)
+            with closing(recording.frames):
+                for start, frames in select_episodes(
+                    self.plan.kind, recording, self.plan.unit, starts
+                ):
+                    with tempfile.TemporaryDirectory(dir=worker.folder) as name:
+                        folder, stored = Path(name), replace(episode.id, start=start)
+                        episodes.append(self._write(stored, recording, frames, folder))
+                        for path in sorted(folder.iterdir()):
+                            worker.send_file(staged_file(start, path.name), path.read_bytes())
+        except NothingToStore as reason:
+            if episodes:
+                raise SourceError(f"it became shorter while it was read: {reason}") from None
+            return Staged(episode.id, str(reason))
+        except InterferenceError as error:
+            raise error.about(episode.id) from error
+        return Staged(episode.id, None, tuple(episodes))
+
+    def _starts(self, planned: PlannedEpisode) -> Sequence[int]:
+        """Return the first raw frames of what is stored of an episode."""
+        number, episode = planned
+        unit = self.plan.unit
+        if self.plan.kind not in UNITS or unit.per_episode == 1:
+            return (0,)
+        # How long it is shows at its end: its frames are counted first, without images.
+        counted = self.plan.sources[number].read(episode, ())
+        with closing(counted.frames):
+            length = sum(1 for _ in counted.frames)
+        starts = unit_starts(length, unit)
+        if not starts:
+            raise too_short(length, unit)
+        return starts
 
     def close(self) -> None:
         """Close the sources."""
         for source in self.plan.sources:
             source.close()
 
-    def _write(self, episode: EpisodeId, recording: Recording, folder: Path) -> Staged:
+    def _write(
+        self, episode: EpisodeId, recording: Recording, frames: Iterator[Frame], folder: Path
+    ) -> StagedEpisode:
+        """Write the files of a stored episode; return its metadata."""
         codec = get_codec(self.plan.codec)
         fps = recording.robot.at(self.plan.fps)
-        writer = _Writer(codec, folder, fps)
+        writer = _Writer(codec, folder, fps, self.plan.resize)
         try:
-            for frame in select_frames(self.plan.kind, recording, self.plan.unit):
+            for frame in frames:
                 writer.add(frame)
-        except NothingToStore as reason:
-            writer.abandon()
-            return Staged(episode, str(reason))
         except BaseException:
             writer.abandon()
             raise
@@ -168,7 +138,7 @@ class StageTask:
             difficulty=recording.difficulty,
             simulator=recording.simulator,
             exec_start_idx=start,
-            exact=recording.exact and codec.exact,
+            exact=recording.exact and codec.exact and not writer.resized,
             feature_sha256=session,
             span_sha256=SpanDigests(*map(combine, parts)) if parts else None,
             evidence=None if start is None else recording.evidence,
@@ -180,51 +150,44 @@ class StageTask:
         }
         recording.robot.check_names(writer.features)
         robot = replace(recording.robot, fps=fps)
-        return Staged(episode, None, record, writer.features, stats, robot)
-
-
-def keep_staged(folder: Path, staged: Staged, files: Mapping[str, bytes]) -> None:
-    """Write a staged episode and its files into a folder, which appears complete."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
-    try:
-        for name, data in files.items():
-            (partial / name).write_bytes(data)
-        write_json(partial / _RECORD, to_dict(staged))
-        for path in partial.iterdir():  # the data must reach the disk before the name does
-            with path.open("rb+") as file:  # Windows flushes only what is open for writing
-                os.fsync(file.fileno())
-        partial.rename(folder)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-
-
-def read_staged(folder: Path) -> Staged | None:
-    """Return the metadata of the episode staged in a folder; None if there is no such folder."""
-    path = folder / _RECORD
-    return read_header(path, Staged) if path.is_file() else None
+        return StagedEpisode(record, writer.features, stats, robot)
 
 
 class _Writer:
-    """Writes the files of a staged episode; all maps are by feature."""
+    """Writes the files of a staged episode; all maps are by feature.
 
-    def __init__(self, codec: Codec, folder: Path, fps: float):
-        self._codec, self._folder, self._fps = codec, folder, fps
+    Attributes:
+        features: Shapes of the stored values.
+        stats: Statistics of the stored images.
+        digests: Digests of what was stored.
+        length: Number of frames.
+        resized: Whether a stored image is not the recorded one.
+    """
+
+    def __init__(self, codec: Codec, folder: Path, fps: float, resize: Resize | None):
+        self._codec, self._folder, self._fps, self._resize = codec, folder, fps, resize
+        self._recorded: dict[str, tuple[int, ...]] = {}  # shapes before images are resized
         self._encoders: dict[str, VideoEncoder] = {}
         self._vectors: dict[str, list[NDArray[np.float32]]] = {}
         self.features: dict[str, tuple[int, ...]] = {}
         self.stats: dict[str, ImageStats] = {}
         self.digests = FeatureDigests()
         self.length = 0
+        self.resized = False
 
     def add(self, frame: Frame) -> None:
         """Add the next frame, which must have the first one's shapes and finite numbers."""
         images = {CAMERA_PREFIX + camera: image for camera, image in frame.images.items()}
         vectors = {STATE: frame.state} | ({} if frame.action is None else {ACTION: frame.action})
+        shapes = {name: value.shape for name, value in (images | vectors).items()}
+        if not self.length:
+            _check_images(images)
+            self._recorded = shapes
+        check_same_shapes(shapes, self._recorded, f"stored frame {self.length}")
+        if self._resize is not None:
+            images = {name: self._resize.apply(image) for name, image in images.items()}
         if not self.length:
             self._begin(images, vectors)
-        shapes = {name: value.shape for name, value in (images | vectors).items()}
-        check_same_shapes(shapes, self.features, f"stored frame {self.length}")
         for name, image in images.items():
             self._encoders[name].add(image)
             self.stats[name].add(image)
@@ -274,11 +237,15 @@ class _Writer:
                 path, self._codec, self._fps, len(image), image.shape[1]
             )
             self.stats[name] = ImageStats()
-        if not images and not any(value.size for value in vectors.values()):
-            raise InvalidOptionError(
-                "there is nothing to store: the recording has no states, and no camera is chosen",
-                f"Choose {named('cameras')}.",
-                option="cameras",
-            )
         self._vectors = {name: [] for name in vectors}
         self.features = {name: value.shape for name, value in (images | vectors).items()}
+        self.resized = self.features != self._recorded
+
+
+def _check_images(images: Mapping[str, NDArray[Any]]) -> None:
+    """Check that the images of a frame are RGB images."""
+    for name, image in images.items():
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+            raise SourceError(
+                f"{name} holds images {image.shape} {image.dtype}; expected (H, W, 3) uint8"
+            )

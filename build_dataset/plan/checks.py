@@ -1,13 +1,20 @@
 """Checks before a build: its folder, units that suffice, planned buffers that would change."""
 
 from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
 
 from robomme_interference_data.build_dataset.config import BuffersConfig
 from robomme_interference_data.build_dataset.dataset.existing import ExistingDataset, open_existing
 from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan
 from robomme_interference_data.build_dataset.manifests import check_manifests_folder
-from robomme_interference_data.constants import DATASETS, DEMONSTRATIONS, DISTRACTORS, MANIFESTS
+from robomme_interference_data.constants import (
+    DATASETS,
+    DEMONSTRATIONS,
+    DISTRACTORS,
+    MANIFESTS,
+    MAX_K,
+)
 from robomme_interference_data.errors import BuildError, named
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.draw import UnitPool, check_units
@@ -55,7 +62,9 @@ def check_plans(
     units, built = plans[DISTRACTORS], existing[DISTRACTORS]
     adds_units = _adds_episodes(units, built)
     following = next_buffers(planned, request, queries=queries, units_change=adds_units)
-    available = {unit.episode.id for unit in units.episodes}
+    # As many as the episodes may yield: how long they are is known only when they are read.
+    most = min(units.unit.per_episode, MAX_K)
+    available = {replace(unit.episode.id, start=n) for unit in units.episodes for n in range(most)}
     if built is not None:
         available |= built.ids
     _check_units(available, queries, following)

@@ -8,6 +8,7 @@ from collections.abc import Container, Sequence
 from robomme_interference_data.build_dataset.config import NO_CAMERAS, BuildConfig, parse_unit
 from robomme_interference_data.build_dataset.dataset.frame_selection import unmarked_error
 from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan, PlannedEpisode
+from robomme_interference_data.build_dataset.dataset.resize import Resize
 from robomme_interference_data.build_dataset.sources import Source, open_source, takes
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
@@ -33,7 +34,7 @@ def plan_dataset(
     """Open the sources and plan one dataset, of `queries` or of the episodes that are chosen."""
     check_root(config.buffer_set)
     check_values(config)
-    unit = parse_unit(config.unit)
+    unit = parse_unit(config.unit, config.units_per_episode)
     split = config.split
     if kind in UNITS:
         _check_split_of_units(config)
@@ -66,6 +67,7 @@ def plan_dataset(
         time_limit_s=config.time_limit_s,
         unit=unit,
         fps=config.fps,
+        resize=None if config.resize is None else Resize.parse(config.resize),
     )
 
 
@@ -96,6 +98,14 @@ def check_values(config: BuildConfig) -> None:
         raise InvalidOptionError.expected("version", config.version, "a version such as 1.0.0")
     if config.time_limit_s is not None and not config.time_limit_s > 0:
         raise InvalidOptionError.expected("time_limit_s", config.time_limit_s, "a positive number")
+    if config.resize is not None:
+        Resize.parse(config.resize)
+        if config.cameras == NO_CAMERAS:
+            raise InvalidOptionError(
+                f"{named('resize')} has no effect without cameras",
+                f"Leave it out, or choose {named('cameras')}.",
+                option="resize",
+            )
     if config.fps is not None and not 0 < config.fps < math.inf:
         raise InvalidOptionError.expected("fps", config.fps, "a positive number")
     make_executor(config)  # checks its settings
@@ -111,6 +121,8 @@ def check_values(config: BuildConfig) -> None:
 def open_sources(kind: str, config: BuildConfig, unit: Unit) -> tuple[Source, ...]:
     """Open the sources of a build, for one of its datasets."""
     columns, kept = _columns(config.columns), config.buffer_set / FAMILIES_PATH
+    # A simulator draws only the frames that a unit stores, if the first one is frame 0.
+    one_unit = kind in UNITS and unit.per_episode == 1
     return tuple(
         open_source(
             text,
@@ -119,9 +131,7 @@ def open_sources(kind: str, config: BuildConfig, unit: Unit) -> tuple[Source, ..
             families_from=config.families_from,
             several_tasks=config.several_tasks,
             kept_families=kept if kept.is_file() else None,
-            robomme_python=config.robomme_python,
-            # A simulator draws only the frames that a unit stores.
-            every=unit.in_dataset(kind).stride if kind in UNITS else 1,
+            every=unit.in_dataset(kind).stride if one_unit else 1,
         )
         for text in config.source
     )

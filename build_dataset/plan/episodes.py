@@ -34,7 +34,8 @@ def choose_episodes(
 
     Raises:
         InvalidOptionError: A family or split is unknown.
-        SourceError: No episode passes, one is recorded twice, or cannot be used.
+        SourceError: No episode passes, one is recorded twice, cannot be used, or is a unit of an
+            episode.
     """
     listed = [
         PlannedEpisode(number, episode)
@@ -58,6 +59,12 @@ def choose_episodes(
         (planned for planned in listed if passes(planned.episode)),
         key=lambda planned: planned.episode.id.sort_key,
     )
+    for planned in chosen:
+        if planned.episode.id.start:
+            raise SourceError(
+                f"{planned.episode.id} of source {planned.source + 1} is a distractor unit",
+                "Build from recordings of whole episodes.",
+            )
     for first, second in pairwise(chosen):
         if first.episode.id == second.episode.id:
             raise SourceError(

@@ -32,7 +32,6 @@ from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import BuildError, InvalidOptionError, named
 from robomme_interference_data.runtime.executor import WorkersConfig
 from robomme_interference_data.schema.conditions import datasets_of
-from robomme_interference_data.schema.settings import SETTING
 from robomme_interference_data.storage.files import Files, LocalFiles
 from robomme_interference_data.storage.hub import locate
 
@@ -141,8 +140,7 @@ def _changed(config: BuildConfig | BuffersConfig, used: Iterable[str] = ()) -> l
     return [
         setting.name
         for setting in fields(config)
-        # An environment variable is set for other commands.
-        if setting.name not in used and setting.metadata[SETTING]["env"] is None
+        if setting.name not in used
         if getattr(config, setting.name) != setting.default
     ]
 
@@ -208,10 +206,13 @@ def plan_alone(kind: str, config: BuildConfig) -> DatasetPlan:
 
     It has their cameras, unless others are chosen, and that of query episodes also their episodes.
     """
-    if kind not in UNITS and parse_unit(config.unit) != PAPER_UNIT:
-        raise InvalidOptionError(
-            f"{named('unit')} has no effect on {kind}", "Leave it out.", option="unit"
-        )
+    if kind not in UNITS:
+        unit = parse_unit(config.unit, config.units_per_episode)
+        if unit != PAPER_UNIT:
+            option = "unit" if unit.per_episode == 1 else "units_per_episode"
+            raise InvalidOptionError(
+                f"{named(option)} has no effect on {kind}", "Leave it out.", option=option
+            )
     if kind in UNITS:
         config = _settings_of_units(config, alone=True)
     elif config.unit_episodes is not None:

@@ -64,7 +64,7 @@ def open_source(specification: str, *, shifted: bool = False, **options: Any) ->
             the user, as in `make_simulator`.
         shifted: Whether to open the first live views under shifts instead of the episodes.
         **options: `columns`, `families_from`, `kept_families` and `several_tasks` for `lerobot`,
-            `robomme_python` and `every` for simulators; other kinds ignore them.
+            `every` for simulators; other kinds ignore them.
     """
     spec = _parse(specification)
     simulator = spec.arguments.get("name")

@@ -148,7 +148,8 @@ def value_names(features: Features, columns: Sequence[str]) -> tuple[str, ...] |
 
 def _names(feature: Mapping[str, Any]) -> tuple[str, ...] | None:
     """Return the names of a vector's values, if the dataset has a different one for each."""
-    names, size = feature.get("names"), feature["shape"][0]
+    names: Any = feature.get("names")
+    size = feature["shape"][0]
     if isinstance(names, list) and len(names) == 1 and _size(names[0]) == size:  # [["x", "y"]]
         [names] = names
     if isinstance(names, dict):

@@ -18,10 +18,11 @@ def parse_flag(value: Any) -> bool:
         value = value.reshape(()).item()
     if isinstance(value, bytes):
         value = value.decode(errors="replace")
+    known = None
     if isinstance(value, str):
         known = _WORDS.get(value.strip().lower())
-    else:
-        known = {0: False, 1: True}.get(value) if isinstance(value, bool | int | float) else None
+    elif isinstance(value, bool | int | float) and value in (0, 1):
+        known = value == 1
     if known is None:
         raise ValueError(f"{value!r}; expected true or false, or 1 or 0")
     return known

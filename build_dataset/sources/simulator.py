@@ -32,14 +32,11 @@ class SimulatorSource(Source):
 
     Args:
         name: Registered name of the simulator.
-        robomme_python: RoboMME's interpreter.
         every: Draw every n-th frame only; all others have no images.
         shifted: Give the first live view under each shift instead of the episode.
     """
 
-    def __init__(
-        self, name: str, robomme_python: str | None = None, every: int = 1, shifted: bool = False
-    ):
+    def __init__(self, name: str, every: int = 1, shifted: bool = False):
         self.name, self._every, self._shifted = name, every, shifted
         self._class = simulator_class(name)
         self.time_limit_s = self._class.episode_s
@@ -48,7 +45,7 @@ class SimulatorSource(Source):
         self.provenance = {"kind": name}
         if version is not None:
             self.provenance["suite_version"] = version
-        self._settings = {"python": robomme_python, "subgoals": False}
+        self._settings = {"subgoals": False}
         self._simulator: Simulator | None = None
         self._cameras: tuple[str, ...] = ()
 

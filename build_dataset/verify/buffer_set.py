@@ -38,7 +38,7 @@ from robomme_interference_data.schema.conditions import datasets_of, in_order
 from robomme_interference_data.schema.manifest import BufferManifest, ManifestHeader
 from robomme_interference_data.storage.arrays import combine
 from robomme_interference_data.storage.encode import CODECS, decode_image
-from robomme_interference_data.storage.files import LocalFiles, all_files, sha256_file
+from robomme_interference_data.storage.files import LocalFiles, all_files, is_hidden, sha256_file
 from robomme_interference_data.storage.parquet import open_parquet
 from robomme_interference_data.storage.staging import staging_path
 
@@ -153,10 +153,10 @@ def _files(buffer_set: BufferSet, root: Path) -> Iterator[Violation]:
     """Check the manifests' files; name what a copy has lost, and what belongs to nothing."""
     header = buffer_set.header
     for path in all_files(root / MANIFESTS):
-        # Hidden rows belong to manifests whose replacement was interrupted; the next build removes
-        # them.
-        hidden = path.startswith(".") and path.endswith(".parquet")
-        if path not in (MANIFEST_HEADER, MANIFEST_ROWS, Path(FETCH_RECORD).name) and not hidden:
+        # Of our own, hidden rows belong to manifests whose replacement was interrupted; the next
+        # build removes them.
+        known = (MANIFEST_HEADER, MANIFEST_ROWS, Path(FETCH_RECORD).name)
+        if path not in known and not is_hidden(path):
             yield Violation(f"{MANIFESTS}/{path}", UNLISTED)
     pending = pending_rows(header)
     rows = pending if (root / pending).is_file() else _ROWS

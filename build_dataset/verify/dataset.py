@@ -2,7 +2,8 @@
 
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,7 @@ from robomme_interference_data.data.embeddings import normalized, open_index
 from robomme_interference_data.data.fetched_copy import FetchedCopy
 from robomme_interference_data.data.index_layout import IndexHeader, index_folder
 from robomme_interference_data.errors import InterferenceError, visible
+from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.retrieval.segment import typical_cosine
 from robomme_interference_data.schema.manifest import ManifestHeader
@@ -44,6 +46,7 @@ from robomme_interference_data.storage.encode import CODECS
 from robomme_interference_data.storage.files import (
     all_files,
     digest_json,
+    is_hidden,
     read_header,
     read_json,
     sha256_file,
@@ -107,6 +110,7 @@ def dataset_violations(
     )
     for record in records:
         yield from _record(f"{name} {record.episode_id}", name, record, unit)
+    yield from start_violations(name, records, unit)
     if progress is None:
         return
     for record in records:
@@ -191,10 +195,28 @@ def _record(where: str, name: str, record: EpisodeRecord, unit: Unit) -> Iterato
     elif name == EXECUTIONS:
         expected = range(1, record.length + 1)
     else:
-        most, stride = unit.in_dataset(name)
-        expected = range((unit.raw_frames - 1) // stride + 1, most + 1)
+        stored = unit.in_dataset(name)
+        expected = range((unit.raw_frames - 1) // stored.stride + 1, stored.frames + 1)
     if record.length not in expected:
         yield Violation(where, f"holds {record.length} frames, not {expected[-1]}")
+
+
+def start_violations(
+    name: str, records: Iterable[EpisodeRecord], unit: Unit
+) -> Iterator[Violation]:
+    """Check that the units of a recorded episode are no more than allowed, and do not overlap."""
+    starts: dict[EpisodeId, list[int]] = {}
+    for record in records:
+        starts.setdefault(replace(record.episode_id, start=0), []).append(record.episode_id.start)
+    most, apart = (unit.per_episode, unit.frames * unit.stride) if name in UNITS else (1, 1)
+    for episode, found in starts.items():
+        near = any(after - before < apart for before, after in pairwise(sorted(found)))
+        if min(found) != 0 or len(found) > most or near:
+            yield Violation(
+                f"{name} {episode}",
+                f"episodes begin at the raw frames {', '.join(map(str, sorted(found)))}; expected "
+                f"0, then at most {most - 1} more, each {apart} or more later",
+            )
 
 
 def _episode(where: str, dataset: Dataset, record: EpisodeRecord) -> Iterator[Violation]:
@@ -233,9 +255,11 @@ def index_violations(
     folders: set[str] = set()
     for path in all_files(root):
         folder, _, file = path.partition("/")
+        if is_hidden(path):  # such as an index that is being made
+            continue
         if not file:
             yield Violation(f"{name}/{INDEX_DIR}/{path}", UNLISTED)
-        elif not path.startswith("."):  # an index that is being made
+        else:
             folders.add(f"{INDEX_DIR}/{folder}")
             if not (root / path).is_file():
                 yield Violation(f"{name}/{INDEX_DIR}/{path}", "is a broken link, or no file")

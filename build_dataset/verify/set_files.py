@@ -13,11 +13,11 @@ from robomme_interference_data.constants import (
     MANIFESTS,
     QUESTIONS_PATH,
 )
-from robomme_interference_data.storage.files import all_files
+from robomme_interference_data.storage.files import all_files, is_hidden
 from robomme_interference_data.storage.staging import staging_path
 
-_BESIDE = r"(README|LICENSE)[^/]*|\.gitattributes|\.git/.*|\.cache/huggingface/.*"
-"""Cards, and files of Git and of the Hub's client."""
+_BESIDE = r"(README|LICENSE)[^/]*"
+"""Cards."""
 
 _IN_DATASET = re.compile(rf"({'|'.join((*DATASET_FOLDERS, INDEX_DIR))})/.*|{_BESIDE}")
 _IN_SET = re.compile(rf"{MANIFESTS}/.*|{QUESTIONS_PATH}|{FAMILIES_PATH}|{_BESIDE}")
@@ -32,7 +32,8 @@ def further_files(root: Path, datasets: Collection[str]) -> Iterator[str]:
     """Yield the paths of the files of a folder that belong to no dataset or buffer set.
 
     Files in the folders of datasets and manifests count as theirs here, and are checked with them;
-    those of unfinished builds are left out.
+    those of unfinished builds are left out, and hidden ones, such as those of Git, of the Hub's
+    client and of macOS.
 
     Args:
         root: Folder of a buffer set, or of a single dataset.
@@ -41,6 +42,8 @@ def further_files(root: Path, datasets: Collection[str]) -> Iterator[str]:
     has_dataset = (root / INFO_PATH).is_file()  # a published buffer set has its units at the root
     staging = {staging_path(root / name).name for name in unfinished_builds(root)}
     for path in all_files(root):
+        if is_hidden(path):
+            continue
         folder, _, inner = path.partition("/")
         if folder in staging:
             continue

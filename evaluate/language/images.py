@@ -87,7 +87,7 @@ class HistoryFrames:
     def frames(self, places: Sequence[int]) -> NDArray[np.uint8]:
         """Decode frames by their ascending places, `(n, H, W, 3) uint8` RGB."""
         indices = [self._indices[place] for place in places]
-        chunks = self._reader.stream(self._buffer, 64, (self.camera,), indices)
+        chunks = self._reader.stream(self._buffer, 64, (self.camera,), indices, other_states="omit")
         return np.concatenate([chunk.frames[self.camera] for chunk in chunks])
 
     def video(self, places: Sequence[int], fps: float | None = None) -> Video:

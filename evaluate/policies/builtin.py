@@ -145,6 +145,7 @@ class Privileged(Policy):
     """`oracle` or `guess`: the simulator's own scripts, with the hidden answer or a random one."""
 
     privileged = True
+    other_states = "omit"  # it reads no history
 
     def __init__(self, name: str):
         self.name = name
@@ -235,6 +236,8 @@ class Recall(Privileged):
 
 class Noop(Policy):
     """`noop`: holds the current pose."""
+
+    other_states = "omit"  # it reads no history
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the current joint positions as targets, gripper open, `(16, 8) float32`."""

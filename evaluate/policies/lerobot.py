@@ -27,6 +27,7 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.errors import MissingExtraError, MissingFileError, PolicyError
 from robomme_interference_data.runtime.device import choose_device
+from robomme_interference_data.schema.other_states import check_rule
 from robomme_interference_data.simulators.episode import ACTION_SIZE, Observation
 from robomme_interference_data.storage.hub import locate
 from robomme_interference_data.storage.weights import digest_weights
@@ -61,9 +62,12 @@ class LeRobotPolicy(BatchPolicy):
         path: Folder that `save_pretrained` wrote, or a model on the Hub, `namespace/name` or
             `namespace/name@revision`.
         device: `cpu`, `cuda` or `cuda:1`; by default the first GPU, or else the CPU.
+        other_states: What it gets of the states of units of another robot, see
+            `Policy.other_states`.
     """
 
-    def __init__(self, path: str, *, device: str | None = None):
+    def __init__(self, path: str, *, device: str | None = None, other_states: str = "refuse"):
+        self.other_states = check_rule(other_states)
         self._device = str(choose_device(device))
         self._folder, self._source = find_policy(path)
         with _explained(path):

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.schema.evidence import Evidence
+from robomme_interference_data.schema.other_states import OtherStates
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.episode import Observation
 
@@ -63,6 +64,10 @@ class Policy(ABC):
         privileged: Whether it gets `RolloutInfo.simulator` and `RolloutInfo.evidence`.
         every_frame: Whether `observe` gets the observations after every action; if not, only the
             one on which it acts next, and simulators need not draw the others.
+        other_states: What it gets of the states of units of another robot, which have another
+            number of values than the query's: `pad`, zeros after fewer values; `omit`, zeros in
+            place of all values; or `refuse`, no run with such units. A policy that reads no history
+            states declares `omit`.
         memory: Rule by which it keeps frames, `full`, `framesamp:N` or `window:N`, from which rows
             get `evidence_kept`, the share of the evidence that it still has. None if it keeps none,
             or by another rule.
@@ -73,6 +78,7 @@ class Policy(ABC):
     wants_history: bool = True
     privileged: bool = False
     every_frame: bool = False
+    other_states: OtherStates = "refuse"
     memory: str | None = None
 
     def reset(self, info: RolloutInfo) -> None:
@@ -83,7 +89,8 @@ class Policy(ABC):
 
         Args:
             frames: `(T, H, W, 3) uint8` RGB of each of `history_cameras`, T at least 1.
-            states: `(T, 8) float32`, one for each frame: rad and m, see `Policy`.
+            states: `(T, 8) float32`, one for each frame: rad and m, see `Policy`; of units of
+                another robot what `other_states` declares.
             exec_start_idx: Number of history frames in all, the same with every chunk.
         """
 

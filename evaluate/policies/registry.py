@@ -14,6 +14,7 @@ from robomme_interference_data.runtime.specs import (
     import_factory,
     signature_of,
 )
+from robomme_interference_data.schema.other_states import OTHER_STATES, OtherStates
 from robomme_interference_data.schema.sampling import MEMORY_FORM, Memory
 
 from .kinds import KINDS, Address, PolicyKind, Role, addresses
@@ -156,6 +157,10 @@ _EXPECTED: dict[Any, tuple[Callable[[Any], bool], str]] = {
     tuple[str, ...]: (
         _is_names,
         "a tuple of names of cameras, such as ('front', 'wrist'), or an empty one",
+    ),
+    OtherStates: (
+        lambda value: value in OTHER_STATES,
+        ", ".join(OTHER_STATES[:-1]) + f" or {OTHER_STATES[-1]}",
     ),
     str | None: (_is_memory, f"{MEMORY_FORM}, or None"),
 }

@@ -27,6 +27,7 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.runtime import guard
 from robomme_interference_data.runtime.safe_path import user_environment
+from robomme_interference_data.schema.other_states import check_rule
 from robomme_interference_data.simulators.episode import ACTION_SIZE, Observation
 
 from .connection import OpenpiConnection, check_server_options
@@ -62,6 +63,8 @@ class WebsocketPolicy(Policy):
             takes minutes.
         response_s: Maximum seconds from a message to the end of its answer. First answers take
             long, because servers compile then.
+        other_states: What the server gets of the states of units of another robot, see
+            `Policy.other_states`.
     """
 
     cameras = ("front", "wrist")
@@ -78,10 +81,12 @@ class WebsocketPolicy(Policy):
         chunk_frames: int = ACTION_CHUNK,
         connect_s: float = 600.0,
         response_s: float = 600.0,
+        other_states: str = "refuse",
     ):
         check_server_options(
             checkpoint, chunk_frames=chunk_frames, connect_s=connect_s, response_s=response_s
         )
+        self.other_states = check_rule(other_states)
         self._chunk = chunk_frames
         self._server = OpenpiConnection(
             host, port, tls=tls, connect_s=connect_s, response_s=response_s, check=self._check
@@ -201,7 +206,7 @@ class ServedPolicy(WebsocketPolicy):
 
     Args:
         command: The command.
-        checkpoint, chunk_frames, connect_s, response_s: See `WebsocketPolicy`.
+        checkpoint, chunk_frames, connect_s, response_s, other_states: See `WebsocketPolicy`.
 
     Attributes:
         started: When, UTC, `20260131T120000.000000Z`.
@@ -215,6 +220,7 @@ class ServedPolicy(WebsocketPolicy):
         chunk_frames: int = ACTION_CHUNK,
         connect_s: float = 600.0,
         response_s: float = 600.0,
+        other_states: str = "refuse",
     ):
         self._command, self.started = command, ""
         self._process: subprocess.Popen[bytes] | None = None
@@ -228,6 +234,7 @@ class ServedPolicy(WebsocketPolicy):
             chunk_frames=chunk_frames,
             connect_s=connect_s,
             response_s=response_s,
+            other_states=other_states,
         )
 
     def reset(self, info: RolloutInfo) -> None:

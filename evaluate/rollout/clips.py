@@ -166,7 +166,7 @@ def _lesson_of(buffer: Buffer) -> Generator[NDArray[np.uint8]]:
     camera = buffer.query.dataset.camera()
     lessons = [session for session in buffer.sessions if session.role == "lesson"]
     indices = [index for session in lessons for index in range(session.start, session.stop)]
-    for chunk in buffer.stream(1, (camera,), indices):
+    for chunk in buffer.stream(1, (camera,), indices, other_states="omit"):
         yield chunk.frames[camera][0]
 
 

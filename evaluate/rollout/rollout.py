@@ -232,7 +232,8 @@ def _decode(
 ) -> AbstractContextManager[Iterator[Chunk]]:
     """Start to decode the history frames of a policy; give them in chunks, in order."""
     size, cameras = config.history_chunk, tuple(policy.history_cameras)
-    return read_ahead(reader.stream(buffer, size, cameras, received), max(1, _FRAMES_AHEAD // size))
+    stream = reader.stream(buffer, size, cameras, received, policy.other_states)
+    return read_ahead(stream, max(1, _FRAMES_AHEAD // size))
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from robomme_interference_data.constants import EXECUTIONS, ORACLE
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import open_dataset
+from robomme_interference_data.data.state_sizes import other_state_sizes
 from robomme_interference_data.errors import (
     InterferenceError,
     PolicyServerError,
@@ -43,6 +44,7 @@ from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.registry import simulator_class, simulator_versions
 
 from .checks import check_plan, check_settings
+from .other_states import check_other_states
 from .settings import complete_settings
 from .worker import RolloutFunction, StartServer, StartSimulator
 
@@ -87,6 +89,7 @@ def plan_rollouts(config: RunConfig, buffer_set: BufferSet) -> PlannedRun[RunCon
     plan = plan_run(config, run.facts, buffer_set)
     items = plan.items()
     check_plan(config, system, buffer_set, plan, items)
+    check_other_states(config, buffer_set, policy, items)
     if config.offline:
         executions = open_dataset(buffer_set, EXECUTIONS)
         for episode in dict.fromkeys(item.episode for item in items):
@@ -112,7 +115,7 @@ def _describe_run(
         subgoals_identity = optional.subgoals_identity(config, writer)
         metadata |= writer
     identity = policy_identity(config.policy, config.policy_options, policy_metadata)
-    versions = simulator_versions(config.simulator, config.robomme_python)
+    versions = simulator_versions(config.simulator)
     facts = SystemFacts(
         policy=POLICIES.parse(config.policy).kind,
         policy_id=short_digest(identity),
@@ -125,6 +128,9 @@ def _describe_run(
         reference=config.subgoals == ORACLE
         or (kind.role is Role.REFERENCE and config.subgoals is None),
     )
+    # Without units of another robot the rule has no effect.
+    others = other_state_sizes(buffer_set.datasets)
+    other_states = {"other_states": policy.other_states} if others else {}
     return RunContext(
         config,
         system.name,
@@ -132,7 +138,12 @@ def _describe_run(
         buffer_set.name,
         buffer_set.revision,
         metadata=metadata,
-        identity={"simulator_version": dict(versions), "subgoals": subgoals_identity, **identity},
+        identity={
+            "simulator_version": dict(versions),
+            "subgoals": subgoals_identity,
+            **other_states,
+            **identity,
+        },
         versions=versions,
     )
 

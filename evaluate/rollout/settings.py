@@ -181,7 +181,6 @@ def simulator_options(
     settings = {
         "cameras": tuple(sorted(used)),
         "shift": config.shift,
-        "python": config.robomme_python,
         "subgoals": config.subgoals == ORACLE,
         "buffer_set": config.buffer_set,
         # Its own limit ends a little before the worker's: its error shows its output.

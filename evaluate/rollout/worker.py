@@ -97,8 +97,7 @@ class RolloutFunction(RunFunction[RunConfig]):
 
     def describe(self) -> dict[str, str]:
         """Return the buffer set's revision and all versions."""
-        config = self.config
-        return super().describe() | simulator_versions(config.simulator, config.robomme_python)
+        return super().describe() | simulator_versions(self.config.simulator)
 
     def close(self) -> None:
         """Release simulator, policy and subgoal writer."""

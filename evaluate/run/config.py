@@ -116,7 +116,11 @@ class RunConfig(WorkConfig):
         group=_SIMULATOR,
         help="Compare actions with those of the buffer set's executions, without a simulator.",
     )
-    simulator: str = setting("tabletop", group=_SIMULATOR, help="tabletop, robomme or module:name.")
+    simulator: str = setting(
+        "tabletop",
+        group=_SIMULATOR,
+        help="tabletop, robomme (its Python: ROBOMME_PYTHON) or module:name.",
+    )
     shift: str = setting(NO_SHIFT, group=_SIMULATOR, help=SHIFT_HELP)
     policies: int | None = setting(
         None,
@@ -163,13 +167,6 @@ class RunConfig(WorkConfig):
         metavar="NAME=VALUE",
         group=_SUBGOALS,
         help="Options of the writer, such as frames=32 or response_s=60.",
-    )
-    robomme_python: str | None = setting(
-        None,
-        group=_SIMULATOR,
-        help="Python interpreter with RoboMME.",
-        env="ROBOMME_PYTHON",
-        rare=True,
     )
     videos: bool = setting(False, group=_EXECUTION, help="Write a video of each rollout.")
     check_lesson: bool = setting(

@@ -11,6 +11,7 @@ from robomme_interference_data.data.dataset import Dataset, camera_feature
 from robomme_interference_data.errors import HashMismatchError
 from robomme_interference_data.retrieval.columns import retrieval_columns
 from robomme_interference_data.schema.manifest import SessionEntry
+from robomme_interference_data.schema.other_states import OtherStates
 from robomme_interference_data.schema.sampling import (
     Memory,
     evidence_kept,
@@ -31,24 +32,36 @@ class HistoryReader:
         self._verified: set[tuple[SessionEntry, tuple[str, ...]]] = set()
 
     def stream(
-        self, buffer: Buffer, size: int, cameras: Sequence[str], indices: Sequence[int]
+        self,
+        buffer: Buffer,
+        size: int,
+        cameras: Sequence[str],
+        indices: Sequence[int],
+        other_states: OtherStates = "refuse",
     ) -> Generator[Chunk]:
         """Decode frames of a buffer, by their indices, in chunks of at most `size` frames.
+
+        `other_states` is as for `Buffer.stream`.
 
         Raises `HashMismatchError` if states or frames of a session are not the recorded ones. So
         sessions that were not compared yet are decoded whole, even for a few of their frames.
         """
         frames = np.asarray(indices, np.int64)
         unverified = {}  # sessions to compare, with the digests of what was decoded so far
-        for session in buffer.sessions:
+        for number, session in enumerate(buffer.sessions):
             key = session.entry, tuple(sorted(cameras))
             read = ((frames >= session.start) & (frames < session.stop)).any()
             if read and key not in self._verified:
-                unverified[key] = session, FeatureDigests()
+                digests = FeatureDigests()
+                # As they were recorded, whatever the policy gets of them.
+                states = buffer.session_states(number)[:: session.entry.repeat]
+                digests.update(STATE, states)
+                unverified[key] = session, digests
         decoded = [frames]
         for session, _ in unverified.values():
             decoded.append(np.arange(session.start, session.stop))
-        for chunk in buffer.stream(size, cameras, np.unique(np.concatenate(decoded)).tolist()):
+        needed = np.unique(np.concatenate(decoded)).tolist()
+        for chunk in buffer.stream(size, cameras, needed, other_states):
             for key in [*unverified]:
                 session, digests = unverified[key]
                 inside = (chunk.indices >= session.start) & (chunk.indices < session.stop)
@@ -56,7 +69,6 @@ class HistoryReader:
                     continue
                 # Digests are over stored frames; a held frame stands in the buffer several times.
                 stored = inside & ((chunk.indices - session.start) % session.entry.repeat == 0)
-                digests.update(STATE, chunk.states[stored])
                 for camera in cameras:
                     images = chunk.frames[camera]
                     if not stored.all():  # indexing copies all pixels

@@ -41,7 +41,6 @@ SETTINGS = (
     "model_seed",
     # The simulator:
     "simulator",
-    "robomme_python",
     "shift",
     "check_lesson",
     # The retrieval step:
@@ -64,6 +63,7 @@ class HarnessPolicy(ObservingPolicy):
         self.cameras = tuple(CAMERAS)[: 1 + wrist]
         self.history_cameras = self.cameras if history else ()
         self.wants_history, self.sends_state = history, state
+        self.other_states = "refuse" if state else "omit"
         self.requests, self.answers = SimpleQueue[Any](), SimpleQueue[Any]()
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:

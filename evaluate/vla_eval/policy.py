@@ -12,6 +12,7 @@ from vla_eval.specs import GRIPPER_CLOSE_NEG, IMAGE_RGB, LANGUAGE, DimSpec
 from robomme_interference_data.errors import PolicyServerError
 from robomme_interference_data.evaluate.policies.connection import check_server_options
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
+from robomme_interference_data.schema.other_states import check_rule
 from robomme_interference_data.simulators.episode import ACTION_SIZE, Observation
 
 from .connection import VlaEvalConnection
@@ -61,6 +62,8 @@ class VlaEvalPolicy(ObservingPolicy):
         connect_s: Maximum seconds to wait until the server accepts connections: loading a model
             takes minutes.
         response_s: Maximum seconds from a message to the end of its answer.
+        other_states: What the server gets of the states of units of another robot, see
+            `Policy.other_states`.
 
     Attributes:
         one_client: Whether the server is known to hold one memory for all its connections.
@@ -75,6 +78,7 @@ class VlaEvalPolicy(ObservingPolicy):
         checkpoint: str,
         connect_s: float = 600.0,
         response_s: float = 600.0,
+        other_states: str = "refuse",
     ):
         check_server_options(checkpoint, connect_s=connect_s, response_s=response_s)
         self._server = VlaEvalConnection(
@@ -88,6 +92,8 @@ class VlaEvalPolicy(ObservingPolicy):
         wrist = asked.get("send_wrist_image", any(name in declared for name in _WRISTS))
         history = asked.get("send_video_history", HISTORIES["front"] in declared)
         self.sends_state = bool(asked.get("send_state", "state" in declared))
+        rule = check_rule(other_states)
+        self.other_states = rule if self.sends_state else "omit"
         self.cameras = ("front", "wrist") if wrist else ("front",)
         self.history_cameras = self.cameras if history else ()
         self.wants_history = bool(history)

@@ -208,7 +208,7 @@ def check_robomme() -> Check:
         return Check(name, None, f"only --simulator robomme needs {PYTHON_VARIABLE}", fix)
     try:
         with RoboMMESimulator(python, (), ROBOMME_S, subgoals=False) as simulator:
-            versions = [f"{key} {value}" for key, value in simulator.versions(python).items()]
+            versions = [f"{key} {value}" for key, value in simulator.versions().items()]
             status = play(simulator, ORACLE_EPISODE, "oracle", None)["status"]
     except InterferenceError as error:
         return Check(name, False, first_line(error), fix)

@@ -166,7 +166,6 @@ def _option(field: dataclasses.Field[Any], kind: Any) -> inspect.Parameter:
     attributes = {
         "help": declared["help"],
         "metavar": declared["metavar"],
-        "envvar": declared["env"],
         "rich_help_panel": declared["group"],
     }
     plain = _without_none(kind)

@@ -32,18 +32,9 @@ def simulate(
     video: Annotated[Path | None, _option("Output", "Write a video to this .mp4 file.")] = None,
     as_json: AsJson = False,
     simulator: Annotated[
-        str, _option("Simulator", "tabletop, robomme or module:name.")
+        str, _option("Simulator", "tabletop, robomme (its Python: ROBOMME_PYTHON) or module:name.")
     ] = "tabletop",
     shift: Annotated[str, _option("Simulator", SHIFT_HELP)] = NO_SHIFT,
-    robomme_python: Annotated[
-        str | None,
-        _option(
-            "Simulator",
-            "Path of RoboMME's own Python interpreter.",
-            envvar="ROBOMME_PYTHON",
-            show_envvar=True,
-        ),
-    ] = None,
 ) -> None:
     r"""Play one episode: its demonstration, then a built-in policy.
 
@@ -53,7 +44,7 @@ def simulate(
     Examples:
     ```
     robomme-interference simulate --family MoveCube --episode 3 --video out.mp4
-    robomme-interference simulate --simulator robomme --robomme-python PATH \
+    ROBOMME_PYTHON=PATH robomme-interference simulate --simulator robomme \
       --family MoveCube
     ```
     """
@@ -75,7 +66,7 @@ def simulate(
         raise InvalidOptionError.expected("--video", str(video), "the path of an .mp4 file")
     check_output(video)
     name = str(EpisodeId(family, split, episode))
-    settings: dict[str, Any] = {"shift": shift, "python": robomme_python}
+    settings: dict[str, Any] = {"shift": shift}
     if video is None:
         settings["cameras"] = ()
     options = accepted_settings(simulator, settings)

@@ -4,7 +4,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,12 @@ from robomme_interference_data.constants import DISTRACTORS, STATE
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId, whole_number
 from robomme_interference_data.schema.manifest import BufferManifest, SessionEntry, layout_sessions
+from robomme_interference_data.schema.other_states import (
+    OtherStates,
+    check_rule,
+    check_sizes,
+    fit_states,
+)
 
 from .dataset import Dataset
 from .frame_reader import FrameReader, allocate_frames
@@ -32,7 +38,7 @@ class Chunk:
     Attributes:
         indices: Indices of the frames in the buffer, ascending, `(n,) int64`.
         frames: By camera, `(n, H, W, 3) uint8` RGB.
-        states: Robot states, `(n, 8) float32`, see `Buffer.states`.
+        states: Robot states, `(n, 8) float32`, see `Buffer.states` and `Buffer.stream`.
         session_index: Number of each frame's session, from 0, `(n,) int64`.
     """
 
@@ -69,6 +75,11 @@ class Buffer:
         self.sessions = layout_sessions(manifest.sessions)
         self._datasets, self._check_rules = datasets, check_rules
         self._reader = FrameReader(self.sessions, datasets, cache, threads)
+        self._states: dict[OtherStates, NDArray[np.float32]] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy in another process reads them again.
+        return {name: value for name, value in self.__dict__.items() if name != "_states"}
 
     def __repr__(self) -> str:
         return (
@@ -108,18 +119,59 @@ class Buffer:
 
     @property
     def states(self) -> NDArray[np.float32]:
-        """Robot states, `(T, 8) float32`: 7 joint positions in rad, the gripper; a new array."""
+        """Robot states, `(T, 8) float32`: 7 joint positions in rad, the gripper; a new array.
+
+        Raises:
+            InvalidOptionError: A unit is of a robot with another number of values; see `states_by`.
+        """
+        return self.states_by("refuse")
+
+    def states_by(self, other_states: OtherStates) -> NDArray[np.float32]:
+        """Return the states with the query's number of values, `(T, D) float32`; a new array.
+
+        Args:
+            other_states: What to do with states of another number of values: `refuse`, `pad` (zeros
+                after fewer values) or `omit` (zeros in place of all values).
+
+        Raises:
+            InvalidOptionError: The rule is `refuse`, or `pad` with more values than the query's.
+        """
         # A copy: later chunks of `stream` are cut from this array.
-        return self._states.copy()
+        return self._fitted(other_states).copy()
+
+    def session_states(self, session: int) -> NDArray[np.float32]:
+        """Return the states of a session as they were recorded, `(n, D) float32`; a new array.
+
+        Args:
+            session: Number of the session, from 0.
+        """
+        return np.repeat(self._recorded[session], self.manifest.sessions[session].repeat, 0)
 
     @cached_property
-    def _states(self) -> NDArray[np.float32]:
-        return self.gather(
-            lambda entry: self._datasets[entry.dataset].read_vectors(
+    def _recorded(self) -> tuple[NDArray[np.float32], ...]:
+        """The stored states of each session; a held frame is there once."""
+        return tuple(
+            self._datasets[entry.dataset].read_vectors(
                 entry.episode_index, STATE, entry.start, entry.stop
-            ),
-            np.empty((0, *self.query.dataset.features[STATE]), np.float32),
+            )
+            for entry in self.manifest.sessions
         )
+
+    def _fitted(self, other_states: str) -> NDArray[np.float32]:
+        rule = check_rule(other_states)
+        if rule not in self._states:
+            (size,) = self.query.dataset.features[STATE]
+            recorded = dict(zip(self.manifest.sessions, self._recorded, strict=True))
+            sizes = {
+                f"session {number} ({entry.source} of the {entry.dataset})": states.shape[1]
+                for number, (entry, states) in enumerate(recorded.items())
+            }
+            check_sizes(str(self.manifest), size, sizes, rule, "other_states")
+            self._states[rule] = self.gather(
+                lambda entry: fit_states(recorded[entry], size, rule),
+                np.empty((0, size), np.float32),
+            )
+        return self._states[rule]
 
     def gather[Value: np.generic](
         self, read: Callable[[SessionEntry], NDArray[Value]], empty: NDArray[Value]
@@ -234,6 +286,7 @@ class Buffer:
         chunk: int = 64,
         cameras: Sequence[str] | None = None,
         indices: Sequence[int] | None = None,
+        other_states: OtherStates = "refuse",
     ) -> Generator[Chunk]:
         """Decode the buffer, or some of its frames, in chunks; one chunk is in memory at a time.
 
@@ -243,10 +296,12 @@ class Buffer:
             chunk: Frames per chunk; the last one may be shorter.
             cameras: Names of the cameras; None for all.
             indices: Indices of the frames, strictly ascending; None for all.
+            other_states: What to do with states of another number of values than the query's, see
+                `states_by`; `omit` if states are not used.
 
         Raises:
-            InvalidOptionError: `chunk` is not positive, the indices do not ascend, or an argument
-                has the wrong type.
+            InvalidOptionError: `chunk` is not positive, the indices do not ascend, an argument has
+                the wrong type, or `other_states` does not allow the states of a session.
             UnknownNameError: The buffer has no such frame or camera.
             MissingFileError, FormatError: As for `frames`.
         """
@@ -256,6 +311,7 @@ class Buffer:
         shapes = {name: self.query.dataset.shape(name) for name in names}
         session_index = self.session_index
         used = {*session_index[chosen].tolist()}
+        check_rule(other_states)
         # Fetched together, so that no chunk waits for its videos. `states` needs all sessions.
         self._fetch(names if number in used else () for number in range(len(self.sessions)))
         decoders = {name: self._reader.iter(name, chosen.tolist()) for name in names}
@@ -268,9 +324,8 @@ class Buffer:
                     frames[name] = np.empty((len(indices_now), *shape), np.uint8)
                     for image in frames[name]:
                         image[...] = next(decoders[name])
-                yield Chunk(
-                    indices_now, frames, self._states[indices_now], session_index[indices_now]
-                )
+                states = self._fitted(other_states)[indices_now]
+                yield Chunk(indices_now, frames, states, session_index[indices_now])
         finally:
             # Also if the caller stops early: each holds an open file and its decoder.
             for decoder in decoders.values():

@@ -21,6 +21,7 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.errors import (
     FormatError,
+    HashMismatchError,
     InvalidOptionError,
     UnknownNameError,
     counted,
@@ -85,6 +86,9 @@ class BufferSet:
         for name, dataset in self.header.datasets.items():
             if not _LOCATION.fullmatch(dataset.location or "."):
                 raise FormatError.damaged(path, f"{name} has the location {dataset.location!r}")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _open_again, (self.files, self._cache, self._threads, self.header)
 
     def __repr__(self) -> str:
         return f"BufferSet({self.name}, buffers={len(self)}, conditions={list(self.conditions)})"
@@ -467,6 +471,22 @@ class BufferSet:
     @cached_property
     def _episodes(self) -> frozenset[EpisodeId]:
         return frozenset(self.episode_ids)
+
+
+def _open_again(
+    files: "LocalFiles | HubFiles",
+    cache: "DecodedCache | None",
+    threads: int | None,
+    header: ManifestHeader,
+) -> BufferSet:
+    """Return an unpickled buffer set, or a copy of one: open files cannot be pickled."""
+    buffer_set = BufferSet(files, cache, threads)
+    if buffer_set.header != header:
+        raise HashMismatchError(
+            f"{buffer_set.location} was changed since it was pickled: it has other buffers",
+            "Open it again; do not change a buffer set that is in use.",
+        )
+    return buffer_set
 
 
 def _condition(condition: Condition | str | None, k: int | None) -> Condition:

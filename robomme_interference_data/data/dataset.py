@@ -110,6 +110,9 @@ class Dataset:
         self._records: dict[int, EpisodeRecord] = {}
         self._checked = False
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _open_again, (self.files, self.revision)
+
     def __repr__(self) -> str:
         return f"Dataset({self.kind}, {self._name}, episodes={len(self)})"
 
@@ -129,7 +132,9 @@ class Dataset:
             FormatError: The identity records no valid one.
         """
         stored = self.identity.unit
-        if stored is None or {*stored} != {*Unit._fields} or min(stored.values()) < 1:
+        known = {*Unit._fields}
+        needed = known - {*Unit._field_defaults}
+        if stored is None or not needed <= {*stored} <= known or min(stored.values()) < 1:
             raise FormatError.damaged(self._name, f"{IDENTITY_PATH}: unit is {stored}")
         return Unit(**stored)
 
@@ -349,3 +354,15 @@ class Dataset:
 
     def _feature(self, camera: str | None) -> str:
         return camera_feature(self.camera(camera))
+
+
+def _open_again(files: Files, revision: str) -> Dataset:
+    """Return an unpickled dataset, or a copy of one: open files cannot be pickled."""
+    dataset = Dataset(files)
+    if dataset.revision != revision:
+        raise HashMismatchError(
+            f"{files.describe()} has revision {dataset.revision[:12]}…; the dataset that was "
+            f"pickled had {revision[:12]}…",
+            "Open it again; do not change data that is in use.",
+        )
+    return dataset

@@ -169,7 +169,7 @@ def cached_session(
         check_session(dataset, record, feature, digests)
 
     whole = (stop - start, *(shape or dataset.shape(camera)))
-    layout = "HWC" if convert is None else "CHW"
+    layout = "HWC" if convert is None else "CHW, means of areas"
     return cache.frames(digest_json([recorded, layout, whole]), whole, decode)
 
 

@@ -81,11 +81,12 @@ class SessionSource:
         """Return the session of an episode in a dataset; contradictions go by their query's id."""
         dataset = self.datasets[name]
         if name not in self._sessions:
-            self._sessions[name] = {
-                # A contradiction's own id has another answer; its scene is that of its query.
-                record.episode_id.scene: dataset.session(_ROLES[name], record)
-                for record in dataset.records()
-            }
+            sessions = self._sessions[name] = {}
+            for record in dataset.records():
+                key = record.episode_id
+                if name == CONTRADICTIONS:  # its own id has another answer than its query's
+                    key = key.scene
+                sessions[key] = dataset.session(_ROLES[name], record)
         session = self._sessions[name].get(episode)
         if session is None:
             raise SourceError(

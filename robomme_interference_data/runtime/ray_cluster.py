@@ -38,7 +38,7 @@ from .worker import Outcome, TaskFunction, end_if_starting, unpickle_outcome
 
 logger = logging.getLogger(__name__)
 
-_PASSED = (SAFE_PATH, "HF_ENDPOINT", "HF_HUB_OFFLINE")
+_PASSED = (SAFE_PATH, "HF_ENDPOINT", "HF_HUB_OFFLINE", "ROBOMME_PYTHON")
 """Environment variables that workers inherit."""
 
 _CONNECT_S = 10.0

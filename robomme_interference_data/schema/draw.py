@@ -2,7 +2,8 @@
 
 Rules 1 to 4 of the protocol. The draw for a query depends only on its id, the ids of the units of
 other families, the seed and the rule version. Choices come from SHA-256, not from a random
-generator.
+generator. Several units of one recorded episode are units like others: they do not overlap, and a
+buffer may hold two of them.
 
 Rule version 1, for a query of family F and index i:
 
@@ -69,11 +70,11 @@ class UnitPool:
         return list(islice(self._units(query, others), k))
 
     def draw_own(self, query: EpisodeId, k: int) -> list[EpisodeId]:
-        """Draw `k` distinct units of the query's family, without the query's; nested in `k`.
+        """Draw `k` distinct units of the query's family, of other episodes; nested in `k`.
 
         They are consecutive in the family's order; queries start seven units apart.
         """
-        units = [unit for unit in self._families.get(query.family, []) if unit != query]
+        units = [unit for unit in self._families.get(query.family, []) if unit.scene != query.scene]
         if k > len(units):
             raise BuildError(
                 f"{query} needs {k} units of its own family; the pool has {len(units)} "

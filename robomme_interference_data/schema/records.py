@@ -57,7 +57,11 @@ class EpisodeRecord:
     """An episode of a dataset, with the metadata of its source."""
 
     episode_index: Annotated[int, "Number of the episode in the dataset, from 0."]
-    episode_id: Annotated[EpisodeId, "Id of the recorded episode; of a unit, of its source."]
+    episode_id: Annotated[
+        EpisodeId,
+        "Id of the recorded episode; of a unit with its first raw frame, as in "
+        "`Lift/train/7@1000`, if that is not 0.",
+    ]
     length: Annotated[int, "Stored frames. A demonstration's last one is the query frame."]
     goals: Annotated[
         tuple[str, ...], "Wordings of the goal, at least one; the first is LeRobot's task."
@@ -165,7 +169,9 @@ class DatasetIdentity:
     codec: Annotated[str, "Name of the video settings."]
     cameras: Annotated[tuple[str, ...], "Names of the cameras, sorted."]
     unit: Annotated[
-        dict[str, int] | None, "`frames` and `stride` of a unit; None for other datasets."
+        dict[str, int] | None,
+        "`frames` and `stride` of a unit, and `per_episode`, the most units of a recorded episode, "
+        "if that is not 1; None for other datasets.",
     ]
     simulators: Annotated[tuple[str, ...], "Simulators of the episodes."]
     sources: Annotated[tuple[dict[str, Any], ...], "Metadata of the sources."]

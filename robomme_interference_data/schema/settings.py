@@ -23,7 +23,6 @@ def setting(
     help: str,
     name: str | None = None,
     metavar: str | None = None,
-    env: str | None = None,
     shown: str | None = None,
     whole: bool = False,
     group: str | None = None,
@@ -36,20 +35,12 @@ def setting(
         help: One line of help.
         name: The option, if it is not derived from the field's name; `-` for an argument.
         metavar: Placeholder for the value in the help.
-        env: Environment variable that can set it.
         shown: Default to show in the help instead of the value.
         whole: Whether values of a list may contain commas, which do not separate them then.
         group: Title of the help section that lists it.
         rare: Whether it has no option of its own: a command sets it with `--set NAME=VALUE`.
     """
     declared = dict(
-        help=help,
-        name=name,
-        metavar=metavar,
-        env=env,
-        shown=shown,
-        whole=whole,
-        group=group,
-        rare=rare,
+        help=help, name=name, metavar=metavar, shown=shown, whole=whole, group=group, rare=rare
     )
     return dataclasses.field(default=default, metadata={SETTING: declared})

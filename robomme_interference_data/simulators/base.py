@@ -47,9 +47,8 @@ class Simulator(ABC):
         state_names: Names of the values of a state; None if they have none.
         action_names: Names of the values of an action; None if they have none.
         settings: Settings of a run that its constructor accepts: `cameras` (to render), `shift`,
-            `python` (path of another interpreter), `subgoals` (whether `subgoal` will be called),
-            `answer_s` (seconds that a call may take), `buffer_set` (its location). A function
-            accepts those that are its parameters.
+            `subgoals` (whether `subgoal` will be called), `answer_s` (seconds that a call may
+            take), `buffer_set` (its location). A function accepts those that are its parameters.
         policies: Its built-in policies: those of `act`, and `follow-subgoals` if it has
             `follow_subgoal`.
         shifts: Whether it supports shifts of the live scene.
@@ -84,14 +83,11 @@ class Simulator(ABC):
     _closed = False
 
     @classmethod
-    def versions(cls, python: str | None = None) -> dict[str, str]:
+    def versions(cls) -> dict[str, str]:
         """Return the versions that its results depend on, by name, without starting it.
 
-        Args:
-            python: Path of its own interpreter, if it has one.
-
         Raises:
-            InvalidOptionError: That interpreter does not run.
+            InvalidOptionError: Its own interpreter, if it has one, does not run.
         """
         return {} if cls.suite_version is None else {cls.name: str(cls.suite_version)}
 

@@ -123,6 +123,6 @@ def recorded_scene(query: "Query") -> Scene | None:
     return simulator_class(name).scene(query.episode_id.family, seed, difficulty, scene)
 
 
-def simulator_versions(name: str, python: str | None = None) -> dict[str, str]:
+def simulator_versions(name: str) -> dict[str, str]:
     """Return the versions that a simulator's results depend on; see `Simulator.versions`."""
-    return simulator_class(name).versions(python)
+    return simulator_class(name).versions()

@@ -96,6 +96,10 @@ class LocalFiles(Files):
     root: Path
     refetch: str | None = None
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Another process may have another working directory.
+        return LocalFiles, (self.root.absolute(), self.refetch)
+
     def path(self, relative: str) -> Path:
         """See `Files.path`."""
         path = self.root / check_relative(relative, self.describe())
@@ -276,16 +280,21 @@ def read_bytes(path: Path, most: int) -> bytes:
     return data
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file that holds an object."""
-    return parse_json(read_bytes(path, _MAX_JSON_BYTES), path)
+def read_json(path: Path, *, nan_as_none: bool = False) -> dict[str, Any]:
+    """Read a JSON file that holds an object; see `parse_json`."""
+    return parse_json(read_bytes(path, _MAX_JSON_BYTES), path, nan_as_none=nan_as_none)
 
 
-def parse_json(data: bytes, where: object) -> dict[str, Any]:
-    """Parse a JSON object, in which keys are unique and numbers are finite; see `decode_text`."""
+def parse_json(data: bytes, where: object, *, nan_as_none: bool = False) -> dict[str, Any]:
+    """Parse a JSON object, in which keys are unique and numbers are finite; see `decode_text`.
+
+    With `nan_as_none`, for files of other programs, NaN and infinities are read as None: Python and
+    pandas write NaN for values that are missing.
+    """
     text = decode_text(data, where)
+    decoder = _JSON_WITH_NAN if nan_as_none else _JSON
     try:
-        value = _JSON.decode(text)
+        value = decoder.decode(text)
         # The number of brackets bounds the depth, and is quickly counted.
         if data.count(b"[") + data.count(b"{") > _MAX_DEPTH and _is_deep(value):
             raise ValueError(f"over {_MAX_DEPTH} nested arrays and objects")
@@ -316,6 +325,9 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 _JSON = json.JSONDecoder(object_pairs_hook=_unique, parse_float=_finite, parse_constant=_not_finite)
+_JSON_WITH_NAN = json.JSONDecoder(
+    object_pairs_hook=_unique, parse_float=_finite, parse_constant=lambda text: None
+)
 
 
 def _is_deep(value: Any) -> bool:

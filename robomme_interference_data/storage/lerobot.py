@@ -65,7 +65,7 @@ class LeRobotFiles:
                 f"{files.describe()} is no LeRobot dataset: {INFO_PATH} is missing",
                 "Give the folder that holds meta/, data/ and videos/.",
             ) from error
-        self.info = read_json(path)
+        self.info = read_json(path, nan_as_none=True)
         self.version = self.info.get("codebase_version")
         if self.version not in VERSIONS:
             raise FormatError(
@@ -191,11 +191,11 @@ class LeRobotFiles:
         rows = self.rows(index)
         values = rows.vectors(column)
         if values.shape[1:] != self.shape(column):
-            what = (
-                f"{column} of episode {index} has {values.shape[1]} values a frame; info.json has "
-                f"{self.shape(column)}"
+            raise FormatError(
+                f"{rows.path}: {column} of episode {index} has {values.shape[1]} values in each "
+                f"frame; {INFO_PATH} has the shape {self.shape(column)}",
+                "Correct the one that is wrong.",
             )
-            raise FormatError.damaged(rows.path, what)
         return values
 
     def iter_frames(

@@ -143,4 +143,4 @@ def _json_lines(files: Files, relative: str) -> Iterator[dict[str, Any]]:
     path = files.path(relative)
     for number, line in enumerate(read_bytes(path, _MAX_LINES_BYTES).splitlines(), 1):
         if line.strip():
-            yield parse_json(line, f"{path}, line {number}")
+            yield parse_json(line, f"{path}, line {number}", nan_as_none=True)

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 import pyarrow as pa
@@ -130,7 +130,10 @@ def _check_size(
             for number, fixed_length in chosen:
                 column = file.metadata.row_group(group).column(number)
                 values += column.num_values
-                size += decoded_size(raw, column, fixed_length, _MAX_BYTES)
+                try:
+                    size += decoded_size(raw, column, fixed_length, _MAX_BYTES)
+                except FormatError as error:
+                    raise error.about(path) from None
                 if size > _MAX_BYTES or values > MAX_READ_VALUES:
                     what = f"over {_MAX_BYTES:,} bytes or {MAX_READ_VALUES:,} values once decoded"
                     raise ValueError(what)
@@ -238,7 +241,10 @@ class RowSpan:
         # LeRobot stores vectors of one value as the value.
         flat = pc.list_flatten(column) if is_listed(column.type) else column
         if not is_number(flat.type):
-            raise FormatError(f"{what} is of type {stored}; expected lists of numbers")
+            raise FormatError(
+                f"{what} is of type {stored}; expected lists of numbers",
+                "Store the values of each row as a list of numbers, always in the same order.",
+            )
         lengths = [1]
         if is_listed(column.type):
             lengths = pc.unique(pc.list_value_length(column)).drop_null().to_pylist()
@@ -263,14 +269,15 @@ class RowSpan:
         At most one row group is held in memory, and less if the file's pages are smaller.
         """
         kind = self._type(name)
-        stored = simple_type(kind)
+        stored: Any = simple_type(kind)
         in_structs = stored is not None and pa.types.is_struct(stored)
         if in_structs and stored.get_field_index("bytes") >= 0:
             stored = stored.field("bytes").type
         if stored != pa.binary():
             raise FormatError(
                 f"{self.path}: column {name!r} is of type {kind}; expected images as PNG or JPEG, "
-                "in struct<bytes, path>"
+                "in struct<bytes, path>",
+                "Encode the images as PNG, which is lossless.",
             )
         groups, row = self._row_groups()
         with reading(self.path):

@@ -12,6 +12,8 @@ from typing import Any, BinaryIO, NamedTuple
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from robomme_interference_data.errors import FormatError
+
 _DATA, _DICTIONARY, _DATA_V2 = 0, 2, 3
 _DETAILS = {_DATA: 5, _DICTIONARY: 7, _DATA_V2: 8}
 """Types of pages, and the field of a header that holds what only pages of that type have."""
@@ -62,7 +64,11 @@ def decoded_size(
         elif page.encoding in _BY_DICTIONARY:
             references += page.values
         elif page.encoding == _BY_PREFIX and texts:
-            raise ValueError("a column is encoded by common prefixes, which is not supported")
+            raise FormatError(
+                f"column {column.path_in_schema!r} is encoded by common prefixes "
+                "(DELTA_BYTE_ARRAY), which is not read",
+                "Write the file with another encoding, such as pyarrow's default.",
+            )
     if texts and dictionary is not None:
         longest = dictionary.size
         if size + references * longest > most:  # only then, as it takes time

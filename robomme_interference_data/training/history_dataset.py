@@ -12,6 +12,7 @@ from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, SHIFTED,
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import camera_feature
 from robomme_interference_data.data.loading import load_buffer_set, open_cache
+from robomme_interference_data.data.state_sizes import other_state_sizes, query_state_size
 from robomme_interference_data.data.views import shifted_view
 from robomme_interference_data.errors import (
     HashMismatchError,
@@ -21,9 +22,12 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.ids import EpisodeId, parse_numbers, whole_number
 from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.retrieval.stored_selector import StoredSelector
+from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.schema.manifest import ManifestHeader
+from robomme_interference_data.schema.other_states import check_rule, check_sizes
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.schema.shifts import NO_SHIFT, Shift, parse_shift
+from robomme_interference_data.storage.files import LocalFiles
 
 from .draws import Weights
 from .histories import DrawnHistory, Histories
@@ -100,6 +104,8 @@ class HistoryDataset:
             ones. Then conditions need not be planned.
         unit_episodes: With `redraw`, indices of the train episodes whose units may be drawn, such
             as `0-5`, so that others can be kept for testing; None for all.
+        other_states: What to do with states of units of another robot, with another number of
+            values than the query's: `refuse`, `pad` (zeros after fewer values) or `omit` (zeros).
         seed: Seed of everything that is drawn.
         cache: Where decoded frames are kept: a `DecodedCache`, a folder for one of 20 GiB, or True
             for the folder `~/.cache/robomme-interference`.
@@ -131,6 +137,7 @@ class HistoryDataset:
         questions: bool = False,
         redraw: bool = False,
         unit_episodes: str | None = None,
+        other_states: str = "refuse",
         seed: int = 0,
         cache: "bool | str | os.PathLike[str] | DecodedCache" = True,
         quiet: bool = False,
@@ -146,7 +153,8 @@ class HistoryDataset:
             conditions=conditions, memory=memory, cameras=cameras, image_size=image_size,
             chunk=chunk, families=tuple(families), episodes=episodes, retrieval=retrieval,
             retrieval_rule=retrieval_rule, retrieval_camera=retrieval_camera, shifts=shifts,
-            questions=questions, redraw=redraw, unit_episodes=unit_episodes, seed=seed, cache=cache,
+            questions=questions, redraw=redraw, unit_episodes=unit_episodes,
+            other_states=other_states, seed=seed, cache=cache,
         )  # fmt: skip
         self.memory, self.seed = Memory.parse(memory), seed
         self.chunk = whole_number("chunk", chunk, "an integer from 0", 0)
@@ -176,7 +184,12 @@ class HistoryDataset:
         if kept is None:
             raise InvalidOptionError.expected("cache", cache, "True, a folder or a DecodedCache")
         size = check_size(self.buffer_set, self.cameras, image_size)
-        self._rows = StoredRows(datasets, kept, size)
+        rule, others = check_rule(other_states), dict[str, int]()
+        if any(parse_condition(name).k for name in self._conditions.names):
+            others = other_state_sizes(datasets)
+        what = f"HistoryDataset of {self.buffer_set.name}"
+        check_sizes(what, query_state_size(datasets), others, rule, "other_states")
+        self._rows = StoredRows(datasets, kept, size, rule)
         self._moments = choose_moments(
             self.buffer_set, self._rows, families, episodes, actions=actions
         )
@@ -204,8 +217,11 @@ class HistoryDataset:
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # type: ignore[no-untyped-call]
 
     def __reduce__(self) -> tuple[Any, ...]:
+        files = self.buffer_set.files
+        # Another process may have another working directory.
+        local = isinstance(files, LocalFiles)
         return _open_again, (
-            self.buffer_set.location,
+            str(files.root.absolute()) if local else files.location,
             self._arguments,
             self._epoch,
             self.buffer_set.header,

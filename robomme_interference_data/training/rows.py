@@ -14,11 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import CAMERA_PREFIX
+from robomme_interference_data.constants import CAMERA_PREFIX, DEMONSTRATIONS, STATE
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.frame_reader import cached_session, check_session
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.progress import WorkProgress
+from robomme_interference_data.schema.other_states import OtherStates, fit_states
 from robomme_interference_data.storage.arrays import FeatureDigests
 from robomme_interference_data.storage.cache import DecodedCache
 
@@ -44,10 +45,19 @@ class StoredRows:
         datasets: The datasets by name.
         cache: Where decoded and resized frames are.
         size: Side of resized images in pixels; None for no change of size.
+        other_states: What takes the place of states of units of another robot, see `other_states`
+            in the schema.
     """
 
-    def __init__(self, datasets: Mapping[str, Dataset], cache: DecodedCache, size: int | None):
+    def __init__(
+        self,
+        datasets: Mapping[str, Dataset],
+        cache: DecodedCache,
+        size: int | None,
+        other_states: OtherStates = "refuse",
+    ):
         self._datasets, self._cache, self._size = dict(datasets), cache, size
+        self._other_states = other_states
         self._first: dict[str, list[int]] = {}
         self._spans: list[_Span] = []
         starts, total = [], 0
@@ -152,12 +162,18 @@ class StoredRows:
         values = dataset.read_vectors(span.episode, feature, 0, record.length)
         digests.update(feature, values[slice(*record.session)])
         check_session(dataset, record, feature, digests)
-        return values[span.start : span.stop]
+        values = values[span.start : span.stop]
+        if feature != STATE:
+            return values
+        (size,) = self._shape(dataset, STATE)
+        return fit_states(values, size, self._other_states)
 
     def _converted(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
         return resize(frame[None], self._size)[0]
 
     def _shape(self, dataset: Dataset, feature: str) -> tuple[int, ...]:
+        if feature == STATE:  # the query's number of values, also of units of another robot
+            return self._datasets.get(DEMONSTRATIONS, dataset).features[STATE]
         if not _is_camera(feature):
             return dataset.features[feature]
         height, width, _ = dataset.shape(feature)

@@ -38,12 +38,15 @@ def write_recording(buffer: "Buffer", out: Path, live: Mapping[str, NDArray[np.u
         recording = rerun.RecordingStream("robomme-interference", recording_id=name)
         recording.save(str(partial))
         recording.send_recording_name(f"{name}: {buffer.goal}")
-        for chunk in buffer.stream(cameras=tuple(live)):
+        states = [
+            state for n, _ in enumerate(buffer.sessions) for state in buffer.session_states(n)
+        ]
+        for chunk in buffer.stream(cameras=tuple(live), other_states="omit"):
             for place, index in enumerate(chunk.indices.tolist()):
                 recording.set_time("frame", sequence=index)
                 for camera, frames in chunk.frames.items():
                     recording.log(camera, _image(rerun, frames[place]))
-                recording.log("state", rerun.Scalars(chunk.states[place]))
+                recording.log("state", rerun.Scalars(states[index]))
                 recording.log("session", rerun.Scalars(int(chunk.session_index[place])))
                 recording.log("sample", rerun.Scalars(int(index in sample)))
                 shown = any(entry.seen([index]) for entry in buffer.evidence or ())

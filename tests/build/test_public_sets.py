@@ -10,9 +10,13 @@ from support.public_sets import SETS, STATELESS, write_public_set
 from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.training import HistoryDataset
 
-LENGTHS = (14, 9)
-TASKS = ("Open the drawer.", "stack the cups")
-NAMES = "episode_index,family,split,exec_start_idx\n0,OpenDrawer,test,8\n1,StackCups,train,0\n"
+LENGTHS = (9, 8, 7)
+TASKS = ("Open the drawer.", "Open the drawer.", "stack the cups")
+NAMES = """episode_index,family,split,exec_start_idx
+0,OpenDrawer,test,6
+1,OpenDrawer,test,5
+2,StackCups,train,0
+"""
 SMALL = ("--unit", "4x2", "--workers", "1")
 
 
@@ -36,13 +40,13 @@ def test_from_recordings_to_a_policy(name: str, tmp_path: Path, run: Any) -> Non
     code, _, err = run(
         *("build", root, "--source", f"lerobot:{source}", "--families-from", names),
         *("--split", "test", "--conditions", "no-history,k0,k1", "--with", "executions"),
-        *(*SMALL, *options),
+        *("--codec", "lerobot-default", *SMALL, *options),
     )
     assert code == 0, err
     code, out, err = run("verify", root)
     assert code == 0, out + err
     buffer = load_buffer("OpenDrawer/test/0", "k1", buffer_set=root)
-    assert buffer.states.shape == (8 + 4, layout.state)
+    assert buffer.states.shape == (6 + 4, layout.state)
     assert tuple(buffer.cameras) == layout.cameras
     opened = load_buffer_set(root)
     assert opened.datasets["demonstrations"].fps == layout.fps
@@ -66,9 +70,9 @@ def test_recordings_without_states(tmp_path: Path, run: Any) -> None:
         code, out, err = run("verify", root, *check)
         assert code == 0, out + err
     buffer = load_buffer("OpenDrawer/test/0", "k1", buffer_set=root, verify=True)
-    assert buffer.states.shape == (12, 0) and buffer.states.dtype == np.float32
+    assert buffer.states.shape == (10, 0) and buffer.states.dtype == np.float32
     assert buffer.query.state().shape == (0,)
-    assert buffer.frames("top").shape == (12, 64, 96, 3)
+    assert buffer.frames("top").shape == (10, 64, 96, 3)
     units = load_buffer_set(root).datasets["distractors"]
     assert "observation.state" not in units.lerobot.features
     code, _, err = run("build", root, *options)  # again: nothing to add

@@ -1,5 +1,6 @@
 """How the episodes of a LeRobot dataset get their ids, and which goals fit which family."""
 
+import unicodedata
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +119,15 @@ def test_a_line_for_each_task(tmp_path: Path) -> None:
         path.write_text(path.read_text().replace("<family>", name, 1))
     ids = names(ids_by_columns(read_families(path, TASKS, "set"), "here"))
     assert ids == dict(enumerate(["Open/train/0", "Stack/train/0", "Open/train/1", "Push/train/0"]))
+
+
+def test_a_task_in_another_form_of_unicode(tmp_path: Path) -> None:
+    """macOS writes "ö" as two characters, and most keyboards as one."""
+    one, two = (unicodedata.normalize(form, "öffne") for form in ("NFC", "NFD"))
+    path = tmp_path / "families.csv"
+    for written, recorded in ((one, two), (two, one)):
+        path.write_text(f"task,family\n{written},Drawer\n", encoding="utf-8")
+        assert read_families(path, [[recorded]]) == [{"family": "Drawer"}]
 
 
 def test_lines_that_a_file_lacks_are_offered(tmp_path: Path) -> None:

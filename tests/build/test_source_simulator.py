@@ -77,7 +77,7 @@ def test_only_every_third_frame_is_drawn(made: list[Double]) -> None:
 
 
 def test_robomme_provides_demonstrations_without_actions(made: list[Double]) -> None:
-    source = open_source("robomme", robomme_python="/opt/python")
+    source = open_source("robomme")
     assert source.provenance == {"kind": "robomme"}
     assert source.time_limit_s == 1800
     frames = list(read(source).frames)
@@ -85,7 +85,7 @@ def test_robomme_provides_demonstrations_without_actions(made: list[Double]) -> 
     assert [frame.action is None for frame in frames] == [True] * 5 + [False] * 3
     lesson = list(select_frames(DEMONSTRATIONS, read(source)))
     assert [frame.action for frame in lesson] == [None] * 6
-    assert made[0].options == {"python": "/opt/python", "subgoals": False}
+    assert made[0].options == {"subgoals": False}
 
 
 def test_the_tabletop_under_shifts(made: list[Double]) -> None:

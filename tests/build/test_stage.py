@@ -27,9 +27,9 @@ from robomme_interference_data.build_dataset.dataset.frame_selection import (
 )
 from robomme_interference_data.build_dataset.dataset.lerobot_writer import StoredEpisode
 from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan
-from robomme_interference_data.build_dataset.dataset.stage import (
+from robomme_interference_data.build_dataset.dataset.stage import StageTask
+from robomme_interference_data.build_dataset.dataset.staged import (
     Staged,
-    StageTask,
     keep_staged,
     read_staged,
     staged_name,
@@ -70,7 +70,8 @@ def staged(
 
 def stored(folder: Path, source: MadeUpSource, **options: Any) -> StoredEpisode:
     made, place = staged(folder, source, **options)
-    return made.stored(place)
+    [episode] = made.stored(place)
+    return episode
 
 
 @pytest.mark.parametrize("kind", ["demonstrations", "distractors"])
@@ -78,8 +79,9 @@ def test_evidence_is_of_a_lesson(tmp_path: Path, kind: str) -> None:
     shown = (EvidenceSpan(0, "lifts cube 2", 5, 20),)
     source = MadeUpSource({NAME: (260, 20)}, evidence=shown)
     made, place = staged(tmp_path, source, kind)
-    assert made.record is not None and read_staged(place) == made
-    assert made.record.evidence == (shown if kind == "demonstrations" else None)
+    [episode] = made.episodes
+    assert read_staged(place) == made
+    assert episode.record.evidence == (shown if kind == "demonstrations" else None)
 
 
 def test_a_demonstration(tmp_path: Path) -> None:

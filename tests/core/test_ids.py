@@ -18,6 +18,13 @@ IDS = st.builds(
     st.sampled_from(SPLITS),
     st.integers(0, 10**18 - 1),
     st.none() | st.integers(0, 10**18 - 1),
+) | st.builds(
+    EpisodeId,
+    st.sampled_from(FAMILIES),
+    st.sampled_from(SPLITS),
+    st.integers(0, 10**18 - 1),
+    st.none(),
+    st.integers(0, 10**18 - 1),
 )
 
 
@@ -35,6 +42,8 @@ def test_round_trip(episode: EpisodeId) -> None:
         *("9Family/test/1", "Move Cube/test/1", "MoveCube/test/1 ", "MoveCube/test/٣", "../test/1"),
         *("MoveCube/test/1234567890123456789", None, 7, ("MoveCube", "test", 1)),
         *("all/test/1", "easy/test/1"),  # names of other rows of tables
+        *("MoveCube/test/1@0", "MoveCube/test/1@", "MoveCube/test/1@08", "MoveCube/test/1@8@9"),
+        *("MoveCube/test/1/2@8", "MoveCube@8/test/1", "MoveCube/test/1@-8"),
     ],
 )
 def test_what_is_no_id(given: Any) -> None:
@@ -48,6 +57,16 @@ def test_indices_and_answers_are_numbers(number: Any) -> None:
         EpisodeId("MoveCube", "test", number)
     with raises(InvalidIdError):
         EpisodeId("MoveCube", "test", 1, number)
+    with raises(InvalidIdError):
+        EpisodeId("MoveCube", "test", 1, None, number)
+
+
+def test_starts_of_units() -> None:
+    unit = EpisodeId.parse("MoveCube/train/1@1000")
+    assert unit == EpisodeId("MoveCube", "train", 1, start=1000)
+    assert str(unit) == "MoveCube/train/1@1000"
+    assert unit.scene == EpisodeId("MoveCube", "train", 1) != unit
+    assert str(EpisodeId("MoveCube", "train", 1, start=0)) == "MoveCube/train/1"
 
 
 def test_answers_scenes_and_a_misspelled_split() -> None:
@@ -63,6 +82,7 @@ def test_canonical_order() -> None:
     texts = [
         *("VideoRepick/train/0", "VideoRepick/test/2", "VideoRepick/test/2/0"),
         *("VideoRepick/test/2/1", "VideoRepick/test/10"),
+        *("VideoRepick/test/10@9", "VideoRepick/test/10@10", "VideoRepick/test/11"),
         *("RouteStick/train/0", "AFamily/val/0", "Other/train/1"),
     ]
     ids = [EpisodeId.parse(text) for text in texts]

@@ -307,6 +307,16 @@ def test_lines_that_are_wrong(tmp_path: Path, text: str) -> None:
         _ = opened(root).table
 
 
+def test_nan_in_json_is_no_value(tmp_path: Path) -> None:
+    """Python and pandas write it for missing values."""
+    root = write_lerobot(tmp_path, version="v2.1", stored=None, seed=[1, float("nan"), 2])
+    assert "NaN" in (root / "meta/episodes.jsonl").read_text()
+    edit_info(root, quality=float("nan"))
+    lerobot = opened(root)
+    assert [lerobot.row(index)["seed"] for index in range(3)] == [1, None, 2]
+    assert lerobot.info["quality"] is None
+
+
 @pytest.mark.parametrize(
     "columns",
     [

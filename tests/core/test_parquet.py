@@ -215,6 +215,16 @@ def test_kinds_of_columns_that_no_table_of_ours_has(tmp_path: Path, column: pa.A
     assert RowSpan(tmp_path / "t").table(["w"]).num_rows == 1
 
 
+def test_an_encoding_that_is_not_read(tmp_path: Path) -> None:
+    """Each value may repeat the one before, so that a small file has a large content."""
+    encoding = {"v": "DELTA_BYTE_ARRAY"}
+    table = pa.table({"v": ["ab", "abc"]})
+    pq.write_table(table, tmp_path / "t", use_dictionary=False, column_encoding=encoding)
+    with raises(FormatError) as raised:
+        RowSpan(tmp_path / "t").table()
+    assert raised.value.hint and "download" not in raised.value.hint
+
+
 def test_text_that_is_none(tmp_path: Path) -> None:
     column = pa.Array.from_buffers(
         pa.string(), 1, [None, pa.array([0, 1], pa.int32()).buffers()[1], pa.py_buffer(b"\xff")]

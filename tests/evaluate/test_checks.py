@@ -170,10 +170,10 @@ def test_only_cameras_in_use_are_rendered(tiny_buffers: Path) -> None:
     step = STEP | {"retrieval_camera": "wrist"}
     assert options("tabletop", "front", **step)["cameras"] == ("front", "wrist")
     assert options("tabletop", videos=True)["cameras"] == ("front", "wrist")
-    assert options("robomme", "front", robomme_python="./py", simulator_timeout_s=100.0) == {
-        **{"python": "./py", "cameras": ("front",), "answer_s": 90.0, "subgoals": False}
+    assert options("robomme", "front", simulator_timeout_s=100.0) == {
+        **{"cameras": ("front",), "answer_s": 90.0, "subgoals": False}
     }
-    oracle = {"policy": "websocket://h:1", "robomme_python": "./py", "subgoals": "oracle"}
+    oracle = {"policy": "websocket://h:1", "subgoals": "oracle"}
     assert options("robomme", "front", **oracle)["subgoals"] is True
 
 

@@ -82,7 +82,7 @@ def test_another_shape_of_an_undeclared_simulator(tiny_buffers: Path) -> None:
 
 def test_settings_are_those_that_a_class_declares_or_a_function_takes(tiny_buffers: Path) -> None:
     demonstrations = load_buffer_set(tiny_buffers).datasets["demonstrations"]
-    given = {"cameras": ("top",), "shift": "none", "python": None}
+    given = {"cameras": ("top",), "shift": "none", "answer_s": 9.0}
     for name in ("Listed", "make_listed"):
         assert accepted_settings(OWN + name, given) == {"cameras": ("top",)}
     assert accepted_settings(f"{OWN}make_any", given) == {}

@@ -162,7 +162,7 @@ def test_the_part_of_a_policy_that_can_change_a_result() -> None:
     metadata = {"policy": "websocket", "server": "a:1", "server_metadata": {"model": "m"}}
     assert policy_identity("websocket://a:1,b:2", ("response_s=5", "checkpoint=7"), metadata) == {
         "policy": "websocket",
-        "policy_options": {"checkpoint": "7", "chunk_frames": 16},
+        "policy_options": {"checkpoint": "7", "chunk_frames": 16, "other_states": "refuse"},
         "policy_metadata": {"policy": "websocket", "server_metadata": {"model": "m"}},
     }
     assert policy_identity(STILL, ("gripper=1",), {}) == policy_identity(STILL, (), {})
@@ -259,7 +259,7 @@ def test_users_import_everything_from_one_place() -> None:
 
 def test_every_member_of_the_protocol_is_required() -> None:
     members = [name for name in vars(Policy) if not name.startswith("_")]
-    assert len(members) == 12
+    assert len(members) == 13
     for name in members:
         with raises(PolicyError):
             make_policy(f"{OWN}lacking", [f"name={name}"])

@@ -153,7 +153,7 @@ def test_a_run_resumes_with_the_same_checkpoint_only(tmp_path: Path) -> None:
         }
         identity = header(tmp_path / "run")["identity"]
         assert (identity["policy"], identity["policy_options"]) == (
-            *("vla-eval", {"checkpoint": "mine/1"}),
+            *("vla-eval", {"checkpoint": "mine/1", "other_states": "refuse"}),
         )
         (start,) = header(tmp_path / "run")["invocations"]
         assert start["policy"]["server"] == f"127.0.0.1:{port}"

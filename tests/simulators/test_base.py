@@ -166,7 +166,7 @@ def test_simulate_plays_an_episode_and_writes_what_is_seen(run: Run, tmp_path: P
         ("--policy orakel", "oracle, guess, none"),
         ("--shift fog:1", "such as light:2"),
         ("--shift light:2 --simulator robomme", "does not support shifts"),
-        ("--simulator robomme", "set --robomme-python to its Python"),
+        ("--simulator robomme", "variable ROBOMME_PYTHON"),
         ("--video {}/out.mp4", "no such episode"),
     ],
 )

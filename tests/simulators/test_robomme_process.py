@@ -124,7 +124,7 @@ def test_an_interpreter_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_missing_interpreter(tmp_path: Path) -> None:
     with raises(InvalidOptionError) as caught:
         make_simulator("robomme")
-    assert "`robomme_python`" in str(caught.value)
+    assert "ROBOMME_PYTHON" in str(caught.value)
     (tmp_path / "notes.txt").write_text("not a program")
     for path in (tmp_path / "nowhere" / "python", tmp_path, tmp_path / "notes.txt"):
         with raises(InvalidOptionError):
@@ -172,14 +172,14 @@ def test_versions(robomme_python: Path, tmp_path: Path, monkeypatch: pytest.Monk
     (installed / "METADATA").write_text("Metadata-Version: 2.1\nName: robomme\nVersion: 0.2\n")
     origin = {"url": "https://example.org/robomme", "vcs_info": {"vcs": "git", "commit_id": "ab12"}}
     (installed / "direct_url.json").write_text(json.dumps(origin))
-    found = simulator_versions("robomme", str(robomme_python))
+    found = simulator_versions("robomme")
     # A package that is only on the path has no version.
     assert found.keys() == {"robomme_python", "robomme_numpy"}
     assert found["robomme_python"] == platform.python_version()
     assert found["robomme_numpy"].startswith("1.")
     monkeypatch.setenv("PYTHONPATH", f"{os.environ['PYTHONPATH']}:{tmp_path}")
     installed_versions.cache_clear()
-    installed_too = simulator_versions("robomme", str(robomme_python))
+    installed_too = simulator_versions("robomme")
     assert installed_too == {**found, "robomme": "0.2+ab12"}
     assert simulator_versions("tabletop") == {"tabletop": str(SUITE_VERSION)}
     assert simulator_versions("support.worlds:World") == {}

@@ -94,6 +94,7 @@ class MadeUpSource(Source):
         wrong: Of an episode, frame number to what is returned in its place, or raised.
         actions: Whether frames have actions.
         evidence: Evidence of every episode.
+        values: Values of a state, and of an action.
     """
 
     lengths: dict[str, tuple[int, int | None]]
@@ -101,6 +102,7 @@ class MadeUpSource(Source):
     actions: bool = True
     cameras: tuple[str, ...] = ("front",)
     evidence: tuple[EvidenceSpan, ...] | None = None
+    values: int = 8
     robot: Robot = field(default_factory=lambda: Robot(10))
     provenance: dict[str, Any] = field(default_factory=lambda: {"kind": "made-up"})
 
@@ -130,8 +132,8 @@ class MadeUpSource(Source):
         """Frame `number` of an episode."""
         return Frame(
             {camera: picture(f"{name} {camera}", number) for camera in cameras},
-            np.full(8, number, np.float32),
-            np.full(8, -number, np.float32) if self.actions else None,
+            np.full(self.values, number, np.float32),
+            np.full(self.values, -number, np.float32) if self.actions else None,
             None if lesson is None else number < lesson,
         )
 

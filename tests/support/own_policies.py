@@ -21,6 +21,7 @@ class Still:
     wants_history = False
     privileged = False
     every_frame = False
+    other_states = "refuse"
     memory = None
 
     def __init__(self, gripper: float = 1.0, worker: int = 0):
@@ -49,6 +50,14 @@ class Watcher(Still):
         super().__init__()
         self.cameras = self.history_cameras = (camera,)
         self.wants_history = True
+
+
+class OfTwoRobots(Watcher):
+    """Declares by an option what it gets of the states of units of another robot."""
+
+    def __init__(self, other_states: str = "refuse"):
+        super().__init__("front")
+        self.other_states: Any = other_states
 
 
 class Told(Still):

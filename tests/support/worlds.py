@@ -144,6 +144,7 @@ class Cheat:
     wants_history = True
     privileged = False
     every_frame = True
+    other_states = "refuse"
     memory = None
 
     def reset(self, info: RolloutInfo) -> None:

@@ -13,7 +13,7 @@ import pytest
 from support.buffer_sets import contents
 from support.build_server import BuildServer
 
-from robomme_interference_data.build_dataset.dataset.stage import read_staged
+from robomme_interference_data.build_dataset.dataset.staged import read_staged
 from robomme_interference_data.storage.staging import staging_path
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs /proc")

@@ -9,6 +9,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from support.chat_server import ChatServer
 from support.hub import push_buffer_set
 from support.page_scripts import Step, folder_on_path, steps_of, words_of
 from support.policy_server import PolicyServer
+from support.public_sets import HSR, PublicSet, vector, video, write_public_set
 from support.recordings import make_episode, rows_of, write_table, write_video
 from support.serve_policy import command as serve_command
 from support.tabletop import copy_tabletop
@@ -125,9 +127,35 @@ def recorded(folder: Path) -> None:
     write_table(folder / "my-recordings", rows)
 
 
+def robots(folder: Path) -> None:
+    """Recordings of two robots, the queries of the first one marked."""
+    mine = PublicSet(
+        version="v2.1",
+        fps=10,
+        robot="mine",
+        features={
+            "observation.images.top": video(48, 96),
+            "observation.state": vector(8),
+            "action": vector(8),
+        },
+        columns={},
+        state=8,
+        cameras=("top",),
+    )
+    tasks = ("open the drawer", "stack the cups", "open the drawer")
+    write_public_set(folder / "my_robot", mine, (80, 20, 70), tasks)
+    small = {"observation.image.head": video(48, 64), "observation.image.hand": video(48, 64)}
+    theirs = replace(HSR, version="v2.0", features=HSR.features | small)
+    write_public_set(folder / "their_robot", theirs, (600,), ("Pick up the red cup.",))
+    lines = ("0,OpenDrawer,test,60,10,75", "1,StackCups,train,0,,", "2,OpenDrawer,test,50,,")
+    header = "episode_index,family,split,exec_start_idx,start,stop"
+    (folder / "queries.csv").write_text("\n".join((header, *lines)))
+
+
 PREPARED: dict[str, Callable[[Path], None]] = {
     "another-benchmark.md": nothing,
     "publish.md": recorded,
+    "real-robots.md": robots,
     "retrieval.md": nothing,
     "train-a-policy.md": trained,
     "vision-language-model.md": asked,

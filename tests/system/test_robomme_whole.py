@@ -23,14 +23,9 @@ def build(kind: str, config: BuildConfig) -> int:
     return build_dataset(plan, config.buffer_set / kind, Serial(), WorkProgress(quiet=True)).added
 
 
-def config_of(out: Path, python: Path, episodes: str) -> BuildConfig:
+def config_of(out: Path, episodes: str) -> BuildConfig:
     return BuildConfig(
-        source=("robomme",),
-        buffer_set=out,
-        families=("MoveCube",),
-        split="test",
-        episodes=episodes,
-        robomme_python=str(python),
+        source=("robomme",), buffer_set=out, families=("MoveCube",), split="test", episodes=episodes
     )
 
 
@@ -39,7 +34,7 @@ def test_an_evaluation_on_it(tmp_path: Path, robomme_python: Path) -> None:
     from robomme_interference_data.evaluate import run_evaluation
     from robomme_interference_data.evaluate.run.config import RunConfig
 
-    queries = config_of(tmp_path, robomme_python, "45-47")
+    queries = config_of(tmp_path, "45-47")
     assert build(DEMONSTRATIONS, replace(queries, cameras=("front",))) == 3
     assert build(DEMONSTRATIONS, replace(queries, cameras=("front",))) == 0
     # The stand-in hides the answers of this family, so its oracle cannot complete an episode.
@@ -59,7 +54,6 @@ def test_an_evaluation_on_it(tmp_path: Path, robomme_python: Path) -> None:
         buffer_set=tmp_path,
         out=tmp_path / "run",
         simulator="robomme",
-        robomme_python=str(robomme_python),
         episodes="45-47",
         check_lesson=True,
     )

@@ -28,9 +28,9 @@ def test_resize_by_hand() -> None:
     assert small.shape == (1, 3, 2, 2) and small.dtype == np.uint8
     assert small[0].tolist() == [[[2, 0], [0, 0]], [[0, 255], [0, 0]], [[0, 0], [0, 0]]]
     np.testing.assert_array_equal(resize(image, None), image.transpose(0, 3, 1, 2))
-    # 4 pixels to 3: each is the mean of the two that it touches.
+    # 4 pixels to 3: each is the mean of a pixel and a third, (3 · 0 + 10) / 4 = 2.5 at the left.
     row = np.array([0, 10, 20, 30], np.uint8)[None, None, :, None].repeat(4, 1).repeat(3, 3)
-    assert resize(row, 3)[0, 0, 0].tolist() == [5, 15, 25]
+    assert resize(row, 3)[0, 0, 0].tolist() == [2, 15, 28]
 
 
 @pytest.mark.parametrize("kind", ["demonstrations", "distractors"])

@@ -19,7 +19,6 @@ from robomme_interference_data.errors import (
     MissingExtraError,
     SimulatorCrashError,
     UnknownNameError,
-    named,
     printed_last,
 )
 from robomme_interference_data.runtime.safe_path import SAFE_PATH
@@ -41,8 +40,8 @@ _ENVIRONMENT = {
 def _advice() -> str:
     return (
         "Install RoboMME (https://github.com/RoboMME/robomme_benchmark) into a separate "
-        f"environment and set {named('robomme_python')} to its Python, or export "
-        f"{PYTHON_VARIABLE}=PATH."
+        f"environment, and set the environment variable {PYTHON_VARIABLE} to the path of its "
+        "Python."
     )
 
 

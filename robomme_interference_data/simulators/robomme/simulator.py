@@ -73,7 +73,7 @@ class RoboMMESimulator(Simulator):
     action_names = VALUE_NAMES
     name = "robomme"
     about = "the official simulator, RoboMME"
-    settings = ("cameras", "python", "subgoals", "answer_s")
+    settings = ("cameras", "subgoals", "answer_s")
     own_episodes = True
     try_out = False
     episode_s = 1800.0
@@ -99,13 +99,13 @@ class RoboMMESimulator(Simulator):
         return self._process.patches
 
     @classmethod
-    def versions(cls, python: str | None = None) -> dict[str, str]:
-        """Return the versions in its interpreter: `robomme`, `robomme_mani_skill`, and so on.
+    def versions(cls) -> dict[str, str]:
+        """Return the versions in the interpreter `ROBOMME_PYTHON`.
 
-        They include Python, sapien, torch and numpy, and the commit of a package that was
-        installed from one.
+        They are of `robomme`, `robomme_mani_skill` and so on, and include Python, sapien, torch and
+        numpy, and the commit of a package that was installed from one.
         """
-        return installed_versions(find_python(python))
+        return installed_versions(find_python(None))
 
     @classmethod
     def episodes(cls) -> list[EpisodeId]:
