@@ -58,6 +58,15 @@ def differences(left: tuple[str, Look], right: tuple[str, Look]) -> list[str]:
     return unequal((first, here), (second, {what: values[1] for what, values in facts.items()}))
 
 
+def describe(look: Look) -> str:
+    """Return a look for people, such as `camera front 64×48 pixels, state 8 values, 10 Hz`."""
+    parts = [f"{_title(name)} {_size(shape)}" for name, shape in sorted(look.features.items())]
+    parts.append(f"{look.fps:g} frames per second")
+    if look.robot_type is not None:
+        parts.append(f"robot {look.robot_type}")
+    return ", ".join(parts)
+
+
 def differ_in_cameras(left: Look, right: Look) -> bool:
     """Return whether two looks differ in cameras alone, so that a choice of cameras mends it."""
 

@@ -1,9 +1,11 @@
 """The settings of a build."""
 
+import dataclasses
 import os
 import re
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
+from typing import Any
 
 from robomme_interference_data.constants import (
     DATASETS,
@@ -17,7 +19,7 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.runtime.executor import WorkersConfig
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS
-from robomme_interference_data.schema.settings import setting
+from robomme_interference_data.schema.settings import SETTING, setting
 
 _CPUS = os.cpu_count() or 1
 
@@ -154,6 +156,33 @@ class BuildConfig(WorkersConfig):
     )
     _: KW_ONLY
     workers: int = setting(_CPUS, help="Worker processes.", shown="all CPUs", group="Execution")
+
+
+def _same(name: str, **changed: Any) -> Any:
+    """Return the declaration of a setting of a build, for another command."""
+    declared = BuildConfig.__dataclass_fields__[name]
+    metadata = {SETTING: {**declared.metadata[SETTING], **changed}}
+    return dataclasses.field(default=declared.default, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class SourceConfig(WorkersConfig):
+    """Settings of a build that decide which recordings are read, and how."""
+
+    source: tuple[str, ...] = _same("source", group="Sources")
+    split: str | None = _same("split", help="Split to read.", group="Sources")
+    episodes: str | None = _same(
+        "episodes", help="Indices of the episodes to read, such as 0-49.", group="Sources"
+    )
+    cameras: tuple[str, ...] = _same(
+        "cameras", help="Cameras to read, or none for states alone; default: all.", group="Sources"
+    )
+    columns: tuple[str, ...] = _same("columns")
+    families_from: str | None = _same("families_from")
+    several_tasks: str | None = _same("several_tasks")
+    fps: float | None = _same("fps")
+    _: KW_ONLY
+    workers: int = _same("workers")
 
 
 @dataclass(frozen=True)

@@ -319,7 +319,7 @@ def nearest(given: str, known: Iterable[str], *, more: str = "Known: ") -> str:
 
     `more` is the beginning of the list; if it is empty, nothing is listed.
     """
-    names = sorted(known)
+    names = sorted(str(name) for name in known)  # members of an enumeration are quoted as values
     folded = {name.lower(): name for name in names}
     close = get_close_matches(given.lower(), list(folded), n=3, cutoff=0.6)
     if close:

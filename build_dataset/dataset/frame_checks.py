@@ -1,4 +1,4 @@
-"""Check that every reader accepts the frames of an episode, before one is stored. Pure rules."""
+"""Check the frames of an episode: what is stored, every reader must accept. Pure rules."""
 
 import re
 from collections.abc import Mapping
@@ -6,6 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.build_dataset.alike import Look, differences
 from robomme_interference_data.constants import CAMERA_PREFIX, STATE
 from robomme_interference_data.errors import InvalidOptionError, SourceError, named
 from robomme_interference_data.storage.limits import MAX_FRAME_VALUES, MAX_NAME, MAX_VECTOR
@@ -53,6 +54,42 @@ def check_shapes(
             "there is nothing to store: the recording has no states, and no camera is chosen",
             f"Choose {named('cameras')}.",
             option="cameras",
+        )
+
+
+def check_same_shapes(
+    shapes: Mapping[str, tuple[int, ...]], first: Mapping[str, tuple[int, ...]], frame: str
+) -> None:
+    """Check that a frame has the shapes of the first one.
+
+    Args:
+        shapes: Features to the shapes of their values.
+        first: Those of the first frame.
+        frame: The frame for messages, such as `stored frame 7`.
+
+    Raises:
+        SourceError: It has others.
+    """
+    if shapes != first:
+        # Only of episodes, rates differ.
+        found = differences(("the first", Look(first, 1.0)), (frame, Look(shapes, 1.0)))
+        raise SourceError(
+            f"frames of different sizes: {'; '.join(found)}",
+            "All frames of an episode must have the same cameras and sizes.",
+        )
+
+
+def check_numbers(feature: str, value: NDArray[np.float32], frame: str) -> None:
+    """Check that the values of a vector are finite; `frame` is the frame for messages.
+
+    Raises:
+        SourceError: They are not, or of another type.
+    """
+    if value.dtype != np.float32 or not np.isfinite(value).all():
+        raise SourceError(
+            f"{feature} of {frame} is {value.tolist()}; expected finite float32 numbers",
+            "Correct the recording, or leave it out of the source. "
+            f"{named('episodes')} chooses indices in all families alike.",
         )
 
 

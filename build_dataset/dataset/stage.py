@@ -13,14 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.build_dataset.alike import Look, differences
 from robomme_interference_data.build_dataset.sources import Frame, Recording
 from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, LESSONS, STATE, UNITS
 from robomme_interference_data.errors import (
     BuildError,
     InterferenceError,
     SourceError,
-    named,
     naming_options,
     option_names,
 )
@@ -37,7 +35,7 @@ from robomme_interference_data.storage.encode import Codec, VideoEncoder, get_co
 from robomme_interference_data.storage.limits import MAX_READ_VALUES
 from robomme_interference_data.storage.video import iter_frames
 
-from .frame_checks import check_shapes
+from .frame_checks import check_numbers, check_same_shapes, check_shapes
 from .frame_selection import NothingToStore, select_episodes, too_short, unit_starts
 from .plan import DatasetPlan, PlannedEpisode
 from .resize import Resize
@@ -185,13 +183,7 @@ class _Writer:
         if not self.length:
             _check_images(images)
             self._recorded = shapes
-        if shapes != self._recorded:
-            looks = Look(self._recorded, self._fps), Look(shapes, self._fps)
-            found = differences(("the first", looks[0]), (f"stored frame {self.length}", looks[1]))
-            raise SourceError(
-                f"frames of different sizes: {'; '.join(found)}",
-                "All frames of an episode must have the same cameras and sizes.",
-            )
+        check_same_shapes(shapes, self._recorded, f"stored frame {self.length}")
         if self._resize is not None:
             images = {name: self._resize.apply(image) for name, image in images.items()}
         if not self.length:
@@ -201,13 +193,7 @@ class _Writer:
             self.stats[name].add(image)
             self.digests.update(name, image)
         for name, value in vectors.items():
-            if value.dtype != np.float32 or not np.isfinite(value).all():
-                raise SourceError(
-                    f"{name} of stored frame {self.length} is {value.tolist()}; expected finite "
-                    "float32 numbers",
-                    "Correct the recording, or leave it out of the source. "
-                    f"{named('episodes')} chooses indices in all families alike.",
-                )
+            check_numbers(name, value, f"stored frame {self.length}")
             if (self.length + 1) * value.size > MAX_READ_VALUES:
                 raise SourceError(
                     f"{name} has {value.size} values in over {self.length} stored frames; expected "

@@ -33,13 +33,13 @@ def plan_dataset(
 ) -> DatasetPlan:
     """Open the sources and plan one dataset, of `queries` or of the episodes that are chosen."""
     check_root(config.buffer_set)
-    _check_values(config)
+    check_values(config)
     unit = parse_unit(config.unit, config.units_per_episode)
     split = config.split
     if kind in UNITS:
         _check_split_of_units(config)
         split = "train"
-    sources = _open_sources(kind, config, unit)
+    sources = open_sources(kind, config, unit)
     episodes = choose_episodes(
         sources,
         families=config.families,
@@ -91,7 +91,8 @@ def _check_split_of_units(config: BuildConfig) -> None:
     )
 
 
-def _check_values(config: BuildConfig) -> None:
+def check_values(config: BuildConfig) -> None:
+    """Check the settings of a build that are wrong by themselves."""
     get_codec(config.codec)
     if not re.fullmatch(r"\d+\.\d+\.\d+", config.version, re.ASCII):
         raise InvalidOptionError.expected("version", config.version, "a version such as 1.0.0")
@@ -117,7 +118,8 @@ def _check_values(config: BuildConfig) -> None:
             )
 
 
-def _open_sources(kind: str, config: BuildConfig, unit: Unit) -> tuple[Source, ...]:
+def open_sources(kind: str, config: BuildConfig, unit: Unit) -> tuple[Source, ...]:
+    """Open the sources of a build, for one of its datasets."""
     columns, kept = _columns(config.columns), config.buffer_set / FAMILIES_PATH
     # A simulator draws only the frames that a unit stores, if the first one is frame 0.
     one_unit = kind in UNITS and unit.per_episode == 1

@@ -34,7 +34,8 @@ def choose_episodes(
 
     Raises:
         InvalidOptionError: A family or split is unknown.
-        SourceError: No episode passes, one is recorded twice, or one is a unit of an episode.
+        SourceError: No episode passes, one is recorded twice, cannot be used, or is a unit of an
+            episode.
     """
     listed = [
         PlannedEpisode(number, episode)
@@ -52,9 +53,7 @@ def choose_episodes(
     def passes(episode: SourceEpisode) -> bool:
         if queries is not None:
             return episode.id in queries
-        if episode.id.family not in chosen_families or split not in (None, episode.id.split):
-            return False
-        return not episode.further if indices is None else episode.id.index in indices
+        return episode.id.family in chosen_families and in_selection(episode, split, indices)
 
     chosen = sorted(
         (planned for planned in listed if passes(planned.episode)),
@@ -73,6 +72,8 @@ def choose_episodes(
                 f"{second.source + 1})",
                 "Give only one of these sources, or name the episode differently in one of them.",
             )
+    for planned in chosen:
+        planned.episode.check()
     if not chosen:
         filters = sorted(families)
         if split is not None:
@@ -85,6 +86,16 @@ def choose_episodes(
             f"There are: {_described(planned.episode.id for planned in listed)}. Choose others.",
         )
     return tuple(chosen)
+
+
+def in_selection(episode: SourceEpisode, split: str | None, indices: Container[int] | None) -> bool:
+    """Return whether an episode is in a split, with one of these indices in it.
+
+    Without a split all are. Without indices, those that a source lists as further ones are not.
+    """
+    if split not in (None, episode.id.split):
+        return False
+    return not episode.further if indices is None else episode.id.index in indices
 
 
 def _described(episodes: Iterable[EpisodeId]) -> str:

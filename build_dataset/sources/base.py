@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import DIFFICULTIES
-from robomme_interference_data.errors import SourceError, named, nearest
+from robomme_interference_data.errors import InterferenceError, SourceError, named, nearest
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import MAX_GOAL, EvidenceSpan
 from robomme_interference_data.storage.limits import MAX_NAME, MAX_RATE, MIN_RATE
@@ -50,12 +50,19 @@ class SourceEpisode:
             the file's time and size). Must be picklable.
         marked: False if the source knows that it cannot tell where the demonstration ends.
         further: Whether it is built only if its number is given.
+        problem: Why it cannot be used, if the list already shows that; None if it can be read.
     """
 
     id: EpisodeId
     key: Any = field(default=None, compare=False)
     marked: bool = field(default=True, compare=False)
     further: bool = field(default=False, compare=False)
+    problem: InterferenceError | None = field(default=None, compare=False)
+
+    def check(self) -> None:
+        """Raise the problem, if there is one."""
+        if self.problem is not None:
+            raise self.problem
 
 
 @dataclass(frozen=True)

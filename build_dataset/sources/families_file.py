@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.constants import FAMILIES_PATH
-from robomme_interference_data.errors import SourceError
-from robomme_interference_data.storage.files import write_text
+from robomme_interference_data.errors import InterferenceError, SourceError
+from robomme_interference_data.storage.files import read_text, write_text
 
 TASK = "task"
 DATASET = "dataset"
@@ -51,6 +51,8 @@ def read_families(path: Path, tasks: Sequence[Sequence[str]], name: str) -> list
     """
     try:
         header, rows = _read_rows(path, len(tasks))
+    except InterferenceError:  # of the text, such as another encoding
+        raise
     except OSError as error:
         hint = f"Give {TASK}, {DATASET} or the path of a CSV file. {_FORM}"
         raise SourceError(f"families file {path}: {error.strerror}", hint) from None
@@ -90,7 +92,7 @@ def keep_families(given: str, families: Iterable[Mapping[str, str]], root: Path)
         merged = {name: family for named in families for name, family in named.items()}
         text = _csv([[given, "family"], *map(list, merged.items())])
     else:
-        text = Path(given).read_text(encoding="utf-8-sig")
+        text = read_text(Path(given))
     write_text(root / FAMILIES_PATH, text)
 
 
@@ -113,7 +115,7 @@ def _keys(key: str, tasks: Sequence[Sequence[str]], name: str) -> list[list[Any]
 
 def _read_rows(path: Path, count: int) -> tuple[list[str], dict[Any, dict[str, Any]]]:
     """Return the columns of a file, its key first, and its rows by that key."""
-    lines = csv.reader(io.StringIO(path.read_text(encoding="utf-8-sig"), newline=""))
+    lines = csv.reader(io.StringIO(read_text(path), newline=""))
     header = [name.strip() for name in next(lines, [])]
     keys = [name for name in _KNOWN if name in header]
     known = len(keys) == 1 and {*header} <= _KNOWN[keys[0]]

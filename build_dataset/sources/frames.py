@@ -12,7 +12,7 @@ from typing import Any, override
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, SourceError, named
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators.episode import choose_cameras
-from robomme_interference_data.storage.files import is_hidden
+from robomme_interference_data.storage.files import is_hidden, read_bytes
 from robomme_interference_data.storage.parquet import RowSpan
 from robomme_interference_data.storage.video import iter_frames
 
@@ -20,6 +20,9 @@ from ..alike import same_rate
 from .base import Recording, Robot, Source, SourceEpisode, compose, file_state
 from .frames_table import LAYOUT, TABLE, EpisodeRows, read_frames_table
 from .images import decode_images, probe_video
+
+_MAX_IMAGE_BYTES = 256 << 20
+"""Four times the bytes of the largest image that is decoded."""
 
 _VIDEO_SUFFIXES = (".mkv", ".mp4", ".avi", ".mov", ".webm")
 
@@ -61,17 +64,23 @@ class FramesSource(Source):
                     "Keep one of them.",
                 )
         cameras = tuple(sorted({camera for paths in images.values() for camera in paths}))
-        return [
-            SourceEpisode(
-                name,
-                _Key(table[name], cameras, paths, self._state(paths)),
-                marked=table[name].lesson is not None,
-            )
-            for name, paths in images.items()
-        ]
+        return [self._listed(name, table[name], cameras, paths) for name, paths in images.items()]
+
+    def _listed(
+        self,
+        name: EpisodeId,
+        rows: EpisodeRows | SourceError,
+        cameras: tuple[str, ...],
+        paths: dict[str, Path],
+    ) -> SourceEpisode:
+        if isinstance(rows, SourceError):
+            return SourceEpisode(name, problem=rows)
+        key = _Key(rows, cameras, paths, self._state(paths))
+        return SourceEpisode(name, key, marked=rows.lesson is not None)
 
     @override
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
+        episode.check()
         key: _Key = episode.key
         if not key.cameras and cameras != ():
             raise InvalidOptionError(
@@ -98,7 +107,9 @@ class FramesSource(Source):
             if path.is_dir():
                 _check_names(path, length)
                 files = [path / _image_name(number) for number in range(length)]
-                streams[camera] = decode_images(((f, f.read_bytes()) for f in files), exact=True)
+                streams[camera] = decode_images(
+                    ((f, read_bytes(f, _MAX_IMAGE_BYTES)) for f in files), exact=True
+                )
             else:
                 video = probe_video(path, key.rows.fps)
                 if video.count != length:

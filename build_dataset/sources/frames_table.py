@@ -103,8 +103,8 @@ _PARSED = ("seed", "difficulty", "simulator", "exact")
 _COLUMNS = {**_REQUIRED, "action": _VECTOR, "is_demo": _FLAG, **_NULLABLE}
 
 
-def read_frames_table(path: Path) -> dict[EpisodeId, EpisodeRows]:
-    """Read and check the table of a frames folder."""
+def read_frames_table(path: Path) -> dict[EpisodeId, EpisodeRows | SourceError]:
+    """Read and check the table of a frames folder; an episode may have an error instead of rows."""
     try:
         table = RowSpan(path).table()
         with reading(path):
@@ -115,7 +115,7 @@ def read_frames_table(path: Path) -> dict[EpisodeId, EpisodeRows]:
         raise SourceError(f"{path} has no rows", LAYOUT)
     if problem := _column_problem(table):
         raise SourceError(f"{path}: {problem}", LAYOUT)
-    episodes: dict[EpisodeId, EpisodeRows] = {}
+    episodes: dict[EpisodeId, EpisodeRows | SourceError] = {}
     names = np.array(table["episode_id"].to_pylist(), dtype=object)
     cuts = [0, *(np.flatnonzero(names[1:] != names[:-1]) + 1).tolist(), len(names)]
     for start, stop in pairwise(cuts):
@@ -128,7 +128,10 @@ def read_frames_table(path: Path) -> dict[EpisodeId, EpisodeRows]:
                 f"{path}: the rows of {name} are not together: row {start} is another part",
                 "Sort the table by episode_id and frame_index.",
             )
-        episodes[name] = _episode(f"{path}: {name}", table.slice(start, stop - start), start)
+        try:
+            episodes[name] = _episode(f"{path}: {name}", table.slice(start, stop - start), start)
+        except SourceError as error:
+            episodes[name] = error
     return episodes
 
 

@@ -20,6 +20,7 @@ from robomme_interference_data.errors import InterferenceError, InvalidIdError, 
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.evidence import spans_of_texts
 from robomme_interference_data.simulators.episode import choose_cameras
+from robomme_interference_data.storage.files import check_not_pointer
 
 from .base import Frame, Recording, Robot, Source, SourceEpisode, demonstration_length, file_state
 from .episode_columns import parse_column
@@ -150,8 +151,10 @@ def _complete(where: object) -> Iterator[None]:
 
 @contextmanager
 def _opened(path: str | Path) -> Iterator[h5py.File]:
-    with _complete(path), h5py.File(path, "r") as file:
-        yield file
+    with _complete(path):
+        check_not_pointer(Path(path))
+        with h5py.File(path, "r") as file:
+            yield file
 
 
 def _frames(

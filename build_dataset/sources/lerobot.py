@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import OFFICIAL, VALUE_NAMES
 from robomme_interference_data.errors import (
     FormatError,
+    InterferenceError,
     MissingFileError,
     SourceError,
     counted,
@@ -87,20 +88,28 @@ class LeRobotSource(Source):
         ids, simulator = self._ids(rows)
         listed = []
         for index, name in ids.items():
-            metadata = self._metadata(index, rows[index])
-            goals = self._goals(index, self._tasks[index], metadata)
-            played = simulator or metadata.simulator
-            if played in (None, OFFICIAL):
-                self._check_goals(index, name, goals)
-            self._trim(index)  # checks it
-            marks = self._columns.is_demo, self._columns.exec_start_idx, metadata.exec_start_idx
-            key = index, played, self._state(index)
-            known = any(mark is not None for mark in marks)
-            listed.append(SourceEpisode(name, key, marked=known))
+            try:
+                listed.append(self._listed(index, name, rows[index], simulator))
+            except InterferenceError as error:
+                listed.append(SourceEpisode(name, problem=error))
         return sorted(listed, key=lambda episode: episode.id)
+
+    def _listed(
+        self, index: int, name: EpisodeId, row: dict[str, Any], simulator: str | None
+    ) -> SourceEpisode:
+        metadata = self._metadata(index, row)
+        goals = self._goals(index, self._tasks[index], metadata)
+        played = simulator or metadata.simulator
+        if played in (None, OFFICIAL):
+            self._check_goals(index, name, goals)
+        self._trim(index)  # checks it
+        marks = self._columns.is_demo, self._columns.exec_start_idx, metadata.exec_start_idx
+        known = any(mark is not None for mark in marks)
+        return SourceEpisode(name, (index, played, self._state(index)), marked=known)
 
     @override
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
+        episode.check()
         index, simulator, _ = episode.key
         columns, metadata = self._columns, self._metadata(index, self._lerobot.row(index))
         chosen = choose_cameras(cameras, tuple(columns.cameras))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Self
 
 from robomme_interference_data.errors import FormatError, UnknownNameError, counted, nearest
-from robomme_interference_data.storage.files import digest_json
+from robomme_interference_data.storage.files import decode_text, digest_json
 
 from .models import ChatModel, Part, Video, model_identity
 
@@ -102,10 +102,11 @@ class Prompt:
                 f"Expected {', '.join(cls.packaged)}, or the path of a TOML file ({page}).",
             )
         data = path.read_bytes()
+        text = decode_text(data, name)
         try:
             if len(data) > _MAX_BYTES:
                 raise ValueError(f"{len(data)} bytes; expected at most {_MAX_BYTES}")
-            return cls._of(tomllib.loads(data.decode()))
+            return cls._of(tomllib.loads(text))
         except (ValueError, RecursionError) as error:
             raise FormatError(f"{name} is no prompt: {error}", f"See {page}.") from None
 

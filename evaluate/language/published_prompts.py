@@ -12,6 +12,7 @@ from typing import Any
 
 from robomme_interference_data.constants import POSITION_LIMIT
 from robomme_interference_data.errors import FormatError, InvalidOptionError, named
+from robomme_interference_data.storage.files import read_text
 
 from .subgoal_prompt import SubgoalPrompt
 
@@ -121,7 +122,7 @@ def load_published(name: str, system: str | None) -> SubgoalPrompt:
     if published is None or not name.endswith(".py"):
         return SubgoalPrompt.load(name)
     try:
-        return read_client(Path(name).read_text(encoding="utf-8"), published)
+        return read_client(read_text(Path(name)), published)
     except (ValueError, SyntaxError, OSError) as error:
         raise FormatError(
             f"{name} is not {published.file} of the released client: {error}",

@@ -1,5 +1,6 @@
 """The policy `answers`, and the checked answers of a run of questions that it carries out."""
 
+import io
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 from numpy.typing import NDArray
 
+from robomme_interference_data.constants import MAX_ROW_BYTES
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.questions import Question, digest_questions, read_questions
 from robomme_interference_data.errors import (
@@ -25,7 +27,7 @@ from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout, is_done
 from robomme_interference_data.schema.codec import arrow_schema, from_table
 from robomme_interference_data.simulators.episode import Observation
-from robomme_interference_data.storage.files import sha256_file
+from robomme_interference_data.storage.files import read_text, sha256_file
 
 from .builtin import Noop, Privileged
 from .policy import RolloutInfo
@@ -141,11 +143,12 @@ def chosen_answer(row: Rollout, question: Question) -> int | None:
 
 
 def _read_csv(path: Path) -> dict[WorkItem, Rollout]:
+    text = read_text(path, MAX_ROW_BYTES)
     options = pa_csv.ConvertOptions(column_types=arrow_schema(Rollout), strings_can_be_null=True)
     try:
-        table = pa_csv.read_csv(path, convert_options=options)
+        table = pa_csv.read_csv(io.BytesIO(text.encode()), convert_options=options)
     except pa.ArrowInvalid as error:
-        raise FormatError.damaged(path, first_line(error)) from None
+        raise FormatError(f"{path}: {first_line(error)}", _ASK) from None
     if len({*table.column_names}) < len(table.column_names):
         raise FormatError.damaged(path, "a column occurs twice")
     rows = [*from_table(Rollout, table, path)]

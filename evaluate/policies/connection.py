@@ -4,6 +4,7 @@ import http.client
 import logging
 import os
 import socket
+import ssl
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
@@ -78,13 +79,14 @@ class ServerConnection(ABC):
     Args:
         host: Name or address of the server.
         port: Its port.
+        tls: Whether to connect with TLS, as `wss://`; the certificate is verified.
         connect_s: Maximum seconds to wait until it accepts a connection.
         response_s: Maximum seconds from a message to the end of its answer.
         check: Called when no answer came: raises if the reason is known, else returns a hint or
             None.
 
     Attributes:
-        name: `host:port`.
+        name: `host:port`, or `wss://host:port`.
         metadata: What the server reported at the last connection; None before.
         guide: The page of the documentation about such servers.
     """
@@ -96,11 +98,14 @@ class ServerConnection(ABC):
         host: str,
         port: int,
         *,
+        tls: bool = False,
         connect_s: float,
         response_s: float,
         check: Callable[[], str | None] = lambda: None,
     ):
-        self.name = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        place = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        self.name = f"wss://{place}" if tls else place
+        self._url = self.name if tls else f"ws://{place}"
         self.metadata: dict[str, Any] | None = None
         self._connect_s, self._response_s, self._check = connect_s, response_s, check
         self._connection: ClientConnection | None = None
@@ -162,7 +167,7 @@ class ServerConnection(ABC):
         key = os.environ.get(API_KEY_VARIABLE)
         try:
             connection = connect(
-                f"ws://{self.name}",
+                self._url,
                 additional_headers={"Authorization": f"Api-Key {key}"} if key else {},
                 open_timeout=seconds,
                 close_timeout=2.0,
@@ -178,7 +183,20 @@ class ServerConnection(ABC):
             if status < http.HTTPStatus.INTERNAL_SERVER_ERROR:
                 raise self._refusal(status) from error
             raise _NoAnswerError(f"it answers {status}") from error
+        except ssl.SSLCertVerificationError as error:
+            raise PolicyServerError(
+                f"policy server {self.name} has a certificate that this machine does not trust: "
+                f"{error.verify_message}",
+                "Use the host name of its certificate. For a certificate of your own, set "
+                "SSL_CERT_FILE to a PEM file with it, or with that of its issuer.",
+            ) from error
         except (OSError, EOFError, InvalidMessage) as error:
+            # A server that closes the connection may be starting; one that speaks no TLS is not.
+            if isinstance(error, ssl.SSLError) and not isinstance(error, ssl.SSLEOFError):
+                raise PolicyServerError(
+                    f"policy server {self.name} does not speak TLS: {error.reason}",
+                    "Check host and port; without TLS its address has no wss.",
+                ) from error
             reason = str(error) or type(error).__name__
             if isinstance(error, socket.gaierror):  # an unknown host name stays unknown
                 raise self._unreachable(reason) from error
@@ -192,7 +210,7 @@ class ServerConnection(ABC):
     def _unreachable(self, reason: str, hint: str | None = None) -> PolicyServerError:
         return PolicyServerError(
             f"policy server {self.name} cannot be reached: {reason}",
-            hint or f"Start it, or check host and port; {self.guide} describes how to start one.",
+            hint or f"Start it, or check its address; {self.guide} describes how to start one.",
         )
 
     def _refusal(self, reason: object) -> PolicyServerError:

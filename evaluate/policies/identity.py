@@ -45,8 +45,9 @@ MAX_METADATA = 1 << 16
 def lock_servers(text: str, out: Path) -> Iterator[None]:
     """Keep other runs from a policy's servers in the block; `out` is this run's folder."""
     with ExitStack() as stack:
-        for host, port in server_addresses(text) if one_client(text) else ():
-            stack.enter_context(optional.lock_server(host, port, f"the run in {out.resolve()}"))
+        for server in server_addresses(text) if one_client(text) else ():
+            holder = f"the run in {out.resolve()}"
+            stack.enter_context(optional.lock_server(server.host, server.port, holder))
         yield
 
 
@@ -166,10 +167,10 @@ def check_servers_memory(text: str, options: Sequence[str], system: System) -> N
     """
     if system.keeps_frames is None:
         return
-    for worker, (host, port) in enumerate(server_addresses(text)):
+    for worker, server in enumerate(server_addresses(text)):
         policy: Any = make_policy(text, options, worker=worker)
         with closing(policy):
-            check_memory_kind(policy.keeps_frames(), f"{host}:{port}", system)
+            check_memory_kind(policy.keeps_frames(), f"{server.host}:{server.port}", system)
 
 
 def check_memory_kind(keeps: bool, server: str, system: System) -> None:

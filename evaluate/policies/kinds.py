@@ -9,6 +9,7 @@ import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import NamedTuple
 
 from robomme_interference_data.runtime.specs import SpecKind
 from robomme_interference_data.schema.sampling import Memory
@@ -93,18 +94,26 @@ _SERVER_OPTIONS = ("server", "connect_s", "response_s")
 """Options, and metadata, of a server that change no result."""
 
 
-def addresses(target: str) -> tuple[tuple[str, int], ...]:
-    """Return host and port of each server of `//…` or `ws://HOST:PORT,…`; empty for a command."""
+class Address(NamedTuple):
+    """Where a server listens, and whether the connection is encrypted (`wss://`)."""
+
+    host: str
+    port: int
+    tls: bool = False
+
+
+def addresses(target: str) -> tuple[Address, ...]:
+    """Return each server of `//HOST:PORT,…`, `ws://…` or `wss://…`; empty for a command."""
     scheme, slashes, servers = target.partition("//")
-    if scheme not in ("", "ws:") or not slashes:
+    if scheme not in ("", "ws:", "wss:") or not slashes:
         return ()
     pairs = (server.rpartition(":") for server in servers.split(","))
-    return tuple((host.strip("[]"), int(port)) for host, _, port in pairs)
+    return tuple(Address(host.strip("[]"), int(port), scheme == "wss:") for host, _, port in pairs)
 
 
 def _valid_addresses(target: str) -> bool:
     servers = addresses(target)
-    return len({*servers}) == len(servers) and all(0 < port < 65536 for _, port in servers)
+    return len({*servers}) == len(servers) and all(0 < server.port < 65536 for server in servers)
 
 
 def _valid_command(target: str) -> bool:
@@ -209,10 +218,10 @@ KINDS: dict[str, PolicyKind] = {
     ),
     "websocket": replace(
         _LEARNED,
-        form="websocket://host:port, with commas between several servers, each once, or "
-        "websocket:COMMAND with {port}, which each worker starts",
+        form="websocket://host:port, with TLS websocket:wss://host:port, with commas between "
+        "several servers, each once, or websocket:COMMAND with {port}, which each worker starts",
         factory=f"{_HERE}.websocket:WebsocketPolicy",
-        target=rf"//{_SERVER}(?:,{_SERVER})*|(?!//).*\{{port\}}.*",
+        target=rf"(?:wss:)?//{_SERVER}(?:,{_SERVER})*|(?!//).*\{{port\}}.*",
         extra="evaluate",
         not_in_identity=_SERVER_OPTIONS,
         valid=lambda target: _valid_addresses(target) and _valid_command(target),
@@ -222,9 +231,9 @@ KINDS: dict[str, PolicyKind] = {
     ),
     "vla-eval": replace(
         _LEARNED,
-        form="vla-eval:ws://host:port, with commas between several servers, each once",
+        form="vla-eval:ws://host:port, or wss://, with commas between several servers, each once",
         factory="robomme_interference_data.evaluate.vla_eval.policy:VlaEvalPolicy",
-        target=rf"ws://{_SERVER}(?:,{_SERVER})*",
+        target=rf"wss?://{_SERVER}(?:,{_SERVER})*",
         extra="vla-eval",
         not_in_identity=_SERVER_OPTIONS,
         valid=_valid_addresses,

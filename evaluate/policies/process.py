@@ -9,7 +9,6 @@ import os
 import secrets
 import shutil
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -32,6 +31,7 @@ from robomme_interference_data.runtime.executor import (
     ray_address,
 )
 from robomme_interference_data.runtime.process import CLOSE_S
+from robomme_interference_data.runtime.sockets import socket_folder
 
 from .shared import Address, Ask, PolicyHost, SharedPolicy, ended
 
@@ -170,7 +170,7 @@ def _local_processes(config: RunConfig) -> Iterator[Sequence[Address]]:
     count = config.policies or 0
     failures = list[WorkerError]()
     # Not below the run: the path of a socket holds about 100 bytes. Other users cannot enter it.
-    folder = Path(tempfile.mkdtemp(prefix="policies-"))
+    folder = socket_folder("policies-")
     key = secrets.token_bytes(_KEY_BYTES)
     addresses = tuple(SocketAddress(folder / str(n), key, n) for n in range(count))
     with make_executor(replace(config, workers=count)).pool(ServePolicy(config)) as pool:

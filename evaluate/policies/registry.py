@@ -17,7 +17,7 @@ from robomme_interference_data.runtime.specs import (
 from robomme_interference_data.schema.other_states import OTHER_STATES, OtherStates
 from robomme_interference_data.schema.sampling import MEMORY_FORM, Memory
 
-from .kinds import KINDS, PolicyKind, Role, addresses
+from .kinds import KINDS, Address, PolicyKind, Role, addresses
 from .policy import Policy
 
 POLICIES = Registry("policy", KINDS)
@@ -34,8 +34,8 @@ def policy_memory(text: str) -> str | None:
     return POLICIES.parse(text).arguments.get("memory")
 
 
-def server_addresses(text: str) -> tuple[tuple[str, int], ...]:
-    """Return host and port of each server that a policy names, in order."""
+def server_addresses(text: str) -> tuple[Address, ...]:
+    """Return the address of each server that a policy names, in order."""
     spec = POLICIES.parse(text)
     return addresses(spec.target) if POLICIES.kinds[spec.kind].server is not None else ()
 
@@ -105,8 +105,7 @@ def _factory(text: str, worker: int) -> tuple[Factory, dict[str, Any]]:
     if servers := server_addresses(text):
         if one_client(text):
             check_workers(text, worker + 1)
-        host, port = servers[worker % len(servers)]
-        return POLICIES.factory(spec), {"host": host, "port": port}
+        return POLICIES.factory(spec), servers[worker % len(servers)]._asdict()
     return POLICIES.factory(spec), dict(spec.arguments)
 
 

@@ -54,6 +54,7 @@ class WebsocketPolicy(Policy):
     Args:
         host: Name or address of the server.
         port: Its port.
+        tls: Whether to connect with TLS, which verifies the server's certificate.
         checkpoint: Which checkpoint it serves, for the record; required if the server does not
             report it.
         chunk_frames: Maximum frames in a message. The default is the length of live messages: a
@@ -75,6 +76,7 @@ class WebsocketPolicy(Policy):
         host: str,
         port: int,
         *,
+        tls: bool = False,
         checkpoint: str | None = None,
         chunk_frames: int = ACTION_CHUNK,
         connect_s: float = 600.0,
@@ -87,7 +89,7 @@ class WebsocketPolicy(Policy):
         self.other_states = check_rule(other_states)
         self._chunk = chunk_frames
         self._server = OpenpiConnection(
-            host, port, connect_s=connect_s, response_s=response_s, check=self._check
+            host, port, tls=tls, connect_s=connect_s, response_s=response_s, check=self._check
         )
         self._history = 0  # history frames in this rollout
         self._live = False  # whether a live observation was sent

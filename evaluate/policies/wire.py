@@ -3,6 +3,9 @@
 An array is a map with four keys of bytes: `__ndarray__` true, `data` its bytes in C order,
 `dtype` such as `<f4`, and `shape`. A NumPy scalar is one with `__npgeneric__` true, `data` the
 number, and `dtype`. Everything else is plain msgpack.
+
+Servers with other libraries answer in other dialects, which are read but never sent: the same keys
+as text, and the keys `nd`, `type` and `shape` of the package msgpack-numpy.
 """
 
 from collections.abc import Callable, Iterator
@@ -64,7 +67,8 @@ def check_items(data: bytes, forbidden: Callable[[Any], bool] = lambda items: Fa
         if count > MAX_ITEMS:
             raise ValueError(f"over {MAX_ITEMS:,} maps and lists")
         if isinstance(items, dict):
-            dtype = items.get("dtype", items.get(b"dtype"))
+            named = _named(items)
+            dtype = named.get("type" if "nd" in named else "dtype")
             if dtype is not None and not (isinstance(dtype, str) and len(dtype) <= _DTYPE_LETTERS):
                 raise ValueError(f"a dtype {dtype!r:.80}")
         if forbidden(items):
@@ -110,19 +114,36 @@ def _pack_numpy(value: Any) -> dict[bytes, Any]:
     return {b"__ndarray__": True, b"data": flat, **about}
 
 
+def _named(items: dict[Any, Any]) -> dict[Any, Any]:
+    """Return a map with its keys of bytes as text."""
+    return {
+        key.decode(errors="replace") if isinstance(key, bytes) else key: value
+        for key, value in items.items()
+    }
+
+
 def _unpack_numpy(value: dict[Any, Any]) -> Any:
-    if b"__ndarray__" in value:
-        data, shape = value.get(b"data"), value.get(b"shape")
-        dtype = _checked(np.dtype(value[b"dtype"]))
-        if not isinstance(data, bytes) or not isinstance(shape, list):
-            raise TypeError("an array without bytes and shape")
-        array: NDArray[Any] = np.ndarray(tuple(shape), dtype, buffer=data)
-        if array.nbytes != len(data):
-            raise ValueError(f"an array of {array.nbytes} bytes with {len(data)} bytes of data")
-        return array
-    if b"__npgeneric__" in value:
-        return _checked(np.dtype(value[b"dtype"])).type(value[b"data"])
+    named = _named(value)
+    if "__ndarray__" in named:
+        return _array(named.get("data"), named["dtype"], named.get("shape"))
+    if "__npgeneric__" in named:
+        return _checked(np.dtype(named["dtype"])).type(named["data"])
+    if {"nd", "type", "data"} <= named.keys():  # msgpack-numpy
+        if named.get("kind") not in (None, "", b""):  # structured types, and pickled objects
+            raise ValueError("an array of msgpack-numpy with a kind of its own")
+        # It sends a scalar as an array of one value, without a shape.
+        array = _array(named["data"], named["type"], named["shape"] if named["nd"] else [1])
+        return array if named["nd"] else array[0]
     return value
+
+
+def _array(data: Any, dtype: Any, shape: Any) -> NDArray[Any]:
+    if not isinstance(data, bytes) or not isinstance(shape, list):
+        raise TypeError("an array without bytes and shape")
+    array: NDArray[Any] = np.ndarray(tuple(shape), _checked(np.dtype(dtype)), buffer=data)
+    if array.nbytes != len(data):
+        raise ValueError(f"an array of {array.nbytes} bytes with {len(data)} bytes of data")
+    return array
 
 
 def _checked(dtype: np.dtype[Any]) -> np.dtype[Any]:

@@ -57,6 +57,7 @@ class VlaEvalPolicy(ObservingPolicy):
     Args:
         host: Name or address of the server.
         port: Its port.
+        tls: Whether to connect with TLS, which verifies the server's certificate.
         checkpoint: Which checkpoint it serves, for the record: its hello names none.
         connect_s: Maximum seconds to wait until the server accepts connections: loading a model
             takes minutes.
@@ -73,13 +74,16 @@ class VlaEvalPolicy(ObservingPolicy):
         host: str,
         port: int,
         *,
+        tls: bool = False,
         checkpoint: str,
         connect_s: float = 600.0,
         response_s: float = 600.0,
         other_states: str = "refuse",
     ):
         check_server_options(checkpoint, connect_s=connect_s, response_s=response_s)
-        self._server = VlaEvalConnection(host, port, connect_s=connect_s, response_s=response_s)
+        self._server = VlaEvalConnection(
+            host, port, tls=tls, connect_s=connect_s, response_s=response_s
+        )
         self._server.open()
         self._server.close()  # the first rollout may be minutes away
         hello = self._hello = self._server.metadata or {}

@@ -5,18 +5,33 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robomme_interference_data.errors import MissingFileError, counted
+from robomme_interference_data.build_dataset.config import SourceConfig
+from robomme_interference_data.errors import InvalidOptionError, MissingFileError, counted, named
 
 from .console import echo, print_json, print_status
-from .options import AsJson, BufferSetFolder
+from .options import AsJson, with_settings
 
 if TYPE_CHECKING:
     from robomme_interference_data.data.buffer_set import BufferSet
     from robomme_interference_data.evaluate.shortcuts import Shortcut
 
 
+_FOR_SOURCES = "my-buffers"
+"""The folder in the command that builds verified sources, if none is given."""
+
+
+@with_settings
 def verify(
-    buffer_set: BufferSetFolder,
+    sources: SourceConfig,
+    buffer_set: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="BUFFER_SET",
+            help="Folder of the buffer set, or NAMESPACE/NAME. With --source, optionally the "
+            "folder to build.",
+            show_default=False,
+        ),
+    ] = None,
     decode: Annotated[
         bool, typer.Option(help="Also decode all frames and check their hashes (slow).")
     ] = True,
@@ -32,6 +47,9 @@ def verify(
 ) -> None:
     """Recompute every hash and rule of a buffer set and list the violations; fails if there is one.
 
+    With --source, check recordings before a build instead: read all frames of all episodes, and
+    list everything that is wrong, by episode and frame.
+
     With --audit, a leak fails as well. A policy can use lesson length, goal and live view without
     any memory: each episode is guessed from the others of its family.
 
@@ -39,8 +57,49 @@ def verify(
     ```
     robomme-interference verify my-buffers
     robomme-interference verify my-buffers --audit --no-decode
+    robomme-interference verify --source frames:mine
     ```
     """
+    if _of_sources(sources, buffer_set, decode=decode, audit=audit):
+        from .verify_source import verify_sources
+
+        verify_sources(sources, Path(buffer_set or _FOR_SOURCES), as_json=as_json)
+    else:
+        assert buffer_set is not None
+        _verify_buffer_set(buffer_set, decode=decode, audit=audit, as_json=as_json)
+
+
+def _of_sources(
+    sources: SourceConfig, buffer_set: str | None, *, decode: bool, audit: bool
+) -> bool:
+    """Return whether sources are verified, not a buffer set.
+
+    Raises:
+        InvalidOptionError: Neither is given, or options without effect.
+    """
+    from .verify_source import given_settings
+
+    if sources.source:
+        if audit or not decode:
+            raise InvalidOptionError(
+                f"{'--audit' if audit else '--no-decode'} has no effect on {named('source')}",
+                "Leave it out: all frames of a source are read.",
+            )
+        return True
+    if given := given_settings(sources):
+        raise InvalidOptionError(
+            f"{named(given[0])} has no effect without {named('source')}",
+            f"Leave it out, or add {named('source')}.",
+        )
+    if buffer_set is None:
+        raise InvalidOptionError(
+            "there is nothing to verify",
+            "Give a buffer set, or recordings before a build: --source KIND:FOLDER",
+        )
+    return False
+
+
+def _verify_buffer_set(buffer_set: str, *, decode: bool, audit: bool, as_json: bool) -> None:
     from robomme_interference_data.build_dataset.verify.buffer_set import (
         undecoded_frames,
         verify_buffer_set,

@@ -33,6 +33,7 @@ from .process import CLOSE_S, START_S
 from .process_worker import ProcessWorker, read_remains
 from .safe_path import SAFE_PATH, safe_path
 from .scheduler import Scheduler
+from .sockets import long_path_error
 from .worker import Outcome, TaskFunction, end_if_starting, unpickle_outcome
 
 logger = logging.getLogger(__name__)
@@ -269,6 +270,10 @@ def connected(address: str) -> Iterator[None]:
                     runtime_env={"env_vars": environment},
                 )
         except (OSError, OverflowError, ValueError, RuntimeError, RayError) as error:
+            if "AF_UNIX path length" in str(error):  # Ray has no class of its own for it
+                raise long_path_error(
+                    os.environ.get("RAY_TMPDIR", tempfile.gettempdir())
+                ) from error
             raise WorkerError(
                 f"cannot connect to the Ray cluster at {address!r}: {first_line(error)}",
                 'Start one with  ray start --head  and set its address, or set "local". Its nodes '

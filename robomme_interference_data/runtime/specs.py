@@ -100,6 +100,8 @@ class Registry[K: SpecKind]:
             hint = nearest(name, self.kinds, more="")
             if "python" in self.kinds and OWN.fullmatch(text):
                 hint = f"For a class or function of your own, write python:{text}."
+            if "websocket" in self.kinds and name in ("ws", "wss"):
+                hint = f"Write websocket:{target}" if name == "ws" else f"Write websocket:{text}"
             raise UnknownNameError(
                 f"there is no {self._what} {text!r}; expected {self.forms}", hint
             )

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import ACTION
 from robomme_interference_data.errors import FormatError
 
-from .files import canonical_json
+from .files import canonical_json, check_not_pointer
 
 _FILE = re.compile(
     rb"\x93NUMPY\x01\x00..\{'descr': '([<|][a-z]\d)', 'fortran_order': False, "
@@ -52,6 +52,7 @@ def read_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:
     anything is allocated. `np.load` would also open archives.
     """
     expected = f"{np.dtype(dtype)} of shape {shape}"
+    check_not_pointer(path)
     with path.open("rb") as file:
         header = _FILE.match(start := file.read(_MAX_HEADER_BYTES))
     if header is None or int.from_bytes(start[8:10], "little") != header.end() - 10:

@@ -1,10 +1,12 @@
-"""Access the files of a dataset, read JSON within bounds, and write files atomically."""
+"""Access the files of a dataset, read text and JSON within bounds, and write files atomically."""
 
+import codecs
 import errno
 import hashlib
 import json
 import math
 import os
+import shlex
 import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
@@ -19,11 +21,24 @@ from robomme_interference_data.errors import FormatError, InterferenceError, Mis
 _MAX_JSON_BYTES = 16 << 20
 """Our files have some thousand bytes, and Python takes forty times as many for some values."""
 
+_MAX_TEXT_BYTES = 64 << 20
+"""A CSV file with a line for each of half a million episodes."""
+
 _MAX_SUMS_BYTES = 64 << 20
 """A list of the SHA-256 of half a million files."""
 
+_POINTER = b"version https://git-lfs.github.com/spec/"
+"""First bytes of the text that stands for a file which Git LFS has not downloaded."""
+
+_SHARED_BLOBS = ".huggingface-shared-blobs"
+"""File with which the Hub's client marks the blobs that repositories in its cache share."""
+
 _MAX_DEPTH = 64
 """Nesting of JSON: Python can read more than it can always print, compare or write."""
+
+
+_CORRECT = "Correct it, restore it from a copy, or download or build it again."
+"""What to do about text that may have been edited."""
 
 
 class Files(ABC):
@@ -88,16 +103,12 @@ class LocalFiles(Files):
     def path(self, relative: str) -> Path:
         """See `Files.path`."""
         path = self.root / check_relative(relative, self.describe())
-        # A link may lead inside the folder. In a snapshot of the Hub's cache, or a folder of one,
-        # it may also lead to the cache's `blobs`.
-        root = self.root.resolve()
-        snapshots = (path for path in (root, root.parent) if path.parent.name == "snapshots")
-        blobs = next((path.parent.parent / "blobs" for path in snapshots), root)
         target = Path(os.path.realpath(path))  # unlike `Path.resolve`, it accepts circular links
-        if not (target.is_relative_to(root) or target.is_relative_to(blobs)):
+        if not any(target.is_relative_to(folder) for folder in _linked_folders(self.root)):
             raise FormatError(
                 f"{relative} in {self.root} is a link that leads out of the folder",
-                "Replace the link by the file.",
+                "Replace the link by the file, or copy the folder with its files: "
+                f"cp -rL {shlex.quote(str(self.root))} NEW",
             )
         try:
             exists = target.is_file()
@@ -133,6 +144,23 @@ class LocalFiles(Files):
     def describe(self) -> str:
         """Return the folder."""
         return str(self.root)
+
+
+def _linked_folders(root: Path) -> list[Path]:
+    """Return the folders into which links of a folder may lead: itself, and the Hub's blobs.
+
+    In the cache of the Hub's client, `CACHE/REPOSITORY/snapshots/COMMIT/…` has links to
+    `CACHE/REPOSITORY/blobs`, which may lead on to the blobs that repositories share.
+    """
+    root = root.resolve()
+    folders = [root]
+    snapshots = (path.parent for path in (root, *root.parents) if path.parent.name == "snapshots")
+    if (snapshot := next(snapshots, None)) is not None:
+        repository = snapshot.parent
+        folders.append(repository / "blobs")
+        if (repository.parent / "blobs" / _SHARED_BLOBS).is_file():
+            folders.append(repository.parent / "blobs")
+    return folders
 
 
 def is_hidden(relative: str) -> bool:
@@ -187,14 +215,69 @@ def indented_json(value: Any) -> str:
     return text + "\n"
 
 
+def check_not_pointer(path: Path) -> None:
+    """Check that a file holds its content: a clone without Git LFS has short texts instead.
+
+    Raises:
+        MissingFileError: The file is a pointer of Git LFS.
+    """
+    with path.open("rb") as file:
+        _check_start(path, file.read(len(_POINTER)))
+
+
+def _check_start(path: Path, data: bytes) -> None:
+    if data.startswith(_POINTER):
+        clones = (folder for folder in path.resolve().parents if (folder / ".git").exists())
+        raise MissingFileError(
+            f"{path} is a Git LFS pointer, not the file",
+            f"Install Git LFS, then run `git lfs pull` in {next(clones, path.parent)}",
+        )
+
+
+def read_text(path: Path, most: int = _MAX_TEXT_BYTES) -> str:
+    """Read text that people or their programs wrote, of at most `most` bytes: see `decode_text`."""
+    return decode_text(read_bytes(path, most), path)
+
+
+def decode_text(data: bytes, where: object) -> str:
+    """Decode text in UTF-8, or in UTF-16 or UTF-8 with the mark that programs of Windows write.
+
+    Raises:
+        FormatError: It has another encoding; nothing in the data tells which, so none is guessed.
+    """
+    first = [byte != 0 for byte in data[:2]]
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        encoding, shown = "utf-16", "UTF-16"
+    elif first in ([True, False], [False, True]):  # of two bytes for a letter, one is zero
+        name = "UTF-16LE" if first[0] else "UTF-16BE"
+        raise FormatError(
+            f"{where} is not text in UTF-8, but in {name} without its mark",
+            f"Save it as UTF-8, such as with iconv -f {name} -t UTF-8 OLD > NEW.",
+        )
+    else:
+        encoding, shown = "utf-8-sig", "UTF-8"
+    try:
+        return data.decode(encoding)
+    except UnicodeDecodeError as error:
+        before = data[: error.start].decode(encoding).rpartition("\n")[2][-40:]
+        place = f"after {before!r}" if before else "at the beginning of a line"
+        raise FormatError(
+            f"{where} is not text in {shown}: byte 0x{data[error.start]:02x} {place}",
+            "Save it as UTF-8. Text in Latin-1 or Windows-1252 is converted by iconv "
+            "-f WINDOWS-1252 -t UTF-8 OLD > NEW; a downloaded file may be damaged.",
+        ) from None
+
+
 def read_bytes(path: Path, most: int) -> bytes:
     """Return the bytes of a file that has at most `most`."""
     with path.open("rb") as file:
         # Of the open file: by now, another one may have the path.
         size = os.fstat(file.fileno()).st_size
         if size > most:
-            raise FormatError.damaged(path, f"{size:,} bytes; expected at most {most:,}")
-        return file.read()
+            raise FormatError(f"{path}: {size:,} bytes; expected at most {most:,}", _CORRECT)
+        data = file.read()
+    _check_start(path, data)  # not by opening it again: it may be a pipe
+    return data
 
 
 def read_json(path: Path, *, nan_as_none: bool = False) -> dict[str, Any]:
@@ -203,21 +286,22 @@ def read_json(path: Path, *, nan_as_none: bool = False) -> dict[str, Any]:
 
 
 def parse_json(data: bytes, where: object, *, nan_as_none: bool = False) -> dict[str, Any]:
-    """Parse a JSON object in UTF-8, in which keys are unique and numbers are finite.
+    """Parse a JSON object, in which keys are unique and numbers are finite; see `decode_text`.
 
     With `nan_as_none`, for files of other programs, NaN and infinities are read as None: Python and
     pandas write NaN for values that are missing.
     """
+    text = decode_text(data, where)
     decoder = _JSON_WITH_NAN if nan_as_none else _JSON
     try:
-        value = decoder.decode(data.decode())
+        value = decoder.decode(text)
         # The number of brackets bounds the depth, and is quickly counted.
         if data.count(b"[") + data.count(b"{") > _MAX_DEPTH and _is_deep(value):
             raise ValueError(f"over {_MAX_DEPTH} nested arrays and objects")
     except (ValueError, RecursionError) as error:
-        raise FormatError.damaged(where, f"not valid JSON: {error}") from None
+        raise FormatError(f"{where}: not valid JSON: {error}", _CORRECT) from None
     if not isinstance(value, dict):
-        raise FormatError.damaged(where, "not a JSON object")
+        raise FormatError(f"{where}: not a JSON object", _CORRECT)
     return value
 
 
@@ -347,11 +431,7 @@ def digest_folder(folder: Path, patterns: Iterable[str]) -> str:
 def read_sums(path: Path) -> dict[str, str]:
     """Read a file in the format of `format_sums`: SHA-256 by path."""
     sums = {}
-    try:
-        lines = read_bytes(path, _MAX_SUMS_BYTES).decode().splitlines()
-    except UnicodeDecodeError as error:
-        raise FormatError.damaged(path, error) from None
-    for line in lines:
+    for line in read_text(path, _MAX_SUMS_BYTES).splitlines():
         digest, gap, name = line.partition("  ")
         if not gap or len(digest) != 64 or not name:
             raise FormatError.damaged(path, f"{line[:80]!r} is not a SHA-256 and a path")
@@ -360,8 +440,13 @@ def read_sums(path: Path) -> dict[str, str]:
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """Turn pyarrow's errors on a damaged file into `FormatError`."""
+def reading(path: Path, hint: str | None = None) -> Iterator[None]:
+    """Turn pyarrow's errors on a damaged file into `FormatError`.
+
+    Args:
+        path: The file.
+        hint: What to do about a file that people may have written; None for that it is damaged.
+    """
     import pyarrow as pa  # not to load or list a file
 
     try:
@@ -369,5 +454,7 @@ def reading(path: Path) -> Iterator[None]:
     except (InterferenceError, MemoryError):  # of pyarrow's, one is an `ArrowException`, too
         raise
     except (pa.ArrowException, OSError, ValueError, OverflowError, RecursionError) as error:
-        text = str(error).partition("\n")[0]
-        raise FormatError.damaged(path, f"cannot be read: {text}") from None
+        what = f"cannot be read: {str(error).partition('\n')[0]}"
+        if hint is None:
+            raise FormatError.damaged(path, what) from None
+        raise FormatError(f"{path}: {what}", hint) from None

@@ -6,7 +6,7 @@ The stock client does the work, so its own settings hold (`HF_ENDPOINT`, `HF_HUB
 
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import cached_property, partial
@@ -206,26 +206,31 @@ class HubFiles(Files):
     def _check(self, downloaded: dict[str, Path]) -> None:
         """Remove downloaded files whose digest differs from the Hub's, and raise.
 
-        The client checks only their length. It names files in its cache by their digests: Git's of
-        small ones, SHA-256 of large ones.
+        The client checks only their length.
         """
-        from huggingface_hub.utils.sha import git_hash
-
         damaged = []
-        digests = {40: lambda blob: git_hash(blob.read_bytes()), 64: sha256_file}
         for relative, path in downloaded.items():
-            blob = path.resolve()
-            # Where Windows allows no links, the cache holds the file under its own name.
-            digest = digests.get(len(blob.name)) if blob.parent.name == "blobs" else None
-            if digest is not None and digest(blob) != blob.name:
-                path.unlink()
-                blob.unlink(missing_ok=True)
+            if not _has_digest(path, self._digest(relative, path)):
+                # A link leads to a blob of the repository, which may lead to one that all share.
+                for linked in (path.resolve(), *_links(path)):
+                    linked.unlink(missing_ok=True)
                 damaged.append(relative)
         if damaged:
             raise HashMismatchError(
                 f"{', '.join(damaged)} of {self.describe()} came damaged: the digest differs",
                 "The damaged files were deleted. Run the same command again.",
             )
+
+    def _digest(self, relative: str, path: Path) -> str:
+        """Return the Hub's digest of a downloaded file, its entity tag."""
+        if path.is_symlink():  # to a blob, whose name is the digest
+            return path.readlink().name
+        # Without links, as on Windows, the cache does not hold the digest.
+        from huggingface_hub import get_hf_file_metadata, hf_hub_url
+
+        name = self.folder + relative
+        url = hf_hub_url(self.repo_id, name, **self._options)
+        return str(self._call(name).run(get_hf_file_metadata, url).etag)
 
     @property
     def _options(self) -> dict[str, Any]:
@@ -238,3 +243,22 @@ class HubFiles(Files):
     def _known_revision(self) -> str:
         revision: str = self.__dict__.get("commit", self.revision)
         return revision
+
+
+def _links(path: Path) -> Iterator[Path]:
+    """Yield a path and those that its links lead to, as far as they are links."""
+    while path.is_symlink():
+        following = path.parent / path.readlink()
+        yield path
+        path = following
+
+
+def _has_digest(path: Path, digest: str) -> bool:
+    """Return whether a file has a digest of the Hub: Git's of small ones, SHA-256 of large ones."""
+    from huggingface_hub.utils.sha import git_hash
+
+    if re.fullmatch(r"[0-9a-f]{64}", digest):
+        return sha256_file(path) == digest
+    if re.fullmatch(r"[0-9a-f]{40}", digest):
+        return bool(git_hash(path.read_bytes()) == digest)
+    return True  # of a server with other tags

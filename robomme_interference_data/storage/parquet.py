@@ -28,7 +28,7 @@ from .arrow_columns import (
     simple_type,
     simplified,
 )
-from .files import atomic_path, reading
+from .files import atomic_path, check_not_pointer, reading
 from .limits import MAX_READ_VALUES
 from .parquet_pages import decoded_size
 
@@ -51,6 +51,7 @@ _MAX_BYTES = 2 << 30
 def open_parquet(path: Path) -> pq.ParquetFile:
     """Open a parquet file for reading piece by piece."""
     with reading(path):
+        check_not_pointer(path)
         _check_metadata_size(path)
         file = pq.ParquetFile(
             pa.OSFile(os.fsencode(path)),  # as pyarrow cannot encode names that are not UTF-8

@@ -17,7 +17,9 @@ from typing import BinaryIO
 import av
 import numpy as np
 
-from robomme_interference_data.errors import FormatError, MissingFileError
+from robomme_interference_data.errors import FormatError, InterferenceError, MissingFileError
+
+from .files import check_not_pointer
 
 MAX_PIXELS = 1 << 24
 """Upper bound on the pixels of a frame: twice 3840 × 2160."""
@@ -70,13 +72,14 @@ def open_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.Vid
     limits = {"max_pixels": str(MAX_PIXELS)}
     allowed = {"protocol_whitelist": "file", "codec_whitelist": ",".join(_DECODERS)}
     try:
+        check_not_pointer(path)
         kind = find_container(path)
         if kind == "mp4":
             check_samples(path)
         container = av.open(file_url(path), format=kind, options=limits, container_options=allowed)
     except FileNotFoundError:
         raise MissingFileError(f"{path} does not exist") from None
-    except FormatError:
+    except InterferenceError:
         raise
     except (av.error.FFmpegError, ValueError) as error:  # ValueError: a damaged header
         raise FormatError.damaged(path, f"not a readable video: {reason(error)}") from error

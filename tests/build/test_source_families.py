@@ -17,7 +17,7 @@ from robomme_interference_data.build_dataset.sources.robomme_families import (
     ROBOMME,
     families_for_goal,
 )
-from robomme_interference_data.errors import SourceError
+from robomme_interference_data.errors import FormatError, SourceError
 
 
 def written(folder: Path, text: str, name: str = "families.csv") -> Path:
@@ -98,9 +98,12 @@ def test_errors_name_the_line_or_episode(tmp_path: Path, text: str) -> None:
 
 def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / "latin.csv").write_bytes("episode_index,famílie\n".encode("latin1"))
-    for name in ("none.csv", "latin.csv"):
-        with raises(SourceError):
+    for name, kind in (("none.csv", SourceError), ("latin.csv", FormatError)):
+        with raises(kind):
             ids_by_file(tmp_path / name, 1)
+    (tmp_path / "excel.csv").write_text("episode_index,family\n0,Öffnen\n", "utf-16")
+    with raises(SourceError):  # it is read, and the family has a letter that no id has
+        ids_by_file(tmp_path / "excel.csv", 1)
 
 
 TASKS = [["open the drawer"], ['stack, then "wait"'], ["open  the drawer "], ["push"]]

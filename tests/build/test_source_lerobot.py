@@ -104,8 +104,11 @@ def test_1600_episodes_are_named_by_block_and_quickly(tmp_path: Path) -> None:
     assert [episode.id for episode in listed] == sorted(episode.id for episode in listed)
 
     edit_columns(root / TABLE, tasks=[[g] for g in [*goals[:950], PEG, *goals[951:]]])
+    listed = open_source(f"lerobot:{root}").episodes()
+    [wrong] = [episode for episode in listed if episode.problem is not None]
+    assert str(wrong.id) == "MoveCube/train/50"
     with raises(SourceError) as caught:
-        open_source(f"lerobot:{root}").episodes()
+        wrong.check()
     assert "`families_from`" in str(caught.value.hint)
     families = [name.split("/")[0] for _, (name, _) in sorted(found.items())]
     families[950] = "InsertPeg"

@@ -19,6 +19,7 @@ from robomme_interference_data.errors import (
     naming_options,
     nearest,
 )
+from robomme_interference_data.schema.rollouts import Status
 
 CLASSES = [
     value
@@ -57,6 +58,7 @@ def test_an_error_about_something_keeps_the_rest() -> None:
         ("VideoRepik", ["VideoRepick", "MoveCube"], "Did you mean 'VideoRepick'?"),
         ("wirst", ["wrist", "waist"], "Did you mean 'wrist' or 'waist'?"),
         ("xyz", ["front", "wrist"], "Known: front, wrist"),
+        ("failed", list(Status), "Did you mean 'fail'?"),
         ("anything", [], ""),
         ("#", list("abcdefghijkl"), "Known: a, b, c, d, e, f, g, h, i, j, … (12 in all)"),
     ],

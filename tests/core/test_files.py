@@ -19,6 +19,7 @@ from robomme_interference_data.storage.files import (
     parse_json,
     read_json,
     read_sums,
+    read_text,
     write_json,
 )
 
@@ -91,6 +92,34 @@ def test_invalid_json_objects(tmp_path: Path, data: bytes) -> None:
     assert caught.value.hint
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_text_in_the_encodings_that_say_which_they_are(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "rows.csv"
+    path.write_bytes("task,family\nschließ die Tür,CloseDoor\n".encode(encoding))
+    assert read_text(path) == "task,family\nschließ die Tür,CloseDoor\n"
+    path.write_bytes('{"a": "ä"}'.encode(encoding))
+    assert read_json(path) == {"a": "ä"}
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b"task,family\nschlie\xdf,Close\n", "0xdf after 'schlie'"),
+        (b"\xe9", "0xe9 at the beginning"),
+        ("task,family\n".encode("utf-16-le"), "UTF-16LE"),
+        ("task,family\n".encode("utf-16-be"), "UTF-16BE"),
+        (b"\xff\xfea\0b", "UTF-16"),
+    ],
+)
+def test_text_in_other_encodings(tmp_path: Path, data: bytes, said: str) -> None:
+    path = tmp_path / "rows.csv"
+    path.write_bytes(data)
+    with raises(FormatError) as caught:
+        read_text(path)
+    assert said in caught.value.message
+    assert "iconv" in str(caught.value.hint)
+
+
 @pytest.mark.parametrize("relative", ["../x", "a/../../x", "/etc/passwd", "..", "meta/\0x"])
 def test_a_path_never_leads_out(tmp_path: Path, relative: str) -> None:
     (tmp_path / "x").write_text("secret")
@@ -129,13 +158,32 @@ def test_snapshots_of_the_hubs_cache_link_to_its_blobs(tmp_path: Path) -> None:
     (tmp_path / "blobs" / "abc").write_text("data")
     (tmp_path / "refs").mkdir()
     (tmp_path / "refs" / "main").write_text("no data")
-    root = tmp_path / "snapshots" / "0123"
+    for folder in (".", "v1", "v1/pick_cube", "sim/v1/pick_cube"):
+        root = tmp_path / "snapshots" / "0123" / folder
+        root.mkdir(parents=True, exist_ok=True)
+        up = "../" * (2 + len(Path(folder).parts))
+        (root / "info.json").symlink_to(f"{up}blobs/abc")
+        (root / "other").symlink_to(f"{up}refs/main")
+        assert LocalFiles(root).path("info.json").read_text() == "data"
+        with raises(FormatError):
+            LocalFiles(root).path("other")
+
+
+def test_blobs_that_repositories_share(tmp_path: Path) -> None:
+    """The client's cache may hold a file once for all repositories."""
+    store = tmp_path / "blobs" / "ab"
+    store.mkdir(parents=True)
+    (store / "abcd").write_text("data")
+    blobs = tmp_path / "datasets--a--b" / "blobs"
+    blobs.mkdir(parents=True)
+    (blobs / "sha").symlink_to("../../blobs/ab/abcd")
+    root = tmp_path / "datasets--a--b" / "snapshots" / "0123"
     root.mkdir(parents=True)
-    (root / "info.json").symlink_to("../../blobs/abc")
-    (root / "other").symlink_to("../../refs/main")
-    assert LocalFiles(root).path("info.json").read_text() == "data"
+    (root / "info.json").symlink_to("../../blobs/sha")
     with raises(FormatError):
-        LocalFiles(root).path("other")
+        LocalFiles(root).path("info.json")
+    (tmp_path / "blobs" / ".huggingface-shared-blobs").touch()
+    assert LocalFiles(root).path("info.json").read_text() == "data"
 
 
 def test_sums_equal_those_of_sha256sum(tmp_path: Path) -> None:

@@ -217,6 +217,41 @@ def test_a_folder_that_comes_damaged(hub: HubServer) -> None:
     assert len(hub.downloads()) == before + 1  # nothing but what was damaged
 
 
+@pytest.fixture
+def no_links(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the client's cache hold copies, as where Windows allows no links."""
+    monkeypatch.setattr(constants, "HF_HUB_DISABLE_SYMLINKS", True)
+
+
+@pytest.mark.usefixtures("no_links")
+@pytest.mark.parametrize("path", ["meta/part-1.json", "data.parquet"])
+def test_what_comes_damaged_into_a_cache_without_links(hub: HubServer, path: str) -> None:
+    """A small file and a large one, whose digests the cache does not hold."""
+    hub.push(DATASET, {"meta/part-1.json": b"{}", "data.parquet": b"PAR1" * 9})
+    fault = hub.fault("GET", f".*{path}", wrong=True, times=2)
+    for read in (lambda: HubFiles(REPO).path(path), lambda: HubFiles(REPO).snapshot(path)):
+        with raises(HashMismatchError):
+            read()
+    fault.times = 0
+    files = HubFiles(REPO)
+    assert files.path(path) == files.snapshot(path) / path
+    assert not files.path(path).is_symlink()
+    before = len(hub.downloads())
+    assert HubFiles(REPO).path(path).read_bytes() in (b"{}", b"PAR1" * 9)
+    assert len(hub.downloads()) == before
+
+
+@pytest.mark.usefixtures("no_links")
+def test_names_that_look_like_digests(hub: HubServer) -> None:
+    """Where the cache has no links, the names of its files are those of the repository."""
+    named = [f"blobs/{'ab' * 20}", f"blobs/{'cd' * 32}", f"{'ef' * 20}"]
+    hub.push(DATASET, {name: name.encode() for name in named})
+    for _ in range(2):
+        files = HubFiles(REPO)
+        assert [files.path(name).read_bytes() for name in named] == [n.encode() for n in named]
+        assert files.list("blobs") == named[:2]
+
+
 # --- no address of a Hub -------------------------------------------------------------------------
 
 

@@ -19,7 +19,7 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.evaluate.policies.identity import policy_identity
-from robomme_interference_data.evaluate.policies.kinds import PolicyKind, Role
+from robomme_interference_data.evaluate.policies.kinds import Address, PolicyKind, Role
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import (
     POLICIES,
@@ -43,9 +43,16 @@ def test_a_policy_is_parsed() -> None:
     assert [str(POLICIES.parse(text)) for text in ("replay", "recall")] == [
         *("replay:full", "recall:full")
     ]
-    addresses = ("gpu-1.lab", 8013), ("10.0.0.2", 1), ("::1", 65535)
-    assert server_addresses("vla-eval:ws://gpu-1.lab:8013,10.0.0.2:1,[::1]:65535") == addresses
-    assert server_addresses("websocket://gpu-1.lab:8013,10.0.0.2:1,[::1]:65535") == addresses
+    places = [("gpu-1.lab", 8013), ("10.0.0.2", 1), ("::1", 65535)]
+    written = "//gpu-1.lab:8013,10.0.0.2:1,[::1]:65535"
+    for scheme, tls in (
+        ("websocket:", False),
+        ("websocket:wss:", True),
+        ("vla-eval:ws:", False),
+        ("vla-eval:wss:", True),
+    ):
+        expected = tuple(Address(*place, tls) for place in places)
+        assert server_addresses(f"{scheme}{written}") == expected
 
 
 @pytest.mark.parametrize(
@@ -53,6 +60,8 @@ def test_a_policy_is_parsed() -> None:
     [
         ("websockets://a:1", UnknownNameError, "Did you mean 'websocket'?"),
         ("lamp:Lamp", UnknownNameError, "write python:lamp:Lamp"),
+        ("wss://a:1", UnknownNameError, "Write websocket:wss://a:1"),
+        ("ws://a:1", UnknownNameError, "Write websocket://a:1"),
         ("zzz", UnknownNameError, "replay, replay:framesamp:N or replay:window:N, recall,"),
         *(
             (text, InvalidOptionError, f"policy '{text}'; expected {text.partition(':')[0]}")
@@ -74,7 +83,7 @@ def test_invalid_policies_are_errors(text: str, error: type[Exception], words: s
 
 @given(
     st.text(max_size=20)
-    | st.from_regex(r"(websocket:/?/?|vla-eval:ws://|python:|lerobot:)[a-z:,1.\[\]]*")
+    | st.from_regex(r"(websocket:(wss:)?/?/?|vla-eval:wss?://|python:|lerobot:)[a-z:,1.\[\]]*")
 )
 def test_any_text_is_a_policy_or_a_clear_error(text: str) -> None:
     try:

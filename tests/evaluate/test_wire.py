@@ -111,10 +111,60 @@ def test_round_trip(message: Any) -> None:
     assert isinstance(read, tuple | list) or type(read) is type(message)
 
 
+ACTIONS = np.arange(16, dtype="<f4").reshape(2, 8)
+OF_OTHER_LIBRARIES = {
+    # openpi's map with keys of text
+    "text": {"__ndarray__": True, "data": ACTIONS.tobytes(), "dtype": "<f4", "shape": [2, 8]},
+    # The package msgpack-numpy.
+    "msgpack-numpy": {
+        b"nd": True,
+        b"type": "<f4",
+        b"kind": b"",
+        b"shape": [2, 8],
+        b"data": ACTIONS.tobytes(),
+    },
+}
+
+
+@pytest.mark.parametrize("name", OF_OTHER_LIBRARIES)
+def test_arrays_of_other_libraries_are_read(name: str) -> None:
+    read = unpack(msgpack.packb({"actions": OF_OTHER_LIBRARIES[name]}))["actions"]
+    assert read.dtype == np.float32
+    np.testing.assert_array_equal(read, ACTIONS)
+
+
+def test_scalars_of_other_libraries_are_read() -> None:
+    text = {"__npgeneric__": True, "data": 2.5, "dtype": "<f4"}
+    package = {b"nd": False, b"type": "<f8", b"data": np.float64(2.5).tobytes()}
+    for sent, kind in ((text, np.float32), (package, np.float64)):
+        read = unpack(msgpack.packb(sent))
+        assert (read, type(read)) == (2.5, kind)
+    plain = {"nd": 3, "type": "a map of its own"}
+    assert unpack(msgpack.packb(plain | {"type": "short"})) == plain | {"type": "short"}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {b"kind": b"O"},  # a pickled object
+        {b"kind": b"V", b"type": [["a", "<f4"]]},
+        {b"type": "O"},
+        {b"type": "<f4,<f4,<f4,<f4,<f4,<f4"},
+        {b"shape": [3, 8]},
+    ],
+)
+def test_arrays_of_msgpack_numpy_that_are_not_read(change: dict[bytes, Any]) -> None:
+    with raises(FormatError):
+        unpack(msgpack.packb(OF_OTHER_LIBRARIES["msgpack-numpy"] | change))
+
+
 CLAIMED = st.builds(
     lambda kind, fields: msgpack.packb({kind: True, **fields}),
-    st.sampled_from([b"__ndarray__", b"__npgeneric__"]),
-    st.dictionaries(st.sampled_from([b"data", b"dtype", b"shape"]), PLAIN | st.just("<f4")),
+    st.sampled_from([b"__ndarray__", b"__npgeneric__", "__ndarray__", b"nd"]),
+    st.dictionaries(
+        st.sampled_from([b"data", b"dtype", b"shape", b"type", "data", "dtype", "shape"]),
+        PLAIN | st.just("<f4"),
+    ),
 )
 
 

@@ -123,13 +123,28 @@ def test_the_released_layout(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
 def test_csv_files_as_other_programs_save_them(tmp_path: Path, end: str) -> None:
-    """With the line ends of any system, a mark at the start, and empty lines."""
+    """With the line ends of any system, a mark at the start, and blank lines."""
     text = made.write_csv(tmp_path / "a.csv", made.rows()).read_text(encoding="utf-8")
-    lines = [*text.splitlines(), "", ""]
+    lines = [*text.splitlines(), "", " ", "," * text.splitlines()[0].count(","), ",,", ""]
     lines.insert(5, "")
     saved = tmp_path / "b.csv"
-    saved.write_text(end.join(lines), encoding="utf-8-sig", newline="")
-    assert told(read_rows([saved])) == told(read_rows([tmp_path / "a.csv"]))
+    for encoding in ("utf-8-sig", "utf-16"):
+        saved.write_text(end.join(lines), encoding=encoding, newline="")
+        assert told(read_rows([saved])) == told(read_rows([tmp_path / "a.csv"]))
+
+
+def test_columns_without_a_name_are_not_read(tmp_path: Path) -> None:
+    """Such as the index of pandas, and what a spreadsheet has behind the last column."""
+    text = made.write_csv(tmp_path / "a.csv", made.rows()).read_text(encoding="utf-8")
+    head, *lines = text.splitlines()
+    wide = [f",{head},,", *(f"{number},{line},," for number, line in enumerate(lines))]
+    (tmp_path / "b.csv").write_text("\n".join(wide), encoding="utf-8")
+    table = pq.read_table(made.write_parquet(tmp_path / "a.parquet", made.rows()))
+    indexed = table.append_column("__index_level_0__", pa.array(range(len(table))))
+    pq.write_table(indexed, tmp_path / "b.parquet")
+    expected = told(read_rows([tmp_path / "a.csv"]))
+    for name in ("b.csv", "b.parquet"):
+        assert told(read_rows([tmp_path / name])) == expected
 
 
 @pytest.mark.parametrize("separator", [";", "\t"])
@@ -190,7 +205,7 @@ BAD = {
     "two difficulties": ("my-memory,MoveCube,k1,0,7,hard,fail,0,9", "difficulty 'hard' beside"),
     "too short": ("my-memory,MoveCube,k0,1,7,easy,fail,0", "the line has 8 fields; expected 9"),
     "twice": (GOOD, "the same rollout as"),
-    "no columns": ('""', "the line has 1 field; expected 9"),
+    "no columns": ("x", "the line has 1 field; expected 9"),
 }
 
 

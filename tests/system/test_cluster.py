@@ -197,6 +197,13 @@ def test_a_token_that_is_missing(cluster: Any, tmp_path: Path) -> None:
     assert "WorkerError" in printed and "~/.ray/auth_token" in printed
 
 
+def test_a_folder_for_temporary_files_that_is_too_long(tmp_path: Path) -> None:
+    folder = tmp_path / ("long" * 20)
+    folder.mkdir()
+    printed = connect("local", TMPDIR=str(folder))
+    assert "WorkerError" in printed and "TMPDIR=/tmp" in printed
+
+
 def test_a_build_has_the_bytes_of_one_process(cluster: Any, tmp_path: Path) -> None:
     source = MadeUpSource({f"MoveCube/test/{number}": (40, 20) for number in range(4)})
     tasks = tuple(PlannedEpisode(0, episode) for episode in source.episodes())

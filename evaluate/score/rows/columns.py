@@ -23,7 +23,8 @@ _RELEASED_NAMES = {"variant": "system", "retrieval_model": "retrieval"}
 
 def select(path: Path, header: Sequence[str], names: Sequence[str]) -> dict[str, str]:
     """Return the column of the file that holds each of the named columns."""
-    if twice := [name for name in header if header.count(name) > 1]:
+    # Columns without a name, such as pandas' index and a spreadsheet's empty ones, are not read.
+    if twice := [name for name in header if name.strip() and header.count(name) > 1]:
         raise FormatError(f"{path} has two columns {twice[0]!r}", "Rename one of them.")
     columns = {_RELEASED_NAMES.get(name, name): name for name in header}
     missing = [name for name in _REQUIRED if name not in columns]

@@ -1,6 +1,5 @@
 """CSV files with a row for each rollout: exported runs, and the paper's released rows."""
 
-import codecs
 import csv
 import io
 import re
@@ -9,7 +8,7 @@ from pathlib import Path
 
 from robomme_interference_data.constants import MAX_ROW_BYTES
 from robomme_interference_data.errors import FormatError, counted
-from robomme_interference_data.storage.files import read_bytes
+from robomme_interference_data.storage.files import read_text
 
 from .columns import select, with_outcomes
 from .row_format import FileColumns, RowFile, RowFormat, check_count
@@ -26,15 +25,7 @@ def _read(file: RowFile, names: Sequence[str]) -> FileColumns:
     path = file.path
     if path.name == _CANONICAL:
         names = [name for name in names if name in _CANONICAL_COLUMNS]
-    data = read_bytes(path, MAX_ROW_BYTES).removeprefix(codecs.BOM_UTF8)
-    try:
-        text = data.decode()
-    except UnicodeDecodeError as error:
-        # Spreadsheet programs save other encodings unless asked: the file need not be damaged.
-        raise FormatError(
-            f"{path} is not UTF-8 text: {error.reason} at byte {error.start:,}",
-            "Save it again as CSV in UTF-8.",
-        ) from None
+    text = read_text(path, MAX_ROW_BYTES)
     before = csv.field_size_limit(len(text) + 1)  # of the whole process
     try:
         return _parse(path, text, names)
@@ -53,8 +44,8 @@ def _parse(path: Path, text: str, names: Sequence[str]) -> FileColumns:
         line = reader.line_num + 1
         for fields in reader:
             check_count(len(rows) + len(malformed))
-            if not fields:
-                pass  # an empty line, as editors leave at the end
+            if not any(field.strip() for field in fields):
+                pass  # a blank line, as editors leave at the end, and spreadsheets with commas
             elif len(fields) == len(header):
                 rows[line] = fields
             else:

@@ -22,6 +22,9 @@ FORMATS = (RUN_RECORD_FORMAT, PARQUET, CSV, VLA_EVAL, LEROBOT_EVAL)
 """Every format that can be read."""
 
 
+_CORRECT = "Correct it, or write it again: it may have been edited, or cut short."
+
+
 def find_sources(paths: Sequence[Path]) -> "dict[Path, RunHeader | None]":
     """Return the file of rows of each path, with the header of the run that it belongs to.
 
@@ -61,7 +64,7 @@ def read_file(path: Path, names: Sequence[str]) -> FileColumns:
         FormatError: The file has none of the known formats, or is damaged.
     """
     file = RowFile(path)
-    with reading(path):
+    with reading(path, _CORRECT):
         for row_format in FORMATS:
             if row_format.matches(file):
                 return row_format.read(file, names)
