@@ -10,6 +10,8 @@ from support.recordings import check_recording, make_episode
 
 from robomme_interference_data.build_dataset.sources.lerobot import LeRobotSource
 from robomme_interference_data.storage.encode import CODECS, Codec
+from robomme_interference_data.storage.files import LocalFiles
+from robomme_interference_data.storage.lerobot import LeRobotFiles
 
 
 @pytest.fixture(scope="module")
@@ -98,6 +100,29 @@ def test_a_dataset_of_lerobots_is_read_as_lerobot_does(
                 pixels = (item[f"observation.images.{camera}"] * 255).round().byte()
                 np.testing.assert_array_equal(image, pixels.permute(1, 2, 0).numpy())
     assert row == len(theirs)
+
+
+@pytest.mark.slow
+def test_what_lerobots_tools_delete_and_merge_is_read(lerobot: Any, tmp_path: Path) -> None:
+    """They cut videos and put them together, and count the times in the files anew."""
+    from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
+
+    write(tmp_path / "whole", "lerobot-default")
+    whole = lerobot.LeRobotDataset("test/whole", root=tmp_path / "whole", video_backend="pyav")
+    rest = delete_episodes(whole, [0], output_dir=tmp_path / "rest", repo_id="test/rest")
+    merge_datasets([rest, whole], output_repo_id="test/merged", output_dir=tmp_path / "merged")
+    theirs = lerobot.LeRobotDataset("test/merged", root=tmp_path / "merged", video_backend="pyav")
+    ours = LeRobotFiles(LocalFiles(tmp_path / "merged"))
+    assert [ours.locate(index).length for index in range(len(ours))] == [7, 12, 7]
+    for camera in ours.video_features:
+        assert [ours.locate_video(index, camera).first for index in range(3)] == [0, 7, 19]
+        row = 0
+        for index, length in enumerate((7, 12, 7)):
+            ours.check_video(index, camera)
+            for frame in ours.iter_frames(index, camera, 0, length):
+                pixels = (theirs[row][camera] * 255).round().byte().permute(1, 2, 0)
+                np.testing.assert_array_equal(frame, pixels.numpy())
+                row += 1
 
 
 @pytest.mark.parametrize("name", ["demonstrations", "distractors"])
