@@ -87,8 +87,8 @@ def test_a_certificate_of_another_host(
 
 
 def test_a_server_without_tls(server: PolicyServer) -> None:
-    """It waits for the end of what it takes for a request."""
-    with raises(PolicyServerError):
+    """It waits for the end of what it takes for a request, or closes the connection."""
+    with pytest.raises(PolicyServerError):
         make_policy(f"websocket:wss://127.0.0.1:{server.port}", ["connect_s=0.2"]).metadata()
 
 
