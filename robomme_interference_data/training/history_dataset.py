@@ -219,9 +219,9 @@ class HistoryDataset:
     def __reduce__(self) -> tuple[Any, ...]:
         files = self.buffer_set.files
         # Another process may have another working directory.
-        local = isinstance(files, LocalFiles)
+        location = str(files.root.absolute()) if isinstance(files, LocalFiles) else files.location
         return _open_again, (
-            str(files.root.absolute()) if local else files.location,
+            location,
             self._arguments,
             self._epoch,
             self.buffer_set.header,
