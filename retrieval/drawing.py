@@ -144,9 +144,9 @@ def _draw_adjacent(axes: Any, buffer: Buffer, measured: Similarities, choice: Ch
     axes.plot(frames, values, color=_CURVE_INK, linewidth=0.9)
     label = f"threshold {threshold:.3f}"
     axes.axhline(threshold, color="black", linewidth=0.9, linestyle="--", label=label)
-    cut = values < threshold
-    label = f"{int(cut.sum())} cuts"
-    axes.plot(frames[cut], values[cut], "v", color="black", markersize=4, label=label)
+    cuts = values < threshold
+    label = f"{int(cuts.sum())} cuts"
+    axes.plot(frames[cuts], values[cuts], "v", color="black", markersize=4, label=label)
     axes.tick_params(labelbottom=False)
     evidence = "; dark line above: evidence" if buffer.evidence else ""
     _title(axes, f"cosine of each frame with the next; shaded: the true lesson{evidence}")

@@ -53,7 +53,7 @@ def typical_cosine(episodes: int, read: Callable[[int], NDArray[np.float32]]) ->
         return 0.0
     chosen = _middles(episodes, min(episodes, _SAMPLE))
     each = _SAMPLE // len(chosen)
-    parts = [found[_middles(len(found), each)] for found in map(read, chosen)]
+    parts = [rows[_middles(len(rows), each)] for rows in map(read, chosen)]
     sample = np.concatenate(parts)
     owner = np.repeat(np.arange(len(chosen)), each)
     pairs = (sample @ sample.T)[owner[:, None] < owner]

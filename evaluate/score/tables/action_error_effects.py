@@ -19,7 +19,7 @@ from .comparison import (
     ComparisonTable,
     comparison_table,
 )
-from .contrast import START, Contrast, Effect, Measure, comparable
+from .contrast import LESSON_ONLY, Contrast, Effect, Measure, comparable
 from .pairs import pair_errors
 
 _Cell = tuple[str, str]  # system and condition
@@ -94,7 +94,7 @@ def _of(outcomes: Outcomes, system: str) -> Iterator[tuple[Effect, _Cell, _Cell]
     conditions = outcomes.ran(system)
     floor = (system, NO_HISTORY) if NO_HISTORY in conditions else None
     effects = dict[tuple[_Cell, _Cell], Effect]()
-    for reference, effect in ((NO_HISTORY, Effect.HISTORY), (START, Effect.SESSIONS)):
+    for reference, effect in ((NO_HISTORY, Effect.HISTORY), (LESSON_ONLY, Effect.SESSIONS)):
         for condition in conditions if reference in conditions else ():
             if condition not in (NO_HISTORY, reference):
                 effects[(system, reference), (system, condition)] = effect

@@ -136,7 +136,7 @@ def _fitted(outcomes: Outcomes, draws: int) -> list[dict[str, Any]]:
                 "p": p,
                 "p_if_failures": p,
                 "p_if_successes": p,
-                "p_fit": fit_over_runs(p_fit, spreads_along(fall.departures), fall.departures, key),
+                "p_fit": fit_over_runs(p_fit, spreads_along(fall.residuals), fall.residuals, key),
                 "complete": all_complete(outcomes, [system], conditions),
             }
         )

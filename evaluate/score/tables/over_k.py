@@ -1,4 +1,4 @@
-"""The success of systems over k: slopes, departures from a line, and what both share."""
+"""The success of systems over k: slopes, residuals from a line, and what both share."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -15,7 +15,7 @@ from robomme_interference_data.evaluate.score.outcomes import (
     success_by_run,
 )
 from robomme_interference_data.schema.conditions import parse_condition
-from robomme_interference_data.stats.bootstrap import Floats, departure_weights, slope_weights
+from robomme_interference_data.stats.bootstrap import Floats, residual_weights, slope_weights
 from robomme_interference_data.stats.runs import RunSpread, run_spread
 from robomme_interference_data.stats.signs import sign_flips, vector_sign_flips
 
@@ -38,7 +38,7 @@ class Falls(NamedTuple):
     success: Floats  # by episode and condition, the mean over repeats, (E, K)
     slopes: Floats  # by episode, (E,)
     by_run: Floats  # the slopes by training run, (E, R)
-    departures: Floats  # from the line, by training run, along K − 2 directions, (E, R, K − 2)
+    residuals: Floats  # from the line, by training run, along K − 2 directions, (E, R, K − 2)
 
 
 def falls_of(status: Statuses, training: NDArray[np.int64], conditions: Sequence[str]) -> Falls:
@@ -48,18 +48,16 @@ def falls_of(status: Statuses, training: NDArray[np.int64], conditions: Sequence
     by_condition = success(status).T
     by_run = success_by_run(status, training).transpose(1, 2, 0)
     # The directions in which rates can depart from a line: orthogonal ones.
-    directions = np.linalg.svd(departure_weights(ks))[0][:, : len(ks) - 2]
+    directions = np.linalg.svd(residual_weights(ks))[0][:, : len(ks) - 2]
     return Falls(by_condition, by_condition @ weights, by_run @ weights, by_run @ directions)
 
 
-def spreads_along(departures: Floats) -> list[RunSpread]:
+def spreads_along(residuals: Floats) -> list[RunSpread]:
     """Return the spread over training runs along each direction of `(E, R, D)` values."""
-    return [run_spread(along) for along in np.moveaxis(departures, -1, 0)]
+    return [run_spread(along) for along in np.moveaxis(residuals, -1, 0)]
 
 
-def fit_over_runs(
-    p_fit: float, spreads: Sequence[RunSpread], departures: Floats, key: str
-) -> float:
+def fit_over_runs(p_fit: float, spreads: Sequence[RunSpread], residuals: Floats, key: str) -> float:
     """Return p of no departure from a line with training runs as a random effect.
 
     The smallest of the tests along each direction, after Bonferroni's correction, and no less than
@@ -67,7 +65,7 @@ def fit_over_runs(
     """
     if not any(spread.variance for spread in spreads):
         return p_fit
-    tests = sign_flips(departures.mean(axis=1).round(12), key)
+    tests = sign_flips(residuals.mean(axis=1).round(12), key)
     ps = [spread.p(test.at, test.p) for spread, test in zip(spreads, tests, strict=True)]
     return max(p_fit, min(1.0, len(ps) * min(ps)))
 
@@ -83,10 +81,10 @@ def fits(
     values: Sequence[Floats], conditions: Sequence[Sequence[str]], key: str, draws: int
 ) -> list[float]:
     """Return p of no departure of values, `(E, K)`, from a line over k; NaN for two conditions."""
-    departures = [
-        by_k @ departure_weights([parse_condition(name).k for name in names])
+    residuals = [
+        by_k @ residual_weights([parse_condition(name).k for name in names])
         for by_k, names in zip(values, conditions, strict=True)
     ]
-    ps = vector_sign_flips(departures, key, draws)
+    ps = vector_sign_flips(residuals, key, draws)
     # Two points are always on a line.
     return [p if len(names) > 2 else math.nan for p, names in zip(ps, conditions, strict=True)]
