@@ -18,7 +18,7 @@ from robomme_interference_data.viz.tables import Table
 
 from .comparison import ComparisonTable, comparison_table
 from .contrast import Contrast, Effect
-from .over_k import (
+from .decay import (
     Falls,
     all_complete,
     falls_of,
