@@ -20,7 +20,7 @@ from robomme_interference_data.schema.evidence import Evidence
 from robomme_interference_data.schema.manifest import Session
 from robomme_interference_data.schema.sampling import runs
 
-from .segment import Span, adjacent_cosines, closest_cosines, cosines, segments
+from .segment import FrameSpan, adjacent_cosines, closest_cosines, cosines, segments
 
 ADAPTIVE: Final = "adaptive"
 
@@ -137,11 +137,11 @@ class Similarities:
     adjacent: NDArray[np.float32]
     alike: NDArray[np.float32]
     typical: float
-    closest: Callable[[Span], NDArray[np.float32]]
+    closest: Callable[[FrameSpan], NDArray[np.float32]]
     evidence: tuple[Evidence, ...] | None = None
 
     @property
-    def lesson(self) -> tuple[Span, ...]:
+    def lesson(self) -> tuple[FrameSpan, ...]:
         """The parts of the true lesson, in the buffer's order; none where it is absent."""
         return tuple(
             (session.start, session.stop) for session in self.sessions if session.role == "lesson"
@@ -185,11 +185,11 @@ class Choice:
 
     threshold: float
     frames: NDArray[np.int64]
-    segments: tuple[Span, ...]
-    scores: Mapping[Span, float]
+    segments: tuple[FrameSpan, ...]
+    scores: Mapping[FrameSpan, float]
 
     @property
-    def spans(self) -> tuple[Span, ...]:
+    def spans(self) -> tuple[FrameSpan, ...]:
         """The runs of chosen frames, in order."""
         return runs(self.frames.tolist())
 
@@ -206,7 +206,7 @@ def choose(measured: Similarities, rule: Rule) -> Choice:
     spans = segments(measured.adjacent, threshold)
     # If all segments are short, all may be chosen (ours).
     candidates = [(a, b) for a, b in spans if b - a >= MIN_FRAMES] or list(spans)
-    scores: dict[Span, float] = {}
+    scores: dict[FrameSpan, float] = {}
     if rule.method == "top32":
         closest = np.argsort(-measured.alike, kind="stable")[:SAMPLE_FRAMES]
         return Choice(threshold, np.sort(closest), spans, scores)
@@ -229,7 +229,9 @@ def choose(measured: Similarities, rule: Rule) -> Choice:
     return Choice(threshold, np.arange(*chosen), spans, scores)
 
 
-def _joined(measured: Similarities, first: Span, candidates: Sequence[Span]) -> NDArray[np.int64]:
+def _joined(
+    measured: Similarities, first: FrameSpan, candidates: Sequence[FrameSpan]
+) -> NDArray[np.int64]:
     """Return the frames of a segment, and of all segments with a similar frame."""
     following = measured.adjacent[first[0] : first[1] - 1]
     if not len(following):  # a single frame has no adjacent cosine

@@ -26,10 +26,12 @@ from .comparison import (
 from .contrast import Contrast, Effect, Measure
 from .pairs import Pairs, compare_cells
 
-_Compared = Mapping[tuple[str, str], Pairs]
+_PairsOfSystems = Mapping[tuple[str, str], Pairs]
 
 
-def all_pairs(outcomes: Outcomes, condition: str, systems: Sequence[str], here: Flags) -> _Compared:
+def all_pairs(
+    outcomes: Outcomes, condition: str, systems: Sequence[str], here: Flags
+) -> _PairsOfSystems:
     """Compare each pair of systems over some episodes: the first one's rate minus the second's.
 
     Systems whose histories may differ are compared unpaired.
@@ -91,7 +93,7 @@ class Ranking:
         return self.rank_low == 1
 
 
-def rankings(rates: Mapping[str, float], compared: _Compared) -> dict[str, Ranking]:
+def rankings(rates: Mapping[str, float], compared: _PairsOfSystems) -> dict[str, Ranking]:
     """Return where each of several systems stands, from rates and all pairs of them."""
     bounds = rank_bounds([*rates], compared)
     best = max(rates, key=lambda name: rates[name])
@@ -110,7 +112,7 @@ def rankings(rates: Mapping[str, float], compared: _Compared) -> dict[str, Ranki
     return ranking_of
 
 
-def _behind(name: str, best: str, compared: _Compared) -> Interval:
+def _behind(name: str, best: str, compared: _PairsOfSystems) -> Interval:
     """Return the difference of a system to the best one."""
     if name == best:
         return Interval(math.nan)
