@@ -40,6 +40,7 @@ def open_questions(
     """Plan a run, and keep its workers in the block; None if there is nothing to do for them."""
     config, system = _complete_settings(config)
     questions = read_questions(buffer_set)
+    # Made once here, so that a model that is missing is one error, before workers start.
     metadata, images = _describe_model(config)
     run = _describe_run(config, system, buffer_set, questions.values(), metadata)
     plan = plan_run(config, run.facts, buffer_set)
@@ -87,6 +88,7 @@ def _describe_run(
     facts = SystemFacts(
         policy=MODELS.parse(config.model).kind if has_model else config.model,
         policy_id=short_digest({"model": model, "control": config.control}),
+        # A guess sees no frame: a memory would pair it with systems that have one.
         memory=None if config.model == "guess" else config.memory,
         retrieval=retrieval_text(config, buffer_set),
         reference=not has_model,
@@ -171,6 +173,7 @@ def _name(config: AskConfig) -> str:
             f"Set {named('system')}, such as qwen3-vl-4b, or qwen3-vl-4b-blank for a control.",
         )
     name_system(name)
+    # Its rows would be pooled with those of the system that has the name.
     if name != default and name in SYSTEMS:
         raise InvalidOptionError(
             f"{name} is the name of another system than {config.model}",
@@ -216,7 +219,7 @@ class AskFunction(RunFunction[AskConfig]):
         memory = Memory.parse(config.memory)
         kept = memory.kept(received)
         known = None if buffer.evidence is None else known_parts(buffer.evidence, kept)
-        history = HistoryFrames(buffer, kept, self.history)
+        history = HistoryFrames(buffer, kept, self.history)  # decoded only for a model
         prompted = Prompted(question, query, config.model_seed, known, history)
         right = question.letters[question.right]
         columns: dict[str, Any] = {}
@@ -240,7 +243,7 @@ class AskFunction(RunFunction[AskConfig]):
             seed=query.seed,
             difficulty=query.difficulty,
             goal=query.goal,
-            steps=0,
+            steps=0,  # nothing is executed
             **history_columns(buffer, received, memory, retrieved=self.selector is not None),
             answer=letter,
             chance=question.chance,
