@@ -35,6 +35,7 @@ class Prompted:
 
     def draw(self, letters: str) -> str:
         """Draw one of some letters, a function of episode and seed."""
+        # Not a library's generator, whose draws may change with its version.
         lot = hashlib.sha256(f"{self.query.episode_id}/{self.seed}".encode()).digest()
         return letters[int.from_bytes(lot) % len(letters)]
 
@@ -59,6 +60,7 @@ def recall(prompted: Prompted) -> str:
         for letter, choice in zip(question.letters, choices, strict=True)
         if choice in agreeing
     ]
+    # Options are some of the scene's answers: what was seen may fit none of them.
     return prompted.draw("".join(fits) or question.letters)
 
 
@@ -86,6 +88,8 @@ class ModelResponder:
             if len(prompted.history):
                 frames = prompted.history.frames(range(len(prompted.history)))
                 if self._control == "blank":
+                    # Gray frames leave prompt and number of images as they are: only the content is
+                    # gone.
                     frames = np.full_like(frames, 128)
                 views["<history>"] = [Video(frames, prompted.query.dataset.fps)]
         messages = self._prompt.fill(prompted.query.goal, prompted.question, views)
@@ -158,6 +162,7 @@ def read_letter(text: str, letters: str) -> str | None:
     """
     answer = text.rpartition("</think>")[2]
     bare = re.sub(r"[^A-Za-z]", "", answer)
+    # From the clearest form to the least clear: the first that matches decides.
     ways = [[bare] if len(bare) == 1 else [], _ANSWER.findall(answer)[-1:]]
     ways += [pattern.findall(answer) for pattern in (_FIRST, _OPTION, _ALONE)]
     named = {letter.upper() for letter in next(filter(None, ways), ())}

@@ -250,6 +250,7 @@ def check_shared(config: WorkConfig) -> None:
 
 def check_retrieval(config: RetrievalConfig) -> None:
     """Check the names of encoder and rule, without the encoder's library."""
+    # Here, because every command imports this module, for its options.
     from robomme_interference_data.retrieval.encoders import encoder_name
     from robomme_interference_data.retrieval.select import Rule
 

@@ -62,6 +62,7 @@ def _task(file: RowFile, where: str, task: Any) -> tuple[str, int, list[Any]]:
     successes = metrics.get("successes") if isinstance(metrics, Mapping) else None
     if not isinstance(group, str) or not group:
         raise _wrong(file, f"task_group of {where} is {_shown(group)}; expected text")
+    # Not `isinstance`: true is an int in Python.
     if type(number) is not int or number < 0:
         raise _wrong(file, f"task_id of {where} is {_shown(number)}; expected a number from 0")
     if not isinstance(successes, list) or not successes:

@@ -58,6 +58,7 @@ def of_other_scenes(scenes: ScenesOf) -> list[tuple[str, str]]:
     known = {
         key: value for key, value in scenes.items() if all(seed is not None for _, seed in value)
     }
+    # Systems are paired where scenes are those of most; the others are named.
     usual = {}
     for simulator in dict.fromkeys(simulator for simulator, _ in known):
         counts = Counter(value for (name, _), value in known.items() if name == simulator)

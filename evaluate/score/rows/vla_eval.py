@@ -75,6 +75,7 @@ def _rows_of_others(file: RowFile) -> FileColumns:
     }
     if seed is not None:
         columns["model_seed"] = [seed] * len(rows)
+    # Every parameter may change the scenes; the seed is a column of its own.
     settings = {**results.get("config", {}).get("params", {}), "seed": None}
     return FileColumns(
         columns,
