@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,8 +64,26 @@ def recall(prompted: Prompted) -> str:
     return prompted.draw("".join(fits) or question.letters)
 
 
-WITHOUT_MODEL = {"recall": recall, "guess": guess}
-"""The responders without a model."""
+@dataclass(frozen=True, kw_only=True)
+class Responder:
+    """Something without a model that answers questions, and what it declares of itself.
+
+    Attributes:
+        answer: Returns the letter of the chosen option.
+        reads_history: Whether its answers depend on the history, its memory and its retrieval step.
+        needs_scene: Whether it must know all answers that the scene allows.
+    """
+
+    answer: Callable[[Prompted], str]
+    reads_history: bool
+    needs_scene: bool
+
+
+WITHOUT_MODEL = {
+    "recall": Responder(answer=recall, reads_history=True, needs_scene=True),
+    "guess": Responder(answer=guess, reads_history=False, needs_scene=False),
+}
+"""The responders without a model, by name: the ideal observer, and chance."""
 
 
 class ModelResponder:
