@@ -117,14 +117,14 @@ def parse_rules(texts: Sequence[str], published: float | None) -> list[Rule]:
 
 @dataclass(frozen=True, eq=False)
 class Similarities:
-    """Cosines of the frames of a buffer, with each other and with a query frame.
+    """Cosines of the frames of a buffer, with each other and with the first live observation.
 
     Attributes:
         episode_id: The query episode.
         condition: Name of the condition.
         sessions: The true sessions in order.
         adjacent: Cosine of each frame with the next, `(T - 1,) float32`.
-        alike: Cosine of each frame with the query frame, `(T,) float32`.
+        alike: Cosine of each frame with that observation's image, `(T,) float32`.
         typical: Median cosine of two frames of different distractor units.
         closest: Returns for a span the cosine of each frame with the closest frame of the span,
             `(T,) float32`. It reads the embeddings again, which take much memory for many buffers.
@@ -156,8 +156,8 @@ def measure(
 ) -> Similarities:
     """Return the similarities of a buffer from its stored embeddings.
 
-    `query` is the embedding of the query frame, `(D,)`, of length 1; None for the stored first
-    live observation.
+    `query` is the embedding of the first live observation, `(D,)`, of length 1, such as under a
+    shift; None for the stored one.
     """
     embeddings = buffer.embeddings(encoder, camera)
     return Similarities(
@@ -195,7 +195,7 @@ class Choice:
 
 
 def choose(measured: Similarities, rule: Rule) -> Choice:
-    """Choose the part of a history that matches the query frame."""
+    """Choose the part of a history that matches the first live observation."""
     name = f"{measured.episode_id} under {measured.condition}"
     if not len(measured.alike):
         raise InvalidOptionError(
