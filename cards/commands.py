@@ -42,7 +42,7 @@ To = Annotated[
 DryRun = Annotated[
     bool, typer.Option("--dry-run", help="Only show what would be sent.", rich_help_panel=_GROUP)
 ]
-Yes = Annotated[
+PublishYes = Annotated[
     bool, typer.Option("--yes", help="Do not ask for confirmation.", rich_help_panel=_GROUP)
 ]
 
@@ -124,7 +124,7 @@ def publish(
     private: Private = False,
     to: To = None,
     dry_run: DryRun = False,
-    yes: Yes = False,
+    yes: PublishYes = False,
     as_json: AsJson = False,
 ) -> None:
     r"""Publish a buffer set on the Hub, as two repositories with cards.
@@ -200,7 +200,7 @@ def publish_results(
     private: Private = False,
     to: To = None,
     dry_run: DryRun = False,
-    yes: Yes = False,
+    yes: PublishYes = False,
     as_json: AsJson = False,
 ) -> None:
     r"""Publish the results of a run on the Hub: rows, scores, a report and a card.

@@ -114,7 +114,7 @@ def results_facts(results: Score | Path) -> Facts:
                 for table in scored.grids
             ],
             "differences": [{"table": table, "note": Raw(table.note)} for table in differences],
-            "standing": _standing(scored, run),
+            "completeness": _completeness(scored, run),
             "grid": "all recordings in the rows and in the plan of the run"
             if offline
             else _EXPECTED[scored.settings.expected],
@@ -161,7 +161,7 @@ def _whole(scored: Score) -> list[Coverage]:
     return [cell for cell in (*scored.cells, *scored.error_cells) if not cell.part]
 
 
-def _standing(scored: Score, run: RunHeader | None) -> str:
+def _completeness(scored: Score, run: RunHeader | None) -> str:
     """Return how complete the run is, in a sentence."""
     cells = _whole(scored)
     cell_text = f"{sum(cell.complete for cell in cells)} of {len(cells)} cells are complete."

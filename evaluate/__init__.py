@@ -9,6 +9,9 @@ if __name__ == "__main__":  # worker processes import the script
     config = RunConfig(policy="replay", buffer_set=Path("demo/buffers"), out=Path("runs/replay"))
     print(run_evaluation(config).counts)
 ```
+
+What only some runs use (subgoals, answers, shared policies, servers, videos, tracking) is imported
+in the function that uses it: most runs import none of it.
 """
 
 from typing import TYPE_CHECKING

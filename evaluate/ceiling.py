@@ -120,8 +120,10 @@ def chance(query: Query, known: dict[int, str]) -> float | None:
     spans, scene = query.record.evidence, recorded_scene(query)
     if spans is None or scene is None:
         return None
+    # All parts together leave one answer.
     [right] = scene.agreeing({span.part: span.text for span in spans})
     agreeing = scene.agreeing(known)
+    # 0 where a contradicting lesson rules out the right answer.
     return (right in agreeing) / len(agreeing)
 
 

@@ -121,7 +121,7 @@ def by_nearest(features: NDArray[Any], values: Sequence[Hashable]) -> int:
     right = 0
     for at, value in enumerate(values):
         distances = ((features - features[at]) ** 2).sum(axis=1, dtype=np.float64)
-        distances[at] = np.inf
+        distances[at] = np.inf  # not itself
         right += values[int(np.argmin(distances))] == value
     return right
 

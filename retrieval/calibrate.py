@@ -189,9 +189,11 @@ def _true_cosines(
         for session in buffer.sessions:
             entry = session.entry
             stored = entry.dataset, entry.episode_index, entry.start, entry.stop, entry.repeat
+            # The cuts before and after a session that is left out are left out with it.
             current = None if session.family == without else stored
             if before and current:
                 cuts[before, current] = float(buffer.adjacent[session.start - 1])
+            # A single frame has no adjacent cosine.
             if current and len(session) > 1:
                 lowest[current] = float(buffer.adjacent[session.start : session.stop - 1].min())
             before = current
@@ -203,4 +205,5 @@ def sweep_steps(first: float, last: float) -> list[float]:
     if not -1 <= first <= last <= 1:
         expected = "two cosines in ascending order, such as 0.80 0.99"
         raise InvalidOptionError.expected("sweep", (first, last), expected)
+    # A little beyond the last, which rounding would otherwise leave out.
     return np.arange(first, last + 1e-6, 0.01).round(_DIGITS).tolist()

@@ -45,26 +45,26 @@ def draw_cells(cells: Sequence[Cell], title: str, out: Path) -> None:
         )  # fmt: skip
 
 
-def draw_calibration(found: Calibration, title: str, out: Path) -> None:
+def draw_calibration(calibration: Calibration, title: str, out: Path) -> None:
     """Draw the cosines that the released rule separates, and other thresholds."""
     with _two_panels(title, out) as (left, right):
         for label, values, color in (
-            ("across true cuts", found.cuts, INK),
-            ("lowest inside a session", found.lowest, Hue.VERMILION),
+            ("across true cuts", calibration.cuts, INK),
+            ("lowest inside a session", calibration.lowest, Hue.VERMILION),
         ):
             shares = [100 * (n + 1) / len(values) for n in range(len(values))]
             name = f"{label} (n = {len(values)})"
             left.step(values, shares, where="post", color=color, linewidth=1.5, label=name)
         for label, value, color in (
-            ("fitted", found.threshold, Hue.BLUE),
-            ("in use", found.in_use, GRAY),
+            ("fitted", calibration.threshold, Hue.BLUE),
+            ("in use", calibration.in_use, GRAY),
         ):
             name = f"{label}: {value:.3f}"
             left.axvline(value, color=color, linewidth=1.1, linestyle="-.", label=name)
         left.set_xlabel("cosine of adjacent frames", size=8, color=INK)
         left.set_ylabel("share at or below, %", size=8, color=INK)
-        last = found.sweep[-1].condition
-        trials = [trial for trial in found.sweep if trial.condition == last]
+        last = calibration.sweep[-1].condition
+        trials = [trial for trial in calibration.sweep if trial.condition == last]
         lines = ((Hue.BLUE, "-"), (Hue.VERMILION, "--"))  # both are seen where they are equal
         for share, (color, line) in zip(_SHARES, lines, strict=True):
             means = [100 * getattr(trial, share) for trial in trials]

@@ -42,8 +42,8 @@ _SWEEP = (0.80, 0.99)
 _CAMERA_HELP = "Camera whose frames are compared; default: the first."
 
 EncoderName = Annotated[str, typer.Option(help=ENCODER_HELP, rich_help_panel=RETRIEVAL)]
-Camera = Annotated[str | None, typer.Option(help=_CAMERA_HELP, rich_help_panel=RETRIEVAL)]
-Shift = Annotated[str, typer.Option(help=SHIFT_HELP, rich_help_panel=RETRIEVAL)]
+CameraName = Annotated[str | None, typer.Option(help=_CAMERA_HELP, rich_help_panel=RETRIEVAL)]
+ShiftText = Annotated[str, typer.Option(help=SHIFT_HELP, rich_help_panel=RETRIEVAL)]
 
 
 @with_settings
@@ -113,8 +113,8 @@ def retrieve(
     rule: Annotated[
         str, typer.Option(help="RULE, as in retrieval-score.", rich_help_panel=RETRIEVAL)
     ] = "max",
-    camera: Camera = None,
-    shift: Shift = NO_SHIFT,
+    camera: CameraName = None,
+    shift: ShiftText = NO_SHIFT,
     out: Picture = None,
     as_json: AsJson = False,
 ) -> None:
@@ -170,8 +170,8 @@ def retrieval_score(
     ] = ["max"],  # noqa: B006 - typer copies it
     families: Families = [],  # noqa: B006
     conditions: Conditions = [],  # noqa: B006
-    camera: Camera = None,
-    shift: Shift = NO_SHIFT,
+    camera: CameraName = None,
+    shift: ShiftText = NO_SHIFT,
     out: Annotated[
         Path | None,
         typer.Option(

@@ -11,7 +11,7 @@ from robomme_interference_data.viz.figure import GRAY, INK, Page, ink_on, open_p
 from robomme_interference_data.viz.filmstrip import LESSON_COLOR, mark_evidence, session_colors
 
 from .explain import Explanation, frames_text
-from .segment import Span
+from .segment import FrameSpan
 from .select import MIN_FRAMES, Choice, Similarities
 
 # Inches.
@@ -109,7 +109,7 @@ def _draw_segments(page: Page, buffer: Buffer, choice: Choice, top: float) -> No
 
 
 def _draw_bar(
-    page: Page, buffer: Buffer, span: Span, top: float, fill: str, names: list[str]
+    page: Page, buffer: Buffer, span: FrameSpan, top: float, fill: str, names: list[str]
 ) -> None:
     """Draw a span of frames to scale, with the first name that fits."""
     scale = _SPAN / len(buffer)
@@ -144,9 +144,9 @@ def _draw_adjacent(axes: Any, buffer: Buffer, measured: Similarities, choice: Ch
     axes.plot(frames, values, color=_CURVE_INK, linewidth=0.9)
     label = f"threshold {threshold:.3f}"
     axes.axhline(threshold, color="black", linewidth=0.9, linestyle="--", label=label)
-    cut = values < threshold
-    label = f"{int(cut.sum())} cuts"
-    axes.plot(frames[cut], values[cut], "v", color="black", markersize=4, label=label)
+    cuts = values < threshold
+    label = f"{int(cuts.sum())} cuts"
+    axes.plot(frames[cuts], values[cuts], "v", color="black", markersize=4, label=label)
     axes.tick_params(labelbottom=False)
     evidence = "; dark line above: evidence" if buffer.evidence else ""
     _title(axes, f"cosine of each frame with the next; shaded: the true lesson{evidence}")

@@ -9,7 +9,7 @@ from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.viz.tables import percent
 
 from .grade import Grade, grade
-from .segment import Span
+from .segment import FrameSpan
 from .select import METHODS, Choice, Rule, Similarities
 
 
@@ -33,7 +33,7 @@ class Explanation:
     encoder: str
     camera: str
     grade: Grade
-    chosen: tuple[Span, ...]
+    chosen: tuple[FrameSpan, ...]
     score: float | None
     sessions: tuple[str, ...]
     closest: int
@@ -41,7 +41,7 @@ class Explanation:
     other: int | None
     other_cosine: float | None
     other_source: str | None
-    lesson: tuple[Span, ...]
+    lesson: tuple[FrameSpan, ...]
 
     def text(self) -> str:
         """Return the explanation in a few lines."""
@@ -74,7 +74,7 @@ class Explanation:
         return f"purity {percent(graded.purity)}, coverage {percent(graded.coverage)}, {false}"
 
 
-def frames_text(spans: Sequence[Span]) -> str:
+def frames_text(spans: Sequence[FrameSpan]) -> str:
     """Return the first and last frames of spans, of three at most."""
     parts = [f"{start} to {stop - 1}" for start, stop in spans[:3]]
     if len(spans) > len(parts):

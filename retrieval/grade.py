@@ -168,11 +168,11 @@ def _cell(rule: str, family: str, condition: str, grades: Sequence[Grade]) -> Ce
     values = np.array(means, float)  # NaN for None
     # One key for all cells: equal values have equal intervals.
     drawn = bootstrap(values, "retrieval")
-    bounds = (None if math.isnan(number) else number for one in drawn for number in one)
+    bounds = (None if math.isnan(number) else number for interval in drawn for number in interval)
     cuts = np.sum([(g.true_cuts, g.found_cuts, g.false_cuts) for g in grades], axis=0).tolist()
-    passed = min(one.value for one in drawn[:2]) >= PASS_MARK
-    found: list[Any] = [hits / count, *wilson(hits, count), *bounds, *cuts, passed]
-    return Cell(rule, family, condition, count, *found)
+    passed = min(interval.value for interval in drawn[:2]) >= PASS_MARK
+    columns: list[Any] = [hits / count, *wilson(hits, count), *bounds, *cuts, passed]
+    return Cell(rule, family, condition, count, *columns)
 
 
 # --- in words ----------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-Span = tuple[int, int]
+FrameSpan = tuple[int, int]
 """First frame, and the one after the last."""
 
 _DIGITS = 6
@@ -29,13 +29,13 @@ def adjacent_cosines(embeddings: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.round(np.einsum("td,td->t", rows[:-1], rows[1:]), _DIGITS)
 
 
-def closest_cosines(embeddings: NDArray[np.floating], span: Span) -> NDArray[np.float32]:
+def closest_cosines(embeddings: NDArray[np.floating], span: FrameSpan) -> NDArray[np.float32]:
     """Return the cosine of each embedding with the closest one of a span, `(T,) float32`."""
     rows = embeddings.astype(np.float32, copy=False)
     return np.round(rows @ rows[slice(*span)].T, _DIGITS).max(axis=1)
 
 
-def segments(adjacent: NDArray[np.float32], threshold: float) -> tuple[Span, ...]:
+def segments(adjacent: NDArray[np.float32], threshold: float) -> tuple[FrameSpan, ...]:
     """Return the segments of all frames, cut after frame t where `adjacent[t] < threshold`."""
     starts = [0, *(np.flatnonzero(adjacent < threshold) + 1).tolist()]
     stops = [*starts[1:], len(adjacent) + 1]
@@ -53,7 +53,7 @@ def typical_cosine(episodes: int, read: Callable[[int], NDArray[np.float32]]) ->
         return 0.0
     chosen = _middles(episodes, min(episodes, _SAMPLE))
     each = _SAMPLE // len(chosen)
-    parts = [found[_middles(len(found), each)] for found in map(read, chosen)]
+    parts = [rows[_middles(len(rows), each)] for rows in map(read, chosen)]
     sample = np.concatenate(parts)
     owner = np.repeat(np.arange(len(chosen)), each)
     pairs = (sample @ sample.T)[owner[:, None] < owner]

@@ -20,7 +20,7 @@ from robomme_interference_data.schema.evidence import Evidence
 from robomme_interference_data.schema.manifest import Session
 from robomme_interference_data.schema.sampling import runs
 
-from .segment import Span, adjacent_cosines, closest_cosines, cosines, segments
+from .segment import FrameSpan, adjacent_cosines, closest_cosines, cosines, segments
 
 ADAPTIVE: Final = "adaptive"
 
@@ -117,14 +117,14 @@ def parse_rules(texts: Sequence[str], published: float | None) -> list[Rule]:
 
 @dataclass(frozen=True, eq=False)
 class Similarities:
-    """Cosines of the frames of a buffer, with each other and with a query frame.
+    """Cosines of the frames of a buffer, with each other and with the first live observation.
 
     Attributes:
         episode_id: The query episode.
         condition: Name of the condition.
         sessions: The true sessions in order.
         adjacent: Cosine of each frame with the next, `(T - 1,) float32`.
-        alike: Cosine of each frame with the query frame, `(T,) float32`.
+        alike: Cosine of each frame with that observation's image, `(T,) float32`.
         typical: Median cosine of two frames of different distractor units.
         closest: Returns for a span the cosine of each frame with the closest frame of the span,
             `(T,) float32`. It reads the embeddings again, which take much memory for many buffers.
@@ -137,11 +137,11 @@ class Similarities:
     adjacent: NDArray[np.float32]
     alike: NDArray[np.float32]
     typical: float
-    closest: Callable[[Span], NDArray[np.float32]]
+    closest: Callable[[FrameSpan], NDArray[np.float32]]
     evidence: tuple[Evidence, ...] | None = None
 
     @property
-    def lesson(self) -> tuple[Span, ...]:
+    def lesson(self) -> tuple[FrameSpan, ...]:
         """The parts of the true lesson, in the buffer's order; none where it is absent."""
         return tuple(
             (session.start, session.stop) for session in self.sessions if session.role == "lesson"
@@ -156,8 +156,8 @@ def measure(
 ) -> Similarities:
     """Return the similarities of a buffer from its stored embeddings.
 
-    `query` is the embedding of the query frame, `(D,)`, of length 1; None for the stored first
-    live observation.
+    `query` is the embedding of the first live observation, `(D,)`, of length 1, such as under a
+    shift; None for the stored one.
     """
     embeddings = buffer.embeddings(encoder, camera)
     return Similarities(
@@ -185,17 +185,17 @@ class Choice:
 
     threshold: float
     frames: NDArray[np.int64]
-    segments: tuple[Span, ...]
-    scores: Mapping[Span, float]
+    segments: tuple[FrameSpan, ...]
+    scores: Mapping[FrameSpan, float]
 
     @property
-    def spans(self) -> tuple[Span, ...]:
+    def spans(self) -> tuple[FrameSpan, ...]:
         """The runs of chosen frames, in order."""
         return runs(self.frames.tolist())
 
 
 def choose(measured: Similarities, rule: Rule) -> Choice:
-    """Choose the part of a history that matches the query frame."""
+    """Choose the part of a history that matches the first live observation."""
     name = f"{measured.episode_id} under {measured.condition}"
     if not len(measured.alike):
         raise InvalidOptionError(
@@ -206,7 +206,7 @@ def choose(measured: Similarities, rule: Rule) -> Choice:
     spans = segments(measured.adjacent, threshold)
     # If all segments are short, all may be chosen (ours).
     candidates = [(a, b) for a, b in spans if b - a >= MIN_FRAMES] or list(spans)
-    scores: dict[Span, float] = {}
+    scores: dict[FrameSpan, float] = {}
     if rule.method == "top32":
         closest = np.argsort(-measured.alike, kind="stable")[:SAMPLE_FRAMES]
         return Choice(threshold, np.sort(closest), spans, scores)
@@ -229,7 +229,9 @@ def choose(measured: Similarities, rule: Rule) -> Choice:
     return Choice(threshold, np.arange(*chosen), spans, scores)
 
 
-def _joined(measured: Similarities, first: Span, candidates: Sequence[Span]) -> NDArray[np.int64]:
+def _joined(
+    measured: Similarities, first: FrameSpan, candidates: Sequence[FrameSpan]
+) -> NDArray[np.int64]:
     """Return the frames of a segment, and of all segments with a similar frame."""
     following = measured.adjacent[first[0] : first[1] - 1]
     if not len(following):  # a single frame has no adjacent cosine

@@ -1,10 +1,14 @@
-"""Report dense idioms in the package: a text or list times a truth value, and spread literals.
+"""Report dense idioms in the package, and names of types that mean two things.
 
-`"text" * flag` reads as arithmetic and is a choice: write `"text" if flag else ""`. `*("a", "b")`
-and `**{"a": 1}` inside another display only save line breaks: write one item a line.
+Dense are a text or list times a truth value, and spread literals. `"text" * flag` reads as
+arithmetic and is a choice: write `"text" if flag else ""`. `*("a", "b")` and `**{"a": 1}` inside
+another display only save line breaks: write one item a line.
+
+Two classes or type aliases of one name, private ones included, stop a reader who searches for it.
 """
 
 import ast
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,6 +33,9 @@ _NUMBERS = {
 }
 _TRUTH_CALLS = {"all", "any", "bool", "callable", "hasattr", "isinstance", "issubclass"}
 _TRUTH_METHODS = {"endswith", "exists", "startswith"}
+
+_TYPE = re.compile(r"_?[A-Z][A-Z0-9]*[a-z]\w*")
+"""The name of a class or type alias; constants have no small letters."""
 
 
 def dense_idioms(tree: ast.AST) -> Iterator[tuple[int, str]]:
@@ -81,16 +88,36 @@ def _repeats(sequence: ast.expr, factor: ast.expr) -> bool:
     return False
 
 
+def type_names(tree: ast.Module) -> Iterator[tuple[str, int]]:
+    """Yield the name of each class and type alias of a module, without `_`, and its line."""
+    for node in tree.body:
+        names: list[str] = []
+        match node:
+            case ast.ClassDef(name=name):
+                names = [name]
+            case ast.Assign(targets=[ast.Name(id=name)]) | ast.AnnAssign(target=ast.Name(id=name)):
+                names = [name]
+        for name in names:
+            if _TYPE.fullmatch(name):
+                yield name.removeprefix("_"), node.lineno
+
+
 def main() -> int:
     """Print each place; return 1 if there is one."""
-    found = False
+    problems: list[str] = []
+    first_places: dict[str, str] = {}
     for area in AREAS:
         for path in sorted((ROOT / area).rglob("*.py")):
             tree = ast.parse(path.read_text(encoding="utf-8"))
-            for line, idiom in sorted(dense_idioms(tree)):
-                print(f"{path.relative_to(ROOT)}:{line}: {idiom}")
-                found = True
-    return int(found)
+            file = path.relative_to(ROOT)
+            problems += [f"{file}:{line}: {idiom}" for line, idiom in sorted(dense_idioms(tree))]
+            for name, line in type_names(tree):
+                place = f"{file}:{line}"
+                first = first_places.setdefault(name, place)
+                if first != place:
+                    problems.append(f"{place}: the type {name} has the name of another, {first}")
+    print(*problems, sep="\n", end="\n" if problems else "")
+    return int(bool(problems))
 
 
 if __name__ == "__main__":

@@ -137,6 +137,7 @@ def read_client(code: str, published: Published) -> SubgoalPrompt:
         if name in texts:
             texts[name].append(_text(value.body if isinstance(value, ast.IfExp) else value))
     systems, questions, videos = texts.values()
+    # The code assigns each system prompt, then its questions: the first one, and a later one last.
     of_each = len(questions) // max(1, len(systems))
     first = published.number * of_each
     if not videos or not of_each or published.number >= len(systems):

@@ -40,12 +40,14 @@ def open_questions(
     """Plan a run, and keep its workers in the block; None if there is nothing to do for them."""
     config, system = _complete_settings(config)
     questions = read_questions(buffer_set)
+    # Made once here, so that a model that is missing is one error, before workers start.
     metadata, images = _describe_model(config)
     run = _describe_run(config, system, buffer_set, questions.values(), metadata)
     plan = plan_run(config, run.facts, buffer_set)
     items = plan.items()
-    if config.model == "recall":
-        _check_scenes(buffer_set, items)
+    responder = WITHOUT_MODEL.get(config.model)
+    if responder is not None and responder.needs_scene:
+        _check_scenes(config.model, buffer_set, items)
     if images is not None:
         _check_images(config, buffer_set, items, images)
     planned = PlannedRun(run, plan, items)
@@ -81,15 +83,16 @@ def _describe_run(
     metadata: dict[str, Any],
 ) -> RunContext[AskConfig]:
     """Return what is known of a run from its settings, and from what its model reports."""
-    has_model, model = config.model not in WITHOUT_MODEL, metadata
-    if has_model:
+    responder, model = WITHOUT_MODEL.get(config.model), metadata
+    if responder is None:
         model = prompted_identity(config.model, config.model_options, metadata)
     facts = SystemFacts(
-        policy=MODELS.parse(config.model).kind if has_model else config.model,
+        policy=MODELS.parse(config.model).kind if responder is None else config.model,
         policy_id=short_digest({"model": model, "control": config.control}),
-        memory=None if config.model == "guess" else config.memory,
+        # A guess sees no frame: a memory would pair it with systems that have one.
+        memory=config.memory if responder is None or responder.reads_history else None,
         retrieval=retrieval_text(config, buffer_set),
-        reference=not has_model,
+        reference=responder is not None,
     )
     identity = {
         "memory": config.memory,
@@ -108,12 +111,12 @@ def _describe_run(
     )
 
 
-def _check_scenes(buffer_set: BufferSet, items: Sequence[WorkItem]) -> None:
-    """Check that the ideal observer knows the possible answers."""
+def _check_scenes(model: str, buffer_set: BufferSet, items: Sequence[WorkItem]) -> None:
+    """Check that a responder can know all answers that the scenes allow."""
     for episode in dict.fromkeys(item.episode for item in items):
         if recorded_scene(buffer_set.query(episode)) is None:
             raise InvalidOptionError(
-                f"recall does not know the possible answers in {episode}", "Ask a model, or guess."
+                f"{model} does not know the possible answers in {episode}", "Ask a model, or guess."
             )
 
 
@@ -141,9 +144,10 @@ def _check_settings(config: AskConfig) -> None:
     """Check the settings by themselves and against each other."""
     if config.control not in CONTROLS:
         raise InvalidOptionError.one_of("control", config.control, CONTROLS)
-    if config.model in WITHOUT_MODEL:
+    responder = WITHOUT_MODEL.get(config.model)
+    if responder is not None:
         unused = ["model_options", "control", "prompt"]
-        if config.model == "guess":
+        if not responder.reads_history:
             unused += ["memory", "retrieval"]
         check_unused(config, unused, config.model, "Leave it out, or ask a model.")
     elif ":" not in config.model:
@@ -158,10 +162,10 @@ def _check_settings(config: AskConfig) -> None:
 
 def _name(config: AskConfig) -> str:
     """Return the label of the rows: a name of the table only for the responder that it names."""
-    default = None
-    if config.model in WITHOUT_MODEL:
+    default, responder = None, WITHOUT_MODEL.get(config.model)
+    if responder is not None:
         default = f"questions-{config.model}"
-        if config.model == "recall":
+        if responder.reads_history:
             default += f"-{Memory.parse(config.memory).label}"
         default = with_retrieval(default, config)
     name = config.system or default
@@ -171,6 +175,7 @@ def _name(config: AskConfig) -> str:
             f"Set {named('system')}, such as qwen3-vl-4b, or qwen3-vl-4b-blank for a control.",
         )
     name_system(name)
+    # Its rows would be pooled with those of the system that has the name.
     if name != default and name in SYSTEMS:
         raise InvalidOptionError(
             f"{name} is the name of another system than {config.model}",
@@ -216,12 +221,12 @@ class AskFunction(RunFunction[AskConfig]):
         memory = Memory.parse(config.memory)
         kept = memory.kept(received)
         known = None if buffer.evidence is None else known_parts(buffer.evidence, kept)
-        history = HistoryFrames(buffer, kept, self.history)
+        history = HistoryFrames(buffer, kept, self.history)  # decoded only for a model
         prompted = Prompted(question, query, config.model_seed, known, history)
         right = question.letters[question.right]
         columns: dict[str, Any] = {}
         if self._responder is None:
-            letter: str | None = WITHOUT_MODEL[config.model](prompted)
+            letter: str | None = WITHOUT_MODEL[config.model].answer(prompted)
         else:
             letter, prompt, reply = self._responder.answer(prompted)
             columns = model_columns(reply.calls, [reply.tokens], letter is None)
@@ -240,7 +245,7 @@ class AskFunction(RunFunction[AskConfig]):
             seed=query.seed,
             difficulty=query.difficulty,
             goal=query.goal,
-            steps=0,
+            steps=0,  # nothing is executed
             **history_columns(buffer, received, memory, retrieved=self.selector is not None),
             answer=letter,
             chance=question.chance,

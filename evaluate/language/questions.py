@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,6 +35,7 @@ class Prompted:
 
     def draw(self, letters: str) -> str:
         """Draw one of some letters, a function of episode and seed."""
+        # Not a library's generator, whose draws may change with its version.
         lot = hashlib.sha256(f"{self.query.episode_id}/{self.seed}".encode()).digest()
         return letters[int.from_bytes(lot) % len(letters)]
 
@@ -59,11 +60,30 @@ def recall(prompted: Prompted) -> str:
         for letter, choice in zip(question.letters, choices, strict=True)
         if choice in agreeing
     ]
+    # Options are some of the scene's answers: what was seen may fit none of them.
     return prompted.draw("".join(fits) or question.letters)
 
 
-WITHOUT_MODEL = {"recall": recall, "guess": guess}
-"""The responders without a model."""
+@dataclass(frozen=True, kw_only=True)
+class Responder:
+    """Something without a model that answers questions, and what it declares of itself.
+
+    Attributes:
+        answer: Returns the letter of the chosen option.
+        reads_history: Whether its answers depend on the history, its memory and its retrieval step.
+        needs_scene: Whether it must know all answers that the scene allows.
+    """
+
+    answer: Callable[[Prompted], str]
+    reads_history: bool
+    needs_scene: bool
+
+
+WITHOUT_MODEL = {
+    "recall": Responder(answer=recall, reads_history=True, needs_scene=True),
+    "guess": Responder(answer=guess, reads_history=False, needs_scene=False),
+}
+"""The responders without a model, by name: the ideal observer, and chance."""
 
 
 class ModelResponder:
@@ -86,6 +106,8 @@ class ModelResponder:
             if len(prompted.history):
                 frames = prompted.history.frames(range(len(prompted.history)))
                 if self._control == "blank":
+                    # Gray frames leave prompt and number of images as they are: only the content is
+                    # gone.
                     frames = np.full_like(frames, 128)
                 views["<history>"] = [Video(frames, prompted.query.dataset.fps)]
         messages = self._prompt.fill(prompted.query.goal, prompted.question, views)
@@ -158,6 +180,7 @@ def read_letter(text: str, letters: str) -> str | None:
     """
     answer = text.rpartition("</think>")[2]
     bare = re.sub(r"[^A-Za-z]", "", answer)
+    # From the clearest form to the least clear: the first that matches decides.
     ways = [[bare] if len(bare) == 1 else [], _ANSWER.findall(answer)[-1:]]
     ways += [pattern.findall(answer) for pattern in (_FIRST, _OPTION, _ALONE)]
     named = {letter.upper() for letter in next(filter(None, ways), ())}

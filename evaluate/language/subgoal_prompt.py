@@ -128,6 +128,7 @@ class SubgoalPrompt(Prompt):
             if not isinstance(text, str):
                 raise InvalidOptionError.expected(f"its {self.subgoal_key}", text, "text")
             keyframes = _places(fields.get(self.keyframes_key) or [], shown)
+        # Models quote or emphasize what they were asked for.
         lines = [line.strip().strip("\"'`*").strip() for line in text.strip().splitlines()]
         words = _SPECIAL.sub("", next(filter(None, lines), ""))
         if not 0 < len(words) <= _MAX_LETTERS:
@@ -178,6 +179,7 @@ def _to_grid(pixel: int, side: int, grid: int) -> int:
 
 def _json_object(text: str) -> dict[str, Any]:
     """Return the JSON object in an answer, with any text around it."""
+    # Models put it into a code block, or between sentences.
     start, stop = text.find("{"), text.rfind("}")
     try:
         value = json.loads(text[start : stop + 1])

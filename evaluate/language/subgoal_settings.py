@@ -1,6 +1,6 @@
 """What the settings of a run say of its subgoals: `oracle`, or a vision-language model.
 
-Its functions are called, through `evaluate/optional.py`, for runs with subgoals only.
+It is imported for runs with subgoals only.
 """
 
 import inspect

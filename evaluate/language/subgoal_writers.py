@@ -150,6 +150,7 @@ class ModelWriter(SubgoalWriter):
         self._model, self._frames, self._fps, self._near = model, frames, fps, near
         self.prompt, self.every_frame = prompt, prompt.watches
         self._recent, self._stride = recent, stride
+        # No more live frames than the prompt can show.
         self._seen: deque[NDArray[np.uint8]] = deque(maxlen=(recent - 1) * stride + 1)
 
     def start(self, history: HistoryFrames, info: RolloutInfo, simulator: Simulator) -> None:
@@ -159,7 +160,7 @@ class ModelWriter(SubgoalWriter):
         places = spread(0, len(history), self._frames)
         self._history: list[Part] = [history.video(places, self._fps)] if places else []
         self._goal = info.goal
-        self._subgoal = Subgoal(info.goal)
+        self._subgoal = Subgoal(info.goal)  # until the first valid answer
         self._earlier: list[Subgoal] = []
         self._kept: dict[int, NDArray[np.uint8]] = {}
         self._seen.clear()

@@ -72,6 +72,7 @@ class TransformersModel(ChatModel):
         with self._explained():
             processors: Any = transformers.AutoProcessor
             self._processor = processors.from_pretrained(self._folder)
+            # Cheap checks: the weights themselves are loaded by the first question.
             transformers.AutoConfig.from_pretrained(self._folder)
             if not any(self._folder.glob("*.safetensors")):
                 raise OSError("it has no weights, *.safetensors")

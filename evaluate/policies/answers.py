@@ -104,6 +104,7 @@ def read_answers(
     if stated not in (None, digest_questions(questions.values())):
         raise _other_questions(path, buffer_set)
     for row in rows.values():
+        # The same episode and condition have other questions in another buffer set.
         if row.revision != buffer_set.revision:
             raise _other_questions(path, buffer_set)
         for name in ("shift", "model_seed"):
@@ -144,6 +145,7 @@ def chosen_answer(row: Rollout, question: Question) -> int | None:
 
 def _read_csv(path: Path) -> dict[WorkItem, Rollout]:
     text = read_text(path, MAX_ROW_BYTES)
+    # CSV states no types, and guessed ones depend on the values.
     options = pa_csv.ConvertOptions(column_types=arrow_schema(Rollout), strings_can_be_null=True)
     try:
         table = pa_csv.read_csv(io.BytesIO(text.encode()), convert_options=options)
@@ -159,6 +161,7 @@ def _read_csv(path: Path) -> dict[WorkItem, Rollout]:
 
 
 def _check_kind(path: Path, simulators: set[Any]) -> None:
+    # Runs of rollouts have the same files.
     if simulators - {AskConfig.simulator}:
         raise RunError(f"{path} holds rollouts, not answers to questions", _ASK)
 

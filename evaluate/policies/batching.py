@@ -1,16 +1,15 @@
 """Batches: several rollouts ask one policy for actions, each through a session with its memory."""
 
 import logging
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
+from concurrent.futures import Future
+from contextlib import suppress
 from functools import cached_property
 from typing import Any
 
 from .policy import BatchPolicy, Policy
 
 logger = logging.getLogger(__name__)
-
-CallResult = tuple[Any, Exception | None]
-"""What a call returned, or the exception that it raised."""
 
 
 class Batcher[K: Hashable]:
@@ -29,7 +28,8 @@ class Batcher[K: Hashable]:
     def __init__(self, make: Callable[[], BatchPolicy], max_batch_size: int, timeout_s: float):
         self._make, self._size, self._timeout_s = make, max_batch_size, timeout_s
         self._sessions: dict[K, Policy] = {}
-        self._waiting: dict[K, tuple[Any, ...]] = {}  # arguments of `act`, oldest first
+        # Arguments of `act`, and where its answer goes; oldest first.
+        self._waiting: dict[K, tuple[tuple[Any, ...], Future[Any]]] = {}
         self._since: float | None = None  # when the next batch began to be collected
         self._warned = False
 
@@ -47,10 +47,14 @@ class Batcher[K: Hashable]:
         return self._sessions[key]
 
     def drop(self, key: K) -> None:
-        """Close a session, if it is open, and forget its request."""
-        self._waiting.pop(key, None)
-        if (session := self._sessions.pop(key, None)) is not None:
-            attempt(session.close)
+        """Close a session, if it is open, and cancel its request."""
+        _, answer = self._waiting.pop(key, ((), None))
+        if answer is not None:
+            answer.cancel()
+        session = self._sessions.pop(key, None)
+        if session is not None:
+            with suppress(Exception):  # of a session that nobody needs any more
+                session.close()
 
     def close(self) -> None:
         """Close all sessions, and the policy if it was made."""
@@ -59,13 +63,12 @@ class Batcher[K: Hashable]:
         if "_policy" in vars(self):
             self._policy.close()
 
-    def call(self, key: K, request: tuple[str, tuple[Any, ...]]) -> CallResult | None:
-        """Call a session's method, by its name and arguments; None if it is `act`, which waits."""
-        method, arguments = request
+    def call(self, key: K, method: str, arguments: tuple[Any, ...], answer: Future[Any]) -> None:
+        """Call a session's method at once and give its answer; `act` waits for a batch."""
         if method == "act":
-            self._waiting[key] = arguments
-            return None
-        return attempt(getattr(self._sessions[key], method), *arguments)
+            self._waiting[key] = arguments, answer
+        else:
+            give(answer, getattr(self._sessions[key], method), *arguments)
 
     def until_batch_s(self, now: float) -> float | None:
         """Return the seconds until `act` is to be called, 0 for now; None if no request waits."""
@@ -79,33 +82,46 @@ class Batcher[K: Hashable]:
             return 0.0
         return max(0.0, self._since + self._timeout_s - now)
 
-    def act(self) -> dict[K, CallResult]:
+    def act(self) -> None:
         """Answer the oldest requests, as many as fit into a batch.
 
         After an exception in the batch, each request is answered alone: only those at fault fail.
         """
         keys = [*self._waiting][: self._size]
         sessions = [self._sessions[key] for key in keys]
-        requests = [self._waiting.pop(key) for key in keys]
+        requests, answers = zip(*(self._waiting.pop(key) for key in keys), strict=True)
         self._since = None
         if len(keys) > 1:
-            observations, goals = zip(*requests, strict=True)
-            actions, error = attempt(self._policy.act_batch, sessions, observations, goals)
-            if error is None and len(actions) == len(keys):
-                return {key: (chunk, None) for key, chunk in zip(keys, actions, strict=True)}
-            if not self._warned:
-                problem = error or f"it returned {len(actions)} results"
-                logger.warning("A batch of %d is repeated one by one: %s", len(keys), problem)
-                self._warned = True
+            actions = self._act_batch(sessions, requests)
+            if actions is not None:
+                for answer, chunk in zip(answers, actions, strict=True):
+                    answer.set_result(chunk)
+                return
         # Alone, a request needs no batch, and one that raises fails alone.
-        pairs = zip(sessions, requests, strict=True)
-        answers = [attempt(session.act, *request) for session, request in pairs]
-        return dict(zip(keys, answers, strict=True))
+        for session, request, answer in zip(sessions, requests, answers, strict=True):
+            give(answer, session.act, *request)
+
+    def _act_batch(
+        self, sessions: Sequence[Policy], requests: Sequence[tuple[Any, ...]]
+    ) -> Sequence[Any] | None:
+        """Return the actions of each session; None, with a warning, if the batch fails."""
+        observations, goals = zip(*requests, strict=True)
+        try:
+            actions = self._policy.act_batch(sessions, observations, goals)
+            if len(actions) == len(sessions):
+                return actions
+            problem = f"it returned {len(actions)} results"
+        except Exception as error:
+            problem = str(error)
+        if not self._warned:
+            logger.warning("A batch of %d is repeated one by one: %s", len(sessions), problem)
+            self._warned = True
+        return None
 
 
-def attempt(function: Any, *arguments: Any) -> CallResult:
-    """Call a function; return its value, or the exception that it raised."""
+def give(answer: Future[Any], function: Callable[..., Any], *arguments: Any) -> None:
+    """Call a function; its value, or the exception that it raises, becomes the answer."""
     try:
-        return function(*arguments), None
+        answer.set_result(function(*arguments))
     except Exception as error:
-        return None, error
+        answer.set_exception(error)

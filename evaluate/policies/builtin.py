@@ -93,8 +93,8 @@ def thumbnails(frames: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return the mean colors of 16 × 16 tiles, `(T, 16, 16, 3) float32`."""
     count, height, width, _ = frames.shape
     tall, wide = height // THUMBNAIL, width // THUMBNAIL
-    cut = frames[:, : tall * THUMBNAIL, : wide * THUMBNAIL]
-    tiles = cut.reshape(count, THUMBNAIL, tall, THUMBNAIL, wide, 3)
+    cropped = frames[:, : tall * THUMBNAIL, : wide * THUMBNAIL]
+    tiles = cropped.reshape(count, THUMBNAIL, tall, THUMBNAIL, wide, 3)
     return tiles.mean(axis=(2, 4), dtype=np.float32)
 
 

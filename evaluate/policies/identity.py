@@ -15,7 +15,6 @@ from robomme_interference_data.errors import (
     PolicyServerError,
     named,
 )
-from robomme_interference_data.evaluate import optional
 from robomme_interference_data.evaluate.run.identity import plain
 from robomme_interference_data.evaluate.systems import System
 from robomme_interference_data.schema.conditions import NO_HISTORY
@@ -44,10 +43,14 @@ MAX_METADATA = 1 << 16
 @contextmanager
 def lock_servers(text: str, out: Path) -> Iterator[None]:
     """Keep other runs from a policy's servers in the block; `out` is this run's folder."""
+    addresses = server_addresses(text) if one_client(text) else ()
     with ExitStack() as stack:
-        for server in server_addresses(text) if one_client(text) else ():
+        if addresses:
+            from .server_lock import lock_server
+
             holder = f"the run in {out.resolve()}"
-            stack.enter_context(optional.lock_server(server.host, server.port, holder))
+            for server in addresses:
+                stack.enter_context(lock_server(server.host, server.port, holder))
         yield
 
 

@@ -9,6 +9,7 @@ import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
+from pathlib import Path
 from typing import NamedTuple
 
 from robomme_interference_data.runtime.specs import SpecKind
@@ -127,6 +128,18 @@ def _valid_command(target: str) -> bool:
 
 def _memory(target: str) -> str:
     return str(Memory.parse(target))
+
+
+def _module_hint(target: str) -> str | None:
+    """Return how to name the module of `folder/file.py:factory`; None for another target."""
+    path, _, factory = target.rpartition(":")
+    if not path.endswith(".py"):
+        return None
+    file = Path(path)
+    return (
+        f"Name the module, not its file: python:{file.stem}:{factory}, with PYTHONPATH set to the "
+        f"folder {file.parent}."
+    )
 
 
 _CONTROL = PolicyKind(
@@ -255,6 +268,7 @@ KINDS: dict[str, PolicyKind] = {
         _LEARNED,
         form="python:module:factory",
         target=r"[A-Za-z_][\w.]*:[A-Za-z_]\w*",
+        hint=_module_hint,
         role=Role.OWN,
         identified=True,
         published=True,

@@ -134,12 +134,15 @@ class ServePolicy:
 
 
 def _accept(listener: Listener, host: PolicyHost) -> None:
-    """Answer each connection in a thread, until this process ends."""
+    """Answer each connection in a thread, until the listener is closed."""
     while True:
-        # A stranger, or a worker that was killed meanwhile.
-        with suppress(AuthenticationError, EOFError, ConnectionError):
+        try:
             connection = listener.accept()
-            threading.Thread(target=_answer, args=(connection, host), daemon=True).start()
+        except (AuthenticationError, EOFError, ConnectionError):
+            continue  # a stranger, or a worker that was killed meanwhile
+        except OSError:  # closed: the run has ended
+            return
+        threading.Thread(target=_answer, args=(connection, host), daemon=True).start()
 
 
 def _answer(connection: Connection, host: PolicyHost) -> None:

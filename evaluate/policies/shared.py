@@ -23,7 +23,7 @@ from robomme_interference_data.errors import InterferenceError, PolicyError, Ser
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.simulators.episode import Observation
 
-from .batching import Batcher, CallResult, attempt
+from .batching import Batcher, give
 from .policy import Frames, Policy, RolloutInfo
 from .registry import check_members, make_policy
 
@@ -125,10 +125,7 @@ class PolicyHost:
             config.max_batch_size,
             config.batch_wait_timeout_s,
         )
-        self._calls = SimpleQueue[tuple[int, str, tuple[Any, ...], Future[CallResult]]]()
-        self._acting: dict[
-            int, Future[CallResult]
-        ] = {}  # by worker, of requests that wait for a batch
+        self._calls = SimpleQueue[tuple[int, str, tuple[Any, ...], Future[Any]]]()
 
     def start(self) -> None:
         """Make the calls in a thread, until this process ends."""
@@ -141,9 +138,15 @@ class PolicyHost:
             CancelledError: The worker opened another session meanwhile.
         """
         method, arguments = pickle.loads(request)
-        future = Future[CallResult]()
-        self._calls.put((worker, method, arguments, future))
-        return _packed(future.result())
+        answer = Future[Any]()
+        self._calls.put((worker, method, arguments, answer))
+        error = answer.exception()  # waits
+        if error is None:
+            try:
+                return pickle.dumps((answer.result(), None))
+            except Exception as problem:
+                error = problem
+        return pickle.dumps((None, _portable(error)))
 
     def run(self, ended: Callable[[], bool]) -> None:
         """Make the calls until the run has ended."""
@@ -157,38 +160,27 @@ class PolicyHost:
                         self._make(*self._calls.get(block=False))
                 if self._batcher.until_batch_s(time.monotonic()) == 0:
                     with _time_limit(self._config.rollout_timeout_s):
-                        answers = self._batcher.act()
-                    for worker, answer in answers.items():
-                        self._acting.pop(worker).set_result(answer)
+                        self._batcher.act()
 
     def _make(
-        self, worker: int, method: str, arguments: tuple[Any, ...], future: Future[CallResult]
+        self, worker: int, method: str, arguments: tuple[Any, ...], answer: Future[Any]
     ) -> None:
         with _time_limit(self._config.rollout_timeout_s):
-            answer: CallResult | None = (None, None)
-            if method in (_OPEN, _CLOSE):
-                self._drop(worker)
-                if method == _OPEN:
-                    answer = attempt(self._open, worker)
-            elif method == _PING:
-                pass
+            if method == _PING:
+                answer.set_result(None)
+            elif method == _CLOSE:
+                give(answer, self._batcher.drop, worker)
+            elif method == _OPEN:
+                give(answer, self._open, worker)
             elif worker in self._batcher:
-                answer = self._batcher.call(worker, (method, arguments))
+                self._batcher.call(worker, method, arguments, answer)
             else:
                 # An actor that died is started again under its name, without its sessions.
-                answer = None, ended(RuntimeError("it was started again"))
-        if answer is None:
-            self._acting[worker] = future
-        else:
-            future.set_result(answer)
-
-    def _drop(self, worker: int) -> None:
-        self._batcher.drop(worker)
-        if (waiting := self._acting.pop(worker, None)) is not None:
-            waiting.cancel()  # its worker is gone
+                answer.set_exception(ended(RuntimeError("it was started again")))
 
     def _open(self, worker: int) -> dict[str, Any]:
-        """Open a session; return its attributes."""
+        """Open a session in place of the worker's former one; return its attributes."""
+        self._batcher.drop(worker)
         text = f"policy {self._config.policy!r}"
         try:
             session = self._batcher.open(worker)
@@ -217,16 +209,12 @@ def _time_limit(seconds: float) -> Iterator[None]:
         faulthandler.cancel_dump_traceback_later()
 
 
-def _packed(answer: CallResult) -> bytes:
-    """Pickle an answer; an exception with its traceback, and as text if it cannot be pickled."""
-    value, error = answer
-    if error is None:
-        data, error = attempt(pickle.dumps, (value, None))
-        if error is None:
-            return cast("bytes", data)
-    trace = "".join(traceback.format_exception(error))
-    copied, _ = attempt(lambda: pickle.loads(pickle.dumps(error)))
-    if not isinstance(copied, Exception):
-        copied = RuntimeError(f"{type(error).__name__}: {error}")
-    copied.add_note(f"In the policy's process:\n{trace}")
-    return pickle.dumps((None, copied))
+def _portable(error: BaseException) -> Exception:
+    """Return an exception that can be pickled, with the traceback: itself, or its text."""
+    portable: Any = None
+    with suppress(Exception):
+        portable = pickle.loads(pickle.dumps(error))
+    if not isinstance(portable, Exception):
+        portable = RuntimeError(f"{type(error).__name__}: {error}")
+    portable.add_note(f"In the policy's process:\n{''.join(traceback.format_exception(error))}")
+    return portable

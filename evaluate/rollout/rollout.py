@@ -15,7 +15,6 @@ from robomme_interference_data.constants import ACTION_CHUNK, MAX_STEPS
 from robomme_interference_data.data.buffer import Buffer, Chunk
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import InvalidOptionError, PolicyError, RunError
-from robomme_interference_data.evaluate import optional
 from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.history import HistoryReader, history_columns
@@ -107,8 +106,10 @@ def run_rollout(
         for chunk in chunks:
             policy.add_history(chunk.frames, chunk.states, len(received))
     if writer is not None:
+        from robomme_interference_data.evaluate.language.images import HistoryFrames
+
         with clock.part("model_s"):
-            frames = optional.HistoryFrames(buffer, received, reader)
+            frames = HistoryFrames(buffer, received, reader)
             writer.start(frames, rollout_info, simulator)
     live = _Live(run.config, policy, simulator, writer, clock, clip, worker)
     try:

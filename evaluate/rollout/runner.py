@@ -15,7 +15,6 @@ from robomme_interference_data.errors import (
     PolicyServerError,
     SimulatorCrashError,
 )
-from robomme_interference_data.evaluate import optional
 from robomme_interference_data.evaluate.policies.identity import (
     check_memory_kind,
     check_metadata,
@@ -110,9 +109,11 @@ def _describe_run(
         published = system.facts
     subgoals, subgoals_identity, metadata = None, None, dict(policy_metadata)
     if config.subgoals is not None:
-        writer = optional.describe_subgoals(config)
-        subgoals = optional.subgoals_text(config, writer)
-        subgoals_identity = optional.subgoals_identity(config, writer)
+        from robomme_interference_data.evaluate.language import subgoal_settings
+
+        writer = subgoal_settings.describe_subgoals(config)
+        subgoals = subgoal_settings.subgoals_text(config, writer)
+        subgoals_identity = subgoal_settings.subgoals_identity(config, writer)
         metadata |= writer
     identity = policy_identity(config.policy, config.policy_options, policy_metadata)
     versions = simulator_versions(config.simulator)
@@ -154,13 +155,19 @@ def _read_answers(
     """Return the answers that the policy `answers` carries out; None for all other policies."""
     if not policy_kind(config.policy).acts_out_answers:
         return None
+    from robomme_interference_data.evaluate.policies.answers import read_answers
+
     path = Path(POLICIES.parse(config.policy).target)
-    return optional.read_answers(config, path, buffer_set, items)
+    return read_answers(config, path, buffer_set, items)
 
 
 def _shared_policies(config: RunConfig) -> "AbstractContextManager[Sequence[Address]]":
     """Run the processes of shared policies in the block; none if each worker has its own."""
-    return nullcontext(()) if config.policies is None else optional.policy_processes(config)
+    if config.policies is None:
+        return nullcontext(())
+    from robomme_interference_data.evaluate.policies.process import policy_processes
+
+    return policy_processes(config)
 
 
 def _start_server(run: RunContext[RunConfig], pool: WorkerPool) -> RunContext[RunConfig]:

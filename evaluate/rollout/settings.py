@@ -8,7 +8,6 @@ from typing import Any
 from robomme_interference_data.constants import ORACLE, RECORDINGS
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import InvalidOptionError, named
-from robomme_interference_data.evaluate import optional
 from robomme_interference_data.evaluate.policies.kinds import PolicyKind, Role
 from robomme_interference_data.evaluate.policies.registry import (
     POLICIES,
@@ -46,8 +45,13 @@ def complete_settings(config: RunConfig) -> tuple[RunConfig, System]:
     label = config.system or default_system(config)
     config = dataclasses.replace(config, policy=POLICIES.pin(config.policy))
     if config.subgoals is not None:
-        subgoals = optional.pin_subgoals(config.subgoals)
-        config = optional.with_published(dataclasses.replace(config, subgoals=subgoals))
+        from robomme_interference_data.evaluate.language.subgoal_settings import (
+            pin_subgoals,
+            with_published,
+        )
+
+        subgoals = pin_subgoals(config.subgoals)
+        config = with_published(dataclasses.replace(config, subgoals=subgoals))
     check_system(config, label)
     return config, name_system(label)
 

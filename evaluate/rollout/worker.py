@@ -16,7 +16,6 @@ from robomme_interference_data.errors import (
     WorkerRetiredError,
     first_line,
 )
-from robomme_interference_data.evaluate import optional
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import make_policy, starts_server
 from robomme_interference_data.evaluate.run.config import RunConfig
@@ -147,7 +146,9 @@ class RolloutFunction(RunFunction[RunConfig]):
     def _run(self, job: Job[RunConfig], worker: Worker) -> tuple[Rollout, str | None]:
         item, config, clip = job.item, self.config, None
         if config.videos:
-            clip = optional.Clip(item, job.run.system, worker.folder)
+            from .clips import Clip
+
+            clip = Clip(item, job.run.system, worker.folder)
         try:
             row = self._roll(job, worker, clip)
         except Exception as error:
@@ -251,8 +252,10 @@ class RolloutFunction(RunFunction[RunConfig]):
             return self._made_policy
         if not self._addresses:
             return make_policy(config.policy, config.policy_options, worker=worker.number)
+        from robomme_interference_data.evaluate.policies.shared import SharedPolicy
+
         address = self._addresses[worker.number % len(self._addresses)]
-        return optional.SharedPolicy.open(address, worker.number)
+        return SharedPolicy.open(address, worker.number)
 
     def _open_simulator(self, policy: Policy, worker: Worker) -> Simulator:
         config = self.config
@@ -264,7 +267,9 @@ class RolloutFunction(RunFunction[RunConfig]):
 
     def _open_writer(self) -> "SubgoalWriter | None":
         if self._writer is None and self.config.subgoals is not None:
-            self._writer = optional.make_writer(self.config)
+            from robomme_interference_data.evaluate.language.subgoal_settings import make_writer
+
+            self._writer = make_writer(self.config)
         return self._writer
 
     @property

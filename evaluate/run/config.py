@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, ClassVar
 
 from robomme_interference_data.constants import DEMONSTRATIONS, SPLITS
 from robomme_interference_data.errors import InvalidOptionError, named
-from robomme_interference_data.evaluate import optional
 from robomme_interference_data.runtime.executor import WorkersConfig
 from robomme_interference_data.schema.sampling import MEMORY_FORM
 from robomme_interference_data.schema.settings import setting
@@ -244,12 +243,11 @@ def check_shared(config: WorkConfig) -> None:
     if config.split not in SPLITS:
         raise InvalidOptionError.one_of("split", config.split, SPLITS)
     check_retrieval(config)
-    if config.track is not None:
-        optional.check_tracker(config.track)
 
 
 def check_retrieval(config: RetrievalConfig) -> None:
     """Check the names of encoder and rule, without the encoder's library."""
+    # Here, because every command imports this module, for its options.
     from robomme_interference_data.retrieval.encoders import encoder_name
     from robomme_interference_data.retrieval.select import Rule
 

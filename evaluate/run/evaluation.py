@@ -27,7 +27,6 @@ from robomme_interference_data.errors import (
     SimulatorCrashError,
     first_line,
 )
-from robomme_interference_data.evaluate import optional
 from robomme_interference_data.runtime.executor import (
     Executor,
     Outcome,
@@ -128,6 +127,10 @@ def run_evaluation(
     """
     end_if_starting()  # a worker that imports a script without the guard
     check_shared(config)  # before anything is loaded
+    if config.track is not None:
+        from .tracking import check_tracker
+
+        check_tracker(config.track)
     buffer_set, folder = load_buffer_set(config.buffer_set), Path(config.out)
     config = with_camera(config, buffer_set)
     config = dataclasses.replace(config, buffer_set=buffer_set.location)
@@ -145,8 +148,10 @@ def run_evaluation(
         run = dataclasses.replace(run, buffer_set=log.header.buffer_set)
         callbacks = [] if progress is None else [progress]
         if config.track is not None:
-            opened = partial(optional.open_tracker, config.track, folder, plain(identity))
-            callbacks.append(stack.enter_context(optional.Tracking(config.track, opened)))
+            from .tracking import Tracking, open_tracker
+
+            opened = partial(open_tracker, config.track, folder, plain(identity))
+            callbacks.append(stack.enter_context(Tracking(config.track, opened)))
         return _write_rows(run, planned.items, pool, buffer_set, log, callbacks)
 
 

@@ -9,11 +9,11 @@ from robomme_interference_data.constants import STATE
 from robomme_interference_data.data.buffer import Buffer, Chunk
 from robomme_interference_data.data.dataset import Dataset, camera_feature
 from robomme_interference_data.errors import HashMismatchError
-from robomme_interference_data.retrieval.columns import retrieval_columns
 from robomme_interference_data.schema.manifest import SessionEntry
 from robomme_interference_data.schema.other_states import OtherStates
 from robomme_interference_data.schema.sampling import (
     Memory,
+    even_sample,
     evidence_kept,
     lesson_frames,
     lesson_share,
@@ -123,7 +123,23 @@ def history_columns(
         "lesson_share": share,
     }
     if retrieved and share is not None:
-        columns |= retrieval_columns(received, share)
+        columns |= _retrieval_columns(received, share)
     if memory is not None and buffer.evidence is not None:
         columns["evidence_kept"] = evidence_kept(buffer.evidence, memory.kept(received))
     return columns
+
+
+def _retrieval_columns(chosen: Sequence[int], lesson_share: float) -> dict[str, Any]:
+    """Return `RetrievalColumns`, given the chosen frames and the lesson's share of their sample.
+
+    `chosen` are ascending indices of a buffer's frames, at least one.
+    """
+    frames = len(even_sample(len(chosen)))
+    filler = (frames - 1 - round(lesson_share * frames)) / frames
+    return {
+        "retrieval_start": chosen[0],
+        "retrieval_stop": chosen[-1] + 1,
+        "retrieval_selected_lesson_fraction": lesson_share,
+        "retrieval_selected_filler_fraction": filler,
+        "retrieval_selected_query_fraction": 1 / frames,
+    }

@@ -60,6 +60,7 @@ def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
         for item, stored in rows.items():
             row = replace(stored, buffer_set=first.buffer_set)
             earlier = merged[item][0] if item in merged else None
+            # An error gives way to a finished row; of two finished ones the first stays.
             if earlier is None or (is_done(row) and not is_done(earlier)):
                 merged[item] = row, folder
             elif is_done(row):

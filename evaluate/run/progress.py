@@ -17,8 +17,7 @@ from robomme_interference_data.viz.tables import Table
 from .plan import WorkItem
 from .row import Rollout, is_done
 
-Cell = tuple[str, str]
-"""Family and condition."""
+FamilyCondition = tuple[str, str]
 
 
 class RunProgress:
@@ -34,8 +33,8 @@ class RunProgress:
         self._timed: list[Rollout] = []  # until the estimate is printed
         self._bar = WorkProgress(unit=unit, quiet=quiet, above=self.rates)
         self._console = self._bar.console
-        self._planned: Counter[Cell] = Counter()
-        self._ended: dict[Cell, Counter[str]] = {}  # by status
+        self._planned: Counter[FamilyCondition] = Counter()
+        self._ended: dict[FamilyCondition, Counter[str]] = {}  # by status
         self._left = 0  # unfinished rollouts
 
     def __enter__(self) -> Self:
@@ -128,7 +127,7 @@ def rate_table(rows: Iterable[Rollout]) -> Table:
 
 def error_table(rows: Iterable[Rollout]) -> Table:
     """Return the mean action error of an offline run by family and condition, and broken rows."""
-    cells: dict[Cell, list[Rollout]] = {}
+    cells: dict[FamilyCondition, list[Rollout]] = {}
     for row in rows:
         cells.setdefault((row.family, row.condition), []).append(row)
     conditions, lines = _lines(cells, [])
@@ -148,15 +147,15 @@ def _action_error(rows: Sequence[Rollout]) -> str:
     return ", ".join(filter(None, (mean, f"{broken} broke" if broken else "")))
 
 
-def _count(rows: Iterable[Rollout]) -> dict[Cell, Counter[str]]:
+def _count(rows: Iterable[Rollout]) -> dict[FamilyCondition, Counter[str]]:
     """Count rows by status, in each cell."""
-    cells: dict[Cell, Counter[str]] = {}
+    cells: dict[FamilyCondition, Counter[str]] = {}
     for row in rows:
         cells.setdefault((row.family, row.condition), Counter())[row.status] += 1
     return cells
 
 
-def _table(ended: Mapping[Cell, Counter[str]]) -> Table:
+def _table(ended: Mapping[FamilyCondition, Counter[str]]) -> Table:
     conditions, lines = _lines(ended, Counter())
     return Table(
         "rates",
@@ -166,7 +165,9 @@ def _table(ended: Mapping[Cell, Counter[str]]) -> Table:
     )
 
 
-def _lines(cells: Mapping[Cell, Any], empty: Any) -> tuple[list[str], list[tuple[str, list[Any]]]]:
+def _lines(
+    cells: Mapping[FamilyCondition, Any], empty: Any
+) -> tuple[list[str], list[tuple[str, list[Any]]]]:
     """Return the conditions, and each family with its cells; of several families, also all."""
     families = sorted(
         {family for family, _ in cells}, key=lambda family: EpisodeId(family, "test", 0)

@@ -8,7 +8,6 @@ from typing import Annotated, Any
 from robomme_interference_data.constants import RUN_RECORD
 from robomme_interference_data.errors import FormatError, first_line
 from robomme_interference_data.evaluate.systems import SystemFacts
-from robomme_interference_data.retrieval.columns import RetrievalColumns
 from robomme_interference_data.schema.codec import from_dict, to_dict
 from robomme_interference_data.schema.rollouts import OutcomeColumns, RolloutKey, Status, Timing
 from robomme_interference_data.schema.sampling import HistoryColumns
@@ -16,6 +15,27 @@ from robomme_interference_data.storage.files import canonical_json, parse_json
 
 from .plan import WorkItem
 from .record import rows_that_count, whole_lines
+
+
+@dataclass(frozen=True, kw_only=True)
+class RetrievalColumns:
+    """The frames that a retrieval step chose; all None without one, or without a history."""
+
+    retrieval_start: Annotated[int | None, "First retrieved frame of the buffer."] = None
+    retrieval_stop: Annotated[
+        int | None, "Frame after the last retrieved one; frames between may be left out."
+    ] = None
+    retrieval_selected_lesson_fraction: Annotated[
+        float | None,
+        "Share of lesson frames in an even 32-frame sample of the retrieved frames and the first "
+        "live observation, as in the released CSV.",
+    ] = None
+    retrieval_selected_filler_fraction: Annotated[
+        float | None, "Share of frames of other sessions in that sample."
+    ] = None
+    retrieval_selected_query_fraction: Annotated[
+        float | None, "Share of the first live observation in that sample."
+    ] = None
 
 
 @dataclass(frozen=True, kw_only=True)

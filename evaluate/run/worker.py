@@ -63,6 +63,7 @@ class RunContext[C: RunConfig | AskConfig]:
             return self.config.training_seed
         for reported in (self.metadata, self.metadata.get("server_metadata")):
             seed = reported.get("training_seed") if isinstance(reported, Mapping) else None
+            # A bool is an int in Python, and no seed.
             if isinstance(seed, int) and not isinstance(seed, bool) and seed >= 0:
                 return seed
         return None
@@ -155,6 +156,7 @@ class RunFunction[C: RunConfig | AskConfig](ABC):
     @cached_property
     def buffer_set(self) -> BufferSet:
         """The buffer set."""
+        # Workers share the processors: each decodes in one thread.
         return load_buffer_set(self.config.buffer_set, cache=self.config.cache, threads=1)
 
     @cached_property
@@ -172,6 +174,7 @@ class RunFunction[C: RunConfig | AskConfig](ABC):
         try:
             return self.work(task, worker)
         except Exception:
+            # Simulator, server or model may be in any state now.
             self.close()
             raise
 

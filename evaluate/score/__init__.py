@@ -1,1 +1,0 @@
-"""Scores of rollouts: tables, statistics, figures and a report from rows."""

@@ -25,7 +25,7 @@ from .tables.comparison import (
     comparison_table,
     detectable,
 )
-from .tables.contrast import START, Contrast, Effect, Measure
+from .tables.contrast import LESSON_ONLY, Contrast, Effect, Measure
 from .tables.correction import correct
 
 
@@ -222,6 +222,6 @@ def _two_conditions(path: Path, rows: CheckedRows) -> tuple[str, str | None]:
     if len(held) < 2:
         return f"{path} holds {names}: give another run.", None
     # As in the tables: against k0, or else the first condition.
-    before = START if START in held[:-1] else held[0]
+    before = LESSON_ONLY if LESSON_ONLY in held[:-1] else held[0]
     command = f"compare {shlex.quote(str(path))} --conditions {before},{held[-1]}"
     return f"{path} holds {names}. Compare two of them, such as:", command

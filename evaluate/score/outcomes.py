@@ -137,6 +137,7 @@ class Outcomes:
     @cached_property
     def missing(self) -> Flags:
         """Expected episodes that do not count with every seed of the cell, `(S, C, E) bool`."""
+        # The repeats of a cell: each expected episode needs a rollout of each of them.
         seeds = (self.status >= 0).any(axis=2).sum(-1)[..., None]
         return self.expected & (~self.counted | (counting(self.status).sum(-1) < seeds))
 

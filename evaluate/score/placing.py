@@ -20,7 +20,7 @@ from .rows.values import Row
 
 def outcomes_of(rows: CheckedRows, expected: Expected) -> dict[str, Outcomes]:
     """Return the outcomes of each simulator, by its name; recordings have none."""
-    found = {}
+    by_simulator = {}
     for name in rows.names("simulator"):
         if name != RECORDINGS:
             here = [row for row in rows if row.simulator == name]
@@ -28,8 +28,8 @@ def outcomes_of(rows: CheckedRows, expected: Expected) -> dict[str, Outcomes]:
             other = name in {simulator for simulator, _ in rows.scenes}
             grid = Expected.OBSERVED if other else expected
             outcomes = _outcomes(here, name, grid, rows.without_revision)
-            found[name] = replace(outcomes, seeds_repeat=not other)
-    return found
+            by_simulator[name] = replace(outcomes, seeds_repeat=not other)
+    return by_simulator
 
 
 def offline_outcomes(rows: CheckedRows) -> Outcomes | None:

@@ -45,10 +45,10 @@ def power(margin: float, episodes: int, flips: float, alpha: float = ALPHA) -> f
     rare = 2 * fair.cumsum(axis=1) <= alpha
     against = _powers(flips / 2 / both, x) + _powers(1 - flips / 2 / both, rest)
     in_favour = _powers(flips / 2 / both, rest) + _powers(1 - flips / 2 / both, x)
-    found = (np.exp(ways + against) + np.exp(ways + in_favour)) * (rare & (2 * x < d[:, None]))
+    rejecting = (np.exp(ways + against) + np.exp(ways + in_favour)) * (rare & (2 * x < d[:, None]))
     flipping = logs[episodes] - logs[d] - logs[episodes - d]
     flipping = flipping + _powers(both, d) + _powers(1 - both, episodes - d)
-    return float(np.exp(flipping) @ found.sum(axis=1))
+    return float(np.exp(flipping) @ rejecting.sum(axis=1))
 
 
 def needed(margin: float, flips: float, alpha: float = ALPHA) -> int:

@@ -18,11 +18,11 @@ from .partners import base_of, ceilings_of
 from .placing import offline_outcomes, outcomes_of
 from .rows.reading import CheckedRows, read_rows
 from .tables import decay, effects, families, interaction, ranks
-from .tables.cells import SuccessCell, cells_of, main_table
+from .tables.cells import SuccessCell, cells_of
 from .tables.contrast import Contrast
 from .tables.correction import correct, with_primary
 from .tables.cost import cost_table
-from .tables.parts import parts_table
+from .tables.main import main_table, parts_table
 
 if TYPE_CHECKING:
     from .tables.action_error import ErrorCell

@@ -119,8 +119,8 @@ def check_scenes(rows: CheckedRows, other_rows: CheckedRows) -> None:
     """Check that the two runs have the same scenes, as far as their rows tell."""
     for simulator in dict.fromkeys(simulator for simulator, _ in rows.scenes):
         both = (*rows.scenes.items(), *other_rows.scenes.items())
-        found = {scenes for (name, _), scenes in both if name == simulator}
-        if len(found) > 1 or any(seed is None for scenes in found for _, seed in scenes):
+        decided_by = {scenes for (name, _), scenes in both if name == simulator}
+        if len(decided_by) > 1 or any(seed is None for scenes in decided_by for _, seed in scenes):
             raise InvalidOptionError(
                 f"the scenes in {simulator} are not known to be the same in both files",
                 f"If their seeds are the same, name them: {named('model_seed')}; `score` compares "

@@ -23,7 +23,7 @@ from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import row_line, row_of
 from robomme_interference_data.evaluate.run.worker import Job
 from robomme_interference_data.ids import EpisodeId, count_numbers, nth_number
-from robomme_interference_data.runtime.worker import Worker
+from robomme_interference_data.runtime.tasks import Worker
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.simulators.episode import Observation

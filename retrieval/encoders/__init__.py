@@ -103,6 +103,7 @@ def make_encoder(name: str, *, device: str | None = None, batch: int | None = No
     if batch is not None and batch < 1:
         raise InvalidOptionError.expected("batch", batch, "1 or more")
     spec = ENCODERS.parse(name)
+    # `thumbnail` has no device, and its batch is fixed: NumPy computes image by image.
     options = {"device": device, "batch": batch} if spec.kind == "siglip" else {}
     encoder: Encoder = ENCODERS.factory(spec)(**spec.arguments, **options)
     return encoder

@@ -18,9 +18,8 @@ from robomme_interference_data.errors import InvalidOptionError, named
 from robomme_interference_data.lazy import load_extra
 from robomme_interference_data.schema.settings import setting
 
-from .scheduler import Scheduler
 from .specs import bind_options
-from .worker import Outcome, TaskFunction, Worker, attempt, end_if_starting
+from .tasks import Outcome, Scheduler, TaskFunction, Worker, attempt, end_if_starting
 
 __all__ = [
     "Executor",

@@ -19,8 +19,14 @@ from robomme_interference_data.errors import InvalidOptionError, WorkerError
 from .executor import Executor, WorkerPool
 from .process_worker import ProcessWorker, has_begun, read_remains, take_files
 from .safe_path import safe_path
-from .scheduler import Scheduler
-from .worker import STARTED_AGAIN, Outcome, TaskFunction, end_if_starting, unpickle_outcome
+from .tasks import (
+    STARTED_AGAIN,
+    Outcome,
+    Scheduler,
+    TaskFunction,
+    end_if_starting,
+    unpickle_outcome,
+)
 
 CLOSE_S = 10.0
 """Seconds that idle workers have to release their resources."""

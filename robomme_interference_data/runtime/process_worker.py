@@ -14,7 +14,7 @@ from typing import Any
 from urllib.parse import quote, unquote
 
 from . import guard
-from .worker import Outcome, TaskFunction, Worker, attempt, unreadable
+from .tasks import Outcome, TaskFunction, Worker, attempt, unreadable
 
 _SCRATCH, _FILES, _LIMIT = "scratch", "files", "limit"
 

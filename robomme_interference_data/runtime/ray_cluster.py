@@ -32,9 +32,8 @@ from .executor import Executor, Resources, WorkerPool, describe
 from .process import CLOSE_S, START_S
 from .process_worker import ProcessWorker, read_remains
 from .safe_path import SAFE_PATH, safe_path
-from .scheduler import Scheduler
 from .sockets import long_path_error
-from .worker import Outcome, TaskFunction, end_if_starting, unpickle_outcome
+from .tasks import Outcome, Scheduler, TaskFunction, end_if_starting, unpickle_outcome
 
 logger = logging.getLogger(__name__)
 

@@ -11,7 +11,6 @@ import types
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
-from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
@@ -44,6 +43,7 @@ class SpecKind:
         extra: The extra that has its libraries.
         not_in_identity: Options, and keys of metadata, that change no result.
         valid: Further check of the target.
+        hint: Returns what to do about an invalid target; None if its syntax says it all.
         spelled: The one spelling of a target that has several; it may reject the target.
         on_hub: Whether the target is a folder, or a model on the Hub that `pin` pins.
     """
@@ -56,6 +56,7 @@ class SpecKind:
     extra: str = ""
     not_in_identity: tuple[str, ...] = ()
     valid: Callable[[str], bool] = lambda target: True
+    hint: Callable[[str], str | None] = lambda target: None
     spelled: Callable[[str], str] = lambda target: target
     on_hub: bool = False
 
@@ -70,18 +71,6 @@ class Spec:
 
     def __str__(self) -> str:
         return f"{self.kind}:{self.target}" if self.target else self.kind
-
-
-def _module_hint(target: str) -> str | None:
-    """Return how to name the module of `folder/file.py:factory`; None for another target."""
-    path, _, factory = target.rpartition(":")
-    if not path.endswith(".py"):
-        return None
-    file = Path(path)
-    return (
-        f"Name the module, not its file: python:{file.stem}:{factory}, with PYTHONPATH set to the "
-        f"folder {file.parent}."
-    )
 
 
 class Registry[K: SpecKind]:
@@ -110,8 +99,7 @@ class Registry[K: SpecKind]:
         match = re.fullmatch(kind.target, target, re.DOTALL)
         # The comparison is true for `policy:` with nothing behind the colon.
         if match is None or bool(colon) > bool(target) or not kind.valid(target):
-            module_hint = _module_hint(target) if name == "python" else None
-            raise InvalidOptionError.expected(self._what, text, kind.form, module_hint)
+            raise InvalidOptionError.expected(self._what, text, kind.form, kind.hint(target))
         # All that is recorded has the one spelling, so that equal runs look equal.
         if kind.spelled(target) != target:
             return self.parse(f"{name}:{kind.spelled(target)}")

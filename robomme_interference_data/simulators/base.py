@@ -18,7 +18,7 @@ from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.shifts import Shift
 from robomme_interference_data.schema.subgoal import Subgoal
 
-from .episode import ACTION_SIZE, CAMERAS, EpisodeStart, Observation, action_array, check_begun
+from .episode import ACTION_SIZE, CAMERAS, EpisodeStart, Observation, action_array, check_start
 from .scene import Scene
 
 SCRIPTED = ("oracle", "guess", "recall", "answer")
@@ -172,10 +172,10 @@ class Simulator(ABC):
         if demonstration < 0:
             expected = "True, False, or n for every n-th frame"
             raise InvalidOptionError.expected("demonstration", demonstration, expected)
-        begun = self._begin(episode, int(demonstration))
-        check_begun(begun, type(self).__name__, self.cameras, self.action_size)
+        start = self._begin(episode, int(demonstration))
+        check_start(start, type(self).__name__, self.cameras, self.action_size)
         self._episode, self._steps = episode, 0
-        return begun
+        return start
 
     def step(self, action: NDArray[np.float32], observe: bool = True) -> tuple[Observation, Status]:
         """Execute one action for the time between two observations, 0.1 s on RoboMME.

@@ -150,23 +150,23 @@ def _wrong_action(fault: str, expected: str, size: int) -> InvalidOptionError:
     )
 
 
-_BEGUN = (
+_START_HINT = (
     "Return (Demonstration, Observation, EpisodeInfo): states (T, S) and (S,) float32, actions "
     "(T, action_size) float32, images (H, W, 3) uint8 of the declared `cameras`."
 )
 
 
-def check_begun(begun: Any, name: str, cameras: Sequence[str], action_size: int) -> None:
+def check_start(start: Any, name: str, cameras: Sequence[str], action_size: int) -> None:
     """Compare the beginning of an episode with what a simulator declares.
 
     Args:
-        begun: What `_begin` returned.
+        start: What `_begin` returned.
         name: Name of the simulator's class, for errors.
         cameras: Its cameras.
         action_size: Length of its actions.
     """
     kinds = (Demonstration, Observation, EpisodeInfo)
-    parts = begun if isinstance(begun, tuple) else (begun,)
+    parts = start if isinstance(start, tuple) else (start,)
     if len(parts) != len(kinds) or not all(map(isinstance, parts, kinds)):
         returned = ", ".join(type(part).__name__ for part in parts)
         raise _wrong_start(name, [f"`_begin` returned {returned}"])
@@ -213,4 +213,4 @@ def check_drawn(
 
 
 def _wrong_start(name: str, wrong: list[str]) -> SimulatorError:
-    return SimulatorError(f"simulator {name}: {'; '.join(wrong)}", _BEGUN)
+    return SimulatorError(f"simulator {name}: {'; '.join(wrong)}", _START_HINT)

@@ -130,8 +130,8 @@ class Recordings(Simulator):
             for camera, image in images.items():
                 digests.update(camera_feature(camera), image)
             yield Observation(images, state)
-        recorded, found = record.feature_sha256, digests.current()
-        if length == record.length and not found.items() <= recorded.items():
+        recorded, decoded = record.feature_sha256, digests.current()
+        if length == record.length and not decoded.items() <= recorded.items():
             raise HashMismatchError.damaged(
                 f"the execution {record.episode_id} in {self._executions.files.describe()} differs "
                 "from its recorded SHA-256"

@@ -47,8 +47,8 @@ def slope_weights(ks: Sequence[int]) -> Floats:
     return np.asarray(centered / (centered**2).sum())
 
 
-def departure_weights(ks: Sequence[int]) -> Floats:
-    """Return the matrix that takes rates at each k to their departures from the log-linear line.
+def residual_weights(ks: Sequence[int]) -> Floats:
+    """Return the matrix that takes rates at each k to their residuals from the log-linear line.
 
     With X = (1, log₂(k + 1)): I − X (XᵀX)⁻¹ Xᵀ, `(K, K)`, of rank K − 2.
     """

@@ -33,12 +33,12 @@ def look_levels(looks: int) -> tuple[float, ...]:
     points: Floats = np.zeros(1)
     density: Floats = np.ones(1)
     levels = list[float]()
-    for look, due in enumerate(np.diff([0.0, *spent]), start=1):
+    for look, spends in enumerate(np.diff([0.0, *spent]), start=1):
         low, high = 0.0, 10 * math.sqrt(look)
         while high - low > 1e-6:
             middle = (low + high) / 2
             crossed = float(density @ _above(middle - points))
-            low, high = (middle, high) if crossed > due else (low, middle)
+            low, high = (middle, high) if crossed > spends else (low, middle)
         levels.append(2 * float(_above(high / math.sqrt(look))))
         grid = high * np.linspace(-1, 1, _POINTS).astype(np.float64)
         weight: Floats = np.full(_POINTS, grid[1] - grid[0])

@@ -167,9 +167,9 @@ def mantel_haenszel(successes: Floats, trials: Floats, level: float = LEVEL) -> 
     total = of.sum(axis=0)
     sizes = of.prod(axis=0) / total
     weights = sizes / sizes.sum()
-    rates = [float(weights @ one) for one in won / of]
-    worth = [stratified_n(*side, weights) for side in zip(won, of, strict=True)]
-    bounds = [wilson(rate * n, n, level) for rate, n in zip(rates, worth, strict=True)]
+    rates = [float(weights @ side) for side in won / of]
+    effective = [stratified_n(*side, weights) for side in zip(won, of, strict=True)]
+    bounds = [wilson(rate * n, n, level) for rate, n in zip(rates, effective, strict=True)]
     (first, second), pooled = rates, won.sum(axis=0) / total
     interval = mover_interval(second, bounds[1], first, bounds[0])
     spread = math.sqrt(float((of.prod(axis=0) / (total - 1)) @ (pooled * (1 - pooled))))

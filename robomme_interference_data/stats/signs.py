@@ -63,7 +63,7 @@ def sign_flips(values: Floats, key: str, draws: int = DRAWS) -> list[SignFlips]:
     """
     known = ~np.isnan(values)
     masks, place = np.unique(known, axis=1, return_inverse=True)
-    found: list[SignFlips] = [_NOTHING] * values.shape[1]
+    by_column: list[SignFlips] = [_NOTHING] * values.shape[1]
     few = masks.sum(axis=0) <= _most_enumerated(draws)
     # All columns with many episodes share their draws; each set of few episodes has its own flips.
     groups = [(np.ones(len(values), bool), ~few[place])]
@@ -73,8 +73,8 @@ def sign_flips(values: Floats, key: str, draws: int = DRAWS) -> list[SignFlips]:
         if len(numbers) and rows.any():
             tests = _tests(values[np.ix_(rows, numbers)], _flips(key, int(rows.sum()), draws))
             for number, test in zip(numbers.tolist(), tests, strict=True):
-                found[number] = test
-    return found
+                by_column[number] = test
+    return by_column
 
 
 def _tests(values: Floats, flips: NDArray[np.uint8]) -> list[SignFlips]:
@@ -116,7 +116,7 @@ def vector_sign_flips(parts: Sequence[Floats], key: str, draws: int = DRAWS) -> 
     Source: Chung and Fraser (1958), Randomization tests for a multivariate two-sample problem, JASA
     53, 729–735, with signs instead of permutations; Janssen (1999), as for `sign_flips`.
     """
-    found = [math.nan] * len(parts)
+    ps = [math.nan] * len(parts)
     many: dict[int, Floats] = {}
     for number, values in enumerate(parts):
         known = np.asarray(~np.isnan(values).any(axis=1))
@@ -128,15 +128,15 @@ def vector_sign_flips(parts: Sequence[Floats], key: str, draws: int = DRAWS) -> 
         kept = sizes > 1e-9 * max(1.0, float(sizes.max(initial=0.0)))
         whitened = vectors @ (axes[:, kept] / np.sqrt(sizes[kept]))
         if n <= _most_enumerated(draws):
-            [found[number]] = _vector_tests([whitened[known]], _flips(key, n, draws))
+            [ps[number]] = _vector_tests([whitened[known]], _flips(key, n, draws))
         else:
             many[number] = whitened
     if many:
         columns = [*many.values()]
         tests = _vector_tests(columns, _flips(key, len(columns[0]), draws))
         for number, p in zip(many, tests, strict=True):
-            found[number] = p
-    return found
+            ps[number] = p
+    return ps
 
 
 def _vector_tests(whitened: Sequence[Floats], flips: NDArray[np.uint8]) -> list[float]:

@@ -21,7 +21,7 @@ from robomme_interference_data.schema.shifts import Shift
 from .draws import number_from
 from .rows import StoredRows
 
-_Key = tuple[EpisodeId, str, Shift | None]
+_HistoryKey = tuple[EpisodeId, str, Shift | None]
 """Query episode, condition, and the shift of the first live view that a retrieval step matches."""
 
 
@@ -60,7 +60,7 @@ class Histories:
         redraw: tuple[int, frozenset[int] | None] | None,
     ):
         self._set, self._rows, self._retrieval = buffer_set, rows, retrieval
-        self._redraw, self._known = redraw, dict[_Key, DrawnHistory]()
+        self._redraw, self._known = redraw, dict[_HistoryKey, DrawnHistory]()
         self._drawing: tuple[int, SessionSource] | None = None  # epoch, and what its draws are of
         spans = (
             span

@@ -3,18 +3,14 @@
 import csv
 import io
 import math
-import re
-import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from html import escape
-from textwrap import fill, wrap
+from textwrap import wrap
 from typing import Any, Literal
 
 import pyarrow as pa
 
-from robomme_interference_data.errors import visible
 from robomme_interference_data.schema.codec import arrow_schema
 
 Format = Literal["text", "count", "rate", "points", "ratio", "number", "p", "flag"]
@@ -125,110 +121,14 @@ class Table:
         Cells wrap, and columns continue below, to fit the width: by default the terminal's, at
         least 80. The columns that tell rows apart are repeated there. Bold cells end in `*`.
         """
-        width = width or max(80, shutil.get_terminal_size().columns)
+        from .terminal import Column, terminal_text  # scores and pages print nothing
+
         sides, heads, rows = self._layout("left", "right")
-        # Plain text has no bold letters: a star marks them.
-        rows = [[_COUNT_OF.sub(_NO_BREAK, _BOLD.sub(r"\1*", cell)) for cell in row] for row in rows]
-        widths = self._widths(heads, rows, width)
-        parts = [_fill(self.title, width)]
-        for block in self._blocks(rows, widths, width):
-            columns = [(heads[place], sides[place], widths[place]) for place in block]
-            parts.append(_aligned(columns, [[row[place] for place in block] for row in rows]))
-        parts.append(_fill(self.note, width))
-        return visible("\n\n".join(filter(None, parts)).replace(_SOLID_SPACE, " "))
-
-    def _widths(self, heads: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> list[int]:
-        """Return the width of each column: texts give way, so that more columns fit."""
-        columns = list(zip(heads, *rows, strict=True))
-        widths = [max(map(len, cells)) for cells in columns]
-        least = [
-            min(_MAX_WORD, _longest_word(cells))
-            if format_ == "text"
-            else max(_longest_word(cells[:1]), *map(len, cells[1:]), 0)
-            for cells, format_ in zip(columns, self.columns.values(), strict=True)
+        columns = [
+            Column(head, side, wraps=format_ == "text", is_key=format_ in ("text", "count"))
+            for head, side, format_ in zip(heads, sides, self.columns.values(), strict=True)
         ]
-        while sum(widths) + _GAP * (len(widths) - 1) > width and widths != least:
-            wrappable = (place for place, size in enumerate(widths) if size > least[place])
-            # The widest gives way first, a letter at a time.
-            widths[max(wrappable, key=widths.__getitem__)] -= 1
-        return widths
-
-    def _blocks(
-        self, rows: Sequence[Sequence[str]], widths: Sequence[int], width: int
-    ) -> list[list[int]]:
-        """Return the columns of each block of the table; keys stand first in every block."""
-        keys = self._keys(rows)
-        while len(keys) > 1 and sum(widths[key] + _GAP for key in keys) + max(widths) > width:
-            keys.pop()  # they must leave room for any other column
-        blocks: list[list[int]] = [[]]
-        for place, size in enumerate(widths):
-            if place in blocks[-1]:
-                continue  # a key of a block that began before it
-            used = sum(widths[shown] + _GAP for shown in blocks[-1])
-            if used + size > width and not {*blocks[-1]} <= {*keys}:
-                blocks.append([*keys])
-            if place not in blocks[-1]:
-                blocks[-1].append(place)
-        return blocks
-
-    def _keys(self, rows: Sequence[Sequence[str]]) -> list[int]:
-        """Return the columns that tell rows apart: the first ones of names and numbers that do."""
-        keys: list[int] = []
-        apart = 1
-        for place, format_ in enumerate(self.columns.values()):
-            if format_ not in ("text", "count") or apart == len(rows):
-                break
-            found = len({tuple(row[key] for key in (*keys, place)) for row in rows})
-            if found > apart:
-                keys.append(place)
-                apart = found
-        return keys or [0]
-
-
-_BOLD = re.compile(r"\*\*(.+?)\*\*")
-
-_COUNT_OF = re.compile(r"(?<=\d) of (?=\d)")
-"""Inside a count such as `6 of 12`, which is read as one number."""
-
-_SOLID_SPACE = "\ue000"
-"""Stands for a space where no line may end: rich breaks lines at no-break spaces, too."""
-
-_NO_BREAK = f"{_SOLID_SPACE}of{_SOLID_SPACE}"
-
-_GAP = 2
-"""Spaces between columns."""
-
-# Addresses and commands are copied.
-_fill = partial(fill, break_on_hyphens=False, break_long_words=False)
-
-_MAX_WORD = 26
-"""Longer words may be broken to make a table fit."""
-
-
-def _longest_word(cells: Iterable[str]) -> int:
-    return max((len(word) for cell in cells for word in cell.split()), default=0)
-
-
-def _aligned(columns: Sequence[tuple[str, Any, int]], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table as lines, given the head, side and width of each column."""
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table as RichTable
-    from rich.text import Text
-
-    table = RichTable(
-        box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, _GAP - 1, 0, 0)
-    )
-    for head, side, width in columns:
-        table.add_column(Text(head), justify=side, width=width, overflow="fold")
-    for row in rows:
-        table.add_row(*map(Text, row))
-    # Wide enough for all columns, which have their widths already.
-    total = sum(width + _GAP for _, _, width in columns)
-    console = Console(file=io.StringIO(), width=total, color_system=None)
-    with console.capture() as capture:
-        console.print(table)
-    return "\n".join(line.rstrip() for line in capture.get().splitlines())
+        return terminal_text(self.title, columns, rows, self.note, width)
 
 
 def record_columns(record: type) -> Columns:

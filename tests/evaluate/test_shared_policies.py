@@ -5,6 +5,7 @@ import pickle
 import shutil
 import threading
 from collections.abc import Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -29,7 +30,7 @@ from robomme_interference_data.evaluate.policies.process import (
 )
 from robomme_interference_data.evaluate.policies.shared import PolicyHost, SharedPolicy
 from robomme_interference_data.evaluate.run.config import RunConfig
-from robomme_interference_data.runtime.worker import Worker
+from robomme_interference_data.runtime.tasks import Worker
 from robomme_interference_data.simulators.episode import Observation
 
 Calls = list[tuple[int, str, int]]
@@ -70,8 +71,11 @@ def batcher(policy: Any, size: int = 3, timeout_s: float = 1.0) -> Batcher[int]:
     return Batcher(lambda: policy, size, timeout_s)
 
 
-def ask(batches: Batcher[int], key: int, goal: str = "go") -> None:
-    assert batches.call(key, ("act", (0, goal))) is None
+def ask(batches: Batcher[int], key: int, goal: str = "go") -> Future[Any]:
+    answer = Future[Any]()
+    batches.call(key, "act", (0, goal), answer)
+    assert not answer.done()
+    return answer
 
 
 def test_a_batch_is_due_when_it_is_full_when_no_more_can_come_or_in_time() -> None:
@@ -80,23 +84,25 @@ def test_a_batch_is_due_when_it_is_full_when_no_more_can_come_or_in_time() -> No
     assert batches.until_batch_s(0.0) is None
     for key in range(5):
         batches.open(key)
-    ask(batches, 0, "a")
+    answers = [ask(batches, 0, "a")]
     assert batches.until_batch_s(10.0) == 1.0
-    ask(batches, 1, "b")
+    answers.append(ask(batches, 1, "b"))
     assert batches.until_batch_s(10.5) == 0.5  # from the oldest request
     assert batches.until_batch_s(11.5) == 0.0
-    ask(batches, 2, "c")
-    ask(batches, 3, "d")
+    answers += [ask(batches, 2, "c"), ask(batches, 3, "d")]
     assert batches.until_batch_s(10.75) == 0.0  # full
-    assert [*batches.act()] == [0, 1, 2]
+    batches.act()
+    assert [answer.done() for answer in answers] == [True, True, True, False]
     assert batches.until_batch_s(12.0) == 1.0  # from the end of the batch
     assert batches.until_batch_s(12.25) == 0.75
     for key in (0, 1, 2, 4):
         batches.drop(key)
     assert batches.until_batch_s(12.25) == 0.0  # no other session is open
-    assert batches.act() == {3: ([(0, "d")], None)}
-    ask(batches, 3)
+    batches.act()
+    assert answers[3].result(0) == [(0, "d")]
+    lost = ask(batches, 3)
     batches.drop(3)  # its worker is gone, and its request with it
+    assert lost.cancelled()
     assert batches.until_batch_s(12.25) is None
     assert policy.batches == [["a", "b", "c"]]  # alone, it is no batch
     batches.close()
@@ -107,12 +113,13 @@ def test_one_bad_request_fails_alone(caplog: pytest.LogCaptureFixture) -> None:
     policy = Adding()
     batches = batcher(policy)
     for _ in range(2):
+        answers = []
         for key, goal in enumerate(["go", "bad", "stay"]):
             batches.open(key)
-            ask(batches, key, goal)
-        answers = batches.act()
-        assert answers[0] == ([(0, "go")], None) and answers[2] == ([(0, "stay")], None)
-        assert answers[1][0] is None and str(answers[1][1]) == "a bad goal"
+            answers.append(ask(batches, key, goal))
+        batches.act()
+        assert answers[0].result(0) == [(0, "go")] and answers[2].result(0) == [(0, "stay")]
+        assert str(answers[1].exception(0)) == "a bad goal"
     assert caplog.text.count("repeated one by one") == 1
 
 
@@ -122,8 +129,9 @@ def test_a_batch_with_missing_results_is_repeated_one_by_one() -> None:
     batches = batcher(policy)
     for key in (0, 1):
         batches.open(key)
-        ask(batches, key)
-    assert batches.act() == {0: ([(0, "go")], None), 1: ([(0, "go")], None)}
+    answers = [ask(batches, key) for key in (0, 1)]
+    batches.act()
+    assert [answer.result(0) for answer in answers] == [[(0, "go")], [(0, "go")]]
 
 
 def test_a_policy_that_cannot_be_made_is_made_again_for_the_next_session() -> None:
@@ -158,12 +166,14 @@ def test_sessions_never_mix(
     batches = batcher(policy, size, timeout_s)
     answers: dict[int, list[Any]] = {number: [] for number in range(len(sessions))}
     lefts = [[*own] for own in sessions]
-    waiting: set[int] = set()
+    waiting: dict[int, Future[Any]] = {}
 
     def answer() -> None:
-        for key, (value, error) in batches.act().items():
-            answers[key].append(value if error is None else str(error))
-            waiting.remove(key)
+        batches.act()
+        for key in [key for key, request in waiting.items() if request.done()]:
+            request = waiting.pop(key)
+            error = request.exception()
+            answers[key].append(request.result() if error is None else str(error))
 
     for key in answers:
         batches.open(key)
@@ -172,10 +182,11 @@ def test_sessions_never_mix(
             answer()
         call = lefts[turn].pop(0)
         if call == "add":
-            assert batches.call(turn, ("add", (now,))) == (None, None)
+            added = Future[Any]()
+            batches.call(turn, "add", (now,), added)
+            assert added.result(0) is None
         else:
-            ask(batches, turn, "bad" if call == "bad" else f"goal {turn}")
-            waiting.add(turn)
+            waiting[turn] = ask(batches, turn, "bad" if call == "bad" else f"goal {turn}")
         if batches.until_batch_s(now) == 0:
             answer()
     while waiting:

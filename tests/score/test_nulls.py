@@ -34,7 +34,7 @@ from robomme_interference_data.evaluate.score.tables.pairs import pair
 from robomme_interference_data.evaluate.score.tables.ranks import (
     all_pairs,
     matrix_table,
-    standings,
+    rankings,
     system_pairs,
 )
 from robomme_interference_data.evaluate.systems import SystemFacts
@@ -122,13 +122,11 @@ def simulated(case: str) -> dict[str, float]:
         everywhere = np.ones(len(EPISODES), bool)
         won = (outcomes.status[:, 0, :, 0] == 0).mean(axis=1)  # 0 is success
         rates = dict(zip(outcomes.systems, won.tolist(), strict=True))
-        stands = standings(rates, all_pairs(outcomes, "k0", outcomes.systems, everywhere)).values()
-        counts["best"].append(any(one.p_holm < 0.05 for one in stands))
-        behind = [one.behind for one in stands if not math.isnan(one.behind.value)]
+        ranked = rankings(rates, all_pairs(outcomes, "k0", outcomes.systems, everywhere)).values()
+        counts["best"].append(any(ranking.p_holm < 0.05 for ranking in ranked))
+        behind = [ranking.behind for ranking in ranked if not math.isnan(ranking.behind.value)]
         counts["best, joint"].append(all(one.low <= 0 <= one.high for one in behind))
-        counts["ranks"].append(
-            all((one.rank_low, one.rank_high) == (1, len(stands)) for one in stands)
-        )
+        counts["ranks"].append(all((r.rank_low, r.rank_high) == (1, len(ranked)) for r in ranked))
         falls = [fall.joint for fall in primary_falls(primary(outcomes, differences), "made-up")]
         counts["headline"].append(all(fall.low <= 0 <= fall.high for fall in falls))
         counts["interaction, fit"].append(departs(rows["interaction"]))

@@ -8,7 +8,7 @@ from support import scoring as made
 from support.scoring import BASE, OWN, cells, record, records
 
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.stats.bootstrap import departure_weights, slope_weights
+from robomme_interference_data.stats.bootstrap import residual_weights, slope_weights
 
 
 def scored(tmp_path: Path, rates: dict[tuple[str, str], int], of: int = 30) -> Score:
@@ -18,7 +18,7 @@ def scored(tmp_path: Path, rates: dict[tuple[str, str], int], of: int = 30) -> S
 
 
 def test_a_line_departs_from_no_line() -> None:
-    matrix = departure_weights([0, 1, 3, 7])
+    matrix = residual_weights([0, 1, 3, 7])
     for line in ([1, 1, 1, 1], [0, 1, 2, 3]):
         assert matrix @ np.array(line, float) == pytest.approx([0, 0, 0, 0])
     # A fall from k0 to k1 alone: of (1, 0, 0, 0) the line 0.7, 0.4, 0.1, −0.2.

@@ -26,7 +26,7 @@ from robomme_interference_data.simulators.tabletop.episodes import (
 )
 from robomme_interference_data.simulators.tabletop.families import draw_episode
 from robomme_interference_data.simulators.tabletop.families.video_place import RADIUS
-from robomme_interference_data.simulators.tabletop.family import Spot
+from robomme_interference_data.simulators.tabletop.family import TablePoint
 from robomme_interference_data.simulators.tabletop.swaps import lanes
 
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "tabletop.md"
@@ -133,7 +133,7 @@ HALF = {"VideoUnmaskSwap": SIDE, "VideoRepick": CUBE / 2, "VideoPlaceOrder": RAD
 HALF["VideoPlaceButton"] = RADIUS
 
 
-def spots_of(scene: Any) -> list[Spot]:
+def spots_of(scene: Any) -> list[TablePoint]:
     return list(scene.spots if hasattr(scene, "spots") else scene.target_spots)
 
 
@@ -165,7 +165,7 @@ def test_containers_that_change_places_do_not_change_back() -> None:
     assert abs(stays - 34 / 3) < 2 * math.sqrt(34 * 2) / 3
 
 
-def apart(one: Spot, other: Spot) -> float:
+def apart(one: TablePoint, other: TablePoint) -> float:
     return max(abs(one[0] - other[0]), abs(one[1] - other[1]))
 
 

@@ -1,6 +1,7 @@
 """What the package is made of: its project file, its folders, its files."""
 
 import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -23,6 +24,25 @@ def module_files() -> dict[str, Path]:
             if path.is_file() and "__pycache__" not in relative.parts:
                 found[f"{package.replace('.', '/')}/{relative.as_posix()}"] = path
     return found
+
+
+_LIST_MODULES = """
+import sys
+from pathlib import Path
+for name, module in sys.modules.items():
+    # An empty file makes a folder a package.
+    if name.startswith("robomme_interference_data.") and Path(module.__file__).stat().st_size > 0:
+        print(name.partition(".")[2])
+"""
+
+
+def imported_modules(code: str, folder: Path) -> list[str]:
+    """Return the package's modules that code imports, run in a folder by a process of its own."""
+    command = [sys.executable, "-c", f"{code}\n{_LIST_MODULES}"]
+    done = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, timeout=400, check=True
+    )
+    return sorted(done.stdout.split())
 
 
 def committable() -> list[str]:

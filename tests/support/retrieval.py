@@ -17,7 +17,7 @@ from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.segment import (
-    Span,
+    FrameSpan,
     adjacent_cosines,
     closest_cosines,
     cosines,
@@ -94,7 +94,7 @@ def remade(buffer_set: Path, entries: Iterable[SessionEntry], **changes: Any) ->
     return Buffer(replace(manifest, **changes), opened.query(QUERIES[0]), opened.datasets)
 
 
-def sessions_of(names: Sequence[str], spans: Sequence[Span], lessons: Sequence[int]) -> Any:
+def sessions_of(names: Sequence[str], spans: Sequence[FrameSpan], lessons: Sequence[int]) -> Any:
     """Sessions of these episodes in these places; those of the given numbers are of the lesson."""
     entries = []
     for number, (name, (start, stop)) in enumerate(zip(names, spans, strict=True)):
@@ -117,7 +117,7 @@ def made(
     *,
     cuts: dict[int, float],
     high: dict[int, float],
-    spans: tuple[Span, ...] = ((0, 6), (6, 11), (11, 15)),
+    spans: tuple[FrameSpan, ...] = ((0, 6), (6, 11), (11, 15)),
     lessons: Sequence[int] = (0,),
     units: tuple[str, ...] = (),
 ) -> Similarities:
@@ -146,7 +146,7 @@ def made(
     return Similarities(query, condition, sessions, adjacent, alike, 0.0, lambda span: alike)
 
 
-def embedded(history: np.ndarray, query: np.ndarray, lesson: Span = (0, 0)) -> Similarities:
+def embedded(history: np.ndarray, query: np.ndarray, lesson: FrameSpan = (0, 0)) -> Similarities:
     """A buffer of these embeddings: a lesson and what is around it."""
     spans = list(pairwise(sorted({0, *lesson, len(history)})))
     lessons = [spans.index(lesson)] if lesson in spans else []

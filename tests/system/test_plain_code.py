@@ -1,4 +1,4 @@
-"""The check of dense idioms finds them, and nothing that reads plainly."""
+"""The check of plain code finds dense idioms and types, and nothing that reads plainly."""
 
 import ast
 import runpy
@@ -54,3 +54,10 @@ def test_a_spread_literal_is_found(code: str) -> None:
 )
 def test_plain_code_passes(code: str) -> None:
     assert idioms(code) == []
+
+
+def test_classes_and_type_aliases_are_types_and_constants_are_not() -> None:
+    code = (
+        "class _Row: pass\nCell = tuple[str, str]\nLIMIT = 3\n_HERE = 1\nrows: Any = []\nURLs = 1\n"
+    )
+    assert [*SCRIPT["type_names"](ast.parse(code))] == [("Row", 1), ("Cell", 2), ("URLs", 5)]

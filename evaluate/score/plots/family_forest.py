@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from robomme_interference_data.evaluate.score.tables.contrast import START
+from robomme_interference_data.evaluate.score.tables.contrast import LESSON_ONLY
 from robomme_interference_data.viz.figure import GRAY, INK, tidy
 
 from .curves import HEADING, SMALL, TITLE, WIDTH, draw_points, legend, mark, panel_grid
@@ -42,7 +42,7 @@ def family_falls(figure: Any, data: Data) -> bool:
     panels[0].set_yticks(range(len(families)), families, size=SMALL)
     panels[0].set_ylim(len(families) - 0.4, -0.6)
     ends = dict.fromkeys(row["condition"] for row in data.family_falls)
-    compared = f"{' or '.join(ends)} − {START}"
+    compared = f"{' or '.join(ends)} − {LESSON_ONLY}"
     figure.suptitle(f"Falls by family, {data.simulator}", size=TITLE, color=INK)
     notes = [f"{compared}, points, with 95% intervals", "upright lines: all other families"]
     if not all(data.falls[system].complete for system in systems):

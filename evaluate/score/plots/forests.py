@@ -8,7 +8,7 @@ from typing import Any
 
 from robomme_interference_data.evaluate.score.tables.contrast import (
     COMPARISONS,
-    START,
+    LESSON_ONLY,
     Contrast,
     Effect,
 )
@@ -109,10 +109,10 @@ def effects(figure: Any, data: Data) -> bool:
     groups: _Groups = {}
     for contrast in counted:
         name = ""
-        if contrast.effect is Effect.HISTORY and contrast.condition == START:
-            name = f"{START} − {short(contrast.against[1])}"
+        if contrast.effect is Effect.HISTORY and contrast.condition == LESSON_ONLY:
+            name = f"{LESSON_ONLY} − {short(contrast.against[1])}"
         elif contrast.effect is Effect.SESSIONS:
-            name = f"{contrast.condition} − {START}"
+            name = f"{contrast.condition} − {LESSON_ONLY}"
         elif contrast.effect is Effect.RETRIEVAL and parse_condition(contrast.condition).k == last:
             name = f"{contrast.condition}, with − without retrieval"
         if name:

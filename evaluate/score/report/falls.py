@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.score.tables.contrast import START, Verdict
+from robomme_interference_data.evaluate.score.tables.contrast import LESSON_ONLY, Verdict
 from robomme_interference_data.evaluate.score.tables.equivalence import EQUIVALENT
 
 from .quotes import TableRow, rows_of
@@ -83,14 +83,14 @@ def _fall(score: Score, row: TableRow) -> Fall:
     key = {"simulator": row["simulator"], "system": row["system"]}
     start, end = (
         rows_of(score.tables["main"], **key, condition=name)[0]
-        for name in (START, row["condition"])
+        for name in (LESSON_ONLY, row["condition"])
     )
     equivalence = rows_of(
         score.tables.get("equivalence"),
         **key,
         condition=row["condition"],
         against_system=row["system"],
-        against_condition=START,
+        against_condition=LESSON_ONLY,
         against_rows="rows",
     )
     return Fall(row, equivalence[0] if equivalence else None, start, end)

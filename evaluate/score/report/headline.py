@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.score.tables.contrast import START, Scope
+from robomme_interference_data.evaluate.score.tables.contrast import LESSON_ONLY, Scope
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.schema.conditions import in_order
 
@@ -74,7 +74,7 @@ def _fall_rates(score: Score, falls: Sequence[Fall]) -> Sentence:
             count=number_of([fall.row for fall in falls]),
             start=_range([fall.start for fall in falls]),
             of=of,
-            k0=START,
+            k0=LESSON_ONLY,
             end=_range([fall.end for fall in falls]),
             last=" or ".join(lasts),
         )
@@ -90,7 +90,7 @@ def _fall_rates(score: Score, falls: Sequence[Fall]) -> Sentence:
                     name=display_name(fall.system),
                     start=_rate(fall.start),
                     of=of,
-                    k0=START,
+                    k0=LESSON_ONLY,
                     end=_rate(fall.end),
                     last=fall.condition,
                 )
@@ -141,7 +141,7 @@ def _episodes(score: Score, row: TableRow) -> Sentence:
 def _rates(score: Score, cells: Sequence[TableRow]) -> Sentence:
     """State the rates of the first and the last condition that any system ran, by system."""
     conditions = [each.name for each in in_order({str(row["condition"]) for row in cells})]
-    first = START if START in conditions else conditions[0]
+    first = LESSON_ONLY if LESSON_ONLY in conditions else conditions[0]
     shown = dict.fromkeys([first, conditions[-1]])
     parts = []
     for condition in shown:

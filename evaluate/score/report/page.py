@@ -13,7 +13,7 @@ from robomme_interference_data.evaluate.score.config import Expected
 from robomme_interference_data.evaluate.score.plots.data import FEW
 from robomme_interference_data.evaluate.score.plots.figures import FIGURES
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.score.tables.contrast import START
+from robomme_interference_data.evaluate.score.tables.contrast import LESSON_ONLY
 from robomme_interference_data.evaluate.score.tables.correction import NULL_FINDINGS
 from robomme_interference_data.evaluate.systems import SYSTEMS
 from robomme_interference_data.schema.codec import to_dict
@@ -92,7 +92,7 @@ def _leader(score: Score) -> str:
     best = [
         cell.system
         for cell in score.cells
-        if cell.rank == 1 and not cell.part and cell.condition == START
+        if cell.rank == 1 and not cell.part and cell.condition == LESSON_ONLY
     ]
     most = max((len(outcomes.systems) for outcomes in score.outcomes.values()), default=0)
     return best[0] if best and most > FEW else ""

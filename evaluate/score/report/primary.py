@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from robomme_interference_data.evaluate.score.outcomes import Outcomes
 from robomme_interference_data.evaluate.score.scoring import Score, repeat_noise
-from robomme_interference_data.evaluate.score.tables.contrast import START, Scope
+from robomme_interference_data.evaluate.score.tables.contrast import LESSON_ONLY, Scope
 from robomme_interference_data.evaluate.score.tables.grids import family_grid
 from robomme_interference_data.viz.tables import Table
 
@@ -86,16 +86,16 @@ class Screen:
 
 def screens(score: Score) -> list[Screen]:
     """Return the first screen of each simulator, and of recordings."""
-    found = []
+    screens = []
     for grid, outcomes in zip(score.grids, score.all_outcomes, strict=True):
         simulator = outcomes.simulator
         sentences = headline(score, simulator)
         if outcomes is score.recordings:
-            found.append(Screen(simulator, sentences, [grid], {}))
+            screens.append(Screen(simulator, sentences, [grid], {}))
         else:
             tables = [grid, *_tables(score, simulator)]
-            found.append(Screen(simulator, sentences, tables, _checks(score, outcomes)))
-    return found
+            screens.append(Screen(simulator, sentences, tables, _checks(score, outcomes)))
+    return screens
 
 
 def _tables(score: Score, simulator: str) -> list[Table]:
@@ -106,7 +106,7 @@ def _tables(score: Score, simulator: str) -> list[Table]:
         _view(
             rows_of(tables["effects"], **primary),
             _FALLS,
-            f"Falls from {START}, paired over episodes",
+            f"Falls from {LESSON_ONLY}, paired over episodes",
             "difference: rate − against rate, over the n episodes that count under both. joint low "
             "to joint high and p holm: corrected for all falls and differences of falls here.",
         ),

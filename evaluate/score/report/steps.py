@@ -6,7 +6,7 @@ from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.config import Expected
 from robomme_interference_data.evaluate.score.outcomes import TEST_EPISODES
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.score.tables.contrast import START, Scope
+from robomme_interference_data.evaluate.score.tables.contrast import LESSON_ONLY, Scope
 
 from .falls import Fall, Finding
 from .quotes import Sentence, TableRow, rows_of
@@ -40,9 +40,9 @@ def _to_compare(ran: Sequence[TableRow], ranked: Sequence[TableRow], expected: E
         return AGAIN
     if not ranked:
         return "run a system that is no reference"
-    if START not in {row["condition"] for row in ranked}:
-        return f"run {START}, from which falls are measured"
-    return f"run k7, to compare it with {START}"
+    if LESSON_ONLY not in {row["condition"] for row in ranked}:
+        return f"run {LESSON_ONLY}, from which falls are measured"
+    return f"run k7, to compare it with {LESSON_ONLY}"
 
 
 def _to_conclude(falls: Sequence[Fall]) -> str:

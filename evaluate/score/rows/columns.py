@@ -3,9 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
-
-import pyarrow as pa
 
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.schema.rollouts import Status, success_of
@@ -72,12 +69,3 @@ def _with_status(contents: FileColumns) -> FileColumns:
         lines=[contents.lines[at] for at in kept],
         malformed={**contents.malformed, **malformed},
     )
-
-
-def plain_columns(path: Path, table: pa.Table) -> dict[str, list[Any]]:
-    """Return the values of a table without nested columns."""
-    for column in table.columns:
-        kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
-        if pa.types.is_nested(kind):
-            raise FormatError.damaged(path, f"a column holds {kind}; expected text and numbers")
-    return {name: table[name].to_pylist() for name in table.column_names}

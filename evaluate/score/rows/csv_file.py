@@ -11,7 +11,7 @@ from robomme_interference_data.errors import FormatError, counted
 from robomme_interference_data.storage.files import read_text
 
 from .columns import select, with_outcomes
-from .row_format import FileColumns, RowFile, RowFormat, check_count
+from .row_format import FileColumns, RowFile, check_count
 
 _CANONICAL = "canonical_rollouts.csv"
 _CANONICAL_COLUMNS = ("system", "family", "condition", "episode", "difficulty", "success")
@@ -21,7 +21,8 @@ _RELEASED_SYSTEMS = {"retrieval_rollouts.csv": "retrieval-framesamp-modul"}
 """File of released rows without a column for the system, to the system in `SYSTEMS`."""
 
 
-def _read(file: RowFile, names: Sequence[str]) -> FileColumns:
+def read(file: RowFile, names: Sequence[str]) -> FileColumns:
+    """Read those of the named columns that the file has."""
     path = file.path
     if path.name == _CANONICAL:
         names = [name for name in names if name in _CANONICAL_COLUMNS]
@@ -78,10 +79,3 @@ def system_of(path: Path) -> str | None:
         return _RELEASED_SYSTEMS[path.name]
     match = re.fullmatch(r"(.+)-[^-]+_rollouts\.csv", path.name)
     return match[1] if match else None
-
-
-CSV = RowFormat(
-    "rows of a run, or released rows of the paper, as .csv",
-    lambda file: file.suffix == ".csv",
-    _read,
-)

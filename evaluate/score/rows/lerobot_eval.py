@@ -7,10 +7,10 @@ from robomme_interference_data.errors import FormatError
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.rollouts import Status
 
-from .row_format import FileColumns, RowFile, RowFormat, Scenes, check_count, plain_name
+from .row_format import FileColumns, RowFile, Scenes, check_count, plain_name
 
 
-def _read(file: RowFile, names: Sequence[str]) -> FileColumns:
+def read(file: RowFile, names: Sequence[str]) -> FileColumns:
     """Read the episodes of all tasks.
 
     The file has the successes of each task in the order of its episodes. It names neither policy
@@ -62,6 +62,7 @@ def _task(file: RowFile, where: str, task: Any) -> tuple[str, int, list[Any]]:
     successes = metrics.get("successes") if isinstance(metrics, Mapping) else None
     if not isinstance(group, str) or not group:
         raise _wrong(file, f"task_group of {where} is {_shown(group)}; expected text")
+    # Not `isinstance`: true is an int in Python.
     if type(number) is not int or number < 0:
         raise _wrong(file, f"task_id of {where} is {_shown(number)}; expected a number from 0")
     if not isinstance(successes, list) or not successes:
@@ -81,12 +82,3 @@ def _wrong(file: RowFile, problem: str) -> FormatError:
         f"{file.path}: {problem}",
         "Expected eval_info.json as lerobot-eval of lerobot 0.6 writes it.",
     )
-
-
-def _matches(file: RowFile) -> bool:
-    # By its name too: of other versions of lerobot, the error names the key that is missing.
-    named_so = file.path.name == "eval_info.json"
-    return (named_so or "per_task" in file.json) and "tasks" not in file.json
-
-
-LEROBOT_EVAL = RowFormat("eval_info.json of lerobot-eval", _matches, _read)

@@ -2,14 +2,14 @@
 
 from collections.abc import Sequence
 
-from .columns import plain_columns, select, with_outcomes
-from .row_format import FileColumns, RowFile, RowFormat, check_count
+from robomme_interference_data.storage.parquet import open_parquet, read_table
+
+from .columns import select, with_outcomes
+from .row_format import FileColumns, RowFile, check_count, plain_columns
 
 
-def _read(file: RowFile, names: Sequence[str]) -> FileColumns:
-    # Only for these files: a run is read from its record.
-    from robomme_interference_data.storage.parquet import open_parquet, read_table
-
+def read(file: RowFile, names: Sequence[str]) -> FileColumns:
+    """Read those of the named columns that the file has."""
     path = file.path
     with open_parquet(path) as opened:
         check_count(opened.metadata.num_rows)
@@ -21,6 +21,3 @@ def _read(file: RowFile, names: Sequence[str]) -> FileColumns:
             {name: columns[column] for name, column in selected.items()}, range(1, len(table) + 1)
         )
     )
-
-
-PARQUET = RowFormat("rows of a run as .parquet", lambda file: file.suffix == ".parquet", _read)

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 from robomme_interference_data.errors import FormatError, InvalidOptionError, counted, named
 
 from .checks import Checks
-from .files import find_sources, read_file
-from .scenes import ScenesOf, check_apart, notes_on, of_other_scenes, scenes_of
-from .stated import with_stated
+from .files import find_sources, read_file, with_stated
+from .row_format import ReadFiles
 from .values import Row
 
 if TYPE_CHECKING:
     from robomme_interference_data.evaluate.run.record import RunHeader
+
+    from .scenes import ScenesOf
 
 _SHOWN = 10  # bad rows that are listed; the others are counted
 
@@ -39,7 +40,7 @@ class CheckedRows:
     sources: "Mapping[Path, RunHeader | None]"
     revisions: Mapping[str, str] = field(default_factory=dict)
     without_revision: frozenset[tuple[str, str]] = frozenset()
-    scenes: ScenesOf = field(default_factory=dict)
+    scenes: "ScenesOf" = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     bad_reasons: tuple[str, ...] = ()
     bad_count: int = 0
@@ -81,7 +82,7 @@ def read_rows(
     sources = find_sources(paths)
     files = {path: read_file(path, Row._fields) for path in sources}
     files = with_stated(files, systems, model_seeds, system_option)
-    check_apart(files)
+    scenes, same_scenes, notes = _scenes(files)
     checks = Checks()
     for path, run in sources.items():
         checks.add(path, files[path], None if run is None else path.parent)
@@ -103,18 +104,32 @@ def read_rows(
             message += bad_reasons[0]
         raise FormatError(message, "Give at least one valid row.")
     revisions, without_revision = _revisions(rows)
-    scenes = scenes_of(files)
-    same_scenes = scenes.keys() - of_other_scenes(scenes)
     return CheckedRows(
         rows,
         sources,
         revisions,
         without_revision - same_scenes,
         scenes,
-        tuple(notes_on(files, scenes)),
+        notes,
         tuple(bad_reasons[:_SHOWN]),
         len(bad_reasons),
     )
+
+
+def _scenes(files: ReadFiles) -> "tuple[ScenesOf, frozenset[tuple[str, str]], tuple[str, ...]]":
+    """Check evaluations by other programs against one another.
+
+    Returns what decides their scenes, simulator and system of those whose scenes are known to be
+    the same, and what readers must know of them.
+    """
+    if all(contents.scenes is None for contents in files.values()):
+        return {}, frozenset(), ()
+    from .scenes import check_apart, notes_on, of_other_scenes, scenes_of  # only for these files
+
+    check_apart(files)
+    scenes = scenes_of(files)
+    same_scenes = scenes.keys() - of_other_scenes(scenes)
+    return scenes, frozenset(same_scenes), tuple(notes_on(files, scenes))
 
 
 def _revisions(rows: Iterable[Row]) -> tuple[dict[str, str], frozenset[tuple[str, str]]]:

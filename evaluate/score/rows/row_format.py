@@ -4,10 +4,14 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+
 from robomme_interference_data.constants import MAX_ROW_BYTES
+from robomme_interference_data.errors import FormatError
 from robomme_interference_data.storage.files import parse_json, read_bytes
 
 _MAX_ROWS = 1 << 20
@@ -78,13 +82,20 @@ class RowFormat:
 
     Attributes:
         description: The format in a few words, for the error that lists all formats.
+        module: The file of this folder whose function `read` reads it, imported when a file has the
+            format.
         matches: Whether a file has this format. No file has two.
-        read: Reads those of the named columns that a file has.
     """
 
     description: str
+    module: str
     matches: Callable[[RowFile], bool]
-    read: Callable[[RowFile, Sequence[str]], FileColumns]
+
+    def read(self, file: RowFile, names: Sequence[str]) -> FileColumns:
+        """Read those of the named columns that a file has."""
+        read: Callable[[RowFile, Sequence[str]], FileColumns]
+        read = import_module(f"{__package__}.{self.module}").read
+        return read(file, names)
 
 
 def check_count(rows: int) -> None:
@@ -97,3 +108,12 @@ def plain_name(text: str) -> str:
     """Return a name by another program as name of a simulator or family: `pick up` as `pick_up`."""
     name = re.sub(r"[^A-Za-z0-9_.-]+", "_", text)
     return name if name[:1].isalpha() else f"task_{name}"
+
+
+def plain_columns(path: Path, table: pa.Table) -> dict[str, list[Any]]:
+    """Return the values of a table without nested columns."""
+    for column in table.columns:
+        kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
+        if pa.types.is_nested(kind):
+            raise FormatError.damaged(path, f"a column holds {kind}; expected text and numbers")
+    return {name: table[name].to_pylist() for name in table.column_names}

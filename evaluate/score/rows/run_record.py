@@ -7,20 +7,18 @@ import pyarrow as pa
 import pyarrow.json as pa_json
 
 from robomme_interference_data.errors import FormatError
+from robomme_interference_data.evaluate.run.record import rows_that_count, whole_lines
 from robomme_interference_data.schema.rollouts import KEY_COLUMNS
 
-from .columns import plain_columns
-from .row_format import FileColumns, RowFile, RowFormat, check_count
+from .row_format import FileColumns, RowFile, check_count, plain_columns
 from .values import record_schema
 
 
-def _read(file: RowFile, names: Sequence[str]) -> FileColumns:
+def read(file: RowFile, names: Sequence[str]) -> FileColumns:
     """Read every finished row, and of other rollouts the last row.
 
     The types are those of a rollout's row; a row object for each line would take ten times as long.
     """
-    from robomme_interference_data.evaluate.run.record import rows_that_count, whole_lines
-
     path = file.path
     data = whole_lines(path)
     if not data:
@@ -64,8 +62,3 @@ def _parse(path: Path, data: bytes, schema: pa.Schema) -> pa.Table:
                 "Remove the line, and run the command of the run again: it repeats that rollout.",
             ) from None
         raise
-
-
-RUN_RECORD_FORMAT = RowFormat(
-    "the folder of a run, or its rollouts.jsonl", lambda file: file.suffix == ".jsonl", _read
-)

@@ -40,15 +40,17 @@ def _seeds(contents: FileColumns) -> Sequence[Any]:
 
 def scenes_of(files: ReadFiles) -> ScenesOf:
     """Return what decides the scenes of evaluations by other programs."""
-    found: dict[tuple[str, str], set[tuple[str, Any]]] = {}
+    decided_by: dict[tuple[str, str], set[tuple[str, Any]]] = {}
     for contents in files.values():
         if contents.scenes is None:
             continue
         seeds = _seeds(contents)
         rows = zip(contents.columns["simulator"], contents.columns["system"], seeds, strict=True)
         for simulator, system, seed in dict.fromkeys(rows):
-            found.setdefault((simulator, system), set()).add((contents.scenes.evaluation, seed))
-    return {key: frozenset(scenes) for key, scenes in found.items()}
+            decided_by.setdefault((simulator, system), set()).add(
+                (contents.scenes.evaluation, seed)
+            )
+    return {key: frozenset(scenes) for key, scenes in decided_by.items()}
 
 
 def of_other_scenes(scenes: ScenesOf) -> list[tuple[str, str]]:
@@ -56,6 +58,7 @@ def of_other_scenes(scenes: ScenesOf) -> list[tuple[str, str]]:
     known = {
         key: value for key, value in scenes.items() if all(seed is not None for _, seed in value)
     }
+    # Systems are paired where scenes are those of most; the others are named.
     usual = {}
     for simulator in dict.fromkeys(simulator for simulator, _ in known):
         counts = Counter(value for (name, _), value in known.items() if name == simulator)

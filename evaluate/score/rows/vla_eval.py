@@ -9,7 +9,7 @@ from robomme_interference_data.ids import nth_number
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.rollouts import KEY_COLUMNS, Status
 
-from .row_format import FileColumns, RowFile, RowFormat, Scenes, check_count, plain_name
+from .row_format import FileColumns, RowFile, Scenes, check_count, plain_name
 
 _HINT = (
     "Expected a file of `vla-eval run` or `vla-eval export`: see docs/how-to/connect-a-policy.md."
@@ -20,7 +20,7 @@ _REQUIRED = {*KEY_COLUMNS} - {"training_seed"}
 """Columns that every episode has; vla-eval leaves out what is None, as an unknown seed is."""
 
 
-def _read(file: RowFile, names: Sequence[str]) -> FileColumns:
+def read(file: RowFile, names: Sequence[str]) -> FileColumns:
     """Read the episodes of all tasks.
 
     With the benchmark of `evaluate.vla_eval`, an episode's metrics are a row. An episode that has a
@@ -75,6 +75,7 @@ def _rows_of_others(file: RowFile) -> FileColumns:
     }
     if seed is not None:
         columns["model_seed"] = [seed] * len(rows)
+    # Every parameter may change the scenes; the seed is a column of its own.
     settings = {**results.get("config", {}).get("params", {}), "seed": None}
     return FileColumns(
         columns,
@@ -108,10 +109,3 @@ def _outcomes(file: RowFile) -> Iterator[tuple[str, int, Status]]:
                     "expected true, false, 1 or 0",
                     _HINT,
                 )
-
-
-VLA_EVAL = RowFormat(
-    "results of vla-eval (*_aggregate.json)",
-    lambda file: "tasks" in file.json and "per_task" not in file.json,
-    _read,
-)

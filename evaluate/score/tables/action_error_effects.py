@@ -19,10 +19,10 @@ from .comparison import (
     ComparisonTable,
     comparison_table,
 )
-from .contrast import START, Contrast, Effect, Measure, comparable
+from .contrast import LESSON_ONLY, Contrast, Effect, Measure, comparable
 from .pairs import pair_errors
 
-_Cell = tuple[str, str]  # system and condition
+_SystemCondition = tuple[str, str]
 
 
 def _between_systems(contrast: Contrast) -> bool:
@@ -53,7 +53,7 @@ def error_effects_table(contrasts: Iterable[Contrast]) -> Table:
 
 def error_contrasts(outcomes: Outcomes, draws: int = DRAWS) -> list[Contrast]:
     """Compare the conditions of each system, and all pairs of systems under each condition."""
-    compared = list[tuple[Effect, _Cell, _Cell]]()
+    compared = list[tuple[Effect, _SystemCondition, _SystemCondition]]()
     for system in outcomes.systems:
         compared += _of(outcomes, system)
     compared += [(Effect.SYSTEMS, against, cell) for against, cell in _between(outcomes)]
@@ -85,16 +85,18 @@ def error_contrasts(outcomes: Outcomes, draws: int = DRAWS) -> list[Contrast]:
     return contrasts
 
 
-def _complete(outcomes: Outcomes, cell: _Cell) -> bool:
+def _complete(outcomes: Outcomes, cell: _SystemCondition) -> bool:
     return bool(outcomes.complete[outcomes.cell(*cell)])
 
 
-def _of(outcomes: Outcomes, system: str) -> Iterator[tuple[Effect, _Cell, _Cell]]:
+def _of(
+    outcomes: Outcomes, system: str
+) -> Iterator[tuple[Effect, _SystemCondition, _SystemCondition]]:
     """Yield no-history, k0 and the other kind that each condition of a system is compared with."""
     conditions = outcomes.ran(system)
     floor = (system, NO_HISTORY) if NO_HISTORY in conditions else None
-    effects = dict[tuple[_Cell, _Cell], Effect]()
-    for reference, effect in ((NO_HISTORY, Effect.HISTORY), (START, Effect.SESSIONS)):
+    effects = dict[tuple[_SystemCondition, _SystemCondition], Effect]()
+    for reference, effect in ((NO_HISTORY, Effect.HISTORY), (LESSON_ONLY, Effect.SESSIONS)):
         for condition in conditions if reference in conditions else ():
             if condition not in (NO_HISTORY, reference):
                 effects[(system, reference), (system, condition)] = effect
@@ -104,7 +106,7 @@ def _of(outcomes: Outcomes, system: str) -> Iterator[tuple[Effect, _Cell, _Cell]
         yield effect, against, cell
 
 
-def _between(outcomes: Outcomes) -> Iterator[tuple[_Cell, _Cell]]:
+def _between(outcomes: Outcomes) -> Iterator[tuple[_SystemCondition, _SystemCondition]]:
     """Yield each pair of systems under each condition, the second one after the first.
 
     A system that ran without history only, such as a baseline, is compared with the others under
@@ -122,7 +124,7 @@ def _between(outcomes: Outcomes) -> Iterator[tuple[_Cell, _Cell]]:
                 yield against, cell
 
 
-def _cell(outcomes: Outcomes, system: str, condition: str) -> _Cell | None:
+def _cell(outcomes: Outcomes, system: str, condition: str) -> _SystemCondition | None:
     """Return the cell of a system that is compared under a condition, or None."""
     ran = outcomes.ran(system)
     if condition in ran:

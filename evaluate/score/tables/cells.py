@@ -20,38 +20,12 @@ from robomme_interference_data.evaluate.score.outcomes import (
 )
 from robomme_interference_data.ids import EpisodeId, format_numbers
 from robomme_interference_data.schema.rollouts import Status
-from robomme_interference_data.stats.bootstrap import Interval
 from robomme_interference_data.stats.intervals import stratified_n, wilson
-from robomme_interference_data.stats.runs import MIN_RUNS, ONE_RUN, RunSpread
-from robomme_interference_data.viz.tables import Columns, Table
+from robomme_interference_data.stats.runs import ONE_RUN, RunSpread
+from robomme_interference_data.viz.tables import Columns
 
-from .comparison import record_table
 from .contrast import Scope, scope_of
-from .ranks import Standing, all_pairs, standings
-
-NOTE = (
-    "Rates with 95% Wilson intervals. scope: they hold for other training runs, if there are "
-    f"{MIN_RUNS} runs or more, otherwise for this checkpoint alone. n: episodes that count; an "
-    "error is neither success nor failure. †: the cell lacks episodes, or has episodes outside the "
-    "grid, and is not ranked; a cell without any rollout is missing."
-)
-BEST = (
-    "Best (bold, in text *): above zero, and no other system is significantly better, by p after "
-    "Holm's correction over all pairs of systems."
-)
-_MAIN_NOTE = (
-    "fixed low to fixed high: Wilson's interval for other episodes of the same families in the "
-    "same numbers, narrower because the families' rates differ; none with training runs. if errors "
-    "fail, if errors succeed: the rate if every error were a failure, or a success: the bounds if "
-    "errors depend on the outcome. run spread: standard deviation of the rates of training runs. "
-    "rank low to "
-    "rank high: the ranks that the system can have, from the significant differences of the table "
-    "matrix (p holm below 0.05): 1 + the systems that are better, to the number of systems less "
-    "those that are worse; all of a condition hold at once with 95% confidence. difference: the "
-    "rate minus that of the best system, the highest (the first of equal ones); its interval, "
-    "difference low to difference high, and p holm are corrected over all pairs of systems, since "
-    "the best is chosen by its rate."
-)
+from .ranks import Ranking, all_pairs, rankings
 
 
 @dataclass(frozen=True)
@@ -102,7 +76,7 @@ class SuccessCell(Coverage):
     chance: float = math.nan  # mean success of guessing; NaN unless all episodes are questions
     rank: int | None = None  # among complete cells, 1 for the highest rate; None for references
     best: bool = False  # one of several, and no other one is significantly better
-    standing: Standing | None = None  # among the ranked systems; None if there are no others
+    ranking: Ranking | None = None  # among the ranked systems; None if there are no others
 
     @property
     def as_rate(self) -> SuccessRate:
@@ -229,62 +203,18 @@ def _ranked(
             continue
         rates = {cells[place].system: cells[place].rate for place in places}
         compared = all_pairs(outcomes, condition, [*rates], parts[part])
-        standing_of = standings(rates, compared)
+        ranking_of = rankings(rates, compared)
         for place in places:
             cell = cells[place]
-            standing = standing_of[cell.system]
+            ranking = ranking_of[cell.system]
             cells[place] = replace(
                 cell,
-                rank=standing.rank,
-                best=standing.tied_with_best and cell.rate > 0,
-                standing=standing,
+                rank=ranking.rank,
+                best=ranking.tied_with_best and cell.rate > 0,
+                ranking=ranking,
             )
     return cells
 
-
-CELL: Columns = {"simulator": "text", "system": "text", "condition": "text"}
-
-RATE: Columns = {
-    "n": "count",
-    "runs": "count",
-    "scope": "text",
-    "rate": "rate",
-    "low": "rate",
-    "high": "rate",
-}
-
-COUNTS: Columns = {
-    "successes": "count",
-    "fails": "count",
-    "timeouts": "count",
-    "errors": "count",
-    "complete": "flag",
-    "missing": "count",
-    "rank": "count",
-    "best": "flag",
-}
-
-_MAIN: Columns = (
-    CELL
-    | RATE
-    | {
-        "run_spread": "points",
-        "fixed_low": "rate",
-        "fixed_high": "rate",
-        "if_errors_fail": "rate",
-        "if_errors_succeed": "rate",
-    }
-    | COUNTS
-    | {
-        "rank_low": "count",
-        "rank_high": "count",
-        "best_system": "text",
-        "difference": "points",
-        "difference_low": "points",
-        "difference_high": "points",
-        "p_holm": "p",
-    }
-)
 
 EPISODES: Columns = {
     "expected": "count",
@@ -293,59 +223,6 @@ EPISODES: Columns = {
     "other_episodes": "text",
 }
 """Which episodes a cell lacks, which have errors, and which it has beyond the expected ones."""
-
-
-def main_table(cells: Sequence[SuccessCell]) -> Table:
-    """Return a row for each cell over all episodes."""
-    records = [rate_record(cell) | _standing(cell) for cell in cells if not cell.part]
-    note = f"{NOTE} {BEST} {_MAIN_NOTE}"
-    return record_table("main", "Success by system and condition", _MAIN, records, note)
-
-
-def rate_record(cell: SuccessCell) -> dict[str, Any]:
-    """Return the values of the columns that the tables `main` and `parts` share, and more."""
-    # The interval from 0 to 1 of a cell without episodes says nothing.
-    low, high = cell.interval if cell.n else (math.nan, math.nan)
-    successes, fails, timeouts, errors, _ = cell.counts
-    return {
-        "simulator": cell.simulator,
-        "system": cell.system,
-        "condition": cell.condition,
-        "part": cell.part,
-        "n": cell.n,
-        "runs": cell.runs if cell.n else None,
-        "scope": cell.scope if cell.n else "",
-        "rate": cell.rate,
-        "low": low,
-        "high": high,
-        "run_spread": cell.run_spread,
-        "fixed_low": cell.fixed[0],
-        "fixed_high": cell.fixed[1],
-        "if_errors_fail": cell.if_errors_fail,
-        "if_errors_succeed": cell.if_errors_succeed,
-        "successes": successes,
-        "fails": fails,
-        "timeouts": timeouts,
-        "errors": errors,
-        "complete": cell.complete,
-        "missing": len(cell.missing),
-        "rank": cell.rank,
-        "best": cell.best,
-    }
-
-
-def _standing(cell: SuccessCell) -> dict[str, Any]:
-    standing = cell.standing
-    behind = Interval(math.nan) if standing is None else standing.behind
-    return {
-        "rank_low": None if standing is None else standing.rank_low,
-        "rank_high": None if standing is None else standing.rank_high,
-        "best_system": "" if standing is None else standing.best_system,
-        "difference": behind.value,
-        "difference_low": behind.low,
-        "difference_high": behind.high,
-        "p_holm": math.nan if standing is None else standing.p_holm,
-    }
 
 
 def episodes_record(cell: Coverage, *, listed: bool) -> dict[str, Any]:

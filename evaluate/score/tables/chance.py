@@ -50,13 +50,13 @@ def with_chance(
     asked = [cell for cell in shown if not math.isnan(cell.chance)]
     ps = [_p(outcomes[cell.simulator], cell) for cell in asked]
     holms = corrected(ps, [cell.simulator for cell in asked])
-    found = {}
+    values_of = {}
     for cell, p, p_holm in zip(asked, ps, holms, strict=True):
         above = [above_chance(rate, cell.chance) for rate in (cell.rate, *cell.interval)]
-        found[cell.simulator, cell.system, cell.condition] = (cell.chance, *above, p, p_holm)
+        values_of[cell.simulator, cell.system, cell.condition] = (cell.chance, *above, p, p_holm)
     none = (math.nan,) * len(_COLUMNS)
     rows = [
-        (*row, *found.get((cell.simulator, cell.system, cell.condition), none))
+        (*row, *values_of.get((cell.simulator, cell.system, cell.condition), none))
         for row, cell in zip(main.rows, shown, strict=True)
     ]
     repeated = any(sum(cell.counts) - cell.errors > cell.n for cell in asked)

@@ -13,7 +13,7 @@ from robomme_interference_data.stats.signs import simultaneous
 
 from .pairs import Pairs
 
-START = "k0"
+LESSON_ONLY = "k0"
 """The condition that changes and retention are measured from."""
 
 

@@ -114,6 +114,7 @@ def verdict_of(p: float, possible: Iterable[float], alpha: float = ALPHA) -> Ver
     """
     if math.isnan(p):
         return None
+    # Errors may not be random: a finding that depends on them is none.
     if any((other < alpha) != (p < alpha) for other in possible):
         return Verdict.DEPENDS
     return Verdict.SHOWN if p < alpha else Verdict.NOT_SHOWN

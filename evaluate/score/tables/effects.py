@@ -27,7 +27,7 @@ from .comparison import (
     comparison_table,
     detectable,
 )
-from .contrast import START, Contrast, Effect, Scope, comparable
+from .contrast import LESSON_ONLY, Contrast, Effect, Scope, comparable
 from .pairs import compare_cells, shared_runs
 
 TESTED_TOGETHER = {
@@ -60,14 +60,18 @@ EFFECTS = ComparisonTable(
         "those of the same effect, with sessions and retrieval as one effect"
     ),
     note=(
-        f"effect: history, against no history (without history, a system with retrieval is the "
-        f"system without it); sessions, against {START}; retrieval, against the system without it "
+        "effect: history, against no history (without history, a system with retrieval is the "
+        f"system without it); sessions, against {LESSON_ONLY}; retrieval, against the system "
+        "without it "
         "under the same condition; interference, two kinds of conditions with equally many "
         "sessions that differ in one property (asks); ideal observer, against the one that has the "
         "same memory and uses all of the evidence that the memory kept. retention: the difference "
-        f"to no history divided by that at {START}, with Fieller's interval, computed only if that "
-        f"at {START} is above zero with p < {ALPHA}; over the retention n episodes that count "
-        f"under no-history, {START} and the condition, which can be fewer than n in incomplete "
+        f"to no history divided by that at {LESSON_ONLY}, with Fieller's interval, computed only "
+        "if that "
+        f"at {LESSON_ONLY} is above zero with p < {ALPHA}; over the retention n episodes that "
+        "count "
+        f"under no-history, {LESSON_ONLY} and the condition, which can be fewer than n in "
+        "incomplete "
         f"cells. {BOTH_SIDES}"
     ),
 )
@@ -139,10 +143,10 @@ def _compared(
     if floor:
         for condition in ks:
             yield _Compared(floor, (system, condition), Effect.HISTORY)
-    if START in ks:
+    if LESSON_ONLY in ks:
         for condition in ks:
-            if condition != START:
-                yield _Compared((system, START), (system, condition), Effect.SESSIONS)
+            if condition != LESSON_ONLY:
+                yield _Compared((system, LESSON_ONLY), (system, condition), Effect.SESSIONS)
     for condition, against in comparable(system, outcomes.ran(system), floor):
         yield _Compared(against, (system, condition), Effect.INTERFERENCE)
 
@@ -156,10 +160,10 @@ def _partners(
         for condition in ran:
             if partner and condition in outcomes.ran(partner):
                 yield _Compared((partner, condition), (system, condition), effect)
-    if base and START in ran and START in outcomes.ran(base):
+    if base and LESSON_ONLY in ran and LESSON_ONLY in outcomes.ran(base):
         for condition in _counted(outcomes, system):
-            if condition != START:
-                yield _Compared((base, START), (system, condition), Effect.RETRIEVAL_FALL)
+            if condition != LESSON_ONLY:
+                yield _Compared((base, LESSON_ONLY), (system, condition), Effect.RETRIEVAL_FALL)
 
 
 def _contrast(outcomes: Outcomes, compared: _Compared, here: Flags) -> Contrast:
@@ -196,7 +200,7 @@ def _add_retention(
     contrasts: dict[tuple[tuple[str, str], tuple[str, str]], Contrast],
 ) -> None:
     """Add the share of the lift at k0 that is left, which must be significantly above zero."""
-    start = (system, START)
+    start = (system, LESSON_ONLY)
     lift = contrasts.get((start, floor))
     if lift is None or not (lift.pairs.change.value > 0 and lift.pairs.p < ALPHA):
         return

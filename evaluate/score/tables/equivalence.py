@@ -9,7 +9,7 @@ from robomme_interference_data.viz.tables import Columns, Table
 
 from .cells import SuccessCell
 from .comparison import SIDES, ComparisonTable, comparison_table
-from .contrast import START, Contrast, Effect
+from .contrast import LESSON_ONLY, Contrast, Effect
 from .correction import correct
 from .pairs import Pairs, compare_unpaired
 
@@ -84,15 +84,17 @@ def _with_published(
     cells: Iterable[SuccessCell], published: Sequence[SuccessCell]
 ) -> Iterator[Contrast]:
     """Yield each cell compared with the published k0 of the same system without retrieval."""
-    starts = {(cell.simulator, cell.system): cell for cell in published if cell.condition == START}
+    published_at = {
+        (cell.simulator, cell.system): cell for cell in published if cell.condition == LESSON_ONLY
+    }
     for cell in cells:
-        start = starts.get((cell.simulator, published_base(cell.system) or ""))
+        start = published_at.get((cell.simulator, published_base(cell.system) or ""))
         if start is not None and cell.n and not cell.part:
             yield Contrast(
                 cell.simulator,
                 cell.system,
                 cell.condition,
-                (start.system, START),
+                (start.system, LESSON_ONLY),
                 Effect.RETRIEVAL_FALL,
                 compare_unpaired(start.as_rate, cell.as_rate),
                 cell.complete,

@@ -226,6 +226,7 @@ def _failures(kept: Statuses) -> dict[str, Any]:
 def _beside_control(cell: _KeptCell, kept: Statuses, control: str) -> dict[str, Any]:
     """Return the failures of a system and of its control; empty without a shared episode."""
     ran = cell.outcomes.ran(control)
+    # It knows the answer, so that its failures depend little on the condition.
     condition = cell.condition if cell.condition in ran else ran[0]
     own = cell.outcomes.status[cell.outcomes.cell(control, condition)]
     both = counting(kept).any(-1) & counting(own).any(-1)

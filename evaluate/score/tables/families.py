@@ -146,7 +146,7 @@ def over_families(
 
 
 @dataclass(frozen=True)
-class _Families:
+class _ByFamily:
     """The differences of episodes, `(E, K)`, those of a family in consecutive rows."""
 
     values: Floats
@@ -187,7 +187,7 @@ def _over(
     values: Floats, labels: NDArray[np.int64], key: str, draws: int
 ) -> Iterator[OverFamilies]:
     """Yield what `over_families` returns, for values without NaN."""
-    families = _Families.of(values, labels)
+    families = _ByFamily.of(values, labels)
     generator = generator_of(f"{key}, families")
     p = _p_families(families, generator, draws)
     fixed, sampled = _bootstrap(families, generator, draws)
@@ -211,14 +211,14 @@ def _over(
         )
 
 
-def _spread(families: _Families) -> Floats:
+def _spread(families: _ByFamily) -> Floats:
     """Return the standard deviation between families, without the noise of episodes, `(K,)`."""
     variances = families.sums(families.residuals**2) / np.maximum(1, families.sizes - 1)
     noise = (variances / families.sizes).mean(axis=0)
     return np.asarray(np.sqrt(np.maximum(0, families.means.var(axis=0, ddof=1) - noise)))
 
 
-def _p_families(families: _Families, generator: np.random.Generator, draws: int) -> Floats:
+def _p_families(families: _ByFamily, generator: np.random.Generator, draws: int) -> Floats:
     """Return p of equal differences in all families, `(K,)`."""
     sizes, episodes = families.sizes, len(families.values)
     # Residuals vary less than the differences do, in small families most.
@@ -238,7 +238,7 @@ def _p_families(families: _Families, generator: np.random.Generator, draws: int)
 
 
 def _bootstrap(
-    families: _Families, generator: np.random.Generator, draws: int
+    families: _ByFamily, generator: np.random.Generator, draws: int
 ) -> tuple[Floats, Floats]:
     """Return the 95% intervals of the mean of families, `(2, K)`: for these, and for a sample."""
     count = len(families.starts)

@@ -11,7 +11,8 @@ from robomme_interference_data.schema.conditions import in_order
 from robomme_interference_data.viz.tables import Columns, Table, percent
 
 from . import action_error
-from .cells import BEST, NOTE, SuccessCell
+from .cells import SuccessCell
+from .main import BEST, NOTE
 
 NOT_EXPECTED = "n/a"
 """A cell of a grid that nobody expects, unlike a missing one."""
@@ -81,8 +82,8 @@ def family_grid(cells: Sequence[SuccessCell]) -> Table:
     at = {(cell.system, cell.part, cell.condition): cell for cell in own}
     rows = []
     for system, family in dict.fromkeys((cell.system, cell.part) for cell in own):
-        found = [at.get((system, family, condition)) for condition in conditions]
-        rows.append([display_name(system), family, *map(_of_family, found)])
+        row_cells = [at.get((system, family, condition)) for condition in conditions]
+        rows.append([display_name(system), family, *map(_of_family, row_cells)])
     return Table(
         "parts",
         "Success by family and condition",

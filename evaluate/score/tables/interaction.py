@@ -18,7 +18,7 @@ from robomme_interference_data.viz.tables import Table
 
 from .comparison import ComparisonTable, comparison_table
 from .contrast import Contrast, Effect
-from .over_k import (
+from .decay import (
     Falls,
     all_complete,
     falls_of,
@@ -127,9 +127,9 @@ class _Apart(NamedTuple):
         return independent(run_spread(first), run_spread(second))
 
     @property
-    def departure_spreads(self) -> list[RunSpread]:
+    def residual_spreads(self) -> list[RunSpread]:
         """The same along each direction in which the difference can depart from a line."""
-        first, second = self.first.departures, self.second.departures
+        first, second = self.first.residuals, self.second.residuals
         if self.related and first.shape == second.shape:
             return spreads_along(second - first)
         return [
@@ -184,7 +184,7 @@ def _interactions(outcomes: Outcomes, draws: int) -> list[Contrast]:
             lost=int((apart.change < 0).sum()),
             p=test.p,
         )
-        departures = (apart.second.departures.mean(axis=1) - apart.first.departures.mean(axis=1))[
+        residuals = (apart.second.residuals.mean(axis=1) - apart.first.residuals.mean(axis=1))[
             :, None
         ]
         contrasts.append(
@@ -200,7 +200,7 @@ def _interactions(outcomes: Outcomes, draws: int) -> list[Contrast]:
                     "conditions": " ".join(apart.conditions),
                     "slope": pairs.second,
                     "against_slope": pairs.first,
-                    "p_fit": fit_over_runs(p_fit, apart.departure_spreads, departures, key),
+                    "p_fit": fit_over_runs(p_fit, apart.residual_spreads, residuals, key),
                 },
             )
         )

@@ -26,10 +26,12 @@ from .comparison import (
 from .contrast import Contrast, Effect, Measure
 from .pairs import Pairs, compare_cells
 
-_Compared = Mapping[tuple[str, str], Pairs]
+_PairsOfSystems = Mapping[tuple[str, str], Pairs]
 
 
-def all_pairs(outcomes: Outcomes, condition: str, systems: Sequence[str], here: Flags) -> _Compared:
+def all_pairs(
+    outcomes: Outcomes, condition: str, systems: Sequence[str], here: Flags
+) -> _PairsOfSystems:
     """Compare each pair of systems over some episodes: the first one's rate minus the second's.
 
     Systems whose histories may differ are compared unpaired.
@@ -75,7 +77,7 @@ def tied_with_best(systems: Sequence[str], compared: Mapping[tuple[str, str], Pa
 
 
 @dataclass(frozen=True)
-class Standing:
+class Ranking:
     """A system among the ranked systems of a condition."""
 
     rank: int  # 1 for the highest rate
@@ -91,15 +93,15 @@ class Standing:
         return self.rank_low == 1
 
 
-def standings(rates: Mapping[str, float], compared: _Compared) -> dict[str, Standing]:
+def rankings(rates: Mapping[str, float], compared: _PairsOfSystems) -> dict[str, Ranking]:
     """Return where each of several systems stands, from rates and all pairs of them."""
     bounds = rank_bounds([*rates], compared)
     best = max(rates, key=lambda name: rates[name])
     ps = holm([pairs.p for pairs in compared.values()])
     p_holm = {frozenset(both): p for both, p in zip(compared, ps, strict=True)}
-    standing_of = {}
+    ranking_of = {}
     for name, rate in rates.items():
-        standing_of[name] = Standing(
+        ranking_of[name] = Ranking(
             rank=1 + sum(other > rate for other in rates.values()),
             rank_low=bounds[name][0],
             rank_high=bounds[name][1],
@@ -107,10 +109,10 @@ def standings(rates: Mapping[str, float], compared: _Compared) -> dict[str, Stan
             behind=_behind(name, best, compared),
             p_holm=p_holm.get(frozenset((name, best)), math.nan),
         )
-    return standing_of
+    return ranking_of
 
 
-def _behind(name: str, best: str, compared: _Compared) -> Interval:
+def _behind(name: str, best: str, compared: _PairsOfSystems) -> Interval:
     """Return the difference of a system to the best one."""
     if name == best:
         return Interval(math.nan)

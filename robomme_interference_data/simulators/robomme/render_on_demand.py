@@ -66,7 +66,7 @@ class RenderOnDemand:
             if sensors.keys() <= self._last.keys():  # otherwise a camera has no last image yet
                 drawn = {*self.cameras} if self.keep() else set()
                 drawn |= {CAMERAS["front"]} if self.needs_front() else set()
-                env._sensors = {name: one for name, one in sensors.items() if name in drawn}
+                env._sensors = {name: sensor for name, sensor in sensors.items() if name in drawn}
             env.scene.sensors = env._sensors
             try:
                 if env._sensors:
@@ -88,6 +88,6 @@ class RenderOnDemand:
         """Return the current images of some cameras, `(256, 256, 3) uint8` each."""
         if not cameras:
             return {}
-        self.cameras = [CAMERAS[one] for one in cameras]
+        self.cameras = [CAMERAS[camera] for camera in cameras]
         data = env.unwrapped._get_obs_sensor_data()
-        return {one: data[CAMERAS[one]]["rgb"][0].cpu().numpy() for one in cameras}
+        return {name: data[CAMERAS[name]]["rgb"][0].cpu().numpy() for name in cameras}

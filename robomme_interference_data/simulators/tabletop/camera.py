@@ -43,9 +43,9 @@ def to_pixels(
     """
     pose = looking(FRONT_EYE, FRONT_TARGET) if pose is None else pose
     focal = SIZE / 2 / math.tan(FRONT_VIEW / 2)
-    found = []
+    pixels = []
     for point in points:
         ahead, left, up = pose[:3, :3].T @ (np.asarray(point) - pose[:3, 3])
         y, x = (math.floor(SIZE / 2 - focal * part / ahead) for part in (up, left))
-        found.append((min(max(y, 0), SIZE - 1), min(max(x, 0), SIZE - 1)))
-    return tuple(found)
+        pixels.append((min(max(y, 0), SIZE - 1), min(max(x, 0), SIZE - 1)))
+    return tuple(pixels)

@@ -24,8 +24,11 @@ from .camera import SIZE, to_pixels
 from .episodes import turn_of
 from .motion import Arm, Point, Script, eased
 
-Spot = tuple[float, float]
+TablePoint = tuple[float, float]
+"""x and y on the table, in m."""
+
 Vector = NDArray[np.float64]
+"""The same, `(2,)` or `(3,)`, to calculate with."""
 
 ABOVE = 0.001
 """How far above a surface the stick's tip stops when it touches it, in m."""
@@ -128,7 +131,7 @@ class Family(Scene):
 
 def row(
     rng: RandomState, count: int, x: float, spacing: float, jitter: float = 0.01, zigzag: float = 0
-) -> list[Spot]:
+) -> list[TablePoint]:
     """Return spots in a row across the table, each displaced by up to `jitter`, in m."""
     spots = []
     for number in range(count):

@@ -211,14 +211,14 @@ class Arm:
         tcp = tip + np.array([0.0, 0.0, self._stick])
         down = [0.0, math.cos(yaw / 2), math.sin(yaw / 2), 0.0]
         pose = sapien.Pose(tcp - np.array(BASE), down)
-        qpos, found, _ = self._model.compute_inverse_kinematics(
+        qpos, solved, _ = self._model.compute_inverse_kinematics(
             self._tcp, pose, initial_qpos=start, active_qmask=self._mask, max_iterations=200
         )
         arm = np.asarray(qpos[:7])
         inside = (self._limits[:, 0] <= arm) & (arm <= self._limits[:, 1])
-        if not found or not inside.all():
+        if not solved or not inside.all():
             joint = int(np.argmin(inside)) + 1
-            reason = f"joint {joint} at its limit" if found else "no solution"
+            reason = f"joint {joint} at its limit" if solved else "no solution"
             raise RunError(
                 f"the arm cannot reach {np.round(tcp, 3).tolist()} m, rotated by "
                 f"{math.degrees(yaw):.0f}°: {reason}",

@@ -12,7 +12,7 @@ from numpy.random import RandomState
 from robomme_interference_data.simulators.scene import Pair, SwapScene, swap_texts, swapped_places
 
 from .bodies import Body, Placement
-from .family import Family, Spot, shuffled
+from .family import Family, TablePoint, shuffled
 from .motion import Arm, Script, eased
 
 STEPS = 30  # time steps of a swap
@@ -70,7 +70,7 @@ def swap_pairs(order: Sequence[int]) -> list[Pair]:
     return pairs
 
 
-def lanes(spots: Sequence[Spot], pair: Pair, gap: float) -> list[list[Spot]]:
+def lanes(spots: Sequence[TablePoint], pair: Pair, gap: float) -> list[list[TablePoint]]:
     """Return the paths of two things that swap places, a spot per time step.
 
     They collide with nothing: one moves along a lane `gap` m beyond all spots, the other along a

@@ -5,7 +5,6 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.random import RandomState
-from numpy.typing import NDArray
 
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.family_scenes import MoveScene
@@ -13,12 +12,11 @@ from robomme_interference_data.simulators.tabletop.bodies import CUBE, SceneBuil
 from robomme_interference_data.simulators.tabletop.family import (
     Family,
     Step,
+    Vector,
     distance_to_segment,
     is_near,
 )
 from robomme_interference_data.simulators.tabletop.motion import SLOW, Arm, Script
-
-Vector = NDArray[np.float64]
 
 HANDLE, CROSS = 0.17, 0.065  # m, of the hook
 STILL, SLACK = 1e-5, 0.002  # m: motion per step of a resting cube; total motion in wrong manners

@@ -16,14 +16,17 @@ from robomme_interference_data.simulators.tabletop.bodies import Body, SceneBuil
 from robomme_interference_data.simulators.tabletop.family import (
     ABOVE,
     Family,
-    Spot,
     Step,
+    TablePoint,
     distance_to_segment,
 )
 from robomme_interference_data.simulators.tabletop.motion import ROD, Arm, Point, Script
 
-Path = tuple[int, ...]
-Route = tuple[Path, tuple[int, ...]]
+SpotPath = tuple[int, ...]
+"""Numbers of the spots that the stick visits, in order."""
+
+TurnedPath = tuple[SpotPath, tuple[int, ...]]
+"""A path, and the direction in which each move passes the post: 1 or -1."""
 
 TOUCH = 0.004  # m above a surface: a tip below that touches it
 FAST = 0.15  # m/s
@@ -44,12 +47,12 @@ class StickFamily(Family):
         now: Number of the one that is lit, or None.
     """
 
-    flat: ClassVar[Spot]
+    flat: ClassVar[TablePoint]
     high: ClassVar[float]
     shows_start: ClassVar[bool]
     pause: ClassVar[int]
     frames: ClassVar[tuple[int, int, int]]
-    spots: list[Spot]
+    spots: list[TablePoint]
     lamp: Body
     now: int | None
 
@@ -120,13 +123,13 @@ class PatternLock(StickFamily):
             builder.post(spot, (0.85, 0.85, 0.80), radius, height)
         self.lamp = builder.lamp((1.0, 0.55, 0.10), radius, height + ABOVE / 2)
 
-    def answer_texts(self, answer: Path) -> tuple[str, ...]:
+    def answer_texts(self, answer: SpotPath) -> tuple[str, ...]:
         return tuple(f"goes to button {number}" for number in answer)
 
-    def option(self, choice: Path) -> Option:
+    def option(self, choice: SpotPath) -> Option:
         return Option("", tuple((*self.spots[number], self.flat[1]) for number in choice))
 
-    def step(self, answer: Path, number: int) -> Step:
+    def step(self, answer: SpotPath, number: int) -> Step:
         x, y = self.spots[answer[number]]
         height = self.flat[1]
         points: list[Point] = [(x, y, height + ABOVE)]
@@ -136,7 +139,7 @@ class PatternLock(StickFamily):
     def progress(self) -> int:
         return self.done
 
-    def judge(self, arm: Arm, answer: Path) -> Status:
+    def judge(self, arm: Arm, answer: SpotPath) -> Status:
         if self.now is not None and self.now != self.last:
             if self.now != answer[self.done]:
                 return Status.FAIL
@@ -185,7 +188,7 @@ class RouteStick(StickFamily):
             builder.post(spot, (0.12, 0.12, 0.14), self.post, self.tall)
         self.lamp = builder.lamp((0.35, 0.90, 0.45), radius, height + ABOVE / 2)
 
-    def answer_texts(self, answer: Route) -> tuple[str, ...]:
+    def answer_texts(self, answer: TurnedPath) -> tuple[str, ...]:
         targets, sides = answer
         turns = zip(pairwise(targets), sides, strict=True)
         return (
@@ -196,10 +199,10 @@ class RouteStick(StickFamily):
             ),
         )
 
-    def option(self, choice: Route) -> Option:
+    def option(self, choice: TurnedPath) -> Option:
         return Option("", tuple(p for n in range(self.steps) for p in self.leg(choice, n, 0.0)))
 
-    def leg(self, answer: Route, number: int, above: float) -> list[Point]:
+    def leg(self, answer: TurnedPath, number: int, above: float) -> list[Point]:
         """Return the points of a step, some m above the targets: beside the post, on the target."""
         targets, sides = answer
         z = self.flat[1] + above
@@ -209,7 +212,7 @@ class RouteStick(StickFamily):
         x, y = self.posts[min(targets[number - 1 : number + 1])]
         return [(x + sides[number - 1] * self.aside, y, z), end]
 
-    def step(self, answer: Route, number: int) -> Step:
+    def step(self, answer: TurnedPath, number: int) -> Step:
         targets, sides = answer
         text = "go to the target at <point>"
         at: tuple[Point, ...] = ((*self.spots[targets[number]], self.flat[1]),)
@@ -224,7 +227,7 @@ class RouteStick(StickFamily):
     def progress(self) -> int:
         return len(self.reached)
 
-    def judge(self, arm: Arm, answer: Route) -> Status:
+    def judge(self, arm: Arm, answer: TurnedPath) -> Status:
         targets, sides = answer
         if self.follow(arm):
             return Status.FAIL
@@ -257,7 +260,7 @@ class RouteStick(StickFamily):
 
 
 @cache
-def routes(count: int, turns: int) -> list[Route]:
+def routes(count: int, turns: int) -> list[TurnedPath]:
     """Return all routes with a number of turns: targets, and the sides of the passed posts."""
     walks = row_paths(count, range(count), turns)
     return list(product(walks, product((1, -1), repeat=turns)))
