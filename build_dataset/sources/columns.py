@@ -45,7 +45,7 @@ _COUNTERS = ("timestamp", "frame_index", "episode_index", "index", "task_index",
 
 
 @dataclass(frozen=True)
-class Columns:
+class RecordedColumns:
     """The columns that are used.
 
     Attributes:
@@ -71,7 +71,7 @@ class Columns:
         return {feature: columns for feature, columns in vectors.items() if columns}
 
 
-def find_columns(features: Features, given: Mapping[str, str], where: str) -> Columns:
+def find_columns(features: Features, given: Mapping[str, str], where: str) -> RecordedColumns:
     """Return the columns that are used; `given` ones take precedence over usual names.
 
     A given value is a column, several joined with `+` for `state` and `action`, or `none`. Every
@@ -115,7 +115,7 @@ def find_columns(features: Features, given: Mapping[str, str], where: str) -> Co
     single = {
         name: chosen[name][0] for name in _NOT_CAMERAS if chosen.get(name) and name not in _VECTORS
     }
-    return Columns(cameras, chosen.get("state", ()), chosen.get("action", ()), **single)
+    return RecordedColumns(cameras, chosen.get("state", ()), chosen.get("action", ()), **single)
 
 
 def recorded_robot(lerobot: LeRobotFiles, vectors: Mapping[str, Sequence[str]]) -> Robot:

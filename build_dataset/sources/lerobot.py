@@ -32,7 +32,7 @@ from robomme_interference_data.storage.lerobot import LeRobotFiles
 from robomme_interference_data.storage.parquet import RowSpan
 
 from .base import Recording, Robot, Source, SourceEpisode, compose, demonstration_length, file_state
-from .columns import Columns, find_columns, recorded_robot
+from .columns import RecordedColumns, find_columns, recorded_robot
 from .episode_columns import NAMING, EpisodeColumns, read_column, read_episode_columns
 from .families import ids_by_block, ids_by_columns
 from .families_file import TASK, template
@@ -149,7 +149,7 @@ class LeRobotSource(Source):
         return LeRobotFiles(self._files)
 
     @cached_property
-    def _columns(self) -> Columns:
+    def _columns(self) -> RecordedColumns:
         return find_columns(self._lerobot.features, self._given_columns, self._where)
 
     @cached_property
@@ -324,7 +324,7 @@ class LeRobotSource(Source):
         return (*states, *used)
 
 
-def _lesson(rows: RowSpan, columns: Columns, recorded: int | None) -> int | None:
+def _lesson(rows: RowSpan, columns: RecordedColumns, recorded: int | None) -> int | None:
     """Return the number of demonstration frames, on which all columns must agree, if known."""
     lengths = {} if recorded is None else {"per-episode exec_start_idx": recorded}
     if columns.is_demo is not None:

@@ -24,7 +24,7 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Executor, Outcome, Worker
 
-from .source_episode import CheckedEpisode, Finding, check_episode
+from .source_episode import CheckedEpisode, EpisodeProblem, check_episode
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ def _lost(outcome: Outcome) -> CheckedEpisode:
     error = outcome.error
     assert error is not None
     hint = error.hint if isinstance(error, InterferenceError) else None
-    return CheckedEpisode(0, None, None, True, (Finding(None, first_line(error), hint),))
+    return CheckedEpisode(0, None, None, True, (EpisodeProblem(None, first_line(error), hint),))
 
 
 def _twice(names: Sequence[str], episodes: Sequence[PlannedEpisode]) -> Iterator[Problem]:

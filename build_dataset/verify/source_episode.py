@@ -31,7 +31,7 @@ _OF_FRAMES = ("reading", "values", "shapes")
 
 
 @dataclass(frozen=True)
-class Finding:
+class EpisodeProblem:
     """What is wrong with an episode: the first frame with it (None: no frame), and the error."""
 
     frame: int | None
@@ -55,7 +55,7 @@ class CheckedEpisode:
     lesson: int | None
     look: Look | None
     exact: bool
-    findings: tuple[Finding, ...]
+    findings: tuple[EpisodeProblem, ...]
 
 
 def check_episode(
@@ -72,7 +72,7 @@ def check_episode(
     Raises:
         InvalidOptionError, MissingExtraError, SimulatorError: All episodes would fail alike.
     """
-    checks = _Checks()
+    checks = _EpisodeChecks()
 
     def open_recording() -> Recording:
         episode.check()
@@ -102,7 +102,7 @@ def _no_frames() -> None:
     raise SourceError("the episode has no frames", "Leave it out.")
 
 
-class _Checks:
+class _EpisodeChecks:
     """Applies rules to an episode; of each rule, the first frame that breaks it is kept.
 
     Attributes:
@@ -113,7 +113,7 @@ class _Checks:
     def __init__(self) -> None:
         self.shapes: dict[str, tuple[int, ...]] = {}
         self.count = 0
-        self._first: dict[str, Finding] = {}
+        self._first: dict[str, EpisodeProblem] = {}
         self._times = Counter[str]()
 
     def apply[Result](self, rule: str, check: Callable[[], Result]) -> Result | None:
@@ -129,7 +129,7 @@ class _Checks:
         except InterferenceError as error:
             frame = self.count if rule in _OF_FRAMES or rule in self.shapes else None
             self._times[rule] += 1
-            self._first.setdefault(rule, Finding(frame, error.message, error.hint))
+            self._first.setdefault(rule, EpisodeProblem(frame, error.message, error.hint))
             return None
 
     def add(self, frame: Frame) -> None:
@@ -149,7 +149,7 @@ class _Checks:
             self.apply(name, partial(check_numbers, name, value, where))
         self.count += 1
 
-    def findings(self) -> tuple[Finding, ...]:
+    def findings(self) -> tuple[EpisodeProblem, ...]:
         """Return what is wrong, each thing at its first frame."""
         found = []
         for rule, first in self._first.items():

@@ -95,7 +95,7 @@ _SERVER_OPTIONS = ("server", "connect_s", "response_s")
 """Options, and metadata, of a server that change no result."""
 
 
-class Address(NamedTuple):
+class ServerAddress(NamedTuple):
     """Where a server listens, and whether the connection is encrypted (`wss://`)."""
 
     host: str
@@ -103,13 +103,15 @@ class Address(NamedTuple):
     tls: bool = False
 
 
-def addresses(target: str) -> tuple[Address, ...]:
+def addresses(target: str) -> tuple[ServerAddress, ...]:
     """Return each server of `//HOST:PORT,…`, `ws://…` or `wss://…`; empty for a command."""
     scheme, slashes, servers = target.partition("//")
     if scheme not in ("", "ws:", "wss:") or not slashes:
         return ()
     pairs = (server.rpartition(":") for server in servers.split(","))
-    return tuple(Address(host.strip("[]"), int(port), scheme == "wss:") for host, _, port in pairs)
+    return tuple(
+        ServerAddress(host.strip("[]"), int(port), scheme == "wss:") for host, _, port in pairs
+    )
 
 
 def _valid_addresses(target: str) -> bool:

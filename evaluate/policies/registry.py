@@ -17,7 +17,7 @@ from robomme_interference_data.runtime.specs import (
 from robomme_interference_data.schema.other_states import OTHER_STATES, OtherStates
 from robomme_interference_data.schema.sampling import MEMORY_FORM, Memory
 
-from .kinds import KINDS, Address, PolicyKind, Role, addresses
+from .kinds import KINDS, PolicyKind, Role, ServerAddress, addresses
 from .policy import Policy
 
 POLICIES = Registry("policy", KINDS)
@@ -34,7 +34,7 @@ def policy_memory(text: str) -> str | None:
     return POLICIES.parse(text).arguments.get("memory")
 
 
-def server_addresses(text: str) -> tuple[Address, ...]:
+def server_addresses(text: str) -> tuple[ServerAddress, ...]:
     """Return the address of each server that a policy names, in order."""
     spec = POLICIES.parse(text)
     return addresses(spec.target) if POLICIES.kinds[spec.kind].server is not None else ()

@@ -6,7 +6,7 @@ import pytest
 from support.messages import raises
 
 from robomme_interference_data.build_dataset.sources.columns import (
-    Columns,
+    RecordedColumns,
     find_columns,
     value_names,
 )
@@ -47,7 +47,7 @@ AGIBOT = {
 }
 
 
-def found(features: dict[str, Any], **given: str) -> Columns:
+def found(features: dict[str, Any], **given: str) -> RecordedColumns:
     return find_columns(features, given, "here")
 
 
@@ -89,7 +89,7 @@ def test_depth_flags_that_are_false() -> None:
 
 
 def test_a_set_without_states_or_actions_is_read_without() -> None:
-    assert found(FRONT | COUNTERS) == Columns({"front": "observation.images.front"})
+    assert found(FRONT | COUNTERS) == RecordedColumns({"front": "observation.images.front"})
 
 
 def test_columns_that_may_be_the_state_need_a_choice() -> None:
