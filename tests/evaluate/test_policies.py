@@ -19,7 +19,7 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.evaluate.policies.identity import policy_identity
-from robomme_interference_data.evaluate.policies.kinds import Address, PolicyKind, Role
+from robomme_interference_data.evaluate.policies.kinds import PolicyKind, Role, ServerAddress
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import (
     POLICIES,
@@ -51,7 +51,7 @@ def test_a_policy_is_parsed() -> None:
         ("vla-eval:ws:", False),
         ("vla-eval:wss:", True),
     ):
-        expected = tuple(Address(*place, tls) for place in places)
+        expected = tuple(ServerAddress(*place, tls) for place in places)
         assert server_addresses(f"{scheme}{written}") == expected
 
 
