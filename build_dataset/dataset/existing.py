@@ -87,8 +87,8 @@ def open_existing(out: Path, plan: DatasetPlan) -> ExistingDataset | None:
             option="fps",
         )
     _check_recordings(out, dataset, plan)
-    cameras = [CAMERA_PREFIX + camera for camera in dataset.cameras]
-    statistics = episode_statistics(LeRobotFiles(dataset.files, statistics=cameras).table)
+    filmed = [CAMERA_PREFIX + camera for camera in dataset.cameras]
+    statistics = episode_statistics(LeRobotFiles(dataset.files, statistics=filmed).table)
     vectors = {name: (name,) for name in (STATE, ACTION) if name in dataset.lerobot.features}
     robot = recorded_robot(dataset.lerobot, vectors)
     episodes = map(partial(_stored, dataset, robot), dataset.records(), statistics)
