@@ -149,7 +149,6 @@ class BuildConfig(WorkersConfig):
         help="Source lerobot: what the tasks of an episode with several are: `wordings` of one "
         "goal, steps that are `joined` to one goal, or of which the `first` or `last` is the goal.",
         group="Sources",
-        rare=True,
     )
     fps: float | None = setting(
         None, help="Frames per second of recordings that do not state them.", group="Sources"
