@@ -36,6 +36,7 @@ TUTORIAL = DOCS / "tutorial.ipynb"
 PAGES = sorted(one for one in DOCS.rglob("*.md") if "generated" not in one.parts)
 OTHER_PAGES = [page for page in PAGES if page.parent.name != "how-to"]
 README = ROOT / "README.md"
+MOST_WORDS = 24_000
 
 
 def text_of(page: Path) -> str:
@@ -57,14 +58,22 @@ def command_lines(page: Path) -> list[str]:
     # Every second part lies between fences; its first line is the language.
     blocks = text_of(page).split("```")[1::2]
     shell = [block.partition("\n") for block in blocks]
-    text = "\n".join(code for language, _, code in shell if language in ("bash", "text", ""))
-    lines = re.sub(r" *\\\n *", " ", text).splitlines()
+    return shell_lines(
+        "\n".join(code for language, _, code in shell if language in ("bash", "text", ""))
+    )
+
+
+def shell_lines(code: str) -> list[str]:
+    """Return the command lines in shell code, without the command's own name."""
+    lines = re.sub(r" *\\\n *", " ", code).splitlines()
     pattern = re.compile(r"(?:PYTHONPATH=\S+ )?robomme-interference (.*?)(?:\s+#.*)?$")
     return [match[1] for line in lines if (match := pattern.match(line.strip()))]
 
 
 DEMO = runpy.run_path(str(ROOT / "scripts" / "demo.py"))
 ALL = [(page.name, line) for page in (README, TUTORIAL, *PAGES) for line in command_lines(page)]
+SCRIPTS = sorted((ROOT / "examples").rglob("*.sh"))
+ALL += [(path.name, line) for path in SCRIPTS for line in shell_lines(path.read_text("utf-8"))]
 ALL += [("demo.py", line) for line in DEMO["STEPS"].values()]
 ALL += [("demo.py", line.removeprefix("robomme-interference ")) for line in DEMO["NEXT"]]
 
@@ -83,9 +92,6 @@ ELSEWHERE = (
     "--source frames",  # recordings
     "--shift ",  # a renderer
     "k31",  # more units than the golden buffer set has
-    "lerobot:",  # a checkpoint
-    "python:memory_policy",  # has a test of its own
-    "answers:mixture",  # answers of that policy
 )
 """What marks command lines of the pages that need what is not available: they are parsed only."""
 

@@ -6,6 +6,7 @@ A page's folder is prepared with the data that the page starts from. Nothing is 
 
 import os
 import shlex
+import shutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -32,7 +33,6 @@ HOW_TO = ROOT / "docs" / "how-to"
 PAGES = sorted(path.name for path in HOW_TO.glob("*.md"))
 
 NOT_RUN = {
-    ("compare-systems.md", "score canonical_rollouts.csv"): "files that the paper's authors host",
     (
         "connect-a-policy.md",
         "evaluate my-buffers --policy lerobot",
@@ -58,7 +58,6 @@ NOT_RUN = {
         "evaluate my-buffers --policy websocket",
     ): "released checkpoints and RoboMME; test_systems.py",
     ("official-simulator.md", "index my-buffers --encoder siglip"): "3.5 GB of weights",
-    ("publish.md", "score theirs/rollouts.jsonl"): "results that others published",
     ("train-a-policy.md", "build my-"): "hours of simulation",
     ("train-a-policy.md", "from robomme_interference_data.training"): "test_history_dataset.py",
     ("train-a-policy.md", "score k0.csv"): "hours of training; test_memory_policy.py",
@@ -69,10 +68,6 @@ NOT_RUN = {
     ("train-a-policy.md", "evaluate demo/buffers"): "test_memory_policy.py trains and evaluates",
     ("connect-a-policy.md", "evaluate my-buffers --policy vla-eval"): "a server; test_vla_eval.py",
     ("connect-a-policy.md", "score results/*_aggregate.json"): "vla-eval's results; its own test",
-    ("your-own-policy.md", "evaluate my-buffers --policy lerobot"): "a checkpoint",
-    ("your-own-policy.md", "evaluate my-buffers --policy hold"): "executions; test_offline.py",
-    ("your-own-policy.md", "evaluate my-buffers --policy mean"): "executions; test_offline.py",
-    ("your-own-policy.md", "score runs/offline"): "rows of that checkpoint; test_offline.py",
     ("your-own-policy.md", "from pathlib import Path"): "starts processes; test_run.py",
     ("publish.md", "from datasets import load_dataset"): "reads the Hub; test_cards.py",
     ("another-benchmark.md", "from robomme_interference_data.simulators"): "an outline, not code",
@@ -109,6 +104,17 @@ def executed(folder: Path) -> None:
     plan_again(folder / "my-buffers")
 
 
+def scored(folder: Path) -> None:
+    """A buffer set, and rows under the names and in the layouts of the paper's authors."""
+    golden(folder)
+    results = ROOT / "docs" / "results"
+    rows = results / "retrieval-replay-framesamp-robomme_rollouts.csv"
+    shutil.copy(rows, folder / "retrieval_rollouts.csv")
+    head, *lines = (results / "replay-framesamp-robomme_rollouts.csv").read_text().splitlines()
+    named = [f"system,{head}", *(f"perceptual-framesamp-modul,{line}" for line in lines)]
+    (folder / "canonical_rollouts.csv").write_text("\n".join(named) + "\n")
+
+
 def nothing(folder: Path) -> None:
     """The page makes what it needs."""
 
@@ -127,6 +133,7 @@ def recorded(folder: Path) -> None:
 
 PREPARED: dict[str, Callable[[Path], None]] = {
     "another-benchmark.md": nothing,
+    "compare-systems.md": scored,
     "publish.md": recorded,
     "retrieval.md": nothing,
     "train-a-policy.md": trained,
@@ -137,8 +144,12 @@ PREPARED: dict[str, Callable[[Path], None]] = {
 """The data that a page starts from, where that is not any buffer set `my-buffers`."""
 
 BEFORE = {
-    "many-machines.md": "evaluate my-buffers --policy replay --out runs/shard-1 --shard 1/8",
-    "publish.md": "evaluate my-buffers --policy replay --out my-run --episodes 0",
+    "many-machines.md": ("evaluate my-buffers --policy replay --out runs/shard-1 --shard 1/8",),
+    "publish.md": (
+        "evaluate my-buffers --policy replay --out my-run --episodes 0",
+        "evaluate my-buffers --policy replay:window --out theirs --episodes 0",
+        "evaluate my-buffers --policy replay --out runs/mine --episodes 0",
+    ),
 }
 """Runs that a page starts from."""
 
@@ -158,6 +169,7 @@ def stand_ins(hub: Any, login: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator
         servers = [stack.enter_context(PolicyServer().running()) for _ in range(2)]
         yield {
             "openai:http://localhost:8000/v1#Qwen/Qwen3-VL-4B-Instruct": f"openai:{chat.url}#tiny",
+            "lerobot:me/act@v1 --system act-v1 --offline": "python:retrace:make --system act-v1 --offline",
             "localhost:8013": f"localhost:{servers[0].port}",
             "localhost:8014": f"localhost:{servers[1].port}",
             "'websocket:python serve.py --port {port}'": shlex.quote(f"websocket:{server}"),
@@ -183,8 +195,7 @@ def test_a_page_runs_from_top_to_bottom(
     push_buffer_set(hub, GOLDEN, tmp_path / "work", "namespace/name")
     names: dict[str, Any] = {}
     steps = [*steps_of((HOW_TO / page).read_text(encoding="utf-8"))]
-    if page in BEFORE:
-        steps.insert(0, Step("command", BEFORE[page]))
+    steps[:0] = [Step("command", text) for text in BEFORE.get(page, ())]
     for step in steps:
         if any(step.text.startswith(start) for name, start in NOT_RUN if name == page):
             continue
