@@ -64,8 +64,6 @@ NOT_RUN = {
     ("train-a-policy.md", "evaluate my-buffers --policy answers"): "hours of training",
     ("train-a-policy.md", "score results/acted-k0"): "hours of training",
     ("train-a-policy.md", "evaluate my-buffers --policy python"): "hours of training",
-    ("train-a-policy.md", "build demo/buffers --only executions"): "test_memory_policy.py",
-    ("train-a-policy.md", "evaluate demo/buffers"): "test_memory_policy.py trains and evaluates",
     ("connect-a-policy.md", "evaluate my-buffers --policy vla-eval"): "a server; test_vla_eval.py",
     ("connect-a-policy.md", "score results/*_aggregate.json"): "vla-eval's results; its own test",
     ("your-own-policy.md", "from pathlib import Path"): "starts processes; test_run.py",
@@ -91,7 +89,7 @@ def asked(folder: Path) -> None:
 
 
 def trained(folder: Path) -> None:
-    for name in ("my-buffers", "my-training", "demo/buffers"):
+    for name in ("my-buffers", "my-training"):
         copy_tabletop(folder / name)
 
 
