@@ -43,7 +43,7 @@ def test_rows_are_of_the_current_versions() -> None:
 
 @pytest.mark.slow
 def test_rates_are_those_of_the_rows() -> None:
-    assert RATES == runpy.run_path(str(RESULTS / "make_rates.py"))["rates"]()
+    assert runpy.run_path(str(RESULTS / "make_rates.py"))["rates"]() == RATES
 
 
 @pytest.mark.parametrize("first", ["policy", "system"])
@@ -83,6 +83,10 @@ def test_rates_in_sentences() -> None:
     for text, system in (("33.3 to 0.0%", "acts-gru-k0"), ("34.0 to 28.0%", "acts-gru-mixture")):
         rates = [percent(system=system, condition=condition) for condition in ("k0", "k7")]
         assert f"{' to '.join(rates)}%" == text and text in PAGE
+    for condition in ("k0", "k1", "k3", "k7", "k15", "k31"):  # "worse at every k"
+        assert counted(system="learned-long", condition=condition) < counted(
+            system="learned-mixture", condition=condition
+        )
     for condition in ("before-k7", "middle-k7"):
         assert counted(system="acts-mixture", condition=condition) == (0, 75)
 

@@ -13,7 +13,9 @@ SHARED = "cli: options, console"
 
 def folder_of(module: tuple[str, ...]) -> str:
     """The box of a module, given its path inside the package."""
-    return SHARED if module[0] == "cli" and module[1:2] in (("options",), ("console",)) else module[0]
+    if module[:2] in (("cli", "options"), ("cli", "console")):
+        return SHARED
+    return module[0]
 
 
 def modules() -> Iterator[tuple[Path, tuple[str, ...]]]:

@@ -167,7 +167,10 @@ def stand_ins(hub: Any, login: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator
         servers = [stack.enter_context(PolicyServer().running()) for _ in range(2)]
         yield {
             "openai:http://localhost:8000/v1#Qwen/Qwen3-VL-4B-Instruct": f"openai:{chat.url}#tiny",
-            "lerobot:me/act@v1 --system act-v1 --offline": "python:retrace:make --system act-v1 --offline",
+            # Without `device`: of your-own-policy.md, which saves this policy.
+            "lerobot:me/act@v1 --system act-v1 --offline": (
+                "python:retrace:make --system act-v1 --offline"
+            ),
             "localhost:8013": f"localhost:{servers[0].port}",
             "localhost:8014": f"localhost:{servers[1].port}",
             "'websocket:python serve.py --port {port}'": shlex.quote(f"websocket:{server}"),
