@@ -139,20 +139,25 @@ def _kind(hint: Any) -> str:
 
 def condition_pages() -> Iterator[str]:
     """Yield the table of all kinds of conditions."""
+    from robomme_interference_data.evaluate.score.tables.contrast import COMPARISONS
     from robomme_interference_data.schema.conditions import KINDS
 
     yield "# Conditions\n"
     yield (
         "A condition names the history that a policy gets before a query episode. `no-history` "
         "and `k0`, `k1`, `k3`, `k7` are the paper's; the others are additions of this project. "
-        "`<n>` is the number of distractor units, 0 to 63. Units are the same under every kind "
-        "and nested in `n`, so two conditions differ in one thing only.\n"
+        "`<n>` is the number of distractor units, 0 to 63. Units are nested in `n`, and the same "
+        "in every row but `same-k<n>`. The table `effects` of a score compares a condition with "
+        "that of the last column, with as many units.\n"
     )
-    rows = [
-        (f"`{kind.pattern}`", kind.holds, kind.asks, ", ".join(f"`{one}`" for one in kind.needs))
-        for kind in KINDS.values()
-    ]
-    yield table(("condition", "sessions, in order", "question it asks", "further datasets"), rows)
+    rows = []
+    for kind in KINDS.values():
+        needs = ", ".join(f"`{one}`" for one in kind.needs)
+        compared = COMPARISONS.get(kind.name)
+        against = f"`{KINDS[compared.reference].pattern}`" if compared else ""
+        rows.append((f"`{kind.pattern}`", kind.holds, kind.asks, needs, against))
+    titles = ("condition", "sessions, in order", "question", "further datasets", "compared with")
+    yield table(titles, rows)
 
 
 def system_pages() -> Iterator[str]:

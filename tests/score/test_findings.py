@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 from support import scoring as made
+from support.pages import RESULTS, table
 from support.scoring import BASE, OWN, RETRIEVAL, cells, record
 
 from robomme_interference_data.evaluate.score.config import Expected
@@ -47,6 +48,20 @@ def test_published_rates_are_the_papers() -> None:
     assert len(best["no-history"]) == 12  # 93 to 62 of 450: p = 0.006, of 66 pairs
     # 45.3% and 44.9%, then 35.3% with p = 0.002: 22 of 66 pairs are less likely.
     assert best["k0"] == [BASE, "perceptual-tokendrop-modul", RETRIEVAL]
+
+
+def test_the_benchmarks_page_has_the_published_rates() -> None:
+    page = (RESULTS.parent / "explanation" / "benchmark.md").read_text(encoding="utf-8")
+    listed = table(page, "no-history")
+    rates = {(one.system, one.condition): f"{100 * one.rate:.1f}" for one in published()}
+    names = {SYSTEMS[system].display.split(" (")[0]: system for system, _ in rates}
+    shown = {
+        (names[row["system"]], condition): rate
+        for row in listed
+        for condition, rate in row.items()
+        if condition != "system" and rate
+    }
+    assert shown == rates
 
 
 def test_rates_by_family_are_used_where_they_add_up_to_the_published_ones() -> None:
