@@ -48,9 +48,9 @@ def goal_wordings(
         if choice is None:
             raise SourceError(
                 f"it has {len(tasks)} tasks: {', '.join(map(repr, tasks))}",
-                f"Set {named('several_tasks')} to what they are: wordings of one goal, steps that "
-                "are joined to one goal, or of which the first or the last is the goal: "
-                f"{', '.join(SEVERAL_TASKS)}.",
+                f"State what they are, such as {named('several_tasks', 'joined')}: wordings of one "
+                "goal, steps that are joined to one goal, or of which the first or the last is the "
+                f"goal ({', '.join(SEVERAL_TASKS)}).",
             )
         return SEVERAL_TASKS[choice](tasks)
     if wordings and same_text(wordings[0], tasks[0]):

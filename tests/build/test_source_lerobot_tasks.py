@@ -165,7 +165,7 @@ def test_the_choice_is_a_setting_of_a_build(tmp_path: Path, run: Any) -> None:
     build = ("build", tmp_path / "set", "--source", f"lerobot:{root}", "--unit", "3x2")
     options = ("--split", "test", "--conditions", "k0,k1", "--workers", "1")
     code, _, error = run(*build, *options)
-    assert code == 1 and "--several-tasks" in error
-    assert run(*build, *options, "--several-tasks", "joined")[0] == 0
+    assert code == 1 and "several_tasks=joined" in error
+    assert run(*build, *options, "--set", "several_tasks=joined")[0] == 0
     _, printed, _ = run("show", tmp_path / "set", "Drawer/test/0", "k0", "--json")
     assert f"{OPEN}; stack" in printed
