@@ -146,6 +146,7 @@ class BuildConfig(WorkersConfig):
     several_tasks: str | None = setting(
         None,
         metavar="CHOICE",
+        rare=True,
         help="Source lerobot: what the tasks of an episode with several are: `wordings` of one "
         "goal, steps that are `joined` to one goal, or of which the `first` or `last` is the goal.",
         group="Sources",
