@@ -307,7 +307,8 @@ def named(setting: str, value: object = None) -> str:
     option = _option_names.get(setting)
     if option is None:
         return f'{setting}="{value}"' if isinstance(value, str) else f"{setting}={value}"
-    return f"{option} {shlex.quote(str(value))}"
+    between = "=" if option.startswith("--set ") else " "
+    return f"{option}{between}{shlex.quote(str(value))}"
 
 
 def _name_of(setting: str) -> str:
