@@ -20,7 +20,7 @@ from robomme_interference_data.errors import InterferenceError, InvalidIdError, 
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.evidence import spans_of_texts
 from robomme_interference_data.simulators.episode import choose_cameras
-from robomme_interference_data.storage.files import check_not_pointer
+from robomme_interference_data.storage.text import check_not_pointer
 
 from .base import Frame, Recording, Robot, Source, SourceEpisode, demonstration_length, file_state
 from .episode_columns import parse_column

@@ -20,7 +20,7 @@ from robomme_interference_data.constants import INFO_PATH
 from robomme_interference_data.errors import FormatError, MissingFileError, UnknownNameError
 
 from . import video
-from .files import Files, read_json
+from .files import Files
 from .lerobot_location import (
     EpisodeLocation,
     VideoLocation,
@@ -32,6 +32,7 @@ from .lerobot_location import (
 from .lerobot_tables import read_episode_lines, read_episodes, read_tasks
 from .limits import MAX_FRAME_VALUES, MAX_NAME, MAX_RATE, MIN_RATE
 from .parquet import RowSpan
+from .text import read_json
 
 VERSIONS = ("v3.0", "v2.1", "v2.0")
 
