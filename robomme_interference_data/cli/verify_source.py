@@ -9,10 +9,9 @@ import typer
 
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, PAPER_UNIT, SPLITS
 from robomme_interference_data.errors import (
+    SAME_FOR_ALL,
     InterferenceError,
     InvalidOptionError,
-    MissingExtraError,
-    SimulatorError,
     counted,
     named,
 )
@@ -83,7 +82,7 @@ def _listed(
             only = dataclasses.replace(build, source=(name,))
             [source] = open_sources(DEMONSTRATIONS, only, PAPER_UNIT)
             listed = source.episodes()
-        except (InvalidOptionError, MissingExtraError, SimulatorError):
+        except SAME_FOR_ALL:
             raise
         except InterferenceError as error:
             problems.append(Problem(name, None, None, error.message, error.hint))
