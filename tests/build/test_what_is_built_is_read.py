@@ -80,6 +80,7 @@ def made(**options: Any) -> Shaped:
 CASES: dict[str, dict[str, Any]] = {
     "one value each": {"state": 1, "action": 1},
     "one value and no action": {"state": 1, "action": None},
+    "no state": {"state": 0},
     "a gripper's action": {"state": 8, "action": 1},
     "no reading": {"value": NO_READING},
     "the smallest": {"value": -NO_READING, "state": 1},
@@ -124,7 +125,6 @@ def test_it_is_read_and_verified(tmp_path: Path, run: Any, options: dict[str, An
 
 
 NOT_STORED: dict[str, dict[str, Any]] = {
-    "no state": {"state": 0},
     "too many values": {"state": MAX_VECTOR + 1},
     "too many of an action": {"action": MAX_VECTOR + 1},
     "a longer goal": {"goals": (LONG, "b")},

@@ -204,7 +204,6 @@ SETS = {
     "agibot": AGIBOT,
     "bridge": BRIDGE,
     "robomme": ROBOMME,
-    "stateless": STATELESS,
 }
 
 
