@@ -70,7 +70,7 @@ def differences(left: tuple[str, Look], right: tuple[str, Look]) -> list[str]:
 
 
 def describe(look: Look) -> str:
-    """Return a look for people, such as `camera front 64×48 pixels, state 8 values, 10 Hz`."""
+    """Return a look in words: `camera front 64×48 pixels, state 8 values, 10 frames per second`."""
     parts = [f"{_title(name)} {_size(shape)}" for name, shape in sorted(look.features.items())]
     parts.append(f"{look.fps:g} frames per second")
     if look.robot_type is not None:

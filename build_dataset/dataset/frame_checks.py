@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.build_dataset.alike import Look, differences
 from robomme_interference_data.constants import CAMERA_PREFIX, STATE
 from robomme_interference_data.errors import InvalidOptionError, SourceError, named
-from robomme_interference_data.storage.limits import MAX_FRAME_VALUES, MAX_NAME, MAX_VECTOR
+from robomme_interference_data.storage.limits import MAX_NAME, MAX_PIXELS, MAX_VECTOR
 
 _CAMERA = re.compile(r"\w[\w .-]*")
 _MAX_CAMERA = MAX_NAME - len(CAMERA_PREFIX)
@@ -34,11 +34,11 @@ def check_shapes(
             raise SourceError(
                 f"{feature} holds images {image.shape} {image.dtype}; expected (H, W, 3) uint8"
             )
-        if image.size > MAX_FRAME_VALUES:
-            height, width, _ = image.shape
+        height, width, _ = image.shape
+        if height * width > MAX_PIXELS:
             raise SourceError(
                 f"{feature} has images of {width} × {height} pixels; expected at most "
-                f"{MAX_FRAME_VALUES // 3:,} pixels",
+                f"{MAX_PIXELS:,} pixels",
                 "Scale the images down.",
             )
     for feature, vector in vectors.items():

@@ -61,7 +61,8 @@ class SourceReport:
         problems: The problems, by episode and frame.
         episodes: Number of episodes, those with problems included.
         frames: Number of frames that could be read.
-        marked: Number of episodes with demonstration frames and a live observation after them.
+        with_demonstration: Number of episodes with demonstration frames and a live observation
+            after them.
         exact: Number of episodes whose frames were never lossily compressed.
         looks: What can be in one dataset, with the number of its episodes; most frequent first.
     """
@@ -69,7 +70,7 @@ class SourceReport:
     problems: list[Problem]
     episodes: int
     frames: int
-    marked: int
+    with_demonstration: int
     exact: int
     looks: list[tuple[Look, int]]
 
@@ -132,9 +133,9 @@ def check_sources(
             checked[number] = outcome.value if outcome.error is None else _lost(outcome)
     read = [checked[number] for number in range(len(episodes))]
     problems = [
-        Problem(names[source], str(episode.id), finding.frame, finding.what, finding.hint)
+        Problem(names[source], str(episode.id), problem.frame, problem.what, problem.hint)
         for (source, episode), found in zip(episodes, read, strict=True)
-        for finding in found.findings
+        for problem in found.problems
     ]
     looks = {
         number: (str(episodes[number].episode.id), found.look)
@@ -148,7 +149,7 @@ def check_sources(
         problems=problems,
         episodes=len(episodes),
         frames=sum(found.frames for found in read),
-        marked=sum(found.lesson is not None and 0 < found.lesson < found.frames for found in read),
+        with_demonstration=sum(0 < (found.lesson or 0) < found.frames for found in read),
         exact=sum(found.exact for found in read),
         looks=[(looks[group[0]][1], len(group)) for group in groups],
     )

@@ -109,7 +109,7 @@ def _build_command(config: "SourceConfig", root: Path, report: "SourceReport") -
     from robomme_interference_data.runtime.executor import WorkersConfig
 
     words = ["robomme-interference", "build", shlex.quote(str(root))]
-    if not report.marked:  # no episode can be a query
+    if not report.with_demonstration:  # no episode can be a query
         words += ["--only", DISTRACTORS]
     words += [named("source", source) for source in config.source]
     workers = [field.name for field in dataclasses.fields(WorkersConfig)]
@@ -134,7 +134,7 @@ def _print(report: "SourceReport") -> None:
         print_status(f"{counted(count, 'episode')}: {describe(look)}")
     read = f"{counted(report.episodes, 'episode')}, {counted(report.frames, 'frame')}"
     print_status(
-        f"Read: {read}. {report.marked:,} with a demonstration and live frames, "
+        f"Read: {read}. {report.with_demonstration:,} with a demonstration and live frames, "
         f"{report.exact:,} bit-exact."
     )
     if report.problems:
@@ -152,7 +152,7 @@ def _as_dict(report: "SourceReport") -> dict[str, Any]:
         "problems": [vars(problem) for problem in report.problems],
         "episodes": report.episodes,
         "frames": report.frames,
-        "episodes_with_demonstration": report.marked,
+        "episodes_with_demonstration": report.with_demonstration,
         "exact_episodes": report.exact,
         "robots": [
             {

@@ -252,6 +252,9 @@ def read_sums(path: Path) -> dict[str, str]:
     return sums
 
 
+# --- errors of pyarrow ---------------------------------------------------------------------------
+
+
 @contextmanager
 def reading(path: Path, hint: str | None = None) -> Iterator[None]:
     """Turn pyarrow's errors on a damaged file into `FormatError`.

@@ -80,6 +80,7 @@ def made(**options: Any) -> Shaped:
 CASES: dict[str, dict[str, Any]] = {
     "one value each": {"state": 1, "action": 1},
     "one value and no action": {"state": 1, "action": None},
+    "no state": {"state": 0},
     "a gripper's action": {"state": 8, "action": 1},
     "no reading": {"value": NO_READING},
     "the smallest": {"value": -NO_READING, "state": 1},

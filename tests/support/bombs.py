@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from support.buffer_sets import GOLDEN
 
-from robomme_interference_data.storage.video_file import MAX_PIXELS
+from robomme_interference_data.storage.limits import MAX_PIXELS
 
 _VIDEO = GOLDEN / "demonstrations/videos/observation.images.front/chunk-000/file-000.mp4"
 _MEGABYTE = 1 << 20
