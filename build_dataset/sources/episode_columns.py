@@ -7,6 +7,7 @@ ones. What has one meaning is read; the rest is an error that names column and v
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from decimal import Decimal
 from typing import Any
 
 from robomme_interference_data.errors import SourceError
@@ -80,10 +81,12 @@ def _is_empty(value: Any) -> bool:
 
 
 def _whole(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | float | str):
+    if isinstance(value, bool) or not isinstance(value, int | float | Decimal | str):
         raise ValueError(value)
     number = int(value)
-    if isinstance(value, float) and (number != value or abs(number) >= _LARGEST):
+    if not isinstance(value, str) and number != value:
+        raise ValueError(value)
+    if isinstance(value, float) and abs(number) >= _LARGEST:
         raise ValueError(value)
     return number
 

@@ -263,7 +263,11 @@ class LeRobotSource(Source):
         """Return whether images are exact, by their codec or by the first one in parquet."""
         feature = self._lerobot.features[column]
         if feature["dtype"] != "video":
-            return is_png(next(rows.images(column)))
+            first = next(rows.images(column))
+            try:
+                return is_png(first)
+            except FormatError as error:
+                raise error.about(f"{rows.path}: column {column!r}") from None
         return info_is_exact((feature.get("video_info") or {}) | (feature.get("info") or {}))
 
     def _ids(self, rows: list[dict[str, Any]]) -> tuple[dict[int, EpisodeId], str | None]:

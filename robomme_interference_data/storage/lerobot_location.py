@@ -205,5 +205,8 @@ def _path(
 def _whole(row: Mapping[str, Any], name: str, index: int, where: str) -> int:
     value = row.get(name)
     if not isinstance(value, int) or not 0 <= value <= _MAX_FRAME:
-        raise FormatError.damaged(where, f"{name} of episode {index} is {value!r}")
+        raise FormatError(
+            f"{where}: {name} of episode {index} is {value!r}; expected a whole number",
+            "Correct the episode table in meta/, or leave the episode or the camera out.",
+        )
     return value
