@@ -7,7 +7,6 @@ ones. What has one meaning is read; the rest is an error that names column and v
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from decimal import Decimal
 from typing import Any
 
 from robomme_interference_data.errors import SourceError
@@ -81,12 +80,10 @@ def _is_empty(value: Any) -> bool:
 
 
 def _whole(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | float | Decimal | str):
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
         raise ValueError(value)
     number = int(value)
-    if not isinstance(value, str) and number != value:
-        raise ValueError(value)
-    if isinstance(value, float) and abs(number) >= _LARGEST:
+    if isinstance(value, float) and (number != value or abs(number) >= _LARGEST):
         raise ValueError(value)
     return number
 

@@ -28,6 +28,8 @@ _HEADER_BYTES, _CHECKSUM_BYTES = 8, 4
 # Of EXIF: a tag, and the bytes of a tag's number, type, count and value.
 _ORIENTATION, _ENTRY_BYTES = 0x0112, 12
 
+_RESTORE = "Restore the image from a copy, or leave the episode out."
+
 _AS_STORED = 1
 """The orientation of pixels that are shown as they are stored."""
 
@@ -248,9 +250,10 @@ def decode_image(data: bytes) -> NDArray[np.uint8]:
     try:
         frames = codec.decode(av.Packet(data)) + codec.decode(None)
     except (av.error.FFmpegError, ValueError) as error:
-        raise FormatError(f"an image is damaged: {error}") from None
+        raise FormatError(f"an image is damaged: {error}", _RESTORE) from None
     if len(frames) != 1:
-        raise FormatError(f"an image is damaged: it decodes to {len(frames)} frames")
+        what = f"an image is damaged: it decodes to {len(frames)} frames"
+        raise FormatError(what, _RESTORE)
     depth = max(component.bits for component in frames[0].format.components)
     if depth > 8:
         raise FormatError(

@@ -73,8 +73,9 @@ class LeRobotFiles:
             raise FormatError(
                 f"{files.describe()} is a LeRobot dataset of version {self.version!r}; this "
                 f"package reads {', '.join(VERSIONS)}",
-                "Convert it with LeRobot's own scripts (lerobot.scripts."
-                "convert_dataset_v21_to_v30 and its predecessors).",
+                "Convert an older one with LeRobot's own scripts (lerobot.scripts."
+                "convert_dataset_v21_to_v30 and its predecessors); for a newer one, update this "
+                "package.",
             )
         check_info(self.info, path)
 
@@ -251,11 +252,13 @@ class LeRobotFiles:
             self._video_problems[key] = span_problems(spans, first, len(times))
         problem = self._video_problems[key].get(index)
         if problem is not None:
-            raise FormatError(
-                f"{path}: {problem}",
-                "Write the dataset again, or correct from_timestamp in its episode table, or leave "
-                "the episode out.",
-            )
+            hint = "Write the video again, with a frame for each row, or leave the episode out."
+            if self.version == "v3.0":
+                hint = (
+                    "Write the dataset again, or correct from_timestamp in its episode table, or "
+                    "leave the episode out."
+                )
+            raise FormatError(f"{path}: {problem}", hint)
 
     def _spans_in_file(self, index: int, column: str) -> list[VideoSpan]:
         """Return the episodes in the video file that holds an episode, by number."""
