@@ -153,7 +153,7 @@ TABLES: list[tuple[Callable[[], Rows], str]] = [
     (lambda: four()[:2] + rows_of(MOVE, FOUR)[:1] + four()[2:], "not together: row 3"),
     (lambda: rows_of("OpenDrawer", FOUR), "row 0: 'OpenDrawer' is not an episode id"),
     (lambda: changed(3, goal="shut it"), f"{DRAWER} has several values of 'goal'"),
-    (lambda: four(fps=1e-9), f"{DRAWER}: fps is 1e-09; expected 0.001 to 10000"),
+    (lambda: four(fps=1e-9), f"{DRAWER}: fps is 1e-09; expected 0.001 to 10,000"),
     (lambda: four(is_demo=[False, True, True, False]), f"{DRAWER}: is_demo is true in 2 frames"),
 ]
 
