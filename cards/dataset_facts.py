@@ -31,7 +31,7 @@ from robomme_interference_data.errors import FormatError, InvalidOptionError, Mi
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
 from robomme_interference_data.schema.manifest import BufferManifest
 from robomme_interference_data.schema.records import EpisodeRecord
-from robomme_interference_data.storage.files import read_json
+from robomme_interference_data.storage.text import read_json
 from robomme_interference_data.viz.filmstrip import strip_png
 
 from .facts import CardTable, Facts, data_limits, dataset_rows, repositories_of

@@ -276,6 +276,10 @@ class WorkerRetiredError(InterferenceError, RuntimeError):
     """
 
 
+SAME_FOR_ALL = (InvalidOptionError, MissingExtraError, SimulatorError)
+"""Errors about settings or this machine: after one, other episodes would fail alike."""
+
+
 # The names under which the reader of an error sets what is wrong: one command runs in a process.
 _option_names: Mapping[str, str] = {}
 
@@ -307,7 +311,8 @@ def named(setting: str, value: object = None) -> str:
     option = _option_names.get(setting)
     if option is None:
         return f'{setting}="{value}"' if isinstance(value, str) else f"{setting}={value}"
-    return f"{option} {shlex.quote(str(value))}"
+    between = "=" if option.startswith("--set ") else " "
+    return f"{option}{between}{shlex.quote(str(value))}"
 
 
 def _name_of(setting: str) -> str:

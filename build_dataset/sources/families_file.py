@@ -9,7 +9,8 @@ from typing import Any
 
 from robomme_interference_data.constants import FAMILIES_PATH
 from robomme_interference_data.errors import InterferenceError, SourceError
-from robomme_interference_data.storage.files import read_text, write_text
+from robomme_interference_data.storage.files import write_text
+from robomme_interference_data.storage.text import read_text
 
 TASK = "task"
 DATASET = "dataset"

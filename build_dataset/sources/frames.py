@@ -12,8 +12,9 @@ from typing import Any, override
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, SourceError, named
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators.episode import choose_cameras
-from robomme_interference_data.storage.files import is_hidden, read_bytes
+from robomme_interference_data.storage.files import is_hidden
 from robomme_interference_data.storage.parquet import RowSpan
+from robomme_interference_data.storage.text import read_bytes
 from robomme_interference_data.storage.video import iter_frames
 
 from ..alike import same_rate

@@ -3,19 +3,16 @@
 Reading goes through the sources, and the rules of frames and datasets, as in a build.
 """
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
-from robomme_interference_data.build_dataset.alike import Look, differences
+from robomme_interference_data.build_dataset.alike import Look, differences, in_dataset
 from robomme_interference_data.build_dataset.dataset.plan import PlannedEpisode
 from robomme_interference_data.build_dataset.sources import Source
-from robomme_interference_data.constants import ACTION
 from robomme_interference_data.errors import (
+    SAME_FOR_ALL,
     InterferenceError,
-    InvalidOptionError,
-    MissingExtraError,
-    SimulatorError,
     first_line,
     named,
     naming_options,
@@ -129,7 +126,7 @@ def check_sources(
     with closing(executor.run(task, enumerate(episodes), time_limit=limit)) as outcomes:
         for outcome in outcomes:
             advance(1)
-            if isinstance(outcome.error, InvalidOptionError | MissingExtraError | SimulatorError):
+            if isinstance(outcome.error, SAME_FOR_ALL):
                 raise outcome.error
             number, _ = outcome.task
             checked[number] = outcome.value if outcome.error is None else _lost(outcome)
@@ -216,13 +213,6 @@ def _unlike(
 
 
 def _differences(left: tuple[str, Look], right: tuple[str, Look]) -> list[str]:
-    """Return how two episodes differ; one may lack actions."""
-    shared = left[1].features.keys() & right[1].features.keys()
-    without = {ACTION} - shared
-    return differences(_without(left, without), _without(right, without))
-
-
-def _without(named_look: tuple[str, Look], names: Collection[str]) -> tuple[str, Look]:
-    name, look = named_look
-    features = {feature: shape for feature, shape in look.features.items() if feature not in names}
-    return name, replace(look, features=features)
+    """Return how two episodes differ that are to be in one dataset."""
+    looks = in_dataset(left[1], right[1])
+    return differences((left[0], looks[0]), (right[0], looks[1]))

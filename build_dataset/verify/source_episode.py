@@ -17,14 +17,7 @@ from robomme_interference_data.build_dataset.dataset.frame_checks import (
 )
 from robomme_interference_data.build_dataset.sources import Frame, Recording, Source, SourceEpisode
 from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, STATE
-from robomme_interference_data.errors import (
-    InterferenceError,
-    InvalidOptionError,
-    MissingExtraError,
-    SimulatorError,
-    SourceError,
-    counted,
-)
+from robomme_interference_data.errors import SAME_FOR_ALL, InterferenceError, SourceError, counted
 
 _OF_FRAMES = ("reading", "values", "shapes")
 """Rules that are about one frame, as are those of the features."""
@@ -124,7 +117,7 @@ class _EpisodeChecks:
         """
         try:
             return check()
-        except (InvalidOptionError, MissingExtraError, SimulatorError):
+        except SAME_FOR_ALL:
             raise
         except InterferenceError as error:
             frame = self.count if rule in _OF_FRAMES or rule in self.shapes else None

@@ -25,7 +25,7 @@ from robomme_interference_data.errors import (
 )
 
 from . import video
-from .files import Files, read_json
+from .files import Files
 from .lerobot_info import check_info
 from .lerobot_location import (
     EpisodeLocation,
@@ -37,6 +37,7 @@ from .lerobot_location import (
 )
 from .lerobot_tables import read_episode_lines, read_episodes, read_tasks
 from .parquet import RowSpan
+from .text import read_json
 
 VERSIONS = ("v3.0", "v2.1", "v2.0")
 

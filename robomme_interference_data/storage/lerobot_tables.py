@@ -11,8 +11,9 @@ from robomme_interference_data.constants import EPISODES_DIR, TASKS_PATH
 from robomme_interference_data.errors import FormatError, MissingFileError
 
 from .arrow_columns import concatenated, is_plain, simplified
-from .files import Files, parse_json, read_bytes, reading
+from .files import Files, reading
 from .parquet import RowSpan, open_parquet, read_table
+from .text import parse_json, read_bytes
 
 _LINES_OF_EPISODES = "meta/episodes.jsonl"
 _LINES_OF_TASKS = "meta/tasks.jsonl"

@@ -28,9 +28,10 @@ from .arrow_columns import (
     simple_type,
     simplified,
 )
-from .files import atomic_path, check_not_pointer, reading
+from .files import atomic_path, reading
 from .limits import MAX_READ_VALUES
 from .parquet_pages import decoded_size
+from .text import check_not_pointer
 
 # An image may be a PNG of some megabytes.
 _IMAGES_AT_ONCE = 8

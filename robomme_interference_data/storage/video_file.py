@@ -19,7 +19,7 @@ import numpy as np
 
 from robomme_interference_data.errors import FormatError, InterferenceError, MissingFileError
 
-from .files import check_not_pointer
+from .text import check_not_pointer
 
 MAX_PIXELS = 1 << 24
 """Upper bound on the pixels of a frame: twice 3840 × 2160."""
