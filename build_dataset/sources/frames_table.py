@@ -110,7 +110,7 @@ def read_frames_table(path: Path) -> dict[EpisodeId, EpisodeRows | SourceError]:
         with reading(path):
             table = _simplified(table)
     except FormatError as error:
-        raise SourceError(error.message, LAYOUT) from None
+        raise SourceError(error.message, error.hint or LAYOUT) from None
     if not table.num_rows:
         raise SourceError(f"{path} has no rows", LAYOUT)
     if problem := _column_problem(table):

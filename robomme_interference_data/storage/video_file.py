@@ -75,7 +75,7 @@ def open_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.Vid
         if kind == "mp4":
             check_samples(path)
         container = av.open(file_url(path), format=kind, options=limits, container_options=allowed)
-    except InterferenceError:
+    except InterferenceError:  # a missing file that is a Git LFS pointer is a FileNotFoundError
         raise
     except FileNotFoundError:
         raise MissingFileError(f"{path} does not exist") from None
