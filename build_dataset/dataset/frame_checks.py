@@ -15,6 +15,19 @@ _CAMERA = re.compile(r"\w[\w .-]*")
 _MAX_CAMERA = MAX_NAME - len(CAMERA_PREFIX)
 
 
+def check_image(feature: str, image: NDArray[np.uint8]) -> None:
+    """Check that the image of a camera is an RGB image.
+
+    Raises:
+        SourceError: It is not.
+    """
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+        raise SourceError(
+            f"{feature} holds images {image.shape} {image.dtype}; expected (H, W, 3) uint8",
+            "Convert the images to RGB with 8 bits a channel.",
+        )
+
+
 def check_shapes(
     images: Mapping[str, NDArray[np.uint8]], vectors: Mapping[str, NDArray[np.float32]]
 ) -> None:
@@ -30,10 +43,7 @@ def check_shapes(
     """
     for feature, image in images.items():
         _check_camera(feature.removeprefix(CAMERA_PREFIX))
-        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-            raise SourceError(
-                f"{feature} holds images {image.shape} {image.dtype}; expected (H, W, 3) uint8"
-            )
+        check_image(feature, image)
         height, width, _ = image.shape
         if height * width > MAX_PIXELS:
             raise SourceError(
