@@ -32,7 +32,7 @@ def verify_sources(config: "SourceConfig", root: Path, *, as_json: bool) -> None
 
     Args:
         config: The sources, and how they are read.
-        root: The folder that a build would write: it may keep the families of an earlier build.
+        root: The folder that a build would write.
         as_json: Whether to write JSON to stdout.
     """
     from robomme_interference_data.build_dataset.verify.source import CheckTask, check_sources
