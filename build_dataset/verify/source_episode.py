@@ -80,7 +80,7 @@ def check_episode(
 
     recording = checks.apply("opening", open_recording)
     if recording is None:
-        return CheckedEpisode(0, None, None, True, checks.findings())
+        return CheckedEpisode(0, None, None, False, checks.findings())
     rate = checks.apply("rate", partial(recording.robot.at, fps))
     lesson: int | None = None
     with closing(recording.frames):

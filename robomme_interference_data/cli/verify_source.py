@@ -160,10 +160,8 @@ def _print(report: "SourceReport") -> None:
     )
     if report.problems:
         with_problems = {problem.episode for problem in report.problems if problem.episode}
-        print_status(
-            f"{counted(len(report.problems), 'problem')} in "
-            f"{counted(len(with_problems), 'episode')}."
-        )
+        where = f" in {counted(len(with_problems), 'episode')}" if with_problems else ""
+        print_status(f"{counted(len(report.problems), 'problem')}{where}.")
     else:
         print_status("No problems.")
 
