@@ -228,7 +228,8 @@ def _changes(datasets: Mapping[str, Dataset]) -> list[str]:
         if sizes := sorted({str(source["resize"]) for source in sources if "resize" in source}):
             limits.append(f"The frames of the {name or DEMONSTRATIONS} are resized: {sizes[0]}.")
         if dataset.features[STATE] == (0,):
-            limits.append(f"The {name or DEMONSTRATIONS} have no robot states: states have length 0.")
+            part = name or DEMONSTRATIONS
+            limits.append(f"The {part} have no robot states: states have length 0.")
     others = other_state_sizes(datasets) if DEMONSTRATIONS in datasets else {}
     for name, size in others.items():
         limits.append(
