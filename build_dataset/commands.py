@@ -108,9 +108,6 @@ def _build_datasets(plans: "Mapping[str, DatasetPlan]", config: BuildConfig) -> 
     from robomme_interference_data.data.dataset import Dataset
     from robomme_interference_data.storage.files import LocalFiles
 
-    from .sources.families_file import keep_families
-    from .sources.lerobot import LeRobotSource
-
     root, results = config.buffer_set, {}
     for kind, planned in plans.items():
         dataset = planned
@@ -118,12 +115,6 @@ def _build_datasets(plans: "Mapping[str, DatasetPlan]", config: BuildConfig) -> 
             # They are built first, so that other sizes and rates are found early.
             dataset = planned.matching(Dataset(LocalFiles(root / DEMONSTRATIONS)))
         results[kind] = _build_dataset(dataset, root / kind, config)
-    if config.families_from is not None:
-        sources = next(iter(plans.values())).sources
-        families = (
-            source.naming.families for source in sources if isinstance(source, LeRobotSource)
-        )
-        keep_families(config.families_from, families, root)
     return results
 
 

@@ -146,8 +146,7 @@ class BuildConfig(WorkersConfig):
         None,
         metavar="task|dataset|FILE",
         help="Source lerobot: make the families from the tasks, or one of each dataset; or a CSV "
-        "file with the family of each task or episode and, if needed, exec_start_idx. Later builds "
-        "of the buffer set use it too.",
+        "file with the family of each task or episode and, if needed, exec_start_idx.",
         group="Sources",
     )
     several_tasks: str | None = setting(

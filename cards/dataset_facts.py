@@ -27,6 +27,7 @@ from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.query_sessions import buffer_manifest
 from robomme_interference_data.data.questions import Question
+from robomme_interference_data.data.state_sizes import other_state_sizes, query_state_size
 from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
 from robomme_interference_data.schema.manifest import BufferManifest
@@ -179,11 +180,6 @@ def _facts(
     simulators = {record.simulator for dataset in datasets.values() for record in dataset.records()}
     named = sorted(filter(None, simulators))
     sources = {name: list(dataset.identity.sources) for name, dataset in datasets.items()}
-    stateless = [
-        f"The {name or DEMONSTRATIONS} have no robot states: states have length 0."
-        for name, dataset in datasets.items()
-        if dataset.features[STATE] == (0,)
-    ]
 
     @cache
     def pictures() -> dict[str, bytes]:
@@ -195,7 +191,7 @@ def _facts(
     return Facts(
         simulators=named,
         simulated=None not in simulators,
-        limits=data_limits(queries, named, [*limits, *stateless]),
+        limits=data_limits(queries, named, [*limits, *_changes(datasets)]),
         pictures=pictures,
         values={
             "strip": STRIP,
@@ -222,6 +218,26 @@ def _facts(
         },
         **fields,
     )
+
+
+def _changes(datasets: Mapping[str, Dataset]) -> list[str]:
+    """Return what the datasets lack or changed of their recordings, and states that differ."""
+    limits = []
+    for name, dataset in datasets.items():
+        sources = dataset.identity.sources
+        if sizes := sorted({str(source["resize"]) for source in sources if "resize" in source}):
+            limits.append(f"The frames of the {name or DEMONSTRATIONS} are resized: {sizes[0]}.")
+        if dataset.features[STATE] == (0,):
+            part = name or DEMONSTRATIONS
+            limits.append(f"The {part} have no robot states: states have length 0.")
+    others = other_state_sizes(datasets) if DEMONSTRATIONS in datasets else {}
+    for name, size in others.items():
+        limits.append(
+            f"The states of the {name} have {size} values, those of the lessons "
+            f"{query_state_size(datasets)}: buffers that hold both have no single array of states, "
+            "unless the units' are padded or omitted."
+        )
+    return limits
 
 
 def one_split(records: Iterable[EpisodeRecord]) -> str:

@@ -170,9 +170,6 @@ DATASETS = (DEMONSTRATIONS, DISTRACTORS, *OPTIONAL_DATASETS)
 QUESTIONS_PATH = "questions.parquet"
 """Questions about the past; optional."""
 
-FAMILIES_PATH = "families.csv"
-"""The families of the recordings that it was built from, for its next builds; optional."""
-
 MANIFESTS = "manifests"
 MANIFEST_HEADER = "manifest.json"
 MANIFEST_ROWS = "buffers.parquet"

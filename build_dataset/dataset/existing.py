@@ -1,5 +1,6 @@
 """The dataset that a build extends: its episodes are not encoded again."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,6 +12,7 @@ from robomme_interference_data.build_dataset.sources.simulator import SimulatorS
 from robomme_interference_data.constants import (
     ACTION,
     CAMERA_PREFIX,
+    DISTRACTORS,
     IDENTITY_PATH,
     REPORT_PATH,
     STATE,
@@ -30,8 +32,20 @@ from .plan import DatasetPlan
 from .statistics import Statistics, before_scaling, episode_statistics
 
 
-def _advice() -> str:
-    return f"Choose another {named('buffer_set')}, or remove the folder first."
+def _advice(extend: Mapping[str, object] | None = None) -> str:
+    """Return what to do about a dataset that a build does not extend.
+
+    Args:
+        extend: The settings with which it would, and their values; None for a setting to leave out.
+    """
+    advice = f"Choose another {named('buffer_set')}, or remove the folder first."
+    if not extend:
+        return advice
+    ways = [
+        f"without {named(name)}" if value is None else f"with {named(name, value)}"
+        for name, value in extend.items()
+    ]
+    return f"To extend it, build {', '.join(ways)}. {advice}"
 
 
 @dataclass(frozen=True)
@@ -68,11 +82,28 @@ def open_existing(out: Path, plan: DatasetPlan) -> ExistingDataset | None:
     planned["cameras"] = ", ".join(cameras) or "none"
     planned["resize"] = "none" if plan.resize is None else str(plan.resize)
     if found := unequal(("it", existing), ("this build", planned)):
-        raise BuildError(f"{out} exists with other settings: {'; '.join(found)}", _advice())
-    if plan.kind in UNITS and dataset.unit != plan.unit.in_dataset(plan.kind):
+        extend = {
+            "codec": identity.codec,
+            "version": identity.version,
+            "cameras": ",".join(identity.cameras) or "none",
+            "resize": None if existing["resize"] == "none" else existing["resize"],
+        }
+        differ = {name: value for name, value in extend.items() if existing[name] != planned[name]}
         raise BuildError(
-            f"{out} exists with units of {dataset.unit}, not of {plan.unit.in_dataset(plan.kind)}",
-            _advice(),
+            f"{out} exists with other settings: {'; '.join(found)}",
+            # No setting makes a dataset of another kind of it.
+            _advice(differ if existing["kind"] == planned["kind"] else None),
+        )
+    if plan.kind in UNITS and dataset.unit != plan.unit.in_dataset(plan.kind):
+        unit = dataset.unit
+        extend = {
+            "unit": f"{unit.frames}x{unit.stride}",
+            "units_per_episode": unit.per_episode,
+        }
+        raise BuildError(
+            f"{out} exists with units of {unit}, not of {plan.unit.in_dataset(plan.kind)}",
+            # Units at full rate do not show the stride of the others, which they follow from.
+            _advice(extend if plan.kind == DISTRACTORS else None),
         )
     # Another version of a simulator has other episodes under the same ids.
     recorded = {source.get("kind"): source for source in identity.sources}

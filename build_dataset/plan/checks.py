@@ -1,6 +1,6 @@
 """Checks before a build: its folder, units that suffice, planned buffers that would change."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,12 +12,15 @@ from robomme_interference_data.constants import (
     DATASETS,
     DEMONSTRATIONS,
     DISTRACTORS,
+    IDENTITY_PATH,
     MANIFESTS,
     MAX_K,
 )
-from robomme_interference_data.errors import BuildError, named
+from robomme_interference_data.data.loading import next_build
+from robomme_interference_data.errors import BuildError, MissingFileError, named
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.draw import UnitPool, check_units
+from robomme_interference_data.storage.files import Files, LocalFiles
 from robomme_interference_data.storage.staging import staging_path
 
 from .buffers import NextBuffers, next_buffers
@@ -35,6 +38,28 @@ def check_root(root: Path) -> None:
         raise BuildError(
             f"{root} holds {strangers[0]}, and nothing of a buffer set",
             f"Choose a new or empty folder as {named('buffer_set')}.",
+        )
+
+
+def check_built(root: Path, files: Mapping[str, Files]) -> None:
+    """Check that the datasets exist that all manifests need.
+
+    Raises:
+        MissingFileError: One does not: its build has not begun, or has not finished.
+    """
+    for name in (DEMONSTRATIONS, DISTRACTORS):
+        dataset = files[name]
+        if not isinstance(dataset, LocalFiles) or (dataset.root / IDENTITY_PATH).is_file():
+            continue
+        if staging_path(root / name).is_dir():
+            raise MissingFileError(
+                f"the build of the {name} of {root} has not finished",
+                "Run the command that began it again, to resume it.",
+            )
+        raise MissingFileError(
+            f"{root} has no {name}, which buffers are planned from",
+            "Build them first.",
+            next_build(root),
         )
 
 

@@ -18,7 +18,6 @@ from robomme_interference_data.build_dataset.sources import Source, open_source,
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
     EXECUTIONS,
-    FAMILIES_PATH,
     LESSONS,
     SHIFTED,
     UNITS,
@@ -124,7 +123,7 @@ def check_values(config: BuildConfig) -> None:
 
 def open_sources(kind: str, config: BuildConfig, unit: Unit) -> tuple[Source, ...]:
     """Open the sources of a build, for one of its datasets."""
-    columns, kept = _columns(config.columns), config.buffer_set / FAMILIES_PATH
+    columns = _columns(config.columns)
     # A simulator draws only the frames that a unit stores, if the first one is frame 0.
     one_unit = kind in UNITS and unit.per_episode == 1
     return tuple(
@@ -134,7 +133,6 @@ def open_sources(kind: str, config: BuildConfig, unit: Unit) -> tuple[Source, ..
             columns=columns,
             families_from=config.families_from,
             several_tasks=config.several_tasks,
-            kept_families=kept if kept.is_file() else None,
             every=unit.in_dataset(kind).stride if one_unit else 1,
         )
         for text in config.source

@@ -37,7 +37,7 @@ from robomme_interference_data.storage.files import Files, LocalFiles
 from robomme_interference_data.storage.hub import locate
 
 from .buffers import NextBuffers, next_buffers
-from .checks import check_plans, plan_more_units
+from .checks import check_built, check_plans, plan_more_units
 from .datasets import plan_dataset
 from .planned import datasets_in, datasets_of_planned, read_planned
 
@@ -183,6 +183,7 @@ def _plan_whole(config: BuildConfig, request: BuffersConfig) -> BuildPlan:
 def _plan_manifests(root: Path, request: BuffersConfig) -> BuildPlan:
     planned = read_planned(root)
     files = datasets_of_planned(root, planned)
+    check_built(root, files)
     base = Dataset(files[DEMONSTRATIONS])
     queries = {record.episode_id for record in base.records()}
     recorded = None if planned is None else planned.header.datasets.get(DISTRACTORS)

@@ -3,13 +3,11 @@
 import csv
 import io
 import unicodedata
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.constants import FAMILIES_PATH
 from robomme_interference_data.errors import InterferenceError, SourceError
-from robomme_interference_data.storage.files import write_text
 from robomme_interference_data.storage.text import read_text
 
 TASK = "task"
@@ -79,22 +77,6 @@ def read_families(path: Path, tasks: Sequence[Sequence[str]], name: str) -> list
             )
         found.append(first)
     return found
-
-
-def keep_families(given: str, families: Iterable[Mapping[str, str]], root: Path) -> None:
-    """Keep the families of a build in its buffer set, so that later builds need not name them.
-
-    Args:
-        given: `task` or `dataset`, or the path of a families file, which is copied.
-        families: For `task` and `dataset`, the family by task or by dataset, of each source.
-        root: The folder of the buffer set.
-    """
-    if given in (TASK, DATASET):
-        merged = {name: family for named in families for name, family in named.items()}
-        text = _csv([[given, "family"], *map(list, merged.items())])
-    else:
-        text = read_text(Path(given))
-    write_text(root / FAMILIES_PATH, text)
 
 
 def template(tasks: Sequence[Sequence[str]]) -> str:

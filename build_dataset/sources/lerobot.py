@@ -38,7 +38,7 @@ from .families import ids_by_block, ids_by_columns
 from .families_file import TASK, template
 from .goals import check_choice, goal_wordings
 from .images import decode_images, info_is_exact
-from .naming import EpisodeNaming
+from .naming import EpisodeNaming, origin_of_families
 from .robomme_families import BLOCKS, ROBOMME, families_for_goal
 from .subgoals import subgoal_texts
 from .trim import Trim
@@ -52,9 +52,8 @@ class LeRobotSource(Source):
 
     `columns` maps logical names (a camera, `state`, `action`, `is_demo`, `exec_start_idx`,
     `subgoal`) to columns without a usual name: see `find_columns`. `families_from` is `task`,
-    `dataset`, or the path of a families file. `kept_families` is that of an earlier build, for a
-    dataset that does not name its families itself. `several_tasks` is what the goal of an episode
-    with several tasks is, see `goals.SEVERAL_TASKS`.
+    `dataset`, or the path of a families file. `several_tasks` is what the goal of an episode with
+    several tasks is, see `goals.SEVERAL_TASKS`.
     """
 
     def __init__(
@@ -62,17 +61,18 @@ class LeRobotSource(Source):
         location: str,
         columns: dict[str, str] | None = None,
         families_from: str | None = None,
-        kept_families: Path | None = None,
         several_tasks: str | None = None,
     ):
         check_choice(several_tasks)
         self._files = locate(location)
         self._given_columns = columns or {}
-        self._families_from, self._kept_families = families_from, kept_families
+        self._families_from = families_from
         self._several_tasks = several_tasks
         self.provenance = {"kind": "lerobot"}
         if columns:
             self.provenance["columns"] = dict(columns)
+        if families_from is not None:
+            self.provenance["families_from"] = origin_of_families(families_from)
         if isinstance(self._files, HubFiles):
             self.provenance |= {"repo": self._files.repo_id, "revision": self._files.commit}
             if self._files.folder:
@@ -156,12 +156,10 @@ class LeRobotSource(Source):
     def naming(self) -> EpisodeNaming:
         """How the episodes get their names."""
         return EpisodeNaming(
-            table=self._lerobot.table.column_names,
             tasks=self._tasks,
             splits=self._lerobot.info.get("splits"),
             dataset=self._name,
             families_from=self._families_from,
-            kept=self._kept_families,
             dataset_where=self._where,
         )
 

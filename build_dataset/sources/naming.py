@@ -1,16 +1,22 @@
 """How the episodes of a LeRobot dataset that does not name them get their families."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.errors import SourceError, named
-
-from .families import families_by_task, names_episodes, recorded_splits
+from .families import families_by_task, recorded_splits
 from .families_file import DATASET, TASK, one_line, read_families
 from .family_names import families_of
+
+
+def origin_of_families(families_from: str) -> str:
+    """Return what a dataset records of `families_from`: `task`, `dataset` or `file`.
+
+    The path of a file is not recorded: equal recordings give equal datasets on all machines.
+    """
+    return families_from if families_from in (TASK, DATASET) else "file"
 
 
 @dataclass(frozen=True)
@@ -18,29 +24,25 @@ class EpisodeNaming:
     """Where the families of a dataset's episodes come from, if not from the dataset itself.
 
     Attributes:
-        table: Names of the dataset's per-episode columns.
         tasks: The tasks of each episode.
         splits: `splits` of its `info.json`.
         dataset: The name of the dataset.
         families_from: `task`, `dataset` or the path of a families file; None if it is not given.
-        kept: The families file of an earlier build, for a dataset that names no families.
         dataset_where: Where the dataset is, for errors.
     """
 
-    table: Iterable[str]
     tasks: Sequence[Sequence[str]]
     splits: Any
     dataset: str
     families_from: str | None
-    kept: Path | None
     dataset_where: str
 
     @property
     def file(self) -> Path | None:
         """The families file that is used."""
-        if self.families_from is None:
-            return None if names_episodes(self.table) else self.kept
-        return None if self.families_from in (TASK, DATASET) else Path(self.families_from)
+        if self.families_from in (None, TASK, DATASET):
+            return None
+        return Path(self.families_from)
 
     @property
     def where(self) -> str:
@@ -65,7 +67,7 @@ class EpisodeNaming:
         if self.file is None and self.families_from is None:
             return []
         if self.file is not None:
-            rows = self._rows_of_file(self.file)
+            rows = read_families(self.file, self.tasks, self.dataset)
         elif self.families_from == DATASET:
             rows = [{"family": self.families[self.dataset]} for _ in self.tasks]
         else:
@@ -79,12 +81,3 @@ class EpisodeNaming:
     def row(self, index: int) -> dict[str, Any]:
         """Return these columns of an episode."""
         return self.rows[index] if self.rows else {}
-
-    def _rows_of_file(self, path: Path) -> list[dict[str, Any]]:
-        try:
-            return read_families(path, self.tasks, self.dataset)
-        except SourceError as error:
-            if self.families_from is not None:
-                raise
-            more = f"It is of an earlier build: give another with {named('families_from')}."
-            raise SourceError(error.message, f"{error.hint}\n{more}") from None

@@ -7,7 +7,6 @@ from pathlib import Path
 from robomme_interference_data.constants import (
     DATASET_FOLDERS,
     DATASETS,
-    FAMILIES_PATH,
     INDEX_DIR,
     INFO_PATH,
     MANIFESTS,
@@ -20,7 +19,7 @@ _BESIDE = r"(README|LICENSE)[^/]*"
 """Cards."""
 
 _IN_DATASET = re.compile(rf"({'|'.join((*DATASET_FOLDERS, INDEX_DIR))})/.*|{_BESIDE}")
-_IN_SET = re.compile(rf"{MANIFESTS}/.*|{QUESTIONS_PATH}|{FAMILIES_PATH}|{_BESIDE}")
+_IN_SET = re.compile(rf"{MANIFESTS}/.*|{QUESTIONS_PATH}|{_BESIDE}")
 
 
 def unfinished_builds(root: Path) -> list[str]:

@@ -160,7 +160,7 @@ def _lost(outcome: Outcome) -> CheckedEpisode:
     error = outcome.error
     assert error is not None
     hint = error.hint if isinstance(error, InterferenceError) else None
-    return CheckedEpisode(0, None, None, True, (EpisodeProblem(None, first_line(error), hint),))
+    return CheckedEpisode(0, None, None, False, (EpisodeProblem(None, first_line(error), hint),))
 
 
 def _twice(names: Sequence[str], episodes: Sequence[PlannedEpisode]) -> Iterator[Problem]:

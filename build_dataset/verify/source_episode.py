@@ -73,7 +73,7 @@ def check_episode(
 
     recording = checks.apply("opening", open_recording)
     if recording is None:
-        return CheckedEpisode(0, None, None, True, checks.problems())
+        return CheckedEpisode(0, None, None, False, checks.problems())
     rate = checks.apply("rate", partial(recording.robot.at, fps))
     lesson: int | None = None
     with closing(recording.frames):

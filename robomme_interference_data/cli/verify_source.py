@@ -31,7 +31,7 @@ def verify_sources(config: "SourceConfig", root: Path, *, as_json: bool) -> None
 
     Args:
         config: The sources, and how they are read.
-        root: The folder that a build would write: it may keep the families of an earlier build.
+        root: The folder that a build would write.
         as_json: Whether to write JSON to stdout.
     """
     from robomme_interference_data.build_dataset.config import chosen_cameras
@@ -139,10 +139,8 @@ def _print(report: "SourceReport") -> None:
     )
     if report.problems:
         with_problems = {problem.episode for problem in report.problems if problem.episode}
-        print_status(
-            f"{counted(len(report.problems), 'problem')} in "
-            f"{counted(len(with_problems), 'episode')}."
-        )
+        where = f" in {counted(len(with_problems), 'episode')}" if with_problems else ""
+        print_status(f"{counted(len(report.problems), 'problem')}{where}.")
     else:
         print_status("No problems.")
 

@@ -190,32 +190,21 @@ def test_a_families_file_can_mark_the_demonstrations(tmp_path: Path, version: st
     assert shown == [True] * 3 + [False]
 
 
-def test_families_are_kept_with_the_buffer_set(tmp_path: Path, run: Any) -> None:
-    recorded = {"0": make_episode(0, 40, "fold"), "1": make_episode(1, 250, "open")}
+def test_families_of_one_build_are_not_those_of_another(tmp_path: Path, run: Any) -> None:
+    """A file that lists episodes by number would give those of other recordings false families."""
+    recorded = {"0": make_episode(0, 250, "fold"), "1": make_episode(1, 250, "open")}
     data = write_lerobot(tmp_path / "d", recorded, stored="png", marked=False, episode_id=None)
-    root, source = tmp_path / "set", ("--source", f"lerobot:{tmp_path / 'd'}", "--workers", "1")
-    code, _, err = run("build", root, *source, "--json")
-    hint = json.loads(err)["hint"].splitlines()
-    assert code == 1 and hint[1:] == ["task,family", "fold,<family>", "open,<family>"]
+    root, units = tmp_path / "set", ("--only", "distractors", "--workers", "1")
     file = tmp_path / "families.csv"
-    lines = ["task,family,split,exec_start_idx", "fold,Fold,test,20", "open,Open,train,0"]
-    file.write_text("\n".join(lines))
-    units = ("--only", "distractors", *source)
-    assert run("build", root, *units, "--families-from", file)[0] == 0
-    file.unlink()
-    assert run("build", root, *source, "--split", "test", "--conditions", "k0,k1")[0] == 0
-    assert run("verify", root)[0] == 0
-    other = write_lerobot(tmp_path / "e", {"0": make_episode(0, 9, "push")}, episode_id=None)
-    with raises(SourceError) as caught:
-        open_source(f"lerobot:{other}", kept_families=root / "families.csv").episodes()
-    assert "`families_from`" in (caught.value.hint or "")
-    edit_columns(data / TABLE, episode_id=["Fold/test/7", "Open/train/0"])
-    assert [
-        str(episode.id)
-        for episode in open_source(
-            f"lerobot:{data}", kept_families=root / "families.csv"
-        ).episodes()
-    ] == ["Fold/test/7", "Open/train/0"]  # what the recordings name comes first
+    file.write_text("episode_index,family\n0,Fold\n1,Open\n")
+    source = ("--source", f"lerobot:{data}")
+    assert run("build", root, *units, *source, "--families-from", file)[0] == 0
+    assert [path.name for path in root.iterdir()] == ["distractors"]
+    others = {"0": make_episode(2, 250, "push"), "1": make_episode(3, 250, "pull")}
+    other = write_lerobot(tmp_path / "e", others, stored="png", marked=False, episode_id=None)
+    code, _, err = run("build", root, *units, "--source", f"lerobot:{other}", "--json")
+    hint = json.loads(err)["hint"].splitlines()
+    assert code == 1 and hint[1:] == ["task,family", "push,<family>", "pull,<family>"]
 
 
 @pytest.mark.parametrize(
