@@ -165,7 +165,8 @@ def _check_names(path: Path, length: int) -> None:
         what = f"lacks {wrong[0]}" if wrong[0] in expected else f"holds {wrong[0]}"
         raise SourceError(
             f"{path} {what}; {TABLE} has {length} rows, so it must hold {_image_name(0)} to "
-            f"{_image_name(length - 1)} and nothing else"
+            f"{_image_name(length - 1)} and nothing else",
+            LAYOUT,
         )
 
 

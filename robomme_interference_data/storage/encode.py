@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import av
 import numpy as np
@@ -277,7 +277,7 @@ def _png_orientation(data: bytes) -> int:
 
 def _orientation(exif: bytes) -> int:
     """Return the orientation in a block of EXIF, which is a TIFF file without an image."""
-    order = "little" if exif.startswith(b"II") else "big"
+    order: Literal["little", "big"] = "little" if exif.startswith(b"II") else "big"
 
     def number(start: int, size: int) -> int:
         return int.from_bytes(exif[start : start + size], order)

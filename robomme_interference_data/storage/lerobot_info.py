@@ -48,7 +48,7 @@ def _check_feature(name: str, feature: Any, path: object) -> None:
         raise _invalid(path, "the name of a feature", name, f"at most {MAX_NAME} characters")
     if not isinstance(feature, dict) or not isinstance(feature.get("dtype"), str):
         raise _invalid(path, where, feature, "a map with a dtype and a shape")
-    shape = feature.get("shape")
+    shape: Any = feature.get("shape")
     valid = isinstance(shape, list) and len(shape) <= _MAX_SIDES
     # Some datasets declare features of no values, which are not stored.
     valid = valid and all(_is_count(side, 0, MAX_FRAME_VALUES) for side in shape)
