@@ -6,7 +6,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-
 from .families import families_by_task, recorded_splits
 from .families_file import DATASET, TASK, one_line, read_families
 from .family_names import families_of

@@ -166,7 +166,7 @@ class Buffer:
                 f"session {number} ({entry.source} of the {entry.dataset})": states.shape[1]
                 for number, (entry, states) in enumerate(recorded.items())
             }
-            check_sizes(str(self.manifest), size, sizes, rule, "other_states")
+            check_sizes(str(self.manifest), size, sizes, rule, 'states_by("{}")'.format)
             self._states[rule] = self.gather(
                 lambda entry: fit_states(recorded[entry], size, rule),
                 np.empty((0, size), np.float32),
