@@ -33,7 +33,7 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.encode import CODECS, VideoEncoder
-from robomme_interference_data.storage.files import read_json
+from robomme_interference_data.storage.text import read_json
 
 SIDE, LESSON = 32, 8
 CAMERAS = (FRONT, WRIST)

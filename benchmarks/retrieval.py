@@ -39,7 +39,8 @@ from robomme_interference_data.retrieval.encoders import Encoder, make_encoder
 from robomme_interference_data.retrieval.grade import cells, grade
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.select import Rule, choose, measure
-from robomme_interference_data.storage.files import LocalFiles, read_json, write_json
+from robomme_interference_data.storage.files import LocalFiles, write_json
+from robomme_interference_data.storage.text import read_json
 
 QUIET = WorkProgress(quiet=True)
 RULE = Rule("max")

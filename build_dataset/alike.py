@@ -43,6 +43,17 @@ def in_buffers(kind: str, features: Mapping[str, tuple[int, ...]], fps: float) -
     return Look({name: shape for name, shape in features.items() if name not in without}, fps)
 
 
+def in_dataset(left: Look, right: Look) -> tuple[Look, Look]:
+    """Return what must be alike in two episodes of one dataset: one may lack actions."""
+    looks = left, right
+    if all(ACTION in look.features for look in looks):
+        return looks
+    features = [
+        {name: shape for name, shape in look.features.items() if name != ACTION} for look in looks
+    ]
+    return replace(left, features=features[0]), replace(right, features=features[1])
+
+
 def differences(left: tuple[str, Look], right: tuple[str, Look]) -> list[str]:
     """Return how two looks differ, a clause each; every look comes with the name of its owner."""
     (first, a), (second, b) = left, right
@@ -59,7 +70,7 @@ def differences(left: tuple[str, Look], right: tuple[str, Look]) -> list[str]:
 
 
 def describe(look: Look) -> str:
-    """Return a look for people, such as `camera front 64×48 pixels, state 8 values, 10 Hz`."""
+    """Return a look in words: `camera front 64×48 pixels, state 8 values, 10 frames per second`."""
     parts = [f"{_title(name)} {_size(shape)}" for name, shape in sorted(look.features.items())]
     parts.append(f"{look.fps:g} frames per second")
     if look.robot_type is not None:

@@ -36,6 +36,13 @@ NO_CAMERAS = ("none",)
 """Setting of `cameras` for a dataset without images: simulators then render nothing."""
 
 
+def chosen_cameras(setting: tuple[str, ...]) -> tuple[str, ...] | None:
+    """Return the cameras that the setting `cameras` chooses, sorted; None for all."""
+    if setting == NO_CAMERAS:
+        return ()
+    return tuple(sorted(setting)) or None
+
+
 @dataclass(frozen=True)
 class BuildConfig(WorkersConfig):
     """Settings of a build: of a whole buffer set, or of one part of it."""

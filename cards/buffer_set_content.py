@@ -22,8 +22,9 @@ from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import MissingFileError, PublishError
 from robomme_interference_data.schema.codec import to_dict
-from robomme_interference_data.storage.files import LocalFiles, indented_json
+from robomme_interference_data.storage.files import LocalFiles
 from robomme_interference_data.storage.hub import HubFiles
+from robomme_interference_data.storage.text import indented_json
 
 from .checks import missing_extras
 from .dataset_facts import buffer_set_facts, demonstrations_facts

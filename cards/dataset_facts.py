@@ -32,7 +32,7 @@ from robomme_interference_data.errors import FormatError, InvalidOptionError, Mi
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
 from robomme_interference_data.schema.manifest import BufferManifest
 from robomme_interference_data.schema.records import EpisodeRecord
-from robomme_interference_data.storage.files import read_json
+from robomme_interference_data.storage.text import read_json
 from robomme_interference_data.viz.filmstrip import strip_png
 
 from .facts import CardTable, Facts, data_limits, dataset_rows, repositories_of
@@ -229,9 +229,7 @@ def _changes(datasets: Mapping[str, Dataset]) -> list[str]:
         if sizes := sorted({str(source["resize"]) for source in sources if "resize" in source}):
             limits.append(f"The frames of the {named} are resized: {sizes[0]}.")
         if dataset.features[STATE] == (0,):
-            limits.append(
-                f"The {name or DEMONSTRATIONS} have no robot states: states have length 0."
-            )
+            limits.append(f"The {named} have no robot states: states have length 0.")
     others = other_state_sizes(datasets) if DEMONSTRATIONS in datasets else {}
     for name, size in others.items():
         limits.append(

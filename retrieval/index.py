@@ -54,7 +54,6 @@ from robomme_interference_data.storage.files import (
     Files,
     LocalFiles,
     atomic_path,
-    canonical_json,
     format_sums,
     sha256_file,
     write_json,
@@ -62,6 +61,7 @@ from robomme_interference_data.storage.files import (
 )
 from robomme_interference_data.storage.hub import HubFiles
 from robomme_interference_data.storage.staging import replace_folder, staging_dir, staging_path
+from robomme_interference_data.storage.text import canonical_json
 
 from .encoders import Encoder, check_encoder, encoder_digest
 from .segment import typical_cosine

@@ -93,6 +93,9 @@ REPORT_PATH = "meta/build_report.json"
 SUMS_PATH = "meta/SHA256SUMS"
 INDEX_DIR = "index"
 INDEX_HEADER = "index.json"
+
+FRAME_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+"""Columns that LeRobot adds to every frame, in its order."""
 DATASET_FOLDERS = ("data", "meta", "videos")
 """Folders of a dataset's own files, which `SUMS_PATH` lists."""
 

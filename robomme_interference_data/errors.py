@@ -276,6 +276,10 @@ class WorkerRetiredError(InterferenceError, RuntimeError):
     """
 
 
+SAME_FOR_ALL = (InvalidOptionError, MissingExtraError, SimulatorError)
+"""Errors about settings or this machine: after one, other episodes would fail alike."""
+
+
 # The names under which the reader of an error sets what is wrong: one command runs in a process.
 _option_names: Mapping[str, str] = {}
 

@@ -15,19 +15,18 @@ from itertools import islice
 from pathlib import Path
 
 from robomme_interference_data.build_dataset.alike import (
-    Look,
     differ_in_cameras,
     differ_in_image_sizes,
     differences,
     in_buffers,
+    in_dataset,
 )
 from robomme_interference_data.constants import ACTION, INFO_PATH, UNITS
 from robomme_interference_data.errors import (
+    SAME_FOR_ALL,
     BuildError,
     InterferenceError,
     InvalidOptionError,
-    MissingExtraError,
-    SimulatorError,
     SourceError,
     first_line,
     named,
@@ -36,8 +35,8 @@ from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Executor, Outcome
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.encode import get_codec
-from robomme_interference_data.storage.files import canonical_json, read_json
 from robomme_interference_data.storage.staging import replace_folder, staging_dir
+from robomme_interference_data.storage.text import canonical_json, read_json
 
 from .estimate import BuildEstimate
 from .existing import ExistingDataset, open_existing
@@ -141,17 +140,16 @@ def _stage(
                 estimate.take(folder(outcome.task))
                 continue
             failures.append(outcome)
-            if isinstance(outcome.error, InvalidOptionError | MissingExtraError | SimulatorError):
-                break  # the others would fail alike
+            if isinstance(outcome.error, SAME_FOR_ALL):
+                break
     if failures:
         raise _failure(failures, len(todo), some_kept=len(stored) + len(skipped) > before)
 
 
 def _check_alike(first: StoredEpisode, second: StoredEpisode) -> None:
-    """Check that two episodes can be in one dataset; one may lack actions."""
-    without = {ACTION} - (first.features.keys() & second.features.keys())
+    """Check that two episodes can be in one dataset."""
     names = [str(episode.record.episode_id) for episode in (first, second)]
-    looks = [_look(episode, without) for episode in (first, second)]
+    looks = in_dataset(first.look, second.look)
     if found := differences((names[0], looks[0]), (names[1], looks[1])):
         raise SourceError(
             f"{names[0]} and {names[1]} cannot be in one dataset: {'; '.join(found)}",
@@ -160,11 +158,6 @@ def _check_alike(first: StoredEpisode, second: StoredEpisode) -> None:
             if differ_in_cameras(*looks)
             else "Leave one of them out, or build them into separate buffer sets.",
         )
-
-
-def _look(episode: StoredEpisode, without: set[str]) -> Look:
-    features = {name: shape for name, shape in episode.features.items() if name not in without}
-    return Look(features, episode.fps, episode.robot.type, episode.robot.names)
 
 
 def _check_like(episode: StoredEpisode, plan: DatasetPlan) -> None:

@@ -22,8 +22,9 @@ from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError, named
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EpisodeRecord
-from robomme_interference_data.storage.files import LocalFiles, read_header
+from robomme_interference_data.storage.files import LocalFiles
 from robomme_interference_data.storage.lerobot import LeRobotFiles
+from robomme_interference_data.storage.text import read_header
 
 from .identity import BuildReport
 from .lerobot_writer import StoredEpisode

@@ -9,10 +9,23 @@ from numpy.typing import NDArray
 from robomme_interference_data.build_dataset.alike import Look, differences
 from robomme_interference_data.constants import CAMERA_PREFIX, STATE
 from robomme_interference_data.errors import InvalidOptionError, SourceError, named
-from robomme_interference_data.storage.limits import MAX_FRAME_VALUES, MAX_NAME, MAX_VECTOR
+from robomme_interference_data.storage.limits import MAX_NAME, MAX_PIXELS, MAX_VECTOR
 
 _CAMERA = re.compile(r"\w[\w .-]*")
 _MAX_CAMERA = MAX_NAME - len(CAMERA_PREFIX)
+
+
+def check_image(feature: str, image: NDArray[np.uint8]) -> None:
+    """Check that the image of a camera is an RGB image.
+
+    Raises:
+        SourceError: It is not.
+    """
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+        raise SourceError(
+            f"{feature} holds images {image.shape} {image.dtype}; expected (H, W, 3) uint8",
+            "Convert the images to RGB with 8 bits a channel.",
+        )
 
 
 def check_shapes(
@@ -30,15 +43,12 @@ def check_shapes(
     """
     for feature, image in images.items():
         _check_camera(feature.removeprefix(CAMERA_PREFIX))
-        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-            raise SourceError(
-                f"{feature} holds images {image.shape} {image.dtype}; expected (H, W, 3) uint8"
-            )
-        if image.size > MAX_FRAME_VALUES:
-            height, width, _ = image.shape
+        check_image(feature, image)
+        height, width, _ = image.shape
+        if height * width > MAX_PIXELS:
             raise SourceError(
                 f"{feature} has images of {width} × {height} pixels; expected at most "
-                f"{MAX_FRAME_VALUES // 3:,} pixels",
+                f"{MAX_PIXELS:,} pixels",
                 "Scale the images down.",
             )
     for feature, vector in vectors.items():

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.build_dataset.alike import Look
 from robomme_interference_data.build_dataset.sources.base import Robot
 from robomme_interference_data.constants import ACTION, INFO_PATH
 from robomme_interference_data.errors import MissingExtraError
@@ -54,6 +55,11 @@ class StoredEpisode:
         """Frames per second, which staging makes sure are known."""
         assert self.robot.fps is not None
         return self.robot.fps
+
+    @property
+    def look(self) -> Look:
+        """What must be alike in the episodes of a dataset."""
+        return Look(self.features, self.fps, self.robot.type, self.robot.names)
 
 
 def require_lerobot() -> None:

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +34,7 @@ from robomme_interference_data.storage.encode import Codec, VideoEncoder, get_co
 from robomme_interference_data.storage.limits import MAX_READ_VALUES
 from robomme_interference_data.storage.video import iter_frames
 
-from .frame_checks import check_numbers, check_same_shapes, check_shapes
+from .frame_checks import check_image, check_numbers, check_same_shapes, check_shapes
 from .frame_selection import NothingToStore, select_episodes, too_short, unit_starts
 from .plan import DatasetPlan, PlannedEpisode
 from .resize import Resize
@@ -181,7 +180,8 @@ class _Writer:
         vectors = {STATE: frame.state} | ({} if frame.action is None else {ACTION: frame.action})
         shapes = {name: value.shape for name, value in (images | vectors).items()}
         if not self.length:
-            _check_images(images)
+            for name, image in images.items():
+                check_image(name, image)  # before it is resized
             self._recorded = shapes
         check_same_shapes(shapes, self._recorded, f"stored frame {self.length}")
         if self._resize is not None:
@@ -240,12 +240,3 @@ class _Writer:
         self._vectors = {name: [] for name in vectors}
         self.features = {name: value.shape for name, value in (images | vectors).items()}
         self.resized = self.features != self._recorded
-
-
-def _check_images(images: Mapping[str, NDArray[Any]]) -> None:
-    """Check that the images of a frame are RGB images."""
-    for name, image in images.items():
-        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-            raise SourceError(
-                f"{name} holds images {image.shape} {image.dtype}; expected (H, W, 3) uint8"
-            )

@@ -5,7 +5,12 @@ import re
 import shlex
 from collections.abc import Container, Sequence
 
-from robomme_interference_data.build_dataset.config import NO_CAMERAS, BuildConfig, parse_unit
+from robomme_interference_data.build_dataset.config import (
+    NO_CAMERAS,
+    BuildConfig,
+    chosen_cameras,
+    parse_unit,
+)
 from robomme_interference_data.build_dataset.dataset.frame_selection import unmarked_error
 from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan, PlannedEpisode
 from robomme_interference_data.build_dataset.dataset.resize import Resize
@@ -55,12 +60,11 @@ def plan_dataset(
             PlannedEpisode(number, sources[number].contradict(episode))
             for number, episode in episodes
         )
-    cameras = tuple(sorted(config.cameras)) or None
     return DatasetPlan(
         kind=kind,
         sources=sources,
         episodes=episodes,
-        cameras=() if config.cameras == NO_CAMERAS else cameras,
+        cameras=chosen_cameras(config.cameras),
         codec=config.codec,
         version=config.version,
         time_limit_s=config.time_limit_s,

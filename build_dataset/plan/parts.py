@@ -4,7 +4,7 @@ Everything that can be known before a frame is read is checked here.
 """
 
 import shlex
-from collections.abc import Iterable
+from collections.abc import Container
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
@@ -32,6 +32,7 @@ from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import BuildError, InvalidOptionError, named
 from robomme_interference_data.runtime.executor import WorkersConfig
 from robomme_interference_data.schema.conditions import datasets_of
+from robomme_interference_data.schema.settings import changed_settings
 from robomme_interference_data.storage.files import Files, LocalFiles
 from robomme_interference_data.storage.hub import locate
 
@@ -110,7 +111,8 @@ def _is_for_buffers_alone(config: BuildConfig, request: BuffersConfig) -> bool:
     """Return whether a request changes only which buffers of an existing set are planned."""
     planned = (config.buffer_set / MANIFEST_PATH).is_file()
     used = ["buffer_set", *(setting.name for setting in fields(WorkersConfig))]
-    return planned and bool(_changed(request)) and not _changed(config, used)
+    changes = bool(changed_settings(request)) and not changed_settings(config, used)
+    return planned and changes
 
 
 def _require_source(config: BuildConfig, what: str) -> None:
@@ -129,20 +131,10 @@ def _require_source(config: BuildConfig, what: str) -> None:
     )
 
 
-def _check_unset(config: BuildConfig | BuffersConfig, part: str, used: Iterable[str]) -> None:
+def _check_unset(config: BuildConfig | BuffersConfig, part: str, used: Container[str]) -> None:
     """Check that settings which do not matter for a part are left out."""
-    for name in _changed(config, used):
+    for name in changed_settings(config, used):
         raise _no_effect(name, part)
-
-
-def _changed(config: BuildConfig | BuffersConfig, used: Iterable[str] = ()) -> list[str]:
-    """Return the settings that differ from their defaults, without those of `used`."""
-    return [
-        setting.name
-        for setting in fields(config)
-        if setting.name not in used
-        if getattr(config, setting.name) != setting.default
-    ]
 
 
 def _no_effect(setting: str, part: str) -> InvalidOptionError:

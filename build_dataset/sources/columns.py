@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from robomme_interference_data.constants import ACTION, STATE
+from robomme_interference_data.constants import ACTION, FRAME_COLUMNS, STATE
 from robomme_interference_data.errors import (
     InvalidOptionError,
     SourceError,
@@ -40,7 +40,7 @@ then those of `lerobot/robomme` and `Yinpei/robomme_data_lerobot`."""
 
 _CAMERAS = ("front", "wrist")
 _NOT_CAMERAS = tuple(name for name in _USUAL if name not in _CAMERAS)
-_COUNTERS = ("timestamp", "frame_index", "episode_index", "index", "task_index", "subtask_index")
+_COUNTERS = (*FRAME_COLUMNS, "subtask_index")
 """Columns of numbers that LeRobot writes into every dataset, or for annotations."""
 
 

@@ -58,7 +58,11 @@ def ids_by_columns(rows: Sequence[Mapping[str, Any]], where: str) -> dict[int, E
             raise SourceError(f"{where}, episode {episode}: {error.message}", error.hint) from None
         other = ids.setdefault(name, episode)
         if other != episode:
-            raise SourceError(f"{where}: episodes {other} and {episode} are both named {name}")
+            raise SourceError(
+                f"{where}: episodes {other} and {episode} are both named {name}",
+                "Give each a name of its own, for example in a CSV file: "
+                f"{named('families_from', 'FILE.csv')}.",
+            )
     return {episode: name for name, episode in ids.items()}
 
 

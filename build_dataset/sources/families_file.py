@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.errors import InterferenceError, SourceError
-from robomme_interference_data.storage.files import read_text
+from robomme_interference_data.storage.text import read_text
 
 TASK = "task"
 DATASET = "dataset"

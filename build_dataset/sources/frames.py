@@ -12,8 +12,9 @@ from typing import Any, override
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, SourceError, named
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators.episode import choose_cameras
-from robomme_interference_data.storage.files import is_hidden, read_bytes
+from robomme_interference_data.storage.files import is_hidden
 from robomme_interference_data.storage.parquet import RowSpan
+from robomme_interference_data.storage.text import read_bytes
 from robomme_interference_data.storage.video import iter_frames
 
 from ..alike import same_rate
@@ -164,7 +165,8 @@ def _check_names(path: Path, length: int) -> None:
         what = f"lacks {wrong[0]}" if wrong[0] in expected else f"holds {wrong[0]}"
         raise SourceError(
             f"{path} {what}; {TABLE} has {length} rows, so it must hold {_image_name(0)} to "
-            f"{_image_name(length - 1)} and nothing else"
+            f"{_image_name(length - 1)} and nothing else",
+            LAYOUT,
         )
 
 

@@ -65,7 +65,7 @@ def _is_flag(kind: pa.DataType) -> bool:
     return pa.types.is_boolean(kind) or is_number(kind) or is_text(kind)
 
 
-def _is_whole(kind: pa.DataType) -> bool:
+def _is_number_or_text(kind: pa.DataType) -> bool:
     return is_number(kind) or is_text(kind) or pa.types.is_null(kind)
 
 
@@ -80,7 +80,7 @@ _RATE = is_number, "numbers"
 _VECTOR = _is_vector, "lists of numbers"
 _COUNT = is_number, "whole numbers"
 # Text and floats are read where they have one meaning: "7" and 7.0.
-_NUMBER = _is_whole, "whole numbers"
+_NUMBER = _is_number_or_text, "whole numbers"
 _FLAG = _is_flag, "true or false"
 _REQUIRED: dict[str, tuple[Callable[[pa.DataType], bool], str]] = {
     "episode_id": _TEXT,
@@ -110,7 +110,7 @@ def read_frames_table(path: Path) -> dict[EpisodeId, EpisodeRows | SourceError]:
         with reading(path):
             table = _simplified(table)
     except FormatError as error:
-        raise SourceError(error.message, LAYOUT) from None
+        raise SourceError(error.message, error.hint or LAYOUT) from None
     if not table.num_rows:
         raise SourceError(f"{path} has no rows", LAYOUT)
     if problem := _column_problem(table):

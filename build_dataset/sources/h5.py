@@ -16,11 +16,16 @@ import h5py
 import numpy as np
 
 from robomme_interference_data.constants import OFFICIAL
-from robomme_interference_data.errors import InterferenceError, InvalidIdError, SourceError
+from robomme_interference_data.errors import (
+    InterferenceError,
+    InvalidIdError,
+    MissingFileError,
+    SourceError,
+)
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.evidence import spans_of_texts
 from robomme_interference_data.simulators.episode import choose_cameras
-from robomme_interference_data.storage.files import check_not_pointer
+from robomme_interference_data.storage.text import check_not_pointer
 
 from .base import Frame, Recording, Robot, Source, SourceEpisode, demonstration_length, file_state
 from .episode_columns import parse_column
@@ -151,6 +156,8 @@ def _complete(where: object) -> Iterator[None]:
 
 @contextmanager
 def _opened(path: str | Path) -> Iterator[h5py.File]:
+    if not Path(path).is_file():
+        raise MissingFileError(f"{path} does not exist", "Start again.")
     with _complete(path):
         check_not_pointer(Path(path))
         with h5py.File(path, "r") as file:

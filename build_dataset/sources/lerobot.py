@@ -254,14 +254,18 @@ class LeRobotSource(Source):
             yield from self._lerobot.iter_frames(index, column, trim.start, trim.stop)
             return
         cells = enumerate(rows.images(column), trim.start)
-        where = f"of column {column!r}"
-        yield from decode_images(((f"frame {n} {where}", data) for n, data in cells), exact)
+        where = f"{rows.path}: column {column!r}, frame"
+        yield from decode_images(((f"{where} {n}", data) for n, data in cells), exact)
 
     def _is_exact(self, rows: RowSpan, column: str) -> bool:
         """Return whether images are exact, by their codec or by the first one in parquet."""
         feature = self._lerobot.features[column]
         if feature["dtype"] != "video":
-            return is_png(next(rows.images(column)))
+            first = next(rows.images(column))
+            try:
+                return is_png(first)
+            except FormatError as error:
+                raise error.about(f"{rows.path}: column {column!r}") from None
         return info_is_exact((feature.get("video_info") or {}) | (feature.get("info") or {}))
 
     def _ids(self, rows: list[dict[str, Any]]) -> tuple[dict[int, EpisodeId], str | None]:
@@ -289,7 +293,10 @@ class LeRobotSource(Source):
     def _naming_columns(self, index: int, row: dict[str, Any]) -> dict[str, Any]:
         """Return those per-episode columns of an episode that name it."""
         where = f"{self._where}: episode {index}"
-        return {name: read_column(name, row[name], where) for name in NAMING if name in row}
+        columns = {name: read_column(name, row[name], where) for name in NAMING if name in row}
+        if "family" in columns and "episode_id" not in columns:
+            columns["split"] = columns.get("split") or self.naming.recorded_splits[index]
+        return columns
 
     def _check_goals(self, index: int, name: EpisodeId, goals: tuple[str, ...]) -> None:
         for goal in goals:

@@ -57,11 +57,15 @@ class EpisodeNaming:
         return families_by_task(self.tasks, self.dataset_where)
 
     @cached_property
+    def recorded_splits(self) -> list[str]:
+        """The split of each episode by `info.json`."""
+        return recorded_splits(self.splits, len(self.tasks), self.dataset_where)
+
+    @cached_property
     def rows(self) -> list[dict[str, Any]]:
         """Columns `family`, `split` and others of each episode; empty if the dataset names them."""
         if self.file is None and self.families_from is None:
             return []
-        splits = recorded_splits(self.splits, len(self.tasks), self.dataset_where)
         if self.file is not None:
             rows = read_families(self.file, self.tasks, self.dataset)
         elif self.families_from == DATASET:
@@ -71,7 +75,7 @@ class EpisodeNaming:
             rows = [{"family": families[one_line(texts[0])]} for texts in self.tasks]
         return [
             row | {"split": row.get("split") or split}
-            for row, split in zip(rows, splits, strict=True)
+            for row, split in zip(rows, self.recorded_splits, strict=True)
         ]
 
     def row(self, index: int) -> dict[str, Any]:

@@ -25,8 +25,10 @@ class Trim:
             length: Frames of the recording.
 
         Raises:
-            SourceError: They do not lie in the recording in this order.
+            SourceError: They do not lie in the recording in this order, or it has no frames.
         """
+        if length == 0:
+            raise SourceError("the recording has no frames", "Leave the episode out.")
         given_start, given_stop = row.get("start"), row.get("stop")
         start = 0 if given_start is None else given_start
         stop = length if given_stop is None else given_stop

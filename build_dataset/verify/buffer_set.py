@@ -2,18 +2,9 @@
 
 import shlex
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from robomme_interference_data.build_dataset.manifests import plan_manifests, planned_buffers
-from robomme_interference_data.build_dataset.questions import Marks, planned_questions
 from robomme_interference_data.constants import (
-    DATASETS,
     DEMONSTRATIONS,
     DISTRACTORS,
     EXECUTIONS,
@@ -22,27 +13,25 @@ from robomme_interference_data.constants import (
     MANIFEST_ROWS,
     MANIFESTS,
     QUESTIONS_PATH,
-    RULE_VERSION,
 )
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.fetched_copy import FetchedCopy
 from robomme_interference_data.data.loading import built_datasets
-from robomme_interference_data.data.query import Query
-from robomme_interference_data.data.questions import Question, read_questions
+from robomme_interference_data.data.questions import Question
 from robomme_interference_data.data.set_files import pending_rows
-from robomme_interference_data.errors import FormatError, InterferenceError
+from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.progress import WorkProgress
-from robomme_interference_data.schema.codec import arrow_schema, to_dict
-from robomme_interference_data.schema.conditions import datasets_of, in_order
+from robomme_interference_data.schema.codec import arrow_schema
 from robomme_interference_data.schema.manifest import BufferManifest, ManifestHeader
 from robomme_interference_data.storage.arrays import combine
-from robomme_interference_data.storage.encode import CODECS, decode_image
+from robomme_interference_data.storage.encode import CODECS
 from robomme_interference_data.storage.files import LocalFiles, all_files, is_hidden, sha256_file
 from robomme_interference_data.storage.parquet import open_parquet
 from robomme_interference_data.storage.staging import staging_path
 
 from .dataset import HEADER, UNLISTED, Violation, caught, dataset_violations, index_violations
+from .planned_again import buffer_violations, question_violations
 from .set_files import further_files, unfinished_builds
 
 _ROWS = f"{MANIFESTS}/{MANIFEST_ROWS}"
@@ -81,13 +70,13 @@ def verify_buffer_set(
                 yield Violation(f"{name}/{path}", "is not part of the dataset")
     yield from _datasets(datasets, header, copy, progress if decode else None)
     if len(datasets) == len(buffer_set.datasets):
-        yield from caught(MANIFESTS, _buffers(buffer_set, datasets))
+        yield from caught(MANIFESTS, buffer_violations(buffer_set, datasets))
     if decode and {DEMONSTRATIONS, EXECUTIONS} <= datasets.keys():
         executions, demonstrations = datasets[EXECUTIONS], datasets[DEMONSTRATIONS]
         yield from caught(EXECUTIONS, _executions(executions, demonstrations, copy))
     if header.questions is not None and (copy is None or copy.lists(root, QUESTIONS_PATH)):
         yield from caught(QUESTIONS_PATH, _table(root, QUESTIONS_PATH, Question))
-        yield from caught(QUESTIONS_PATH, _questions(buffer_set, decode=decode))
+        yield from caught(QUESTIONS_PATH, question_violations(buffer_set, decode=decode))
     elif (root / QUESTIONS_PATH).exists():
         yield Violation(QUESTIONS_PATH, f"is not listed in {HEADER}")
 
@@ -202,53 +191,6 @@ def _table(root: Path, path: str, record: type) -> Iterator[Violation]:
         yield Violation(path, f"does not have the declared columns; differing: {sorted(differing)}")
 
 
-def _buffers(buffer_set: BufferSet, datasets: Mapping[str, Dataset]) -> Iterator[Violation]:
-    """Plan all buffers again, and compare them with the rows.
-
-    Of a partial copy, those are left out that need a dataset which it lacks.
-    """
-    header, files = buffer_set.header, {name: dataset.files for name, dataset in datasets.items()}
-    if header.rule_version != RULE_VERSION:
-        what = f"rule version {header.rule_version}; this package can check {RULE_VERSION}"
-        yield Violation(HEADER, what)
-        return
-    conditions = in_order(header.conditions)
-    if buffer_set.copy is not None:
-        conditions = tuple(
-            condition for condition in conditions if files.keys() >= {*condition.kind.needs}
-        )
-    plan = plan_manifests(files, conditions, header.seed, header.position_limit)
-    counts = {"queries": len(plan.demonstrations), "buffers": 0, "sessions": 0}
-    stored: dict[str, dict[str, Any]] = {}
-    left_out = {*header.conditions} - {condition.name for condition in conditions}
-    for manifest in buffer_set.planned_manifests():
-        if manifest.condition in left_out:
-            counts["buffers"] += 1
-            counts["sessions"] += len(manifest.sessions)
-        else:
-            stored[str(manifest)] = to_dict(manifest)
-    order = list(stored)
-    for number, manifest in enumerate(planned_buffers(plan)):
-        name = str(manifest)
-        counts["buffers"] += 1
-        counts["sessions"] += len(manifest.sessions)
-        row = stored.pop(name, None)
-        if row is None:
-            yield Violation(name, f"is missing in {MANIFEST_ROWS}")
-            continue
-        if number >= len(order) or order[number] != name:
-            yield Violation(name, f"is out of order in {MANIFEST_ROWS}")
-        for field, value in to_dict(manifest).items():
-            if row[field] != value:
-                yield Violation(name, f"{field} is {_difference(row[field], value)}")
-    yield from (Violation(name, f"should not be in {MANIFEST_ROWS}") for name in stored)
-    if header.counts != counts:
-        yield Violation(HEADER, f"counts are {header.counts}; expected {counts}")
-    needed = {*datasets_of(in_order(header.conditions))}
-    if not needed <= header.datasets.keys() <= {*DATASETS}:
-        yield Violation(HEADER, f"datasets are {sorted(header.datasets)}")
-
-
 def _executions(
     executions: Dataset, demonstrations: Dataset, copy: FetchedCopy | None
 ) -> Iterator[Violation]:
@@ -265,42 +207,3 @@ def _executions(
         if query is not None and combine(first) != query.query:
             what = f"does not begin with the query frame of the {DEMONSTRATIONS}"
             yield Violation(f"{EXECUTIONS} {record.episode_id}", what)
-
-
-def _questions(buffer_set: BufferSet, *, decode: bool) -> Iterator[Violation]:
-    """Plan all questions again, draw their pictures, and compare them with the stored ones."""
-    stored = read_questions(buffer_set)
-    drawn = decode and find_spec("PIL") is not None
-    for question, marks in planned_questions(buffer_set):
-        where = f"{QUESTIONS_PATH} {question.episode_id}"
-        kept = stored.pop(question.episode_id)
-        if (found := replace(kept, picture=b"")) != question:
-            yield Violation(where, f"is {_difference(to_dict(found), to_dict(question))}")
-            continue
-        try:
-            shown = decode_image(kept.picture)
-            if drawn and not _is_picture(shown, buffer_set.query(question.episode_id), marks):
-                yield Violation(where, "has a picture of something else")
-        except FormatError as error:
-            yield Violation(where, error.message)
-    yield from (
-        Violation(f"{QUESTIONS_PATH} {episode}", "belongs to no query") for episode in stored
-    )
-
-
-def _is_picture(stored: NDArray[np.uint8], query: Query, marks: Marks) -> bool:
-    from robomme_interference_data.build_dataset.question_pictures import is_picture
-
-    return is_picture(stored, query.frame(), marks)
-
-
-def _difference(stored: Any, expected: Any) -> str:
-    """Return two different values, shortened to where they differ."""
-    position = ""
-    while isinstance(stored, list) and isinstance(expected, list) and len(stored) == len(expected):
-        index = next(i for i, value in enumerate(stored) if value != expected[i])
-        stored, expected, position = stored[index], expected[index], f"{position} at {index}"
-    if isinstance(stored, dict) and isinstance(expected, dict):
-        keys = [key for key in expected if stored.get(key) != expected[key]]
-        stored, expected = ({key: values.get(key) for key in keys} for values in (stored, expected))
-    return f"{stored!r}{position}; the rules give {expected!r}"

@@ -14,6 +14,7 @@ from robomme_interference_data.build_dataset.dataset.statistics import STATISTIC
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     EPISODES_DIR,
+    FRAME_COLUMNS,
     INFO_PATH,
     RECORDS_PATH,
     TASKS_PATH,
@@ -28,9 +29,6 @@ from robomme_interference_data.storage.lerobot_tables import episode_column_name
 
 _TOLERANCE_S = 1e-4
 """LeRobot's own tolerance of timestamps, in seconds."""
-
-_FRAME_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-"""Columns that LeRobot adds to every frame, in its order."""
 
 
 def lerobot_violations(dataset: Dataset, copy: FetchedCopy | None) -> Iterator[tuple[str, str]]:
@@ -100,7 +98,7 @@ def _columns(dataset: Dataset) -> Iterator[tuple[str, str]]:
     lean |= {*records.names}
     for camera in dataset.cameras:
         lean |= {f"videos/{CAMERA_PREFIX}{camera}/{name}" for name in videos}
-    features = (*_stored(dataset), *_FRAME_COLUMNS)
+    features = (*_stored(dataset), *FRAME_COLUMNS)
     statistics = {f"stats/{feature}/{name}" for feature in features for name in STATISTICS}
     copy = dataset.lerobot.table
     yield from _names(EPISODES_DIR, names, lean | statistics)
@@ -129,7 +127,7 @@ def _info(dataset: Dataset) -> Iterator[tuple[str, str]]:
     for name, value in expected.items():
         if info.get(name) != value:
             yield INFO_PATH, f"{name} is {info.get(name)}; expected {value}"
-    yield from _names(INFO_PATH, [*dataset.lerobot.features], {*_stored(dataset), *_FRAME_COLUMNS})
+    yield from _names(INFO_PATH, [*dataset.lerobot.features], {*_stored(dataset), *FRAME_COLUMNS})
 
 
 def _rows(dataset: Dataset, index: int, first: int, task: int | None) -> Iterator[tuple[str, str]]:
@@ -137,7 +135,7 @@ def _rows(dataset: Dataset, index: int, first: int, task: int | None) -> Iterato
     rows = dataset.lerobot.rows(index)
     path = dataset.lerobot.locate(index).data
     vectors = {name for name in _stored(dataset) if not name.startswith(CAMERA_PREFIX)}
-    yield from _names(path, rows.names, vectors | {*_FRAME_COLUMNS})
+    yield from _names(path, rows.names, vectors | {*FRAME_COLUMNS})
     count = len(rows)
     if not np.array_equal(rows.scalars("index"), first + np.arange(count)):
         yield path, f"index of episode {index} is not {first} to {first + count - 1}"

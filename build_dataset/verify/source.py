@@ -3,19 +3,16 @@
 Reading goes through the sources, and the rules of frames and datasets, as in a build.
 """
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
-from robomme_interference_data.build_dataset.alike import Look, differences
+from robomme_interference_data.build_dataset.alike import Look, differences, in_dataset
 from robomme_interference_data.build_dataset.dataset.plan import PlannedEpisode
 from robomme_interference_data.build_dataset.sources import Source
-from robomme_interference_data.constants import ACTION
 from robomme_interference_data.errors import (
+    SAME_FOR_ALL,
     InterferenceError,
-    InvalidOptionError,
-    MissingExtraError,
-    SimulatorError,
     first_line,
     named,
     naming_options,
@@ -64,7 +61,8 @@ class SourceReport:
         problems: The problems, by episode and frame.
         episodes: Number of episodes, those with problems included.
         frames: Number of frames that could be read.
-        marked: Number of episodes with demonstration frames and a live observation after them.
+        with_demonstration: Number of episodes with demonstration frames and a live observation
+            after them.
         exact: Number of episodes whose frames were never lossily compressed.
         looks: What can be in one dataset, with the number of its episodes; most frequent first.
     """
@@ -72,7 +70,7 @@ class SourceReport:
     problems: list[Problem]
     episodes: int
     frames: int
-    marked: int
+    with_demonstration: int
     exact: int
     looks: list[tuple[Look, int]]
 
@@ -129,15 +127,15 @@ def check_sources(
     with closing(executor.run(task, enumerate(episodes), time_limit=limit)) as outcomes:
         for outcome in outcomes:
             advance(1)
-            if isinstance(outcome.error, InvalidOptionError | MissingExtraError | SimulatorError):
+            if isinstance(outcome.error, SAME_FOR_ALL):
                 raise outcome.error
             number, _ = outcome.task
             checked[number] = outcome.value if outcome.error is None else _lost(outcome)
     read = [checked[number] for number in range(len(episodes))]
     problems = [
-        Problem(names[source], str(episode.id), finding.frame, finding.what, finding.hint)
+        Problem(names[source], str(episode.id), problem.frame, problem.what, problem.hint)
         for (source, episode), found in zip(episodes, read, strict=True)
-        for finding in found.findings
+        for problem in found.problems
     ]
     looks = {
         number: (str(episodes[number].episode.id), found.look)
@@ -151,7 +149,7 @@ def check_sources(
         problems=problems,
         episodes=len(episodes),
         frames=sum(found.frames for found in read),
-        marked=sum(found.lesson is not None and 0 < found.lesson < found.frames for found in read),
+        with_demonstration=sum(0 < (found.lesson or 0) < found.frames for found in read),
         exact=sum(found.exact for found in read),
         looks=[(looks[group[0]][1], len(group)) for group in groups],
     )
@@ -216,13 +214,6 @@ def _unlike(
 
 
 def _differences(left: tuple[str, Look], right: tuple[str, Look]) -> list[str]:
-    """Return how two episodes differ; one may lack actions."""
-    shared = left[1].features.keys() & right[1].features.keys()
-    without = {ACTION} - shared
-    return differences(_without(left, without), _without(right, without))
-
-
-def _without(named_look: tuple[str, Look], names: Collection[str]) -> tuple[str, Look]:
-    name, look = named_look
-    features = {feature: shape for feature, shape in look.features.items() if feature not in names}
-    return name, replace(look, features=features)
+    """Return how two episodes differ that are to be in one dataset."""
+    looks = in_dataset(left[1], right[1])
+    return differences((left[0], looks[0]), (right[0], looks[1]))

@@ -17,17 +17,10 @@ from robomme_interference_data.build_dataset.dataset.frame_checks import (
 )
 from robomme_interference_data.build_dataset.sources import Frame, Recording, Source, SourceEpisode
 from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, STATE
-from robomme_interference_data.errors import (
-    InterferenceError,
-    InvalidOptionError,
-    MissingExtraError,
-    SimulatorError,
-    SourceError,
-    counted,
-)
+from robomme_interference_data.errors import SAME_FOR_ALL, InterferenceError, SourceError, counted
 
-_OF_FRAMES = ("reading", "values", "shapes")
-"""Rules that are about one frame, as are those of the features."""
+_OF_FRAMES = ("reading", "first frame", "same shapes")
+"""Rules that are about one frame, as are those that are named after a feature."""
 
 
 @dataclass(frozen=True)
@@ -48,14 +41,14 @@ class CheckedEpisode:
         lesson: Number of its demonstration frames; None if the source marks none.
         look: What must be alike in all episodes; None if no frame could be read.
         exact: Whether its frames were never lossily compressed.
-        findings: What is wrong with it.
+        problems: What is wrong with it.
     """
 
     frames: int
     lesson: int | None
     look: Look | None
     exact: bool
-    findings: tuple[EpisodeProblem, ...]
+    problems: tuple[EpisodeProblem, ...]
 
 
 def check_episode(
@@ -80,7 +73,7 @@ def check_episode(
 
     recording = checks.apply("opening", open_recording)
     if recording is None:
-        return CheckedEpisode(0, None, None, False, checks.findings())
+        return CheckedEpisode(0, None, None, False, checks.problems())
     rate = checks.apply("rate", partial(recording.robot.at, fps))
     lesson: int | None = None
     with closing(recording.frames):
@@ -89,13 +82,13 @@ def check_episode(
             if frame.is_demonstration is not None:
                 lesson = (lesson or 0) + frame.is_demonstration
             checks.add(frame)
-    if not checks.count and not checks.findings():
+    if not checks.count and not checks.problems():
         checks.apply("length", _no_frames)
     checks.apply("names", partial(recording.robot.check_names, checks.shapes))
     look = None
     if checks.shapes and rate is not None:
         look = Look(checks.shapes, rate, recording.robot.type, recording.robot.names)
-    return CheckedEpisode(checks.count, lesson, look, recording.exact, checks.findings())
+    return CheckedEpisode(checks.count, lesson, look, recording.exact, checks.problems())
 
 
 def _no_frames() -> None:
@@ -124,7 +117,7 @@ class _EpisodeChecks:
         """
         try:
             return check()
-        except (InvalidOptionError, MissingExtraError, SimulatorError):
+        except SAME_FOR_ALL:
             raise
         except InterferenceError as error:
             frame = self.count if rule in _OF_FRAMES or rule in self.shapes else None
@@ -142,14 +135,14 @@ class _EpisodeChecks:
         shapes = {name: value.shape for name, value in (images | vectors).items()}
         if self.count == 0:
             self.shapes = shapes
-            self.apply("values", partial(check_shapes, images, vectors))
+            self.apply("first frame", partial(check_shapes, images, vectors))
         where = f"frame {self.count}"
-        self.apply("shapes", partial(check_same_shapes, shapes, self.shapes, where))
+        self.apply("same shapes", partial(check_same_shapes, shapes, self.shapes, where))
         for name, value in vectors.items():
             self.apply(name, partial(check_numbers, name, value, where))
         self.count += 1
 
-    def findings(self) -> tuple[EpisodeProblem, ...]:
+    def problems(self) -> tuple[EpisodeProblem, ...]:
         """Return what is wrong, each thing at its first frame."""
         found = []
         for rule, first in self._first.items():

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Self
 
 from robomme_interference_data.errors import FormatError, UnknownNameError, counted, nearest
-from robomme_interference_data.storage.files import decode_text, digest_json
+from robomme_interference_data.storage.text import decode_text, digest_json
 
 from .models import ChatModel, Part, Video, model_identity
 

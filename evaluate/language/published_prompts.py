@@ -12,7 +12,7 @@ from typing import Any
 
 from robomme_interference_data.constants import POSITION_LIMIT
 from robomme_interference_data.errors import FormatError, InvalidOptionError, named
-from robomme_interference_data.storage.files import read_text
+from robomme_interference_data.storage.text import read_text
 
 from .subgoal_prompt import SubgoalPrompt
 

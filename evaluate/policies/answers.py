@@ -27,7 +27,8 @@ from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout, is_done
 from robomme_interference_data.schema.codec import arrow_schema, from_table
 from robomme_interference_data.simulators.episode import Observation
-from robomme_interference_data.storage.files import read_text, sha256_file
+from robomme_interference_data.storage.files import sha256_file
+from robomme_interference_data.storage.text import read_text
 
 from .builtin import Noop, Privileged
 from .policy import RolloutInfo

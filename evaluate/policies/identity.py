@@ -19,7 +19,7 @@ from robomme_interference_data.evaluate.run.identity import plain
 from robomme_interference_data.evaluate.systems import System
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.sampling import MEMORY_FORM, Memory
-from robomme_interference_data.storage.files import indented_json
+from robomme_interference_data.storage.text import indented_json
 
 from .kinds import Role
 from .policy import Policy

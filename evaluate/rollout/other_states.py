@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from robomme_interference_data.data.buffer_set import BufferSet
-from robomme_interference_data.data.state_sizes import other_state_sizes, query_state_size
+from robomme_interference_data.data.state_reader import other_state_sizes, query_state_size
 from robomme_interference_data.errors import named
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import policy_options

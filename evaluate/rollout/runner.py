@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from robomme_interference_data.constants import EXECUTIONS, ORACLE
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import open_dataset
-from robomme_interference_data.data.state_sizes import other_state_sizes
+from robomme_interference_data.data.state_reader import other_state_sizes
 from robomme_interference_data.errors import (
     InterferenceError,
     PolicyServerError,

@@ -16,7 +16,7 @@ import numpy as np
 from robomme_interference_data.constants import DEMONSTRATIONS, PROTOCOL_VERSION
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.schema.codec import to_dict
-from robomme_interference_data.storage.files import digest_json
+from robomme_interference_data.storage.text import digest_json
 
 from .config import RetrievalConfig
 from .plan import RunPlan

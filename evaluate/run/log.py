@@ -20,9 +20,10 @@ from robomme_interference_data.constants import FORMAT_VERSION, RUN_HEADER, RUN_
 from robomme_interference_data.errors import RunError, named, visible
 from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
 from robomme_interference_data.schema.rollouts import FINAL, Status
-from robomme_interference_data.storage.files import atomic_path, read_header, write_json
+from robomme_interference_data.storage.files import atomic_path, write_json
 from robomme_interference_data.storage.parquet import writing
 from robomme_interference_data.storage.staging import file_lock
+from robomme_interference_data.storage.text import read_header
 
 from .plan import WorkItem
 from .record import Invocation, RunHeader, whole_lines

@@ -11,7 +11,7 @@ from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId, count_numbers, format_numbers, parse_numbers
 from robomme_interference_data.schema.conditions import NO_HISTORY, in_order, parse_condition
 from robomme_interference_data.schema.rollouts import RolloutKey
-from robomme_interference_data.storage.files import canonical_json
+from robomme_interference_data.storage.text import canonical_json
 
 if TYPE_CHECKING:  # readers of rows need neither
     from robomme_interference_data.data.buffer_set import BufferSet

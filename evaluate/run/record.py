@@ -11,7 +11,7 @@ from typing import Any
 from robomme_interference_data.constants import MAX_ROW_BYTES
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.schema.rollouts import Status
-from robomme_interference_data.storage.files import read_bytes
+from robomme_interference_data.storage.text import read_bytes
 
 from .plan import RunPlan, WorkItem
 

@@ -11,7 +11,7 @@ from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.schema.codec import from_dict, to_dict
 from robomme_interference_data.schema.rollouts import OutcomeColumns, RolloutKey, Status, Timing
 from robomme_interference_data.schema.sampling import HistoryColumns
-from robomme_interference_data.storage.files import canonical_json, parse_json
+from robomme_interference_data.storage.text import canonical_json, parse_json
 
 from .plan import WorkItem
 from .record import rows_that_count, whole_lines

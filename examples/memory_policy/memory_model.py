@@ -17,7 +17,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from robomme_interference_data.errors import FormatError, MissingFileError
-from robomme_interference_data.storage.files import atomic_path, read_json, write_json
+from robomme_interference_data.storage.files import atomic_path, write_json
+from robomme_interference_data.storage.text import read_json
 
 WORDS = 1024  # buckets for hashed words
 CHANNELS = 16  # of a frame's feature map

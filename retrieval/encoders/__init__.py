@@ -9,7 +9,7 @@ from robomme_interference_data.constants import PAPER_ENCODER
 from robomme_interference_data.data.index_layout import EncoderRecord, encoder_id
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.runtime.specs import Registry, SpecKind
-from robomme_interference_data.storage.files import digest_json
+from robomme_interference_data.storage.text import digest_json
 
 ENCODERS = Registry(
     "encoder",

@@ -7,6 +7,7 @@ import typer
 
 from robomme_interference_data.build_dataset.config import SourceConfig
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError, counted, named
+from robomme_interference_data.schema.settings import changed_settings
 
 from .console import echo, print_json, print_status
 from .options import AsJson, with_settings
@@ -77,8 +78,6 @@ def _of_sources(
     Raises:
         InvalidOptionError: Neither is given, or options without effect.
     """
-    from .verify_source import given_settings
-
     if sources.source:
         if audit or not decode:
             raise InvalidOptionError(
@@ -86,7 +85,7 @@ def _of_sources(
                 "Leave it out: all frames of a source are read.",
             )
         return True
-    if given := given_settings(sources):
+    if given := changed_settings(sources):
         raise InvalidOptionError(
             f"{named(given[0])} has no effect without {named('source')}",
             f"Leave it out, or add {named('source')}.",

@@ -9,18 +9,17 @@ import typer
 
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, PAPER_UNIT, SPLITS
 from robomme_interference_data.errors import (
+    SAME_FOR_ALL,
     InterferenceError,
     InvalidOptionError,
-    MissingExtraError,
-    SimulatorError,
     counted,
     named,
 )
+from robomme_interference_data.schema.settings import changed_settings
 
 from .console import echo, graceful_interrupt, print_json, print_status
 
 if TYPE_CHECKING:
-    from robomme_interference_data.build_dataset.alike import Look
     from robomme_interference_data.build_dataset.config import SourceConfig
     from robomme_interference_data.build_dataset.dataset.plan import PlannedEpisode
     from robomme_interference_data.build_dataset.sources import Source
@@ -35,13 +34,14 @@ def verify_sources(config: "SourceConfig", root: Path, *, as_json: bool) -> None
         root: The folder that a build would write.
         as_json: Whether to write JSON to stdout.
     """
+    from robomme_interference_data.build_dataset.config import chosen_cameras
     from robomme_interference_data.build_dataset.verify.source import CheckTask, check_sources
     from robomme_interference_data.progress import WorkProgress
     from robomme_interference_data.runtime.executor import Serial, make_executor
 
     with graceful_interrupt("Nothing is kept"):
         names, sources, episodes, problems = _listed(config, root)
-        task = CheckTask(sources, _cameras(config), config.fps)
+        task = CheckTask(sources, chosen_cameras(config.cameras), config.fps)
         with WorkProgress(unit="episodes") as progress:
             progress.start("Reading", len(episodes))
             # One worker needs no process of its own: there is nothing to write.
@@ -82,7 +82,7 @@ def _listed(
             only = dataclasses.replace(build, source=(name,))
             [source] = open_sources(DEMONSTRATIONS, only, PAPER_UNIT)
             listed = source.episodes()
-        except (InvalidOptionError, MissingExtraError, SimulatorError):
+        except SAME_FOR_ALL:
             raise
         except InterferenceError as error:
             problems.append(Problem(name, None, None, error.message, error.hint))
@@ -104,45 +104,24 @@ def _settings(config: "SourceConfig") -> dict[str, Any]:
     return {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
 
 
-def _cameras(config: "SourceConfig") -> tuple[str, ...] | None:
-    from robomme_interference_data.build_dataset.config import NO_CAMERAS
-
-    if config.cameras == NO_CAMERAS:
-        return ()
-    return tuple(sorted(config.cameras)) or None
-
-
-def given_settings(config: "SourceConfig") -> list[str]:
-    """Return the settings that differ from their defaults."""
-    return [
-        field.name
-        for field in dataclasses.fields(config)
-        if getattr(config, field.name) != field.default
-    ]
-
-
 def _build_command(config: "SourceConfig", root: Path, report: "SourceReport") -> str:
     """Return the command that builds the sources with the same settings."""
     from robomme_interference_data.runtime.executor import WorkersConfig
 
-    words = ["robomme-interference", "build", str(root)]
-    if not report.marked:  # no episode can be a query
+    words = ["robomme-interference", "build", shlex.quote(str(root))]
+    if not report.with_demonstration:  # no episode can be a query
         words += ["--only", DISTRACTORS]
-    workers = {field.name for field in dataclasses.fields(WorkersConfig)}
-    # The sources first, and then how they are read.
-    for name in sorted(
-        {*given_settings(config)} - workers, key=lambda name: (name != "source", name)
-    ):
+    words += [named("source", source) for source in config.source]
+    workers = [field.name for field in dataclasses.fields(WorkersConfig)]
+    for name in changed_settings(config, ["source", *workers]):
         value = getattr(config, name)
-        if name == "source":
-            for source in value:
-                words += [named(name), source]
-        else:
-            words += [named(name), ",".join(value) if isinstance(value, tuple) else str(value)]
-    return shlex.join(words)
+        words.append(named(name, ",".join(value) if isinstance(value, tuple) else value))
+    return " ".join(words)
 
 
 def _print(report: "SourceReport") -> None:
+    from robomme_interference_data.build_dataset.alike import describe
+
     hints = dict[str, int]()
     for problem in report.problems:
         echo(str(problem))
@@ -152,10 +131,10 @@ def _print(report: "SourceReport") -> None:
         times = f" ({counted(count, 'problem')})" if len(report.problems) > 1 else ""
         print_status(f"{hint}{times}")
     for look, count in report.looks:
-        print_status(f"{counted(count, 'episode')}: {_shown(look)}")
+        print_status(f"{counted(count, 'episode')}: {describe(look)}")
     read = f"{counted(report.episodes, 'episode')}, {counted(report.frames, 'frame')}"
     print_status(
-        f"Read: {read}. {report.marked:,} with a demonstration and live frames, "
+        f"Read: {read}. {report.with_demonstration:,} with a demonstration and live frames, "
         f"{report.exact:,} bit-exact."
     )
     if report.problems:
@@ -171,7 +150,7 @@ def _as_dict(report: "SourceReport") -> dict[str, Any]:
         "problems": [vars(problem) for problem in report.problems],
         "episodes": report.episodes,
         "frames": report.frames,
-        "episodes_with_demonstration": report.marked,
+        "episodes_with_demonstration": report.with_demonstration,
         "exact_episodes": report.exact,
         "robots": [
             {
@@ -184,9 +163,3 @@ def _as_dict(report: "SourceReport") -> dict[str, Any]:
             for look, count in report.looks
         ],
     }
-
-
-def _shown(look: "Look") -> str:
-    from robomme_interference_data.build_dataset.alike import describe
-
-    return describe(look)

@@ -4,25 +4,21 @@ from bisect import bisect_right
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import DISTRACTORS, STATE
+from robomme_interference_data.constants import DISTRACTORS
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId, whole_number
 from robomme_interference_data.schema.manifest import BufferManifest, SessionEntry, layout_sessions
-from robomme_interference_data.schema.other_states import (
-    OtherStates,
-    check_rule,
-    check_sizes,
-    fit_states,
-)
+from robomme_interference_data.schema.other_states import OtherStates, check_rule
 
 from .dataset import Dataset
 from .frame_reader import FrameReader, allocate_frames
 from .query import Query
+from .state_reader import StateReader
 
 if TYPE_CHECKING:
     from robomme_interference_data.schema.evidence import Evidence
@@ -75,11 +71,7 @@ class Buffer:
         self.sessions = layout_sessions(manifest.sessions)
         self._datasets, self._check_rules = datasets, check_rules
         self._reader = FrameReader(self.sessions, datasets, cache, threads)
-        self._states: dict[OtherStates, NDArray[np.float32]] = {}
-
-    def __getstate__(self) -> dict[str, Any]:
-        # A copy in another process reads them again.
-        return {name: value for name, value in self.__dict__.items() if name != "_states"}
+        self._states = StateReader(manifest, query.dataset, datasets)
 
     def __repr__(self) -> str:
         return (
@@ -137,7 +129,7 @@ class Buffer:
             InvalidOptionError: The rule is `refuse`, or `pad` with more values than the query's.
         """
         # A copy: later chunks of `stream` are cut from this array.
-        return self._fitted(other_states).copy()
+        return self._states.all(other_states).copy()
 
     def session_states(self, session: int) -> NDArray[np.float32]:
         """Return the states of a session as they were recorded, `(n, D) float32`; a new array.
@@ -145,33 +137,7 @@ class Buffer:
         Args:
             session: Number of the session, from 0.
         """
-        return np.repeat(self._recorded[session], self.manifest.sessions[session].repeat, 0)
-
-    @cached_property
-    def _recorded(self) -> tuple[NDArray[np.float32], ...]:
-        """The stored states of each session; a held frame is there once."""
-        return tuple(
-            self._datasets[entry.dataset].read_vectors(
-                entry.episode_index, STATE, entry.start, entry.stop
-            )
-            for entry in self.manifest.sessions
-        )
-
-    def _fitted(self, other_states: str) -> NDArray[np.float32]:
-        rule = check_rule(other_states)
-        if rule not in self._states:
-            (size,) = self.query.dataset.features[STATE]
-            recorded = dict(zip(self.manifest.sessions, self._recorded, strict=True))
-            sizes = {
-                f"session {number} ({entry.source} of the {entry.dataset})": states.shape[1]
-                for number, (entry, states) in enumerate(recorded.items())
-            }
-            check_sizes(str(self.manifest), size, sizes, rule, 'states_by("{}")'.format)
-            self._states[rule] = self.gather(
-                lambda entry: fit_states(recorded[entry], size, rule),
-                np.empty((0, size), np.float32),
-            )
-        return self._states[rule]
+        return self._states.session(session).copy()
 
     def gather[Value: np.generic](
         self, read: Callable[[SessionEntry], NDArray[Value]], empty: NDArray[Value]
@@ -324,7 +290,7 @@ class Buffer:
                     frames[name] = np.empty((len(indices_now), *shape), np.uint8)
                     for image in frames[name]:
                         image[...] = next(decoders[name])
-                states = self._fitted(other_states)[indices_now]
+                states = self._states.all(other_states)[indices_now]
                 yield Chunk(indices_now, frames, states, session_index[indices_now])
         finally:
             # Also if the caller stops early: each holds an open file and its decoder.

@@ -30,7 +30,8 @@ from robomme_interference_data.ids import EpisodeId, whole_number
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import Condition, datasets_of, parse_condition
 from robomme_interference_data.schema.manifest import BufferManifest, ManifestHeader
-from robomme_interference_data.storage.files import Files, LocalFiles, digest_json, read_header
+from robomme_interference_data.storage.files import Files, LocalFiles
+from robomme_interference_data.storage.text import digest_json, read_header
 
 from .buffer import Buffer
 from .dataset import Dataset

@@ -23,13 +23,8 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.storage.arrays import read_array
-from robomme_interference_data.storage.files import (
-    Files,
-    LocalFiles,
-    read_header,
-    read_sums,
-    sha256_file,
-)
+from robomme_interference_data.storage.files import Files, LocalFiles, read_sums, sha256_file
+from robomme_interference_data.storage.text import read_header
 
 from .dataset import Dataset
 from .index_layout import (

@@ -12,7 +12,8 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.schema.manifest import BufferManifest, FetchRecord, ManifestHeader
-from robomme_interference_data.storage.files import Files, LocalFiles, read_header
+from robomme_interference_data.storage.files import Files, LocalFiles
+from robomme_interference_data.storage.text import read_header
 
 from .dataset import Dataset
 

@@ -17,7 +17,7 @@ from robomme_interference_data.errors import FormatError, HashMismatchError, Int
 from robomme_interference_data.schema.manifest import Session, SessionEntry
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.arrays import FeatureDigests
-from robomme_interference_data.storage.files import digest_json
+from robomme_interference_data.storage.text import digest_json
 
 from .dataset import Dataset, camera_feature
 

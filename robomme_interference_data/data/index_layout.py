@@ -16,7 +16,7 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.errors import FormatError, InvalidOptionError
 from robomme_interference_data.schema.codec import to_dict
-from robomme_interference_data.storage.files import digest_json, read_header
+from robomme_interference_data.storage.text import digest_json, read_header
 
 from .dataset import Dataset
 

@@ -13,8 +13,9 @@ from robomme_interference_data.errors import FormatError, MissingFileError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import from_table, to_dict
 from robomme_interference_data.schema.subgoal import Pixel
-from robomme_interference_data.storage.files import digest_json, sha256_file
+from robomme_interference_data.storage.files import sha256_file
 from robomme_interference_data.storage.parquet import open_parquet, read_table
+from robomme_interference_data.storage.text import digest_json
 
 from .buffer_set import BufferSet
 

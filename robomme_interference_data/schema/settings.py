@@ -11,6 +11,7 @@ class Config:
 """
 
 import dataclasses
+from collections.abc import Container
 from typing import Any
 
 SETTING = "setting"
@@ -44,3 +45,18 @@ def setting(
         help=help, name=name, metavar=metavar, shown=shown, whole=whole, group=group, rare=rare
     )
     return dataclasses.field(default=default, metadata={SETTING: declared})
+
+
+def changed_settings(config: Any, without: Container[str] = ()) -> list[str]:
+    """Return the names of settings that differ from their defaults, in order.
+
+    Args:
+        config: Settings; those without a default count as changed.
+        without: Names to leave out.
+    """
+    return [
+        field.name
+        for field in dataclasses.fields(config)
+        if field.name not in without
+        if getattr(config, field.name) != field.default
+    ]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import ACTION
 from robomme_interference_data.errors import FormatError
 
-from .files import canonical_json, check_not_pointer
+from .text import canonical_json, check_not_pointer
 
 _FILE = re.compile(
     rb"\x93NUMPY\x01\x00..\{'descr': '([<|][a-z]\d)', 'fortran_order': False, "

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import av
 import numpy as np
@@ -15,11 +15,23 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import KEY_FRAMES
 from robomme_interference_data.errors import BuildError, FormatError, InvalidOptionError
 
-from .limits import MAX_RATE, MIN_RATE
+from .limits import MAX_PIXELS, MAX_RATE, MIN_RATE
+from .pixels import turned
 from .video import rate_fraction
-from .video_file import MAX_PIXELS, file_url, reason
+from .video_file import file_url, reason
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+
+# Of a chunk of a PNG file: its size and kind come before its content, a checksum after it.
+_HEADER_BYTES, _CHECKSUM_BYTES = 8, 4
+
+# Of EXIF: a tag, and the bytes of a tag's number, type, count and value.
+_ORIENTATION, _ENTRY_BYTES = 0x0112, 12
+
+_RESTORE = "Restore the image from a copy, or leave the episode out."
+
+_AS_STORED = 1
+"""The orientation of pixels that are shown as they are stored."""
 
 
 @dataclass(frozen=True)
@@ -219,7 +231,18 @@ def is_png(data: bytes) -> bool:
 
 
 def decode_image(data: bytes) -> NDArray[np.uint8]:
-    """Decode a PNG or JPEG image to `(H, W, 3) uint8` RGB, without transparency."""
+    """Decode a PNG or JPEG image to `(H, W, 3) uint8` RGB, without transparency.
+
+    A JPEG image is turned as its EXIF states; no pixel changes by that.
+
+    Raises:
+        FormatError: It is damaged, has more than 8 bits a channel, or is a PNG image to be turned.
+    """
+    if is_png(data) and (orientation := _png_orientation(data)) != _AS_STORED:
+        raise FormatError(
+            f"a PNG image is to be shown turned (EXIF orientation {orientation})",
+            "Write it without EXIF: with Pillow, ImageOps.exif_transpose(image).save(file).",
+        )
     codec = av.CodecContext.create("png" if is_png(data) else "mjpeg", "r")
     codec.thread_count = 1
     # By default, FFmpeg accepts a PNG with a wrong checksum.
@@ -227,13 +250,42 @@ def decode_image(data: bytes) -> NDArray[np.uint8]:
     try:
         frames = codec.decode(av.Packet(data)) + codec.decode(None)
     except (av.error.FFmpegError, ValueError) as error:
-        raise FormatError(f"an image is damaged: {error}") from None
+        raise FormatError(f"an image is damaged: {error}", _RESTORE) from None
     if len(frames) != 1:
-        raise FormatError(f"an image is damaged: it decodes to {len(frames)} frames")
+        what = f"an image is damaged: it decodes to {len(frames)} frames"
+        raise FormatError(what, _RESTORE)
     depth = max(component.bits for component in frames[0].format.components)
     if depth > 8:
         raise FormatError(
             f"an image has {depth} bits a channel ({frames[0].format.name}); expected 8",
             "Convert the images to 8 bits a channel.",
         )
-    return frames[0].to_ndarray(format="rgb24")
+    return turned(frames[0].to_ndarray(format="rgb24"), frames[0])
+
+
+def _png_orientation(data: bytes) -> int:
+    """Return the orientation of a PNG image, from 1 to 8 as in EXIF; 1 if it states none."""
+    start = len(_PNG)
+    while start + _HEADER_BYTES <= len(data):
+        size = int.from_bytes(data[start : start + 4])
+        content = start + _HEADER_BYTES
+        if data[start + 4 : content] == b"eXIf":
+            return _orientation(data[content : content + size])
+        start = content + size + _CHECKSUM_BYTES
+    return _AS_STORED
+
+
+def _orientation(exif: bytes) -> int:
+    """Return the orientation in a block of EXIF, which is a TIFF file without an image."""
+    order: Literal["little", "big"] = "little" if exif.startswith(b"II") else "big"
+
+    def number(start: int, size: int) -> int:
+        return int.from_bytes(exif[start : start + size], order)
+
+    first = number(4, 4)
+    for entry in range(number(first, 2)):
+        start = first + 2 + _ENTRY_BYTES * entry
+        if number(start, 2) == _ORIENTATION:
+            value = number(start + 8, 2)
+            return value if 1 <= value <= 8 else _AS_STORED
+    return _AS_STORED

@@ -17,10 +17,16 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import INFO_PATH
-from robomme_interference_data.errors import FormatError, MissingFileError, UnknownNameError
+from robomme_interference_data.errors import (
+    FormatError,
+    MissingFileError,
+    UnknownNameError,
+    counted,
+)
 
 from . import video
-from .files import Files, read_json
+from .files import Files
+from .lerobot_info import check_info
 from .lerobot_location import (
     EpisodeLocation,
     VideoLocation,
@@ -30,17 +36,16 @@ from .lerobot_location import (
     span_problems,
 )
 from .lerobot_tables import read_episode_lines, read_episodes, read_tasks
-from .limits import MAX_FRAME_VALUES, MAX_NAME, MAX_RATE, MIN_RATE
 from .parquet import RowSpan
+from .text import read_json
 
 VERSIONS = ("v3.0", "v2.1", "v2.0")
 
-
-# Upper bounds, checked before anything is allocated.
-_MAX_SIDES = 8  # numbers in a shape
-_MAX_EPISODES = 10_000_000
-_MAX_FEATURES = 10_000
-_MAX_TEMPLATE = 1000  # characters of a path template
+_CORRECT_EPISODES = f"Correct the episode table in meta/, or {INFO_PATH}, or write both again."
+_CORRECT_ROWS = (
+    "Sort the table by episode_index and frame_index, and correct the one that is wrong, or write "
+    "the dataset again."
+)
 
 
 class LeRobotFiles:
@@ -69,10 +74,11 @@ class LeRobotFiles:
             raise FormatError(
                 f"{files.describe()} is a LeRobot dataset of version {self.version!r}; this "
                 f"package reads {', '.join(VERSIONS)}",
-                "Convert it with LeRobot's own scripts (lerobot.scripts."
-                "convert_dataset_v21_to_v30 and its predecessors).",
+                "Convert an older one with LeRobot's own scripts (lerobot.scripts."
+                "convert_dataset_v21_to_v30 and its predecessors); for a newer one, update this "
+                "package.",
             )
-        _check_info(self.info, path)
+        check_info(self.info, path)
 
     @property
     def fps(self) -> float:
@@ -93,8 +99,11 @@ class LeRobotFiles:
             if len(shape) == 3 and shape[2] != 3:
                 shape = (*shape[1:], shape[0])
             if len(shape) != 3 or shape[2] != 3:
-                what = f"{column} has shape {feature['shape']} in {INFO_PATH}"
-                raise FormatError.damaged(self.files.describe(), what)
+                raise FormatError(
+                    f"{self.files.describe()}: {column} has the shape {feature['shape']} in "
+                    f"{INFO_PATH}; expected (height, width, 3)",
+                    f"Correct {INFO_PATH}, or leave the camera out.",
+                )
         return shape
 
     def __len__(self) -> int:
@@ -111,15 +120,21 @@ class LeRobotFiles:
         for name in ("episode_index", "length"):
             column = table[name] if name in table.column_names else pa.nulls(1)
             if column.null_count or not pa.types.is_integer(column.type):
-                raise FormatError.damaged(where, f"its episodes have no whole numbers {name!r}")
+                raise FormatError(
+                    f"{where}: the episode table has no whole numbers {name!r}", _CORRECT_EPISODES
+                )
         # Its lines may come in any order, since they are found by number.
         if self.version != "v3.0":
             table = table.sort_by("episode_index")
         # LeRobot finds an episode of v3.0 by its place, not by its number.
-        if not np.array_equal(table["episode_index"].to_numpy(), np.arange(len(self))):
-            raise FormatError.damaged(
-                where,
-                f"meta/ does not list the episodes 0 to {len(self) - 1}, each once and in order",
+        numbers = table["episode_index"].to_numpy()
+        if not np.array_equal(numbers, np.arange(len(self))):
+            listed = ", ".join(map(str, numbers[:5].tolist())) + (", …" if len(numbers) > 5 else "")
+            raise FormatError(
+                f"{where}: the episode table lists {counted(len(numbers), 'episode')}: "
+                f"{listed or 'none'}; expected {len(self)}, as total_episodes in {INFO_PATH}, "
+                "numbered from 0, in this order",
+                _CORRECT_EPISODES,
             )
         return table.combine_chunks()
 
@@ -187,11 +202,17 @@ class LeRobotFiles:
         rows = file.part(start, start + len(found))
         numbers = np.arange(len(found))  # not `location.length`, which may be huge
         if len(found) != location.length:
-            what = f"{len(found)} rows of episode {index}; expected {location.length}"
-            raise FormatError.damaged(path, what)
+            raise FormatError(
+                f"{path}: {counted(len(found), 'row')} of episode {index}; the episode table has "
+                f"the length {location.length}",
+                _CORRECT_ROWS,
+            )
         if (found != start + numbers).any() or (rows.scalars("frame_index") != numbers).any():
-            what = f"rows of episode {index} that are not in the order of frame_index, from 0"
-            raise FormatError.damaged(path, what)
+            raise FormatError(
+                f"{path}: the rows of episode {index} are not one after the other, with "
+                "frame_index 0, 1, …",
+                _CORRECT_ROWS,
+            )
         return rows
 
     def vectors(self, index: int, column: str) -> NDArray[np.float32]:
@@ -232,11 +253,13 @@ class LeRobotFiles:
             self._video_problems[key] = span_problems(spans, first, len(times))
         problem = self._video_problems[key].get(index)
         if problem is not None:
-            raise FormatError(
-                f"{path}: {problem}",
-                "Write the dataset again, or correct from_timestamp in its episode table, or leave "
-                "the episode out.",
-            )
+            hint = "Write the video again, with a frame for each row, or leave the episode out."
+            if self.version == "v3.0":
+                hint = (
+                    "Write the dataset again, or correct from_timestamp in its episode table, or "
+                    "leave the episode out."
+                )
+            raise FormatError(f"{path}: {problem}", hint)
 
     def _spans_in_file(self, index: int, column: str) -> list[VideoSpan]:
         """Return the episodes in the video file that holds an episode, by number."""
@@ -264,38 +287,6 @@ class LeRobotFiles:
                 f"episode {index} of {self.files.describe()} has {length} stored frames; frames "
                 f"{start} to {stop - 1} were requested"
             )
-
-
-def _check_info(info: dict[str, Any], path: object) -> None:
-    """Check types and sizes of what is read from `info.json`."""
-
-    def check(valid: bool, name: str) -> None:
-        if not valid:
-            raise FormatError.damaged(path, f"{name} is {repr(info.get(name))[:200]}")
-
-    def is_count(value: Any, least: int, most: int) -> bool:
-        return isinstance(value, int) and least <= value <= most
-
-    def is_template(value: Any) -> bool:
-        return isinstance(value, str) and len(value) <= _MAX_TEMPLATE
-
-    fps, features = info.get("fps"), info.get("features")
-    check(isinstance(fps, int | float) and MIN_RATE <= fps <= MAX_RATE, "fps")
-    check(is_count(info.get("total_episodes"), 0, _MAX_EPISODES), "total_episodes")
-    check(is_count(info.get("chunks_size", 1000), 1, _MAX_EPISODES), "chunks_size")
-    check(is_template(info.get("data_path")), "data_path")
-    check(isinstance(features, dict) and 0 < len(features) <= _MAX_FEATURES, "features")
-    for name, feature in features.items() if isinstance(features, dict) else ():
-        check(len(name) <= MAX_NAME and isinstance(feature, dict), "features")
-        check(isinstance(feature.get("dtype"), str), "features")
-        shape = feature.get("shape")
-        check(isinstance(shape, list) and len(shape) <= _MAX_SIDES, "features")
-        check(all(is_count(side, 1, MAX_FRAME_VALUES) for side in shape), "features")
-        check(math.prod(shape) <= MAX_FRAME_VALUES, "features")
-        pictures = feature["dtype"] in ("video", "image")
-        for key in ("info", "video_info"):  # LeRobot's newer and older name
-            check(isinstance(feature.get(key), dict | None) or not pictures, "features")
-        check(feature["dtype"] != "video" or is_template(info.get("video_path")), "video_path")
 
 
 def _seconds(value: Any) -> float:

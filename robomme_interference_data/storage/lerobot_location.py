@@ -62,7 +62,7 @@ class VideoSpan:
 
 def nearest_frame(position: float) -> int:
     """Return the frame that is less than half a frame away from a position, or -1."""
-    if not 0 <= position <= _MAX_FRAME:  # false for NaN, too
+    if not -0.5 < position <= _MAX_FRAME:  # false for NaN, too
         return -1
     frame = round(position)
     return frame if abs(frame - position) < 0.5 else -1
@@ -112,7 +112,7 @@ def locate_video(
         return VideoLocation(path, 0)
     name = f"{key}/from_timestamp"
     start = row.get(name)
-    valid = isinstance(start, int | float) and 0 <= start < _LATEST_S
+    valid = isinstance(start, int | float) and abs(start) < _LATEST_S
     first = nearest_frame(start * info["fps"]) if valid else -1
     if first < 0:
         what = f"{name} of episode {index} is {start!r}"
@@ -205,5 +205,8 @@ def _path(
 def _whole(row: Mapping[str, Any], name: str, index: int, where: str) -> int:
     value = row.get(name)
     if not isinstance(value, int) or not 0 <= value <= _MAX_FRAME:
-        raise FormatError.damaged(where, f"{name} of episode {index} is {value!r}")
+        raise FormatError(
+            f"{where}: {name} of episode {index} is {value!r}; expected a whole number",
+            "Correct the episode table in meta/, or leave the episode or the camera out.",
+        )
     return value

@@ -10,9 +10,10 @@ import pyarrow.compute as pc
 from robomme_interference_data.constants import EPISODES_DIR, TASKS_PATH
 from robomme_interference_data.errors import FormatError, MissingFileError
 
-from .arrow_columns import concatenated, is_plain
-from .files import Files, parse_json, read_bytes, reading
+from .arrow_columns import concatenated, is_plain, simplified
+from .files import Files, reading
 from .parquet import RowSpan, open_parquet, read_table
+from .text import parse_json, read_bytes
 
 _LINES_OF_EPISODES = "meta/episodes.jsonl"
 _LINES_OF_TASKS = "meta/tasks.jsonl"
@@ -66,7 +67,7 @@ def read_episodes(
             f"{error}",
             "Write the column with one type in all of them.",
         ) from None
-    return _with_whole_numbers(table)
+    return _with_plain_numbers(table)
 
 
 def _episode_tables(files: Files) -> list[Path]:
@@ -85,10 +86,16 @@ def episode_column_names(files: Files) -> list[str]:
     return list(dict.fromkeys(name for names in tables for name in names))
 
 
-def _with_whole_numbers(table: pa.Table) -> pa.Table:
-    """Return the table with integers where pandas made floats of LeRobot's whole numbers."""
+def _with_plain_numbers(table: pa.Table) -> pa.Table:
+    """Return the table with floats for decimals, and LeRobot's whole numbers as integers.
+
+    DuckDB makes decimals of numbers, pandas makes floats of whole ones.
+    """
     for position, name in enumerate(table.column_names):
         column = table[name]
+        if pa.types.is_decimal(column.type):
+            column = simplified(column)
+            table = table.set_column(position, name, column)
         if pa.types.is_floating(column.type) and (name in _WHOLE or name.endswith(_WHOLE_ENDS)):
             whole = pc.cast(column, pa.int64(), safe=False)
             if pc.all(pc.equal(whole, column)).as_py():

@@ -7,8 +7,11 @@ stores anything, so that every reader accepts what was built.
 MAX_VECTOR = 1 << 14
 """Values of a state or an action. Beyond it, LeRobot's statistics exceed the size of a header."""
 
-MAX_FRAME_VALUES = 1 << 26
-"""Values in a frame of a camera: twice an image of 3840 × 2160 pixels."""
+MAX_PIXELS = 1 << 24
+"""Pixels of an image: twice 3840 × 2160."""
+
+MAX_FRAME_VALUES = 4 * MAX_PIXELS
+"""Values of a feature in a frame, such as those of an image with transparency."""
 
 MAX_READ_VALUES = 1 << 26
 """Values of a column that are read at once, such as all states of an episode."""

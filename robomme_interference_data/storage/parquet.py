@@ -17,7 +17,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import FormatError
+from robomme_interference_data.errors import FormatError, counted
 
 from .arrow_columns import (
     is_listed,
@@ -28,9 +28,10 @@ from .arrow_columns import (
     simple_type,
     simplified,
 )
-from .files import atomic_path, check_not_pointer, reading
+from .files import atomic_path, reading
 from .limits import MAX_READ_VALUES
 from .parquet_pages import decoded_size
+from .text import check_not_pointer
 
 # An image may be a PNG of some megabytes.
 _IMAGES_AT_ONCE = 8
@@ -251,8 +252,8 @@ class RowSpan:
             lengths = pc.unique(pc.list_value_length(column)).drop_null().to_pylist()
         if column.null_count or flat.null_count or len(lengths) != 1:
             raise FormatError(
-                f"{what} has empty values or vectors of several lengths: {sorted(lengths)}",
-                "Every row needs a vector of the same length.",
+                f"{what}: {self._first_uneven(column)}",
+                "Every row needs a vector of the same length, without empty values.",
             )
         values = flat.to_numpy().reshape(len(column), lengths[0])
         if is_whole(flat.type) and not (np.abs(values.astype(float)) <= _EXACT_FLOAT32).all():
@@ -263,6 +264,20 @@ class RowSpan:
             )
         with np.errstate(over="ignore"):  # what is too large becomes infinite; callers refuse it
             return np.ascontiguousarray(values, dtype=np.float32)
+
+    def _first_uneven(self, column: pa.ChunkedArray) -> str:
+        """Return what is wrong with the first vector that is empty, or of another length."""
+        size = None
+        for frame, cell in enumerate(column):
+            value = cell.as_py()
+            vector = value if isinstance(value, list) else [value]
+            where = f"frame {frame} (row {self.start + frame})"
+            if value is None or None in vector:
+                return f"{where} has an empty value"
+            if size not in (None, len(vector)):
+                return f"{where} has {counted(len(vector), 'value')}, those before it {size}"
+            size = len(vector)
+        return "it has no rows"
 
     def images(self, name: str) -> Iterator[bytes]:
         """Yield the encoded images of a column of structs with the field `bytes`, in order.

@@ -42,12 +42,18 @@ def to_rgb(frame: av.VideoFrame) -> NDArray[np.uint8]:
         FormatError: The matrix is unknown, or the rotation is another one.
     """
     try:
-        pixels, shown = _convert(frame), frame.side_data.get(Type.DISPLAYMATRIX)
+        pixels = _convert(frame)
     except FormatError:
         raise
     except (av.error.FFmpegError, ValueError) as error:
         what = f"a frame cannot be converted to RGB: {error}"
         raise FormatError(what, _REWRITE) from None
+    return turned(pixels, frame)
+
+
+def turned(pixels: NDArray[np.uint8], frame: av.VideoFrame) -> NDArray[np.uint8]:
+    """Return the pixels of a decoded frame, turned or mirrored as the frame states: see `turn`."""
+    shown = frame.side_data.get(Type.DISPLAYMATRIX)
     if shown is None:
         return pixels
     return turn(pixels, np.frombuffer(bytes(shown), np.int32).reshape(3, 3))

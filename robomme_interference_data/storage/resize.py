@@ -33,7 +33,7 @@ def resize_image(image: NDArray[np.uint8], width: int, height: int) -> NDArray[n
     means, rest = np.divmod(sums.reshape(width, height, channels).transpose(1, 0, 2), weight)
     half = 2 * rest
     means += (half > weight) | ((half == weight) & (means % 2 == 1))
-    return means.astype(np.uint8)
+    return means.astype(np.uint8, order="C")
 
 
 def _area_sums(values: NDArray[Any], size: int, largest: int) -> NDArray[Any]:

@@ -19,10 +19,8 @@ import numpy as np
 
 from robomme_interference_data.errors import FormatError, InterferenceError, MissingFileError
 
-from .files import check_not_pointer
-
-MAX_PIXELS = 1 << 24
-"""Upper bound on the pixels of a frame: twice 3840 × 2160."""
+from .limits import MAX_PIXELS
+from .text import check_not_pointer
 
 _MP4 = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide")
 """The first box of an MP4 or QuickTime file."""
@@ -77,10 +75,10 @@ def open_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.Vid
         if kind == "mp4":
             check_samples(path)
         container = av.open(file_url(path), format=kind, options=limits, container_options=allowed)
+    except InterferenceError:  # a missing file that is a Git LFS pointer is a FileNotFoundError
+        raise
     except FileNotFoundError:
         raise MissingFileError(f"{path} does not exist") from None
-    except InterferenceError:
-        raise
     except (av.error.FFmpegError, ValueError) as error:  # ValueError: a damaged header
         raise FormatError.damaged(path, f"not a readable video: {reason(error)}") from error
     except OSError as error:

@@ -6,7 +6,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from robomme_interference_data.storage.cache import cache_folder
-from robomme_interference_data.storage.files import canonical_json, digest_folder, write_text
+from robomme_interference_data.storage.files import digest_folder, write_text
+from robomme_interference_data.storage.text import canonical_json
 
 
 def digest_weights(folder: Path, patterns: Sequence[str]) -> str:

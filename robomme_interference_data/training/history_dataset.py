@@ -12,7 +12,7 @@ from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, SHIFTED,
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import camera_feature
 from robomme_interference_data.data.loading import load_buffer_set, open_cache
-from robomme_interference_data.data.state_sizes import other_state_sizes, query_state_size
+from robomme_interference_data.data.state_reader import other_state_sizes, query_state_size
 from robomme_interference_data.data.views import shifted_view
 from robomme_interference_data.errors import (
     HashMismatchError,

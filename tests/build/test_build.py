@@ -25,8 +25,9 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Serial
-from robomme_interference_data.storage.files import LocalFiles, read_json
+from robomme_interference_data.storage.files import LocalFiles
 from robomme_interference_data.storage.staging import file_lock, staging_path
+from robomme_interference_data.storage.text import read_json
 
 TRAIN = {f"{family}/train/{index}": (260, None) for family in ("A", "B") for index in range(2)}
 

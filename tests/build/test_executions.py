@@ -30,7 +30,7 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.errors import InvalidOptionError, SourceError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.storage.files import read_json
+from robomme_interference_data.storage.text import read_json
 
 QUERY = "MoveCube/test/0"
 QUERIES = {QUERY: (9, 5), "PatternLock/test/0": (8, 5)}

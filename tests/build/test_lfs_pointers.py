@@ -12,7 +12,7 @@ from support.recordings import EPISODES, write_frames, write_h5
 from robomme_interference_data.build_dataset.sources import open_source
 from robomme_interference_data.data.loading import load_buffer
 from robomme_interference_data.errors import MissingFileError
-from robomme_interference_data.storage.files import check_not_pointer
+from robomme_interference_data.storage.text import check_not_pointer
 
 
 def make_pointer(path: Path) -> None:

@@ -8,6 +8,8 @@ import pytest
 from support.public_sets import SETS, STATELESS, write_public_set
 
 from robomme_interference_data import load_buffer, load_buffer_set
+from robomme_interference_data.data.dataset import Dataset
+from robomme_interference_data.storage.files import LocalFiles
 from robomme_interference_data.training import HistoryDataset
 
 LENGTHS = (9, 8, 7)
@@ -20,16 +22,8 @@ NAMES = """episode_index,family,split,exec_start_idx
 SMALL = ("--unit", "4x2", "--workers", "1")
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param("hsr", marks=pytest.mark.slow),
-        pytest.param("droid", marks=pytest.mark.slow),
-        pytest.param("agibot", marks=pytest.mark.slow),
-        pytest.param("bridge", marks=pytest.mark.slow),
-        pytest.param("robomme", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SETS)
 def test_from_recordings_to_a_policy(name: str, tmp_path: Path, run: Any) -> None:
     layout = SETS[name]
     source = write_public_set(tmp_path / name, layout, LENGTHS, TASKS)
@@ -112,7 +106,5 @@ def test_one_family_for_a_dataset(tmp_path: Path, run: Any) -> None:
 
 
 def load_dataset(folder: Path) -> Any:
-    from robomme_interference_data.data.dataset import Dataset
-    from robomme_interference_data.storage.files import LocalFiles
 
     return Dataset(LocalFiles(folder))

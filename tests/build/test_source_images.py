@@ -71,6 +71,37 @@ def test_png_of_every_kind(mode: str) -> None:
     np.testing.assert_array_equal(decode_image(out.getvalue()), np.asarray(picture.convert("RGB")))
 
 
+def with_orientation(orientation: int, kind: str) -> bytes:
+    exif, out = Image.Exif(), io.BytesIO()
+    exif[0x112] = orientation
+    Image.fromarray(FRAMES[3]).save(out, kind, exif=exif)
+    return out.getvalue()
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_photo_is_turned_as_its_exif_states(orientation: int) -> None:
+    plain, data = with_orientation(1, "JPEG"), with_orientation(orientation, "JPEG")
+    stored = decode_image(plain)
+    turned = {
+        1: stored,
+        2: stored[:, ::-1],
+        3: stored[::-1, ::-1],
+        4: stored[::-1],
+        5: stored.swapaxes(0, 1),
+        6: np.rot90(stored, -1),  # clockwise
+        7: stored.swapaxes(0, 1)[::-1, ::-1],
+        8: np.rot90(stored),
+    }
+    np.testing.assert_array_equal(decode_image(data), turned[orientation])
+
+
+def test_a_png_that_is_to_be_turned_is_an_error() -> None:
+    np.testing.assert_array_equal(decode_image(with_orientation(1, "PNG")), FRAMES[3])
+    for orientation in range(2, 9):
+        with raises(FormatError):
+            decode_image(with_orientation(orientation, "PNG"))
+
+
 def test_every_single_changed_byte_of_a_png_is_noticed() -> None:
     data = encode_image(FRAMES[2][:8, :8])
     for place in range(len(data)):

@@ -3,12 +3,14 @@
 import json
 import time
 from dataclasses import replace
+from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import av
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from numpy.typing import NDArray
@@ -299,6 +301,7 @@ def test_evidence_of_this_projects_datasets_goes_before_subgoals(tmp_path: Path)
         {"episode_id": [None]},
         {"episode_id": [7]},
         {"evidence": ["x"]},
+        {"seed": [Decimal("7.5")]},
     ],
 )
 def test_invalid_values(tmp_path: Path, columns: dict[str, Any]) -> None:
@@ -314,6 +317,7 @@ def test_invalid_values(tmp_path: Path, columns: dict[str, Any]) -> None:
         ({"seed": ["7"]}, {"seed": 7}),
         ({"seed": [float("nan")]}, {"seed": None}),
         ({"seed": [""]}, {"seed": None}),
+        ({"seed": [Decimal("7.00")]}, {"seed": 7}),
         ({"seed": [-(2**62)]}, {"seed": -(2**62)}),
         ({"difficulty": [float("nan")]}, {"difficulty": None}),
         ({"difficulty": [""]}, {"difficulty": None}),
@@ -366,6 +370,51 @@ def test_images_that_are_wrong(tmp_path: Path) -> None:
     assert [next(frames).is_demonstration for _ in range(2)] == [True, True]  # read one by one
     with raises(FormatError):
         next(frames)
+
+
+def test_an_image_of_another_kind_is_named_with_its_file(tmp_path: Path) -> None:
+    root = write_lerobot(tmp_path, one())
+    column = "observation.images.front"
+    cells = pq.read_table(root / DATA)[column].to_pylist()
+    edit_columns(root / DATA, **{column: [{"bytes": b"BM6$", "path": None}, *cells[1:]]})
+    with raises(FormatError) as caught:
+        read(root)
+    assert DATA in caught.value.message
+    assert column in caught.value.message
+
+
+def test_a_recording_without_frames_is_left_out(tmp_path: Path) -> None:
+    root = write_lerobot(tmp_path, {NAME: FOUR, "MoveCube/train/1": make_episode(2, 0)})
+    first, second = open_source(f"lerobot:{root}").episodes()
+    first.check()
+    with raises(SourceError):
+        second.check()
+
+
+def test_features_without_values_that_are_not_used(tmp_path: Path) -> None:
+    """Some datasets declare sensors that their robot has not."""
+    root = write_lerobot(tmp_path, one())
+
+    def declare(info: dict[str, Any]) -> None:
+        info["features"]["observation.force"] = {"dtype": "float32", "shape": [0]}
+
+    edit_info(root, declare)
+    check_recording(read(root), FOUR)
+
+
+@pytest.mark.parametrize(
+    ("columns", "splits"),
+    [({}, ["train", "test", "train"]), ({"split": ["val", "", None]}, ["val", "test", "train"])],
+)
+def test_splits_of_the_dataset(tmp_path: Path, columns: Any, splits: list[str]) -> None:
+    """A per-episode column comes first, then those in info.json."""
+    episodes = {f"Fold/train/{index}": make_episode(index, 4, "fold it") for index in range(3)}
+    root = write_lerobot(tmp_path, episodes, episode_id=None, family=["Fold"] * 3, **columns)
+    edit_info(root, splits={"train": "0:1", "test": "1:2"})
+    listed = {
+        episode.key[0]: episode.id.split for episode in open_source(f"lerobot:{root}").episodes()
+    }
+    assert [listed[index] for index in range(3)] == splits
 
 
 # --- videos --------------------------------------------------------------------------------------
@@ -423,15 +472,17 @@ EVERY, NONE = [True] * 3, [False] * 3
         (ALL_FRAMES[1:], [0, 1.2, 1.9], NONE),
         # Drifting start times: by a third of a frame, by nearly a frame, by far.
         (ALL_FRAMES, [0, 1.233, 1.933], EVERY),
+        (ALL_FRAMES, [-0.033, 1.167, 1.867], EVERY),
+        (ALL_FRAMES, list(map(Decimal, ("0.0", "1.2", "1.9"))), EVERY),
         (ALL_FRAMES, [0, 1.249, 1.99], [True, True, False]),
         (ALL_FRAMES, [0, 1.2, 101.9], [True, True, False]),
     ],
 )
 def test_table_and_video_must_agree(
-    filmed: Path, frames: NDArray[np.uint8], starts: list[float], readable: list[bool]
+    filmed: Path, frames: NDArray[np.uint8], starts: list[Any], readable: list[bool]
 ) -> None:
     film(filmed, frames)
-    edit_columns(filmed / TABLE, **{STARTS: starts})
+    edit_columns(filmed / TABLE, **{STARTS: pa.array(starts)})
     assert outcomes(filmed) == dict(zip(IDS, readable, strict=True))
 
 

@@ -177,8 +177,7 @@ def test_frames_that_cannot_be_stored(tmp_path: Path, number: int, frame: Any) -
 def test_more_values_than_are_read_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of 8 values, 80 are 10 frames, as many as the demonstration with its query frame has."""
     monkeypatch.setattr(stage, "MAX_READ_VALUES", 80)
-    made, _ = staged(tmp_path, MadeUpSource({NAME: (20, 9)}))
-    assert made.record is not None and made.record.length == 10
+    assert stored(tmp_path, MadeUpSource({NAME: (20, 9)})).record.length == 10
     with raises(SourceError):
         staged(tmp_path, MadeUpSource({NAME: (20, 10)}))
 

@@ -36,7 +36,8 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
 from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Serial
-from robomme_interference_data.storage.files import read_json, write_json
+from robomme_interference_data.storage.files import write_json
+from robomme_interference_data.storage.text import read_json
 
 QUERIES = {f"{family}/test/0": (12, 5) for family in ("Lift", "Stack")}
 TRAIN = {f"{family}/train/0": (11, None) for family in ("Lift", "Stack")}

@@ -1,6 +1,7 @@
 """Recordings that are checked before a build: everything that is wrong, by episode and frame."""
 
 import json
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -68,7 +69,8 @@ def test_recordings_without_a_problem(tmp_path: Path, kind: str) -> None:
     report = check(f"{kind}:{tmp_path}")
     assert report.problems == []
     # 12 + 7 + 9 frames; only the first has both a demonstration and live frames.
-    assert (report.episodes, report.frames, report.marked, report.exact) == (3, 28, 1, 3)
+    assert (report.episodes, report.frames) == (3, 28)
+    assert (report.with_demonstration, report.exact) == (1, 3)
     [(look, count)] = report.looks
     assert count == 3
     assert look.features == {
@@ -191,6 +193,18 @@ def test_the_command(tmp_path: Path, run: Run) -> None:
     code, out, _ = run("verify", *sources, "--workers", "1")
     assert code == 1
     assert f"lerobot:{tmp_path}/bad, MoveCube/train/1, frame 6: observation.state" in out
+
+
+def test_the_next_command_has_the_same_settings(tmp_path: Path, run: Run) -> None:
+    folder = tmp_path / "my recordings"
+    write_lerobot(folder)
+    sources = ("--source", f"lerobot:{folder}")
+    settings = ("--columns", "action=none", "--set", "several_tasks=joined")
+    code, _, err = run("verify", "my set", *sources, *settings, "--workers", "1")
+    assert code == 0
+    command = err.partition("Next: ")[2]
+    words = ["robomme-interference", "build", "my set", *sources, *settings]
+    assert shlex.split(command) == words
 
 
 @pytest.mark.parametrize(

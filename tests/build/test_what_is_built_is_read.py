@@ -80,6 +80,7 @@ def made(**options: Any) -> Shaped:
 CASES: dict[str, dict[str, Any]] = {
     "one value each": {"state": 1, "action": 1},
     "one value and no action": {"state": 1, "action": None},
+    "no state": {"state": 0},
     "a gripper's action": {"state": 8, "action": 1},
     "no reading": {"value": NO_READING},
     "the smallest": {"value": -NO_READING, "state": 1},
@@ -124,7 +125,6 @@ def test_it_is_read_and_verified(tmp_path: Path, run: Any, options: dict[str, An
 
 
 NOT_STORED: dict[str, dict[str, Any]] = {
-    "no state": {"state": 0},
     "too many values": {"state": MAX_VECTOR + 1},
     "too many of an action": {"action": MAX_VECTOR + 1},
     "a longer goal": {"goals": (LONG, "b")},
@@ -134,7 +134,7 @@ NOT_STORED: dict[str, dict[str, Any]] = {
     "a camera's long name": {"cameras": ("x" * 182,)},
     "a long name": {"robot": Robot(10, names={STATE: ("a" * 201, "b")})},
     "a slow rate": {"robot": Robot(9e-4)},
-    "a fast rate": {"robot": Robot(1.1e6)},
+    "a fast rate": {"robot": Robot(10_001.0)},
     "a seed of 64 bits": {"seed": 2**63},
 }
 

@@ -20,7 +20,7 @@ from robomme_interference_data.build_dataset.verify.audit import Audit, Leak
 from robomme_interference_data.cards import checks, results
 from robomme_interference_data.cards.checks import check_buffer_set
 from robomme_interference_data.errors import PublishError
-from robomme_interference_data.storage.files import canonical_json
+from robomme_interference_data.storage.text import canonical_json
 
 Login = Callable[..., None]
 Run = Callable[..., tuple[int, str, str]]

@@ -29,7 +29,8 @@ from robomme_interference_data.errors import FormatError, InvalidOptionError
 from robomme_interference_data.evaluate.score.config import Settings
 from robomme_interference_data.evaluate.score.scoring import Score, score
 from robomme_interference_data.schema.manifest import BufferManifest
-from robomme_interference_data.storage.files import format_sums, read_json, write_json
+from robomme_interference_data.storage.files import format_sums, write_json
+from robomme_interference_data.storage.text import read_json
 
 COMMIT = "0123456789" * 4
 

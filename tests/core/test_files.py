@@ -14,14 +14,11 @@ from robomme_interference_data.errors import FormatError, MissingFileError
 from robomme_interference_data.storage.files import (
     LocalFiles,
     atomic_path,
-    canonical_json,
     format_sums,
-    parse_json,
-    read_json,
     read_sums,
-    read_text,
     write_json,
 )
+from robomme_interference_data.storage.text import canonical_json, parse_json, read_json, read_text
 
 values = st.recursive(
     st.none()

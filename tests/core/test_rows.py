@@ -18,7 +18,7 @@ from robomme_interference_data.schema.codec import (
     to_dict,
     to_table,
 )
-from robomme_interference_data.storage.files import read_header
+from robomme_interference_data.storage.text import read_header
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ class Config:
     families: tuple[str, ...] = setting(("all",), help="Families.")
     source: tuple[str, ...] = setting((), help="Sources.", whole=True)
     split: str = setting("test", help="Split.")
-    k: int | None = setting(None, help="Number.", env="OF_THE_TEST_K")
+    k: int | None = setting(None, help="Number.")
     videos: bool = setting(False, help="Clips.", name="--videos")
     limit_s: float = setting(9.0, help="Limit.", rare=True)
     resume: bool = setting(True, help="Resume.", rare=True)
@@ -84,9 +84,10 @@ def options_of(group: Any, words: list[str]) -> Iterator[tuple[list[str], list[s
         yield words, [one.name for one in group.params if one.param_type_name == "option"]
 
 
-def test_all_options(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("OF_THE_TEST_K", "7")
-    config, as_json = called("S", "--videos", "--split=val", "--out=o", "--source=x:a,b", "--json")
+def test_all_options() -> None:
+    config, as_json = called(
+        "S", "--k=7", "--videos", "--split=val", "--out=o", "--source=x:a,b", "--json"
+    )
     expected = Config(Path("S"), Path("o"), k=7, split="val", videos=True, source=("x:a,b",))
     assert config == expected and as_json  # a value of `whole` keeps its comma
 

@@ -15,7 +15,7 @@ from robomme_interference_data.evaluate import RunConfig, run_evaluation
 from robomme_interference_data.evaluate.policies.registry import make_policy, policy_options
 from robomme_interference_data.evaluate.run.history import HistoryReader
 from robomme_interference_data.runtime.executor import Serial
-from robomme_interference_data.storage.files import read_json
+from robomme_interference_data.storage.text import read_json
 from robomme_interference_data.training import HistoryDataset
 
 OWN = "python:support.own_policies:OfTwoRobots"

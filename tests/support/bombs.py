@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from support.buffer_sets import GOLDEN
 
-from robomme_interference_data.storage.video_file import MAX_PIXELS
+from robomme_interference_data.storage.limits import MAX_PIXELS
 
 _VIDEO = GOLDEN / "demonstrations/videos/observation.images.front/chunk-000/file-000.mp4"
 _MEGABYTE = 1 << 20
@@ -284,8 +284,9 @@ def read(kind: str, path: Path) -> object:
     from robomme_interference_data.evaluate.run.record import whole_lines
     from robomme_interference_data.storage.arrays import read_array
     from robomme_interference_data.storage.encode import decode_image
-    from robomme_interference_data.storage.files import read_json, read_sums
+    from robomme_interference_data.storage.files import read_sums
     from robomme_interference_data.storage.parquet import RowSpan
+    from robomme_interference_data.storage.text import read_json
     from robomme_interference_data.storage.video import iter_frames
 
     readers: dict[str, Callable[[], object]] = {

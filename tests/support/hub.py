@@ -22,7 +22,8 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.manifest import ManifestHeader
-from robomme_interference_data.storage.files import read_header, write_json
+from robomme_interference_data.storage.files import write_json
+from robomme_interference_data.storage.text import read_header
 
 BUFFER_SET, BASE = "someone/units", "someone/demonstrations"
 

@@ -198,14 +198,7 @@ STATELESS = PublicSet(
 )
 """Recordings of a camera and of actions alone."""
 
-SETS = {
-    "hsr": HSR,
-    "droid": DROID,
-    "agibot": AGIBOT,
-    "bridge": BRIDGE,
-    "robomme": ROBOMME,
-    "stateless": STATELESS,
-}
+SETS = {"hsr": HSR, "droid": DROID, "agibot": AGIBOT, "bridge": BRIDGE, "robomme": ROBOMME}
 
 
 def write_public_set(

@@ -25,7 +25,8 @@ from robomme_interference_data.retrieval.segment import (
 from robomme_interference_data.retrieval.select import Similarities
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.manifest import layout_sessions
-from robomme_interference_data.storage.files import read_header, write_json
+from robomme_interference_data.storage.files import write_json
+from robomme_interference_data.storage.text import read_header
 
 QUIET = WorkProgress(quiet=True)
 FRAMES = [3 * 49, 17 * 32]

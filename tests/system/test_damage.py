@@ -32,7 +32,8 @@ from robomme_interference_data.evaluate.ceiling import ceiling
 from robomme_interference_data.evaluate.run.config import CeilingConfig
 from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.retrieval.measure import measure_all
-from robomme_interference_data.storage.files import read_json, sha256_file, write_json
+from robomme_interference_data.storage.files import sha256_file, write_json
+from robomme_interference_data.storage.text import read_json
 
 pytestmark = pytest.mark.slow
 

@@ -60,4 +60,4 @@ def test_classes_and_type_aliases_are_types_and_constants_are_not() -> None:
     code = (
         "class _Row: pass\nCell = tuple[str, str]\nLIMIT = 3\n_HERE = 1\nrows: Any = []\nURLs = 1\n"
     )
-    assert [*SCRIPT["type_names"](ast.parse(code))] == [("Row", 1), ("Cell", 2), ("URLs", 5)]
+    assert [*SCRIPT["type_names"](ast.parse(code))] == [("Row", 1), ("Cell", 2), ("URLs", 6)]

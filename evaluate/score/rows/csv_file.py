@@ -8,7 +8,7 @@ from pathlib import Path
 
 from robomme_interference_data.constants import MAX_ROW_BYTES
 from robomme_interference_data.errors import FormatError, counted
-from robomme_interference_data.storage.files import read_text
+from robomme_interference_data.storage.text import read_text
 
 from .columns import select, with_outcomes
 from .row_format import FileColumns, RowFile, check_count

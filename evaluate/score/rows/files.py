@@ -14,7 +14,8 @@ from robomme_interference_data.errors import (
     named,
 )
 from robomme_interference_data.evaluate.systems import name_system
-from robomme_interference_data.storage.files import read_header, reading
+from robomme_interference_data.storage.files import reading
+from robomme_interference_data.storage.text import read_header
 
 from .row_format import FileColumns, ReadFiles, RowFile, RowFormat
 from .values import MAX_NUMBER

@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from robomme_interference_data.constants import MAX_ROW_BYTES
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.storage.files import parse_json, read_bytes
+from robomme_interference_data.storage.text import parse_json, read_bytes
 
 _MAX_ROWS = 1 << 20
 """Rows in a file, at most: the paper's grid has 25,200."""
