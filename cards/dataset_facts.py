@@ -224,12 +224,12 @@ def _changes(datasets: Mapping[str, Dataset]) -> list[str]:
     """Return what the datasets lack or changed of their recordings, and states that differ."""
     limits = []
     for name, dataset in datasets.items():
+        named = name or DEMONSTRATIONS
         sources = dataset.identity.sources
         if sizes := sorted({str(source["resize"]) for source in sources if "resize" in source}):
-            limits.append(f"The frames of the {name or DEMONSTRATIONS} are resized: {sizes[0]}.")
+            limits.append(f"The frames of the {named} are resized: {sizes[0]}.")
         if dataset.features[STATE] == (0,):
-            part = name or DEMONSTRATIONS
-            limits.append(f"The {part} have no robot states: states have length 0.")
+            limits.append(f"The {named} have no robot states: states have length 0.")
     others = other_state_sizes(datasets) if DEMONSTRATIONS in datasets else {}
     for name, size in others.items():
         limits.append(

@@ -9,7 +9,7 @@ from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import policy_options
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.plan import WorkItem
-from robomme_interference_data.schema.other_states import check_sizes
+from robomme_interference_data.schema.other_states import OtherStates, check_sizes
 
 
 def check_other_states(
@@ -32,13 +32,17 @@ def check_other_states(
         for session in manifest.sessions
     }
     sizes = {f"the dataset {name}": size for name, size in others.items() if name in used}
-    setting = "its attribute other_states"
-    if "other_states" in policy_options(config.policy, config.policy_options):
-        setting = f"{named('policy_options')} other_states=…"
+    is_option = "other_states" in policy_options(config.policy, config.policy_options)
+
+    def written(rule: OtherStates) -> str:
+        if is_option:
+            return named("policy_options", f"other_states={rule}")
+        return f'other_states = "{rule}" as an attribute of the policy'
+
     check_sizes(
         f"the policy {config.policy}",
         query_state_size(buffer_set.datasets),
         sizes,
         policy.other_states,
-        setting,
+        written,
     )

@@ -69,7 +69,7 @@ class StateReader:
                 f"session {number} ({entry.source} of the {entry.dataset})": states.shape[1]
                 for number, (entry, states) in enumerate(zip(entries, sessions, strict=True))
             }
-            check_sizes(str(self._manifest), size, sizes, rule, "other_states")
+            check_sizes(str(self._manifest), size, sizes, rule, 'states_by("{}")'.format)
             fitted = [fit_states(states, size, rule) for states in sessions]
             self._arrays[rule] = np.concatenate([np.empty((0, size), np.float32), *fitted])
         return self._arrays[rule]

@@ -8,13 +8,13 @@ buffer exists only by a rule:
 - `omit`: zeros take the place of all values of that session.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import InvalidOptionError, named
 
 OtherStates = Literal["refuse", "pad", "omit"]
 
@@ -34,8 +34,16 @@ def check_rule(rule: str) -> OtherStates:
     raise InvalidOptionError.one_of("other_states", rule, OTHER_STATES)
 
 
+def _as_setting(rule: OtherStates) -> str:
+    return named("other_states", rule)
+
+
 def check_sizes(
-    what: str, size: int, others: Mapping[str, int], rule: OtherStates, setting: str
+    what: str,
+    size: int,
+    others: Mapping[str, int],
+    rule: OtherStates,
+    written: Callable[[OtherStates], str] = _as_setting,
 ) -> None:
     """Check that a rule gives one array of states.
 
@@ -44,7 +52,7 @@ def check_sizes(
         size: Number of values of the query's states.
         others: Numbers of values of other sessions or datasets, by what they are called.
         rule: The rule.
-        setting: How the rule is set, for the error, such as `other_states`.
+        written: Returns how another rule is chosen, for the error.
 
     Raises:
         InvalidOptionError: It does not.
@@ -52,13 +60,13 @@ def check_sizes(
     for name, other in others.items():
         if other == size or rule == "omit" or (rule == "pad" and other < size):
             continue
-        ways = ["omit (zeros in their place)"]
+        ways = [f"{written('omit')} (zeros in their place)"]
         if other < size:
-            ways.insert(0, "pad (zeros after them)")
+            ways.insert(0, f"{written('pad')} (zeros after them)")
         cut = f"; {rule} cuts off no values" if rule == "pad" else ""
         raise InvalidOptionError(
             f"{what}: {name} has states of {other} values, the query of {size}{cut}",
-            f"Set {setting} to {' or '.join(ways)}.",
+            f"Choose {' or '.join(ways)}.",
             option="other_states",
         )
 

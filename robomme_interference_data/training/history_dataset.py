@@ -188,7 +188,7 @@ class HistoryDataset:
         if any(parse_condition(name).k for name in self._conditions.names):
             others = other_state_sizes(datasets)
         what = f"HistoryDataset of {self.buffer_set.name}"
-        check_sizes(what, query_state_size(datasets), others, rule, "other_states")
+        check_sizes(what, query_state_size(datasets), others, rule)
         self._rows = StoredRows(datasets, kept, size, rule)
         self._moments = choose_moments(
             self.buffer_set, self._rows, families, episodes, actions=actions

@@ -18,6 +18,7 @@ from robomme_interference_data.errors import (
     InterferenceError,
     InvalidIdError,
     InvalidOptionError,
+    MissingFileError,
     SourceError,
 )
 from robomme_interference_data.storage.staging import staging_path
@@ -143,6 +144,17 @@ def test_build_all_checks_options_before_it_reads(
     with pytest.raises(error):
         plan_build(BuildConfig(**asked), BuffersConfig(**plan))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_manifests_need_datasets(tmp_path: Path) -> None:
+    manifests = BuildConfig(tmp_path, only="manifests")
+    with raises(MissingFileError) as caught:
+        plan_build(manifests, BuffersConfig())
+    assert f"{tmp_path} --only demonstrations" in str(caught.value.command)
+    staging_path(tmp_path / "demonstrations").mkdir()
+    with raises(MissingFileError) as caught:
+        plan_build(manifests, BuffersConfig())
+    assert caught.value.command is None  # only its builder knows the command that goes on
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:

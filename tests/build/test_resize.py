@@ -173,8 +173,9 @@ def test_a_dataset_is_extended_with_the_same_size_only(tmp_path: Path) -> None:
     build(tmp_path, "8x8:pad")
     more = LENGTHS | {"Lift/train/1": (11, None)}
     for other in ("8x8:crop", None):
-        with raises(BuildError):
+        with raises(BuildError) as caught:
             build(tmp_path, other, more)
+        assert 'resize="8x8:pad"' in str(caught.value.hint)
     assert len(build(tmp_path, "8x8:pad", more)) == 3
 
 

@@ -173,8 +173,9 @@ def test_a_dataset_is_extended_with_as_many_units(buffers: Path, tmp_path: Path)
     some = {name: TRAIN[name] for name in ("Lift/train/0", "Stack/train/1")}
     build(tmp_path, DISTRACTORS, some)
     for other in (THREE._replace(per_episode=2), THREE._replace(per_episode=1)):
-        with raises(BuildError):
+        with raises(BuildError) as caught:
             build(tmp_path, DISTRACTORS, TRAIN, other)
+        assert "units_per_episode=3" in str(caught.value.hint)
     extended, whole = (
         build(tmp_path, DISTRACTORS, TRAIN),
         Dataset(LocalFiles(buffers / DISTRACTORS)),

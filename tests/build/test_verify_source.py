@@ -128,7 +128,7 @@ def test_episodes_that_the_list_shows_to_be_wrong(tmp_path: Path) -> None:
     write_table(tmp_path, rows)
     report = check(f"frames:{tmp_path}")
     assert found(report) == [("Push/train/1", None), ("Push/train/2", None)]
-    assert (report.episodes, report.frames) == (3, 3)
+    assert (report.episodes, report.frames, report.exact) == (3, 3, 1)
 
 
 def test_episodes_that_differ_from_most_others(tmp_path: Path) -> None:

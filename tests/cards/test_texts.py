@@ -10,7 +10,7 @@ import pytest
 from support import scoring
 from support.buffer_sets import plan_again
 from support.cards import OF_BUFFER_SET, OF_DEMONSTRATIONS, OF_RESULTS, RUN
-from support.made_up import record, write_metadata
+from support.made_up import SHAPES, record, write_metadata
 from support.messages import raises
 
 from robomme_interference_data import load_buffer_set
@@ -42,6 +42,7 @@ def made_up(
     unit: dict[str, Any] | None = None,
     identity: dict[str, Any] | None = None,
     report: dict[str, Any] | None = None,
+    unit_values: int = 8,
     **options: Any,
 ) -> BufferSet:
     """A buffer set of metadata alone: one query, and two units of each of three families."""
@@ -52,7 +53,8 @@ def made_up(
         for number in range(2)
     ]
     for kind, records in (("demonstrations", asked), ("distractors", pool)):
-        write_metadata(root / kind, kind, records)
+        values = unit_values if kind == "distractors" else 8
+        write_metadata(root / kind, kind, records, SHAPES | {"observation.state": (values,)})
         sums = format_sums(root / kind, [RECORDS_PATH])
         (root / kind / SUMS_PATH).write_text(sums)
         path, digest = root / kind / IDENTITY_PATH, sha256(sums.encode()).hexdigest()
@@ -98,6 +100,18 @@ def test_the_lossy_copy_of_the_recordings_is_named(tmp_path: Path) -> None:
     assert "It was built from `lerobot/robomme`, a copy of RoboMME" in text
     assert f"`lerobot/robomme@{COMMIT}`" in text
     assert "source_datasets:\n- lerobot/robomme\n" in text
+
+
+def test_what_was_changed_of_recordings_is_a_limit(tmp_path: Path) -> None:
+    source = {"kind": "lerobot", "resize": "6x4:pad"}
+    resized = made_up(tmp_path / "resized", identity={"sources": [source]})
+    assert "frames of the distractors are resized: 6x4:pad" in buffer_set_text(
+        resized, OF_BUFFER_SET
+    )
+    assert "frames of the demonstrations are resized: 6x4:pad" in demonstrations_text(resized)
+    wider = buffer_set_text(made_up(tmp_path / "wider", unit_values=14), OF_BUFFER_SET)
+    assert "states of the distractors have 14 values, those of the lessons 8" in wider
+    assert "resized:" not in wider
 
 
 HOSTILE = (
