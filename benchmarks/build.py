@@ -40,7 +40,7 @@ from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Executor, Serial, Worker
 from robomme_interference_data.runtime.process import Processes
 from robomme_interference_data.storage.arrays import FeatureDigests
-from robomme_interference_data.storage.encode import Codec, VideoEncoder, get_codec
+from robomme_interference_data.storage.video.encode import Codec, VideoEncoder, get_codec
 
 RECORDINGS = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
 FAMILIES = ("VideoUnmask", "VideoUnmaskSwap", "PatternLock")

@@ -32,8 +32,8 @@ from robomme_interference_data.constants import (
     WRIST,
 )
 from robomme_interference_data.schema.records import EpisodeRecord
-from robomme_interference_data.storage.encode import CODECS, VideoEncoder
 from robomme_interference_data.storage.text import read_json
+from robomme_interference_data.storage.video.encode import CODECS, VideoEncoder
 
 SIDE, LESSON = 32, 8
 CAMERAS = (FRONT, WRIST)

@@ -18,10 +18,10 @@ from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_tab
 from robomme_interference_data.schema.manifest import ManifestHeader
 from robomme_interference_data.schema.subgoal import Pixel
 from robomme_interference_data.simulators.registry import recorded_scene
-from robomme_interference_data.storage.encode import png
 from robomme_interference_data.storage.files import sha256_file, write_json
 from robomme_interference_data.storage.parquet import writing
 from robomme_interference_data.storage.text import read_header
+from robomme_interference_data.storage.video.encode import png
 
 _MOST, _DRAWN = 5, 4
 """Most options of a question; if the scene has more answers, the number that is drawn."""

@@ -34,9 +34,9 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Executor, Outcome
 from robomme_interference_data.schema.records import EpisodeRecord
-from robomme_interference_data.storage.encode import get_codec
 from robomme_interference_data.storage.staging import replace_folder, staging_dir
 from robomme_interference_data.storage.text import canonical_json, read_json
+from robomme_interference_data.storage.video.encode import get_codec
 
 from .estimate import BuildEstimate
 from .existing import ExistingDataset, open_existing

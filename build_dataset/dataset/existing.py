@@ -7,7 +7,7 @@ from pathlib import Path
 
 from robomme_interference_data.build_dataset.alike import same_rate, unequal
 from robomme_interference_data.build_dataset.sources.base import Robot
-from robomme_interference_data.build_dataset.sources.columns import recorded_robot
+from robomme_interference_data.build_dataset.sources.lerobot.columns import recorded_robot
 from robomme_interference_data.build_dataset.sources.simulator import SimulatorSource
 from robomme_interference_data.constants import (
     ACTION,
@@ -23,7 +23,7 @@ from robomme_interference_data.errors import BuildError, InvalidOptionError, Sou
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.files import LocalFiles
-from robomme_interference_data.storage.lerobot import LeRobotFiles
+from robomme_interference_data.storage.lerobot.dataset import LeRobotFiles
 from robomme_interference_data.storage.text import read_header
 
 from .identity import BuildReport

@@ -27,8 +27,8 @@ from robomme_interference_data.build_dataset.sources.base import Robot
 from robomme_interference_data.constants import ACTION, INFO_PATH
 from robomme_interference_data.errors import MissingExtraError
 from robomme_interference_data.schema.records import EpisodeRecord
-from robomme_interference_data.storage.encode import Codec
 from robomme_interference_data.storage.files import write_text
+from robomme_interference_data.storage.video.encode import Codec
 
 from .statistics import STATISTICS, vector_statistics
 

@@ -30,9 +30,9 @@ from robomme_interference_data.storage.arrays import (
     digest_spans,
     write_array,
 )
-from robomme_interference_data.storage.encode import Codec, VideoEncoder, get_codec
 from robomme_interference_data.storage.limits import MAX_READ_VALUES
-from robomme_interference_data.storage.video import iter_frames
+from robomme_interference_data.storage.video.encode import Codec, VideoEncoder, get_codec
+from robomme_interference_data.storage.video.frames import iter_frames
 
 from .frame_checks import check_image, check_numbers, check_same_shapes, check_shapes
 from .frame_selection import NothingToStore, select_episodes, too_short, unit_starts

@@ -18,9 +18,9 @@ from robomme_interference_data.constants import PAPER_UNIT
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.records import EpisodeRecord
-from robomme_interference_data.storage.encode import get_codec
 from robomme_interference_data.storage.files import write_json
 from robomme_interference_data.storage.text import canonical_json, read_header
+from robomme_interference_data.storage.video.encode import get_codec
 
 from .lerobot_writer import StoredEpisode
 from .plan import DatasetPlan, PlannedEpisode

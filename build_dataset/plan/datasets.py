@@ -26,7 +26,7 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.errors import InvalidOptionError, named
 from robomme_interference_data.ids import EpisodeId, parse_numbers
 from robomme_interference_data.runtime.executor import make_executor
-from robomme_interference_data.storage.encode import get_codec
+from robomme_interference_data.storage.video.encode import get_codec
 
 from .checks import check_root
 from .episodes import choose_episodes

@@ -40,7 +40,7 @@ SOURCES = Registry(
         ),
         "lerobot": SpecKind(
             "lerobot:FOLDER or lerobot:NAMESPACE/NAME[/FOLDER][@REVISION]",
-            f"{__name__}.lerobot:LeRobotSource",
+            f"{__name__}.lerobot.source:LeRobotSource",
             _LOCATION,
         ),
         "frames": SpecKind("frames:FOLDER", f"{__name__}.frames:FramesSource", _LOCATION),

@@ -15,7 +15,7 @@ from robomme_interference_data.simulators.episode import choose_cameras
 from robomme_interference_data.storage.files import is_hidden
 from robomme_interference_data.storage.parquet import RowSpan
 from robomme_interference_data.storage.text import read_bytes
-from robomme_interference_data.storage.video import iter_frames
+from robomme_interference_data.storage.video.frames import iter_frames
 
 from ..alike import same_rate
 from .base import Recording, Robot, Source, SourceEpisode, compose, file_state

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError, SourceError
-from robomme_interference_data.storage.encode import decode_image, is_png
 from robomme_interference_data.storage.limits import MAX_RATE, MIN_RATE
-from robomme_interference_data.storage.video import read_times
-from robomme_interference_data.storage.video_file import open_video
+from robomme_interference_data.storage.video.encode import decode_image, is_png
+from robomme_interference_data.storage.video.file import open_video
+from robomme_interference_data.storage.video.frames import read_times
 
 _RGB_FORMATS = (
     "rgb24",

@@ -25,10 +25,10 @@ from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.schema.codec import arrow_schema
 from robomme_interference_data.schema.manifest import BufferManifest, ManifestHeader
 from robomme_interference_data.storage.arrays import combine
-from robomme_interference_data.storage.encode import CODECS
 from robomme_interference_data.storage.files import LocalFiles, all_files, is_hidden, sha256_file
 from robomme_interference_data.storage.parquet import open_parquet
 from robomme_interference_data.storage.staging import staging_path
+from robomme_interference_data.storage.video.encode import CODECS
 
 from .dataset import HEADER, UNLISTED, Violation, caught, dataset_violations, index_violations
 from .planned_again import buffer_violations, question_violations

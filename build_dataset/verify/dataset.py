@@ -42,10 +42,10 @@ from robomme_interference_data.schema.manifest import ManifestHeader
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.schema.shifts import SHIFTS
 from robomme_interference_data.storage.arrays import combine
-from robomme_interference_data.storage.encode import CODECS
 from robomme_interference_data.storage.files import all_files, is_hidden, sha256_file
 from robomme_interference_data.storage.text import digest_json, read_header, read_json
-from robomme_interference_data.storage.video_file import open_video
+from robomme_interference_data.storage.video.encode import CODECS
+from robomme_interference_data.storage.video.file import open_video
 
 from .lerobot_files import lerobot_violations
 

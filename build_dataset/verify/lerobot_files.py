@@ -24,8 +24,8 @@ from robomme_interference_data.data.fetched_copy import FetchedCopy
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.schema.codec import arrow_schema
 from robomme_interference_data.schema.records import EpisodeRecord
-from robomme_interference_data.storage.lerobot import LeRobotFiles
-from robomme_interference_data.storage.lerobot_tables import episode_column_names
+from robomme_interference_data.storage.lerobot.dataset import LeRobotFiles
+from robomme_interference_data.storage.lerobot.tables import episode_column_names
 
 _TOLERANCE_S = 1e-4
 """LeRobot's own tolerance of timestamps, in seconds."""

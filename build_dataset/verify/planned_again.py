@@ -23,7 +23,7 @@ from robomme_interference_data.data.questions import read_questions
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import datasets_of, in_order
-from robomme_interference_data.storage.encode import decode_image
+from robomme_interference_data.storage.video.encode import decode_image
 
 from .dataset import HEADER, Violation
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.evaluate.run.history import HistoryReader
 from robomme_interference_data.schema.sampling import spread
-from robomme_interference_data.storage.encode import CLIP, MODEL_VIDEO, VideoEncoder
+from robomme_interference_data.storage.video.encode import CLIP, MODEL_VIDEO, VideoEncoder
 
 from .models import Message, Part, Video
 

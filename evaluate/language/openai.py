@@ -14,7 +14,7 @@ from openai import OpenAI
 from robomme_interference_data.errors import InvalidOptionError, ModelError, first_line
 from robomme_interference_data.evaluate.deadline import shutdown_after
 from robomme_interference_data.retry import growing, retry
-from robomme_interference_data.storage.encode import png
+from robomme_interference_data.storage.video.encode import png
 
 from .images import data_url, mp4, within
 from .models import ChatModel, Message, Part, Reply, Video

@@ -13,7 +13,7 @@ from robomme_interference_data.data.questions import Question
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.evaluate.run.config import AskConfig
 from robomme_interference_data.simulators.registry import recorded_scene
-from robomme_interference_data.storage.encode import decode_image
+from robomme_interference_data.storage.video.encode import decode_image
 
 from .images import HistoryFrames
 from .models import MODELS, Message, Part, Reply, Video

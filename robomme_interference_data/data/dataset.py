@@ -38,7 +38,7 @@ from robomme_interference_data.schema.manifest import SessionEntry
 from robomme_interference_data.schema.records import DatasetIdentity, EpisodeRecord
 from robomme_interference_data.storage.arrays import EMPTY_SHA256, combine, digest_spans
 from robomme_interference_data.storage.files import Files, read_sums, sha256_file
-from robomme_interference_data.storage.lerobot import LeRobotFiles
+from robomme_interference_data.storage.lerobot.dataset import LeRobotFiles
 from robomme_interference_data.storage.text import digest_json, read_header
 
 

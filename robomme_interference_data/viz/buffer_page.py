@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from robomme_interference_data.errors import counted
 from robomme_interference_data.schema.manifest import Session
 from robomme_interference_data.schema.sampling import even_sample, runs
-from robomme_interference_data.storage.encode import png
 from robomme_interference_data.storage.files import write_text
+from robomme_interference_data.storage.video.encode import png
 
 from .figure import ink_on
 from .filmstrip import round_step, session_colors

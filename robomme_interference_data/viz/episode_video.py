@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.errors import MissingExtraError
-from robomme_interference_data.storage.encode import CLIP, VideoEncoder
+from robomme_interference_data.storage.video.encode import CLIP, VideoEncoder
 
 from .figure import Hue
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import MissingExtraError
 from robomme_interference_data.schema.sampling import even_sample
-from robomme_interference_data.storage.encode import png
 from robomme_interference_data.storage.files import atomic_path
+from robomme_interference_data.storage.video.encode import png
 
 if TYPE_CHECKING:
     from robomme_interference_data.data.buffer import Buffer

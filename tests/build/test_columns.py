@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from support.messages import raises
 
-from robomme_interference_data.build_dataset.sources.columns import (
+from robomme_interference_data.build_dataset.sources.lerobot.columns import (
     RecordedColumns,
     find_columns,
     value_names,

@@ -7,11 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.messages import raises
 
-from robomme_interference_data.build_dataset.sources.families import (
+from robomme_interference_data.build_dataset.sources.lerobot.families import (
     families_by_task,
     recorded_splits,
 )
-from robomme_interference_data.build_dataset.sources.family_names import (
+from robomme_interference_data.build_dataset.sources.lerobot.family_names import (
     families_of,
     family_of,
     words_of,

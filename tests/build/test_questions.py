@@ -26,7 +26,7 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators.tabletop.camera import SIZE
 from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, seed_of
 from robomme_interference_data.simulators.tabletop.family import Family
-from robomme_interference_data.storage.encode import decode_image
+from robomme_interference_data.storage.video.encode import decode_image
 
 GRAY = np.full((SIZE, SIZE, 3), 128, np.uint8)
 EPISODES = [

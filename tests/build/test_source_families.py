@@ -11,8 +11,14 @@ from hypothesis import strategies as st
 from support.goal_texts import GOALS, UNMASK
 from support.messages import raises
 
-from robomme_interference_data.build_dataset.sources.families import ids_by_block, ids_by_columns
-from robomme_interference_data.build_dataset.sources.families_file import read_families, template
+from robomme_interference_data.build_dataset.sources.lerobot.families import (
+    ids_by_block,
+    ids_by_columns,
+)
+from robomme_interference_data.build_dataset.sources.lerobot.families_file import (
+    read_families,
+    template,
+)
 from robomme_interference_data.build_dataset.sources.robomme_families import (
     ROBOMME,
     families_for_goal,

@@ -15,8 +15,8 @@ from robomme_interference_data.build_dataset.sources.images import (
     probe_video,
 )
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.storage.encode import CODECS, decode_image, is_png
-from robomme_interference_data.storage.video import iter_frames
+from robomme_interference_data.storage.video.encode import CODECS, decode_image, is_png
+from robomme_interference_data.storage.video.frames import iter_frames
 
 FRAMES = make_episode(7, 5).images["front"]
 OURS = CODECS["av1-lossless"].settings["extra_options"]

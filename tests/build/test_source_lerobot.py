@@ -39,8 +39,8 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.schema.records import EvidenceSpan
-from robomme_interference_data.storage import video
-from robomme_interference_data.storage.video import read_times
+from robomme_interference_data.storage.lerobot import dataset
+from robomme_interference_data.storage.video.frames import read_times
 
 VERSIONS = ("v3.0", "v2.1", "v2.0")
 NAME = "MoveCube/train/0"
@@ -531,7 +531,7 @@ def test_a_camera_that_is_not_used_may_be_broken(
 
 def test_the_times_of_a_file_are_read_once(filmed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read_files = []
-    monkeypatch.setattr(video, "read_times", lambda path: read_files.append(path) or times(path))
+    monkeypatch.setattr(dataset, "read_times", lambda path: read_files.append(path) or times(path))
     times = read_times
     assert all(outcomes(filmed, None).values())
     assert sorted(path.parent.parent.name for path in read_files) == [

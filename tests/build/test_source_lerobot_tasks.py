@@ -15,7 +15,10 @@ from support.messages import raises
 from support.recordings import Episode, make_episode
 
 from robomme_interference_data.build_dataset.sources import open_source
-from robomme_interference_data.build_dataset.sources.goals import SEVERAL_TASKS, goal_wordings
+from robomme_interference_data.build_dataset.sources.lerobot.goals import (
+    SEVERAL_TASKS,
+    goal_wordings,
+)
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError, SourceError
 
 OPEN, CLOSE = "Öffne die Schublade", "then close it"

@@ -41,8 +41,8 @@ from robomme_interference_data.errors import BuildError, SourceError
 from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.schema.records import EvidenceSpan, SpanDigests
 from robomme_interference_data.storage.arrays import combine
-from robomme_interference_data.storage.encode import CODECS, VideoEncoder
-from robomme_interference_data.storage.video import iter_frames
+from robomme_interference_data.storage.video.encode import CODECS, VideoEncoder
+from robomme_interference_data.storage.video.frames import iter_frames
 
 NAME = "MoveCube/test/0"
 

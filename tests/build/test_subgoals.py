@@ -14,7 +14,7 @@ from support.messages import raises
 from support.recordings import MOVE, make_episode
 
 from robomme_interference_data.build_dataset.sources import Recording, open_source
-from robomme_interference_data.build_dataset.sources.trim import Trim
+from robomme_interference_data.build_dataset.sources.lerobot.trim import Trim
 from robomme_interference_data.errors import FormatError, SourceError
 from robomme_interference_data.schema.records import EvidenceSpan
 

@@ -21,9 +21,9 @@ from support.verifying import DATA, EPISODES, FRONT, RECORDS, VIDEO, expect, fir
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.data.dataset import Dataset, revision_of
 from robomme_interference_data.errors import FormatError, HashMismatchError, InterferenceError
-from robomme_interference_data.storage.encode import CODECS, VideoEncoder
 from robomme_interference_data.storage.files import LocalFiles
-from robomme_interference_data.storage.video import iter_frames
+from robomme_interference_data.storage.video.encode import CODECS, VideoEncoder
+from robomme_interference_data.storage.video.frames import iter_frames
 
 
 def as_text(name: str) -> Callable[[pa.Table], pa.Table]:

@@ -20,7 +20,7 @@ from robomme_interference_data import load_buffer_set
 from robomme_interference_data.constants import QUESTIONS_PATH
 from robomme_interference_data.data.questions import read_questions
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.storage.encode import decode_image, png
+from robomme_interference_data.storage.video.encode import decode_image, png
 
 
 @pytest.mark.slow

@@ -256,7 +256,7 @@ load_buffer("MoveCube/test/0", "k7", buffer_set={str(GOLDEN)!r}).frames("front")
     assert folders == {"data", "schema", "storage"}
     unneeded = {
         "storage.hub",
-        "storage.encode",
+        "storage.video.encode",
         "storage.cache",
         "schema.draw",
         "data.query_sessions",

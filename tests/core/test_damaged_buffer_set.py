@@ -23,7 +23,7 @@ from robomme_interference_data.errors import (
     MissingFileError,
     UnknownNameError,
 )
-from robomme_interference_data.storage.encode import CODECS, VideoEncoder
+from robomme_interference_data.storage.video.encode import CODECS, VideoEncoder
 
 
 def test_what_is_no_buffer_set(tmp_path: Path) -> None:

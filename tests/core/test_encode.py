@@ -18,8 +18,8 @@ from support.machine import full_disk
 from support.messages import raises
 
 from robomme_interference_data.errors import BuildError
-from robomme_interference_data.storage.encode import CLIP, CODECS, Codec, VideoEncoder
-from robomme_interference_data.storage.video import iter_frames, read_times
+from robomme_interference_data.storage.video.encode import CLIP, CODECS, Codec, VideoEncoder
+from robomme_interference_data.storage.video.frames import iter_frames, read_times
 
 LOSSLESS, LOSSY = CODECS["av1-lossless"], CODECS["lerobot-default"]
 

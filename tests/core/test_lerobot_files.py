@@ -17,8 +17,8 @@ from support.recordings import EPISODES, MOVE, PEG
 
 from robomme_interference_data.errors import FormatError, MissingFileError, UnknownNameError
 from robomme_interference_data.storage.files import LocalFiles
-from robomme_interference_data.storage.lerobot import LeRobotFiles
-from robomme_interference_data.storage.lerobot_location import VideoLocation, fill_template
+from robomme_interference_data.storage.lerobot.dataset import LeRobotFiles
+from robomme_interference_data.storage.lerobot.location import VideoLocation, fill_template
 
 VIDEO = "videos/observation.images.front/"
 V2 = "chunk-000/episode_000002"

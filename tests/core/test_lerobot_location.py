@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robomme_interference_data.storage.lerobot_location import (
+from robomme_interference_data.storage.lerobot.location import (
     VideoSpan,
     nearest_frame,
     span_problems,

@@ -11,8 +11,8 @@ import pytest
 from support.messages import raises
 
 from robomme_interference_data.errors import FormatError, InterferenceError
-from robomme_interference_data.storage.video import iter_frames
-from robomme_interference_data.storage.video_file import check_samples, find_container
+from robomme_interference_data.storage.video.file import check_samples, find_container
+from robomme_interference_data.storage.video.frames import iter_frames
 
 
 def box(kind: bytes, *parts: bytes) -> bytes:

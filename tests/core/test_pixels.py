@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from support.messages import raises
 
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.storage.pixels import to_rgb, turn
-from robomme_interference_data.storage.video import iter_frames
+from robomme_interference_data.storage.video.frames import iter_frames
+from robomme_interference_data.storage.video.pixels import to_rgb, turn
 
 # --- colors --------------------------------------------------------------------------------------
 

@@ -19,7 +19,7 @@ from robomme_interference_data.constants import QUESTIONS_PATH
 from robomme_interference_data.data.questions import Question, read_questions
 from robomme_interference_data.errors import FormatError, InterferenceError, MissingFileError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.storage.encode import decode_image
+from robomme_interference_data.storage.video.encode import decode_image
 
 MOVE = EpisodeId("MoveCube", "test", 0)
 COLUMNS = {

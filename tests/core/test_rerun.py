@@ -14,7 +14,7 @@ from support.buffer_sets import GOLDEN, QUERIES
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.errors import MissingExtraError
 from robomme_interference_data.schema.sampling import even_sample
-from robomme_interference_data.storage.encode import decode_image
+from robomme_interference_data.storage.video.encode import decode_image
 from robomme_interference_data.viz.rerun_file import write_recording
 
 BUFFER = load_buffer_set(GOLDEN).load(QUERIES[1], "k3")

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from support.messages import raises
 
 from robomme_interference_data.errors import FormatError, InterferenceError, MissingFileError
-from robomme_interference_data.storage.encode import CODECS
-from robomme_interference_data.storage.video import iter_frames, read_times
+from robomme_interference_data.storage.video.encode import CODECS
+from robomme_interference_data.storage.video.frames import iter_frames, read_times
 
 COUNT, SIZE, FPS = 60, (64, 80), 10
 pytestmark = pytest.mark.timeout(120)

@@ -15,7 +15,7 @@ from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.evaluate.rollout.clips import history_picture
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout
-from robomme_interference_data.storage.encode import VideoEncoder
+from robomme_interference_data.storage.video.encode import VideoEncoder
 from robomme_interference_data.viz.filmstrip import session_colors
 
 pytestmark = pytest.mark.usefixtures("trouble")

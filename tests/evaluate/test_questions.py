@@ -22,7 +22,7 @@ from robomme_interference_data.errors import InterferenceError, InvalidOptionErr
 from robomme_interference_data.evaluate.language.questions import Prompted, guess
 from robomme_interference_data.evaluate.run import evaluation
 from robomme_interference_data.runtime.executor import Serial
-from robomme_interference_data.storage.encode import decode_image
+from robomme_interference_data.storage.video.encode import decode_image
 
 pytestmark = pytest.mark.usefixtures("fast_retries")
 

@@ -283,11 +283,11 @@ def read(kind: str, path: Path) -> object:
     """Read a file as what it is."""
     from robomme_interference_data.evaluate.run.record import whole_lines
     from robomme_interference_data.storage.arrays import read_array
-    from robomme_interference_data.storage.encode import decode_image
     from robomme_interference_data.storage.files import read_sums
     from robomme_interference_data.storage.parquet import RowSpan
     from robomme_interference_data.storage.text import read_json
-    from robomme_interference_data.storage.video import iter_frames
+    from robomme_interference_data.storage.video.encode import decode_image
+    from robomme_interference_data.storage.video.frames import iter_frames
 
     readers: dict[str, Callable[[], object]] = {
         "parquet": lambda: RowSpan(path).table(),

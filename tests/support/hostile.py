@@ -34,9 +34,9 @@ from robomme_interference_data.evaluate.run.log import read_run
 from robomme_interference_data.evaluate.score.rows.reading import read_rows
 from robomme_interference_data.simulators.robomme.recorded_scene import read_scene
 from robomme_interference_data.storage.arrays import read_array
-from robomme_interference_data.storage.encode import decode_image
 from robomme_interference_data.storage.files import LocalFiles, read_sums
-from robomme_interference_data.storage.video import iter_frames
+from robomme_interference_data.storage.video.encode import decode_image
+from robomme_interference_data.storage.video.frames import iter_frames
 
 _VIDEO = "demonstrations/videos/observation.images.front/chunk-000/file-000.mp4"
 _ROWS = "demonstrations/data/chunk-000/file-000.parquet"

@@ -12,9 +12,9 @@ from support.buffer_sets import renew_sums
 from support.damage import HEADER, ROWS
 
 from robomme_interference_data.constants import IDENTITY_PATH, QUESTIONS_PATH
-from robomme_interference_data.storage.encode import decode_image, png
 from robomme_interference_data.storage.files import format_sums, sha256_file, write_json
 from robomme_interference_data.storage.text import digest_json, read_json
+from robomme_interference_data.storage.video.encode import decode_image, png
 
 Place = tuple[str | int, ...]
 """Keys and positions that lead to a value; in a table they begin with the column."""

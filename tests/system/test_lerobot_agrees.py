@@ -8,10 +8,10 @@ import pytest
 from support.buffer_sets import GOLDEN, dataset, stored_frames, stored_states
 from support.recordings import check_recording, make_episode
 
-from robomme_interference_data.build_dataset.sources.lerobot import LeRobotSource
-from robomme_interference_data.storage.encode import CODECS, Codec
+from robomme_interference_data.build_dataset.sources.lerobot.source import LeRobotSource
 from robomme_interference_data.storage.files import LocalFiles
-from robomme_interference_data.storage.lerobot import LeRobotFiles
+from robomme_interference_data.storage.lerobot.dataset import LeRobotFiles
+from robomme_interference_data.storage.video.encode import CODECS, Codec
 
 
 @pytest.fixture(scope="module")

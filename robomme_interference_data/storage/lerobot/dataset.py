@@ -24,10 +24,12 @@ from robomme_interference_data.errors import (
     counted,
 )
 
-from . import video
-from .files import Files
-from .lerobot_info import check_info
-from .lerobot_location import (
+from ..files import Files
+from ..parquet import RowSpan
+from ..text import read_json
+from ..video.frames import iter_frames, read_times
+from .info import check_info
+from .location import (
     EpisodeLocation,
     VideoLocation,
     VideoSpan,
@@ -35,9 +37,7 @@ from .lerobot_location import (
     locate_video,
     span_problems,
 )
-from .lerobot_tables import read_episode_lines, read_episodes, read_tasks
-from .parquet import RowSpan
-from .text import read_json
+from .tables import read_episode_lines, read_episodes, read_tasks
 
 VERSIONS = ("v3.0", "v2.1", "v2.0")
 
@@ -234,7 +234,7 @@ class LeRobotFiles:
         self.check_span(index, start, stop)
         location = self.locate_video(index, column)
         path, first = self.files.path(location.path), location.first
-        return video.iter_frames(path, first + start, first + stop, self.fps, self.shape(column))
+        return iter_frames(path, first + start, first + stop, self.fps, self.shape(column))
 
     def check_video(self, index: int, column: str) -> None:
         """Check that an episode's video file has the frames that the episode table states.
@@ -247,7 +247,7 @@ class LeRobotFiles:
         relative = self.locate_video(index, column).path
         path, key = self.files.path(relative), (column, relative)
         if key not in self._video_problems:
-            times = video.read_times(path)
+            times = read_times(path)
             spans = self._spans_in_file(index, column)
             first = times.first_number(self.fps)
             self._video_problems[key] = span_problems(spans, first, len(times))

@@ -12,9 +12,9 @@ from robomme_interference_data.constants import SPLITS
 from robomme_interference_data.errors import InvalidIdError, SourceError, named
 from robomme_interference_data.ids import EpisodeId
 
+from ..robomme_families import BLOCKS
 from .families_file import one_line
 from .family_names import families_of
-from .robomme_families import BLOCKS
 
 _BLOCK = 100
 _RANGE = re.compile(r"(\d{1,9}):(\d{1,9})", re.ASCII)

@@ -13,9 +13,9 @@ from robomme_interference_data.errors import (
     named,
     nearest,
 )
-from robomme_interference_data.storage.lerobot import LeRobotFiles
+from robomme_interference_data.storage.lerobot.dataset import LeRobotFiles
 
-from .base import Robot
+from ..base import Robot
 
 Features = Mapping[str, Mapping[str, Any]]
 """The columns of a dataset, as in `info.json`: each with its `dtype` and `shape`."""

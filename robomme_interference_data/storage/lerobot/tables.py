@@ -10,10 +10,10 @@ import pyarrow.compute as pc
 from robomme_interference_data.constants import EPISODES_DIR, TASKS_PATH
 from robomme_interference_data.errors import FormatError, MissingFileError
 
-from .arrow_columns import concatenated, is_plain, simplified
-from .files import Files, reading
-from .parquet import RowSpan, open_parquet, read_table
-from .text import parse_json, read_bytes
+from ..arrow_columns import concatenated, is_plain, simplified
+from ..files import Files, reading
+from ..parquet import RowSpan, open_parquet, read_table
+from ..text import parse_json, read_bytes
 
 _LINES_OF_EPISODES = "meta/episodes.jsonl"
 _LINES_OF_TASKS = "meta/tasks.jsonl"

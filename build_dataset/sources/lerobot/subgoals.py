@@ -5,7 +5,7 @@ from typing import Any
 
 from robomme_interference_data.errors import FormatError, MissingFileError, SourceError, named
 from robomme_interference_data.storage.arrow_columns import is_text
-from robomme_interference_data.storage.lerobot import LeRobotFiles
+from robomme_interference_data.storage.lerobot.dataset import LeRobotFiles
 from robomme_interference_data.storage.parquet import RowSpan
 
 _SUBTASKS = "meta/subtasks.parquet"

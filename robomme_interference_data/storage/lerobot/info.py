@@ -5,7 +5,7 @@ from typing import Any
 
 from robomme_interference_data.errors import FormatError
 
-from .limits import MAX_FRAME_VALUES, MAX_NAME, MAX_RATE, MIN_RATE
+from ..limits import MAX_FRAME_VALUES, MAX_NAME, MAX_RATE, MIN_RATE
 
 # Upper bounds, checked before anything is allocated.
 _MAX_SIDES = 8  # numbers in a shape

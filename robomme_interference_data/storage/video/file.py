@@ -19,8 +19,8 @@ import numpy as np
 
 from robomme_interference_data.errors import FormatError, InterferenceError, MissingFileError
 
-from .limits import MAX_PIXELS
-from .text import check_not_pointer
+from ..limits import MAX_PIXELS
+from ..text import check_not_pointer
 
 _MP4 = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide")
 """The first box of an MP4 or QuickTime file."""

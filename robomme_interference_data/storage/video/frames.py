@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError
 
+from .file import REWRITE, open_video, reason
 from .pixels import to_rgb
-from .video_file import REWRITE, open_video, reason
 
 _LATEST = 1 << 62
 """Upper bound on the ticks of a container to which FFmpeg can seek."""

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import KEY_FRAMES
 from robomme_interference_data.errors import BuildError, FormatError, InvalidOptionError
 
-from .limits import MAX_PIXELS, MAX_RATE, MIN_RATE
+from ..limits import MAX_PIXELS, MAX_RATE, MIN_RATE
+from .file import file_url, reason
+from .frames import rate_fraction
 from .pixels import turned
-from .video import rate_fraction
-from .video_file import file_url, reason
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 

@@ -26,20 +26,28 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.evidence import spans_of_texts
 from robomme_interference_data.simulators.episode import choose_cameras
-from robomme_interference_data.storage.encode import is_png
 from robomme_interference_data.storage.hub import HubFiles, locate
-from robomme_interference_data.storage.lerobot import LeRobotFiles
+from robomme_interference_data.storage.lerobot.dataset import LeRobotFiles
 from robomme_interference_data.storage.parquet import RowSpan
+from robomme_interference_data.storage.video.encode import is_png
 
-from .base import Recording, Robot, Source, SourceEpisode, compose, demonstration_length, file_state
+from ..base import (
+    Recording,
+    Robot,
+    Source,
+    SourceEpisode,
+    compose,
+    demonstration_length,
+    file_state,
+)
+from ..episode_columns import NAMING, EpisodeColumns, read_column, read_episode_columns
+from ..images import decode_images, info_is_exact
+from ..robomme_families import BLOCKS, ROBOMME, families_for_goal
 from .columns import RecordedColumns, find_columns, recorded_robot
-from .episode_columns import NAMING, EpisodeColumns, read_column, read_episode_columns
 from .families import ids_by_block, ids_by_columns
 from .families_file import TASK, template
 from .goals import check_choice, goal_wordings
-from .images import decode_images, info_is_exact
 from .naming import EpisodeNaming, origin_of_families
-from .robomme_families import BLOCKS, ROBOMME, families_for_goal
 from .subgoals import subgoal_texts
 from .trim import Trim
 
