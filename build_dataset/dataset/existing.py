@@ -96,7 +96,10 @@ def open_existing(out: Path, plan: DatasetPlan) -> ExistingDataset | None:
         )
     if plan.kind in UNITS and dataset.unit != plan.unit.in_dataset(plan.kind):
         unit = dataset.unit
-        extend = {"unit": f"{unit.frames}x{unit.stride}", "units_per_episode": unit.per_episode}
+        extend = {
+            "unit": f"{unit.frames}x{unit.stride}",
+            "units_per_episode": str(unit.per_episode),
+        }
         raise BuildError(
             f"{out} exists with units of {unit}, not of {plan.unit.in_dataset(plan.kind)}",
             # Units at full rate do not show the stride of the others, which they follow from.
