@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.public_sets import SETS, STATELESS, write_public_set
+from support.hub_server import HubServer
+from support.public_sets import SETS, STATELESS, PublicSet, write_public_set
 
 from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.data.dataset import Dataset
@@ -80,6 +81,30 @@ def test_recordings_without_states(tmp_path: Path, run: Any) -> None:
     item = history[0]
     assert item["observation.state"].shape == (0,)
     assert item["memory.state"].shape == (3, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("layout", "size"), [(STATELESS, 0), (SETS["hsr"], 8)])
+def test_recordings_are_published(
+    layout: PublicSet, size: int, tmp_path: Path, run: Any, hub: HubServer, login: Any
+) -> None:
+    login("someone")
+    source = write_public_set(tmp_path / "top", layout, LENGTHS, TASKS)
+    names, root = tmp_path / "names.csv", tmp_path / "buffers"
+    names.write_text(NAMES)
+    options = ("--source", f"lerobot:{source}", "--families-from", names, "--split", "test")
+    given = [f"{logical}={column}" for logical, column in layout.columns.items()]
+    options += ("--columns", ",".join(given)) if given else ()
+    code, _, err = run("build", root, *options, "--conditions", "no-history,k0,k1", *SMALL)
+    assert code == 0, err
+    code, out, err = run("publish", root, "--repo-id", "someone/real", "--license", "mit", "--yes")
+    assert code == 0, out + err
+    mine = load_buffer("OpenDrawer/test/0", "k1", buffer_set=root)
+    theirs = load_buffer("OpenDrawer/test/0", "k1", buffer_set="someone/real", verify=True)
+    assert theirs.states.shape == (10, size)
+    assert np.array_equal(theirs.states, mine.states)
+    for camera in layout.cameras:
+        assert np.array_equal(theirs.frames(camera), mine.frames(camera))
 
 
 def test_units_by_task_for_other_demonstrations(tmp_path: Path, run: Any) -> None:
