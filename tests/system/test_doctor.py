@@ -135,6 +135,7 @@ def test_renderer_check_survives_its_driver(
 def test_robommes_interpreter_is_asked(
     robomme_python: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.delenv("ROBOMME_PYTHON")
     assert doctor.check_robomme().ok is None
     for python, ok, detail in (
         (str(robomme_python), True, "robomme_numpy 1."),
