@@ -96,14 +96,14 @@ def open_existing(out: Path, plan: DatasetPlan) -> ExistingDataset | None:
         )
     if plan.kind in UNITS and dataset.unit != plan.unit.in_dataset(plan.kind):
         unit = dataset.unit
-        extend = {
+        of_units: dict[str, object] = {
             "unit": f"{unit.frames}x{unit.stride}",
-            "units_per_episode": str(unit.per_episode),
+            "units_per_episode": unit.per_episode,
         }
         raise BuildError(
             f"{out} exists with units of {unit}, not of {plan.unit.in_dataset(plan.kind)}",
             # Units at full rate do not show the stride of the others, which they follow from.
-            _advice(extend if plan.kind == DISTRACTORS else None),
+            _advice(of_units if plan.kind == DISTRACTORS else None),
         )
     # Another version of a simulator has other episodes under the same ids.
     recorded = {source.get("kind"): source for source in identity.sources}
