@@ -130,7 +130,7 @@ class BuildConfig(WorkersConfig):
     version: str = setting("1.0.0", help="Version of the datasets.", group="Encoding", rare=True)
     time_limit_s: float | None = setting(
         None,
-        help="Seconds for one episode; a slower one is retried once.",
+        help="Seconds for one episode; a slower one is given up.",
         shown="300 on tabletop and sample, else 1800",
         group="Execution",
         rare=True,
