@@ -25,7 +25,7 @@ NAME = "Lift/test/0"
 @pytest.fixture(scope="module")
 def narrower(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Lessons and executions with states of 8 values, units with 3."""
-    return build_two_robots(tmp_path_factory.mktemp("narrower"), 3, EXECUTIONS)
+    return build_two_robots(tmp_path_factory.mktemp("two_robots"), 3, EXECUTIONS)
 
 
 def run(root: Path, out: Path, **changes: Any) -> Any:
