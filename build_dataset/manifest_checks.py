@@ -39,7 +39,9 @@ def check_features(datasets: Mapping[str, Dataset]) -> None:
     """Check that sessions of all datasets can follow one another in a buffer."""
     base = datasets[DEMONSTRATIONS]
     for name, dataset in datasets.items():
-        expected, found = (in_buffers(name, one.features, one.fps) for one in (base, dataset))
+        expected, found = (
+            in_buffers(name, compared.features, compared.fps) for compared in (base, dataset)
+        )
         if clauses := differences((f"the {DEMONSTRATIONS}", expected), (f"the {name}", found)):
             raise SourceError(
                 "sessions of the datasets cannot follow one another in a buffer: "

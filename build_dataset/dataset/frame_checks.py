@@ -1,18 +1,15 @@
 """Check the frames of an episode: what is stored, every reader must accept. Pure rules."""
 
-import re
 from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.build_dataset.alike import Look, differences
+from robomme_interference_data.build_dataset.sources.base import CAMERA_NAMES, is_camera_name
 from robomme_interference_data.constants import CAMERA_PREFIX, STATE
 from robomme_interference_data.errors import InvalidOptionError, SourceError, named
-from robomme_interference_data.storage.limits import MAX_NAME, MAX_PIXELS, MAX_VECTOR
-
-_CAMERA = re.compile(r"\w[\w .-]*")
-_MAX_CAMERA = MAX_NAME - len(CAMERA_PREFIX)
+from robomme_interference_data.storage.limits import MAX_PIXELS, MAX_VECTOR
 
 
 def check_image(feature: str, image: NDArray[np.uint8]) -> None:
@@ -104,9 +101,8 @@ def check_numbers(feature: str, value: NDArray[np.float32], frame: str) -> None:
 
 
 def _check_camera(name: str) -> None:
-    if len(name) > _MAX_CAMERA or not _CAMERA.fullmatch(name) or name.endswith((" ", ".")):
+    if not is_camera_name(name):
         raise SourceError(
-            f"the camera {name[:300]!r}; expected a name of letters, digits, spaces, _, . and -, "
-            f"with at most {_MAX_CAMERA} characters",
+            f"the camera {name[:300]!r}; expected a name of {CAMERA_NAMES}",
             "Rename the camera in the recordings.",
         )

@@ -1,5 +1,6 @@
 """The interface of a source of recorded episodes."""
 
+import re
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
@@ -9,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import DIFFICULTIES
+from robomme_interference_data.constants import CAMERA_PREFIX, DIFFICULTIES
 from robomme_interference_data.errors import InterferenceError, SourceError, named, nearest
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import MAX_GOAL, EvidenceSpan
@@ -19,6 +20,17 @@ from ..alike import same_rate
 from .flags import parse_flags
 
 _LARGEST_SEED = 1 << 63
+_CAMERA = re.compile(r"\w[\w .-]*")
+_MAX_CAMERA = MAX_NAME - len(CAMERA_PREFIX)
+
+CAMERA_NAMES = f"letters, digits, spaces, _, . and -, with at most {_MAX_CAMERA} characters"
+"""What the name of a camera consists of, for errors: it is a part of paths."""
+
+
+def is_camera_name(name: str) -> bool:
+    """Return whether a camera can have a name."""
+    fits = len(name) <= _MAX_CAMERA and _CAMERA.fullmatch(name) is not None
+    return fits and not name.endswith((" ", "."))  # Windows has no folders of such names
 
 
 @dataclass(frozen=True)

@@ -71,8 +71,8 @@ def probe_video(path: Path, rate: float | None = None) -> ProbedVideo:
         exact = lossless and stream.pix_fmt in _RGB_FORMATS
     if rate is None:
         # Containers store durations in whole ns or ms: 1001 is the denominator of NTSC rates.
-        rates = [float(Fraction(one).limit_denominator(1001)) for one in stated if one]
-        rates = [one for one in dict.fromkeys(rates) if MIN_RATE <= one <= MAX_RATE]
+        rates = [float(Fraction(each).limit_denominator(1001)) for each in stated if each]
+        rates = [each for each in dict.fromkeys(rates) if MIN_RATE <= each <= MAX_RATE]
     else:
         rates = [rate]
     times = read_times(path)

@@ -152,7 +152,7 @@ def condition_pages() -> Iterator[str]:
     )
     rows = []
     for kind in KINDS.values():
-        needs = ", ".join(f"`{one}`" for one in kind.needs)
+        needs = ", ".join(f"`{need}`" for need in kind.needs)
         compared = COMPARISONS.get(kind.name)
         against = f"`{KINDS[compared.reference].pattern}`" if compared else ""
         rows.append((f"`{kind.pattern}`", kind.holds, kind.asks, needs, against))

@@ -45,8 +45,8 @@ def verify_sources(config: "SourceConfig", root: Path, *, as_json: bool) -> None
         with WorkProgress(unit="episodes") as progress:
             progress.start("Reading", len(episodes))
             # One worker needs no process of its own: there is nothing to write.
-            one = config.workers == 1 and not config.on_cluster
-            executor = Serial() if one else make_executor(config)
+            alone = config.workers == 1 and not config.on_cluster
+            executor = Serial() if alone else make_executor(config)
             report = check_sources(names, task, episodes, executor, progress.advance)
     report = dataclasses.replace(report, problems=[*problems, *report.problems])
     command = _build_command(config, root, report)

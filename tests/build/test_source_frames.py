@@ -12,36 +12,33 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from support.frames_folders import (
+    DRAWER,
+    FOUR,
+    FRONT,
+    MOVE,
+    four,
+    place,
+    read_one,
+    replace_by_video,
+    write,
+)
 from support.messages import raises
 from support.recordings import (
     Rows,
     check_recording,
     encode_image,
-    make_episode,
     rows_of,
     write_images,
     write_table,
     write_video,
 )
 
-from robomme_interference_data.build_dataset.sources import Recording, Robot
+from robomme_interference_data.build_dataset.sources import Robot
 from robomme_interference_data.build_dataset.sources.frames import FramesSource
-from robomme_interference_data.errors import FormatError, InterferenceError, SourceError
+from robomme_interference_data.errors import InterferenceError, SourceError
 
-DRAWER, MOVE = "OpenDrawer/train/0", "MoveCube/val/2"
-FOUR = make_episode(4, 4, "open it", cameras=("front",))
-FRONT = FOUR.images["front"]
 DOCS = Path(__file__).parents[2] / "docs" / "how-to" / "your-own-recordings.md"
-
-
-def place(folder: Path, name: str = DRAWER, kind: str = "images", camera: str = "front") -> Path:
-    return folder / kind / camera / (f"{name}.mkv" if kind == "videos" else name)
-
-
-def write(folder: Path, rows: Rows | None = None) -> Path:
-    """Write a folder with one episode of four images; returns the folder of the images."""
-    write_table(folder, rows_of(DRAWER, FOUR) if rows is None else rows)
-    return write_images(place(folder), FRONT)
 
 
 @pytest.mark.parametrize(
@@ -102,11 +99,6 @@ def test_the_rate_of_a_video(tmp_path: Path, rate: Any) -> None:
     check_recording(recording, FOUR, marked=False)
 
 
-def read_one(folder: Path) -> Recording:
-    source = FramesSource(folder)
-    return source.read(source.episodes()[0], None)
-
-
 def test_the_example_in_the_docs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = re.search(r"<!-- example: frames -->\n```python\n(.*?)```", DOCS.read_text(), re.S)
     assert found is not None
@@ -132,10 +124,6 @@ def refused(folder: Path) -> str:
         for episode in source.episodes():
             list(source.read(episode, None).frames)
     return str(caught.value)
-
-
-def four(**values: Any) -> Rows:
-    return rows_of(DRAWER, FOUR, **values)
 
 
 def changed(row: int, **values: Any) -> Rows:
@@ -295,12 +283,6 @@ def test_hidden_files_are_no_recordings(tmp_path: Path, file: str) -> None:
     check_recording(read_one(tmp_path), FOUR, marked=False)
 
 
-def replace_by_video(folder: Path, frames: int) -> None:
-    shutil.rmtree(folder / "images", ignore_errors=True)
-    shown = make_episode(0, frames).images["front"]
-    write_video(place(folder, kind="videos"), shown)
-
-
 def empty(folder: Path) -> None:
     table = pq.read_table(folder / "frames.parquet").slice(0, 0)
     pq.write_table(table, folder / "frames.parquet")
@@ -369,92 +351,3 @@ def test_cameras_that_differ(tmp_path: Path) -> None:
     with raises(SourceError):
         source.read(drawer, None)
     assert len(list(source.read(drawer, ("front",)).frames)) == 4
-
-
-# --- times of videos -----------------------------------------------------------------------------
-
-
-def write_timed(path: Path, milliseconds: list[int], rate: Fraction | int = 10) -> None:
-    """Write the four frames at given times, in a container that states a rate."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("ffv1", Fraction(rate), width=24, height=16, pix_fmt="bgr0")
-        stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
-        for image, time in zip(FRONT, milliseconds, strict=False):
-            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
-            frame.pts, frame.time_base = time, Fraction(1, 1000)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-
-
-@pytest.mark.parametrize(
-    ("times", "stated", "column", "expected"),
-    [
-        ([0, 100, 200, 300], 10, None, 10),
-        ([1500, 1600, 1700, 1800], 10, None, 10),  # from its first frame on
-        ([0, 33, 67, 100], 30, None, 30),
-        ([0, 80, 160, 240], Fraction(25, 2), None, 12.5),
-        ([0, 2000, 4000, 6000], Fraction(1, 2), None, 0.5),
-        ([0, 130, 180, 340], 10, None, 10),  # each nearest to its own number
-        ([0, 33, 67, 100], 24, 30, 30),  # the container states another rate
-        ([0, 33, 67, 100], 24, None, None),
-        ([0, 100, 160, 300], 10, None, 10),
-        ([0, 100, 300, 400], 10, None, None),
-        ([0, 40, 200, 300], 10, None, None),
-        ([0, 100, 200, 300], 10, 30, None),
-        ([0, 0, 0, 0], 10, None, None),
-    ],
-)
-def test_times_of_frames(
-    tmp_path: Path,
-    times: list[int],
-    stated: Fraction | int,
-    column: int | None,
-    expected: float | None,
-) -> None:
-    write_timed(place(tmp_path, kind="videos"), times, stated)
-    write_table(tmp_path, four() if column is None else four(fps=column))
-    if expected is None:
-        with raises(SourceError) as caught:
-            read_one(tmp_path)
-        assert "variable frame rate" in str(caught.value.hint)
-        assert "ffmpeg -i OLD" in str(caught.value.hint)
-        return
-    recording = read_one(tmp_path)
-    assert recording.robot.fps == expected
-    check_recording(recording, FOUR, marked=False)
-
-
-@pytest.mark.parametrize("frames", [3, 5])
-def test_a_video_of_another_length_is_an_error_before_it_is_decoded(
-    tmp_path: Path, frames: int
-) -> None:
-    """Distractor units do not decode the end of an episode."""
-    write_table(tmp_path, four())
-    replace_by_video(tmp_path, frames)
-    with raises(SourceError):
-        read_one(tmp_path)
-
-
-def test_a_camera_that_is_not_used_may_be_broken(tmp_path: Path) -> None:
-    write(tmp_path)
-    place(tmp_path, kind="videos", camera="wrist").parent.mkdir(parents=True)
-    place(tmp_path, kind="videos", camera="wrist").write_bytes(b"none")
-    source = FramesSource(tmp_path)
-    [episode] = source.episodes()
-    assert len(list(source.read(episode, ("front",)).frames)) == 4
-    for cameras in (("wrist",), None):
-        with raises(FormatError):
-            source.read(episode, cameras)
-
-
-def test_a_folder_named_after_a_time_of_day(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As a relative path, FFmpeg takes what precedes the colon for a protocol."""
-    folder = Path("run 12:30?#%d é")
-    write_table(tmp_path / folder, four())
-    write_video(place(tmp_path, kind="videos"), FRONT)
-    (tmp_path / "videos").rename(tmp_path / folder / "videos")
-    monkeypatch.chdir(tmp_path)
-    check_recording(read_one(folder), FOUR, marked=False)

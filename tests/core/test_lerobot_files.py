@@ -37,7 +37,7 @@ def opened(root: Path) -> LeRobotFiles:
 def read_all(root: Path) -> None:
     """Read everything, as sources and datasets do."""
     lerobot = opened(root)
-    assert lerobot.tasks
+    assert lerobot.task_texts
     for index in range(len(lerobot)):
         for name, feature in lerobot.features.items():
             if feature["dtype"] == "video":
@@ -64,7 +64,7 @@ def test_values_frames_and_locations(root: Path) -> None:
     lerobot = opened(root)
     front = NAMES[str(lerobot.version)]["front"]
     assert (len(lerobot), lerobot.fps, lerobot.shape(front)) == (3, 10.0, (16, 24, 3))
-    assert set(lerobot.tasks) == {episode.goal for episode in EPISODES.values()}
+    assert set(lerobot.task_texts.values()) == {episode.goal for episode in EPISODES.values()}
     for index, episode in enumerate(EPISODES.values()):
         frames = episode.images["front"]
         found = np.stack(list(lerobot.iter_frames(index, front, 2, 6)))
@@ -89,7 +89,7 @@ def test_several_files_statistics_and_tasks_as_pandas_writes_them(v30: Path) -> 
     lerobot = opened(v30)
     assert lerobot.table["episode_index"].to_pylist() == [0, 1, 2]
     assert "stats/state/mean" not in lerobot.row(2)  # statistics are never read
-    assert set(lerobot.tasks) == {"one", "two"}
+    assert set(lerobot.task_texts.values()) == {"one", "two"}
 
 
 def _retype(name: str, kind: pa.DataType) -> Callable[[pa.Table], pa.Table]:
@@ -171,7 +171,7 @@ def test_hidden_files_are_no_tables(v30: Path, folder: str) -> None:
 def test_tasks_that_are_not_clear(v30: Path, tasks: dict[str, Any]) -> None:
     pq.write_table(pa.table(tasks), v30 / "meta/tasks.parquet")
     with raises(FormatError):
-        _ = opened(v30).tasks
+        _ = opened(v30).task_texts
 
 
 def test_tasks_of_the_frames(root: Path) -> None:

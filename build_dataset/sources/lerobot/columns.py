@@ -14,8 +14,9 @@ from robomme_interference_data.errors import (
     nearest,
 )
 from robomme_interference_data.storage.lerobot.dataset import LeRobotFiles
+from robomme_interference_data.storage.lerobot.info import picture_info
 
-from ..base import Robot
+from ..base import CAMERA_NAMES, Robot, is_camera_name
 
 Features = Mapping[str, Mapping[str, Any]]
 """The columns of a dataset, as in `info.json`: each with its `dtype` and `shape`."""
@@ -23,7 +24,6 @@ Features = Mapping[str, Mapping[str, Any]]
 NONE = "none"
 """What is written for a column to do without it."""
 
-_CAMERA = re.compile(r"[A-Za-z0-9][\w-]*", re.ASCII)
 _CAMERA_PREFIXES = ("observation.images.", "observation.image.", "observation.")
 _VECTORS = ("state", "action")
 _USUAL = {
@@ -98,9 +98,9 @@ def find_columns(features: Features, given: Mapping[str, str], where: str) -> Re
         name: columns[0] for name, columns in chosen.items() if name not in _NOT_CAMERAS and columns
     }
     for name, column in cameras.items():
-        if not _CAMERA.fullmatch(name):
+        if not is_camera_name(name):
             raise InvalidOptionError(
-                f"{where}: {name!r} is no camera name; expected letters, digits, - and _",
+                f"{where}: {name!r} is no camera name; expected {CAMERA_NAMES}",
                 f"Name the camera with {named('columns', f'NAME={column}')}.",
                 option="columns",
             )
@@ -295,6 +295,6 @@ def _unmet(name: str, feature: Mapping[str, Any]) -> str | None:
 
 def _is_depth(feature: Mapping[str, Any]) -> bool:
     """Return whether a column holds depth maps; some datasets write the flag as text."""
-    described = (feature.get("video_info") or {}) | (feature.get("info") or {})
+    described = picture_info(feature)
     flags = (described.get(key) for key in ("is_depth_map", "video.is_depth_map"))
     return any(str(flag).lower() == "true" for flag in flags)

@@ -2,13 +2,14 @@
 
 import csv
 import io
-import unicodedata
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.errors import InterferenceError, SourceError
 from robomme_interference_data.storage.text import read_text
+
+from .goals import one_form
 
 TASK = "task"
 DATASET = "dataset"
@@ -34,7 +35,7 @@ _LISTED = 40
 
 def one_line(text: str) -> str:
     """Return a text as it is compared: in one Unicode form, with single spaces."""
-    return " ".join(unicodedata.normalize("NFC", text).split())
+    return " ".join(one_form(text).split())
 
 
 def read_families(path: Path, tasks: Sequence[Sequence[str]], name: str) -> list[dict[str, Any]]:

@@ -53,11 +53,11 @@ def goal_wordings(
                 f"goal ({', '.join(SEVERAL_TASKS)}).",
             )
         return SEVERAL_TASKS[choice](tasks)
-    if wordings and same_text(wordings[0], tasks[0]):
+    if wordings and one_form(wordings[0]) == one_form(tasks[0]):
         return tuple(wordings)
     return tuple(tasks)
 
 
-def same_text(left: str, right: str) -> bool:
-    """Return whether two texts are the same, in any of Unicode's forms of a character."""
-    return unicodedata.normalize("NFC", left) == unicodedata.normalize("NFC", right)
+def one_form(text: str) -> str:
+    """Return a text as it is compared: Unicode has several forms of letters such as ö."""
+    return unicodedata.normalize("NFC", text)

@@ -3,7 +3,6 @@
 Read with pyarrow and PyAV alone; `docs/reference/sources.md` describes columns and families.
 """
 
-import unicodedata
 from collections.abc import Generator, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -28,6 +27,7 @@ from robomme_interference_data.schema.evidence import spans_of_texts
 from robomme_interference_data.simulators.episode import choose_cameras
 from robomme_interference_data.storage.hub import HubFiles, locate
 from robomme_interference_data.storage.lerobot.dataset import LeRobotFiles
+from robomme_interference_data.storage.lerobot.info import picture_info
 from robomme_interference_data.storage.parquet import RowSpan
 from robomme_interference_data.storage.video.encode import is_png
 
@@ -46,7 +46,7 @@ from ..robomme_families import BLOCKS, ROBOMME, families_for_goal
 from .columns import RecordedColumns, find_columns, recorded_robot
 from .families import ids_by_block, ids_by_columns
 from .families_file import TASK, template
-from .goals import check_choice, goal_wordings
+from .goals import check_choice, goal_wordings, one_form
 from .naming import EpisodeNaming, origin_of_families
 from .subgoals import subgoal_texts
 from .trim import Trim
@@ -183,12 +183,12 @@ class LeRobotSource(Source):
         """The tasks of each episode: those that its row lists, or else those of its frames."""
         table, texts = self._lerobot.table, self._lerobot.task_texts
         given = table["tasks"].to_pylist() if "tasks" in table.column_names else [None] * len(table)
-        known = {unicodedata.normalize("NFC", text): text for text in texts.values()}
+        known = {one_form(text): text for text in texts.values()}
         tasks = []
         for index, value in enumerate(given):
             where = f"{self._where}: episode {index}"
             listed = read_column("tasks", value, where) or ()
-            found = [known.get(unicodedata.normalize("NFC", text)) for text in listed]
+            found = [known.get(one_form(text)) for text in listed]
             if None in found:
                 raise SourceError(
                     f"{where} has the task {listed[found.index(None)]!r}, which the dataset's list "
@@ -274,7 +274,7 @@ class LeRobotSource(Source):
                 return is_png(first)
             except FormatError as error:
                 raise error.about(f"{rows.path}: column {column!r}") from None
-        return info_is_exact((feature.get("video_info") or {}) | (feature.get("info") or {}))
+        return info_is_exact(picture_info(feature))
 
     def _ids(self, rows: list[dict[str, Any]]) -> tuple[dict[int, EpisodeId], str | None]:
         """Return the episodes' ids, and the simulator where it follows from the dataset."""

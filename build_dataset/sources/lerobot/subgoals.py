@@ -68,21 +68,21 @@ def _annotated(lerobot: LeRobotFiles, rows: RowSpan, column: str) -> list[str]:
     """Return the texts of LeRobot's annotations, which each row has all of."""
     cells = rows.part(rows.start, rows.start + 1).table([column])[column].to_pylist()
     begin: dict[int, str] = {}
-    for one in cells[0] or ():
-        if "timestamp" not in one or "style" not in one:
+    for annotation in cells[0] or ():
+        if "timestamp" not in annotation or "style" not in annotation:
             raise SourceError(
                 f"column {column!r} holds annotations without the time from which they hold",
                 f"Name LeRobot's with {named('columns', 'subgoal=language_persistent')}.",
             )
-        if one["style"] == _STYLE:
-            frame = max(0, math.ceil(one["timestamp"] * lerobot.fps - _LATE))
+        if annotation["style"] == _STYLE:
+            frame = max(0, math.ceil(annotation["timestamp"] * lerobot.fps - _LATE))
             if frame in begin:
                 raise SourceError(
                     f"column {column!r} has two subtasks from frame {frame} on: {begin[frame]!r} "
-                    f"and {one['content']!r}",
+                    f"and {annotation['content']!r}",
                     "Correct the dataset, or leave the column out.",
                 )
-            begin[frame] = one["content"] or ""
+            begin[frame] = annotation["content"] or ""
     texts, current = [], ""
     for frame in range(len(rows)):
         current = begin.get(frame, current)

@@ -33,6 +33,7 @@ from .location import (
     EpisodeLocation,
     VideoLocation,
     VideoSpan,
+    has_own_files,
     locate_episode,
     locate_video,
     span_problems,
@@ -113,7 +114,7 @@ class LeRobotFiles:
     def table(self) -> pa.Table:
         """The per-episode columns by episode index."""
         where = self.files.describe()
-        if self.version == "v3.0":
+        if not has_own_files(self.info):
             table = read_episodes(self.files, self._tables, self._statistics)
         else:
             table = read_episode_lines(self.files)
@@ -124,7 +125,7 @@ class LeRobotFiles:
                     f"{where}: the episode table has no whole numbers {name!r}", _CORRECT_EPISODES
                 )
         # Its lines may come in any order, since they are found by number.
-        if self.version != "v3.0":
+        if has_own_files(self.info):
             table = table.sort_by("episode_index")
         # LeRobot finds an episode of v3.0 by its place, not by its number.
         numbers = table["episode_index"].to_numpy()
@@ -141,12 +142,7 @@ class LeRobotFiles:
     @cached_property
     def task_texts(self) -> dict[int, str]:
         """The task texts that the dataset lists, by their index."""
-        return read_tasks(self.files, lines=self.version != "v3.0")
-
-    @property
-    def tasks(self) -> dict[str, int]:
-        """The index of each task text that the dataset lists."""
-        return {text: index for index, text in self.task_texts.items()}
+        return read_tasks(self.files, lines=has_own_files(self.info))
 
     def tasks_of(self, index: int) -> tuple[str, ...]:
         """Return the tasks of an episode's frames, in the order in which they begin.
@@ -264,7 +260,7 @@ class LeRobotFiles:
     def _spans_in_file(self, index: int, column: str) -> list[VideoSpan]:
         """Return the episodes in the video file that holds an episode, by number."""
         row, fps, key = self.row(index), self.fps, f"videos/{column}"
-        if self.version != "v3.0":
+        if has_own_files(self.info):
             return [VideoSpan(index, row["length"], 0.0, math.nan)]
         names = [f"{key}/chunk_index", f"{key}/file_index"]
         here = [pc.equal(self.table[name], row[name]) for name in names]

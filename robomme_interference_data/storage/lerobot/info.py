@@ -1,6 +1,7 @@
 """Check `info.json` of a LeRobot dataset before it is used. Pure rules."""
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 from robomme_interference_data.errors import FormatError
@@ -60,6 +61,12 @@ def _check_feature(name: str, feature: Any, path: object) -> None:
         for key in ("info", "video_info"):  # LeRobot's newer and older name
             if not isinstance(feature.get(key), dict | None):
                 raise _invalid(path, f"{key} of {where}", feature[key], "a map")
+
+
+def picture_info(feature: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a dataset states about the pictures of a feature; empty if it states nothing."""
+    # LeRobot's older and newer name.
+    return (feature.get("video_info") or {}) | (feature.get("info") or {})
 
 
 def _is_count(value: Any, least: int, most: int) -> bool:

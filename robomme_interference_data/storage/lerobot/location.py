@@ -60,6 +60,11 @@ class VideoSpan:
         return nearest_frame(self.start)
 
 
+def has_own_files(info: Mapping[str, Any]) -> bool:
+    """Return whether every episode has files and a line of text of its own, as before v3.0."""
+    return bool(info["codebase_version"] != "v3.0")
+
+
 def nearest_frame(position: float) -> int:
     """Return the frame that is less than half a frame away from a position, or -1."""
     if not -0.5 < position <= _MAX_FRAME:  # false for NaN, too
@@ -108,7 +113,7 @@ def locate_video(
     """
     key = f"videos/{feature}"
     path = _path(info, info["video_path"], key, index, row, where, video_key=feature)
-    if _has_own_files(info):
+    if has_own_files(info):
         return VideoLocation(path, 0)
     name = f"{key}/from_timestamp"
     start = row.get(name)
@@ -180,11 +185,6 @@ def _is_explained(spans: Sequence[VideoSpan], first: int, stop: int) -> bool:
     return bool(gaps) and set(gaps) == {rest}
 
 
-def _has_own_files(info: Mapping[str, Any]) -> bool:
-    """Return whether every episode has files of its own, as before v3.0."""
-    return bool(info["codebase_version"] != "v3.0")
-
-
 def _path(
     info: Mapping[str, Any],
     template: str,
@@ -194,7 +194,7 @@ def _path(
     where: str,
     **more: str,
 ) -> str:
-    if _has_own_files(info):
+    if has_own_files(info):
         chunk = index // info.get("chunks_size", 1000)
         return fill_template(template, where, episode_chunk=chunk, episode_index=index, **more)
     chunk = _whole(row, f"{key}/chunk_index", index, where)
