@@ -139,7 +139,7 @@ class BuildConfig(WorkersConfig):
         (),
         metavar="NAME=COLUMN,…",
         help="Source lerobot: columns without a usual name, such as front=top_image or "
-        "state=arm+gripper; none for none.",
+        "state=arm+gripper; NAME=none leaves one out.",
         group="Sources",
     )
     families_from: str | None = setting(
