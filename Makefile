@@ -24,7 +24,7 @@ install:  ## Install all but what only tests need.
 vulkan:  ## Install only the software Vulkan driver: sudo make vulkan.
 	@scripts/system_packages.sh vulkan
 
-demo: install  ## Set up, then go the whole way on real or recorded episodes.
+demo: install  ## Set up, then show a lesson used, buried and found again.
 	@$(BIN)/python scripts/demo.py
 
 test: setup  ## Set up, then run the tests; ARGS="-m ''" adds the slow ones.

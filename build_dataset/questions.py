@@ -41,8 +41,9 @@ def make_questions(buffer_set: BufferSet) -> Iterator[Question]:
         side = scene.side
         if view.shape != (side, side, 3):
             raise BuildError(
-                f"the first live view of {question.episode_id} has {view.shape[1]}×{view.shape[0]} "
-                f"pixels; expected {side}×{side}, in which the positions of objects are known",
+                f"the first live observation of {question.episode_id} has "
+                f"{view.shape[1]}×{view.shape[0]} pixels; expected {side}×{side}, in which the "
+                "positions of objects are known",
                 "Build the demonstrations with the simulator itself.",
             )
         yield replace(question, picture=png(picture(view, marks)))

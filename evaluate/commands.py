@@ -22,10 +22,9 @@ from .run.config import AskConfig, CeilingConfig, RunConfig
 
 @with_settings
 def ceiling(buffer_set: BufferSetFolder, config: CeilingConfig, as_json: AsJson = False) -> None:
-    r"""Print the maximum success that a memory rule allows, without a rollout.
+    r"""Print how often an ideal observer with a memory rule would succeed, without a rollout.
 
-    That is the share of the evidence that it keeps and the success rate of the ideal
-    observer: no policy with that memory can do better.
+    It uses marked evidence only; the share of it that the memory keeps is printed, too.
 
     Examples:
     ```
@@ -92,9 +91,9 @@ def evaluate(config: RunConfig, as_json: AsJson = False) -> None:
 def ask(config: AskConfig, as_json: AsJson = False) -> None:
     r"""Ask a model multiple-choice questions about history buffers, without a simulator.
 
-    It sees the goal, the first live view with the possible answers marked, and the history frames
-    that its memory keeps. Rows are scored like those of rollouts; OUT/answers has the transcripts.
-    First make the questions: robomme-interference build BUFFER_SET --only questions.
+    It sees the goal, the first live observation with the possible answers marked, and the history
+    frames that its memory keeps. Rows are scored like those of rollouts; OUT/answers has the
+    transcripts. First make the questions: robomme-interference build BUFFER_SET --only questions.
 
     Examples:
     ```

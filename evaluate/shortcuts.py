@@ -171,6 +171,6 @@ def shortcut_table(measured: Sequence[Shortcut], title: str) -> Table:
         "right guesses of each part of the answer (count: of how many there are) without the "
         "lesson's frames: always the most frequent value; the value of the other episode nearest "
         "in lesson length; the most frequent among episodes with the same goal; the value of the "
-        "episode whose first live view looks most alike. Parts that are equal in all episodes are "
-        "left out.",
+        "episode whose first live observation looks most alike. Parts that are equal in all "
+        "episodes are left out.",
     )

@@ -169,7 +169,9 @@ def _draw_similarity(
         if frame is not None:
             style = {"color": color, "markersize": 7, "label": f"{name}, {frame}"}
             axes.plot(frame + 0.5, cosine, marker, zorder=4, **style)
-    _title(axes, "cosine of each frame with the live image; bars: score of each segment")
+    _title(
+        axes, "cosine of each frame with the first live observation; bars: score of each segment"
+    )
 
 
 def _draw_compared(

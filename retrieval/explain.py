@@ -59,7 +59,7 @@ class Explanation:
             f"cosine of adjacent frames is below {graded.threshold:.3f}",
             f"Chosen: frames {frames_text(self.chosen)}, of {', '.join(self.sessions)}",
             f"Why: {method} takes {METHODS[method]}{score}",
-            f"The live image is closest to frame {self.closest} of these, with cosine "
+            f"The first live observation is closest to frame {self.closest} of these, with cosine "
             f"{self.cosine:.3f}; {outside}",
             f"The lesson is frames {lesson}: {self.graded()}" if lesson else self.graded(),
         )

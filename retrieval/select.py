@@ -31,13 +31,13 @@ _FOLLOWING = 0.1
 """Quantile of a segment's adjacent cosines from which other frames count as similar (ours)."""
 
 METHODS = {
-    "max": "the segment with the frame closest to the live image (released rule)",
+    "max": "the segment with the frame closest to the first live observation (released rule)",
     "latest": "the segment of max, or the last segment with an equally close frame",
     "joined": "the segment of max, and all segments with a similar frame (ours)",
-    "mean": "the segment with the highest mean cosine with the live image",
+    "mean": "the segment with the highest mean cosine with the first live observation",
     "last": "the last segment",
     "random": "a random segment",
-    "top32": "the 32 frames closest to the live image, without segments",
+    "top32": "the 32 frames closest to the first live observation, without segments",
     "oracle": "the true lesson, or its first part",
 }
 """What each method chooses. Ties go to the earliest segment, except for `latest`; segments of fewer

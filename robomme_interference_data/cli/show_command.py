@@ -52,7 +52,7 @@ def show(
     r"""Show the sessions of one buffer as a table; as a film strip (--out) or a web page (--html).
 
     The web page plays the stored videos, and shows what an even sample and retrieval keep. It needs
-    no other file, and takes up to 18 KB per frame and camera of 256 × 256 pixels.
+    no other file, and is a third larger than these videos.
 
     Examples:
     ```

@@ -41,7 +41,8 @@ def verify(
         typer.Option(
             "--audit",
             help="Also report how often units are used, at which positions families occur, what "
-            "leaks, and how far lesson length, goal and first live view reveal the answer.",
+            "leaks, and how far lesson length, goal and first live observation reveal the "
+            "answer.",
         ),
     ] = False,
     as_json: AsJson = False,
@@ -51,8 +52,8 @@ def verify(
     With --source, check recordings before a build instead: read all frames of all episodes, and
     list everything that is wrong, by episode and frame.
 
-    With --audit, a leak fails as well. A policy can use lesson length, goal and live view without
-    any memory: each episode is guessed from the others of its family.
+    With --audit, a leak fails as well. A policy can use lesson length, goal and first live
+    observation without any memory: each episode is guessed from the others of its family.
 
     Examples:
     ```

@@ -47,7 +47,9 @@ class Question:
         "Marked points of each option in the picture, `y,x` in pixels, separated by spaces; empty "
         "where only the words show it.",
     ]
-    picture: Annotated[bytes, "The first live view with marked and lettered options, a PNG file."]
+    picture: Annotated[
+        bytes, "The first live observation with marked and lettered options, a PNG file."
+    ]
 
     def __post_init__(self) -> None:
         count = len(self.options)

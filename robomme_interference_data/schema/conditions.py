@@ -139,8 +139,8 @@ _KINDS = (
     ConditionKind(
         "raw",
         lambda p, k: (p.lesson(), *p.units(k, RAW_DISTRACTORS)),
-        "lesson, the same n units at full rate: 256 frames, stride 1",
-        "whether the change of frame rate reveals where the lesson ends",
+        "lesson, the same n units at full rate: up to 256 frames each",
+        "dilution by eight times the frames, at the rate of the lesson",
         (RAW_DISTRACTORS,),
     ),
     ConditionKind(

@@ -28,7 +28,7 @@ class SpanDigests:
     first: Annotated[str, "First half of the lesson."]
     second: Annotated[str, "Second half, one frame longer if the number of frames is odd."]
     last: Annotated[str, "Last frame of the lesson."]
-    query: Annotated[str, "The query frame."]
+    query: Annotated[str, "The first live observation."]
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,9 @@ class EpisodeRecord:
     episode_id: Annotated[
         EpisodeId, "Id of the recorded episode; of a unit from within it, with the first raw frame."
     ]
-    length: Annotated[int, "Stored frames. A demonstration's last one is the query frame."]
+    length: Annotated[
+        int, "Stored frames. A demonstration's last one is the first live observation."
+    ]
     goals: Annotated[
         tuple[str, ...], "Wordings of the goal, at least one; the first is LeRobot's task."
     ]
@@ -68,14 +70,16 @@ class EpisodeRecord:
     difficulty: Annotated[str | None, "`easy`, `medium`, `hard`, or None."]
     simulator: Annotated[str | None, "`robomme`, `tabletop`, …, or None."]
     exec_start_idx: Annotated[
-        int | None, "Index of the query frame = number of lesson frames; None without a lesson."
+        int | None,
+        "Index of the first live observation = number of lesson frames; None without a lesson.",
     ]
     exact: Annotated[bool, "False if a frame was ever lossily compressed."]
     feature_sha256: Annotated[
         dict[str, str], "Digest by feature over the lesson, or over all frames without a lesson."
     ]
     span_sha256: Annotated[
-        SpanDigests | None, "Digests of parts of the lesson and of the query frame, or None."
+        SpanDigests | None,
+        "Digests of parts of the lesson and of the first live observation, or None.",
     ]
     evidence: Annotated[
         tuple[EvidenceSpan, ...] | None,

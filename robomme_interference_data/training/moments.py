@@ -68,7 +68,7 @@ def check_arguments(given: Mapping[str, Any], shifts: Sequence[str]) -> None:
             "Set a size, such as memory='window:512', or redraw=False.",
         )
     if shifts != (NO_SHIFT,) and given["chunk"]:
-        expected = "none with actions: only first live views are stored under shifts"
+        expected = "none with actions: only first live observations are stored under shifts"
         raise InvalidOptionError.expected("shifts", list(shifts), expected)
 
 

@@ -158,7 +158,7 @@ def test_why(run: Run, tmp_path: Path, indexed: Path) -> None:
     assert first.startswith(about)
     assert chosen == f"Chosen: frames 0 to 47, of lesson {EPISODE}"
     assert why.startswith("Why: oracle takes the true lesson")
-    assert closest.startswith("The live image is closest to frame ")
+    assert closest.startswith("The first live observation is closest to frame ")
     assert "the closest other frame is frame " in closest
     assert lesson.startswith(
         "The lesson is frames 0 to 47: purity 100.0%, coverage 100.0%, 0 false"
