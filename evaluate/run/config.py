@@ -99,7 +99,7 @@ class RunConfig(WorkConfig):
         "python:module:factory; all kinds: docs/reference/policies.md.",
     )
     buffer_set: str = setting(
-        name="-", metavar="BUFFER_SET", help="Folder of the buffer set, or its NAMESPACE/NAME."
+        name="-", metavar="BUFFER_SET", help="Folder of the buffer set, or NAMESPACE/NAME."
     )
     out: Path = setting(help="Folder of the run; an existing run resumes.")
     policy_options: tuple[str, ...] = setting(
@@ -196,7 +196,9 @@ class AskConfig(WorkConfig):
         "observer) or guess.",
     )
     buffer_set: str = setting(
-        name="-", metavar="BUFFER_SET", help="Folder of the buffer set, with its questions."
+        name="-",
+        metavar="BUFFER_SET",
+        help="Folder of the buffer set, or NAMESPACE/NAME, with its questions.",
     )
     out: Path = setting(help="Folder of the run; an existing run resumes.")
     memory: str = setting(
