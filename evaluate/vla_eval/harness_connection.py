@@ -56,9 +56,9 @@ async def _start_episode(connection: Connection, config: dict[str, Any]) -> None
             raise SystemExit(f"Error: {error}") from error
         _hellos[connection] = hello
     elif hello != first:
-        error = PolicyServerError.changed(connection.url, hello, first)
-        logger.error("%s", error)
-        raise error
+        changed = PolicyServerError.changed(connection.url, hello, first)
+        logger.error("%s", changed)  # vla-eval logs no reason
+        raise changed
 
 
 async def _act(connection: Connection, observation: Observation) -> Action:

@@ -89,6 +89,12 @@ def section(start: int, stop: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
     return {name: np.stack(part) for name, part in frames.items()}, np.stack(states)
 
 
+def observation(number: int) -> Observation:
+    """The observation of one of them."""
+    frames, states = section(number, number + 1)
+    return Observation({name: part[0] for name, part in frames.items()}, states[0])
+
+
 def prepared(number: int) -> dict[str, Any]:
     """An observation as LeRobot's processors take it."""
     frames, states = section(number, number + 1)
@@ -110,9 +116,7 @@ def play(policy: Any, history: int, live: list[int]) -> list[np.ndarray]:
     for count in live:
         policy.observe(*section(at, at + count))
         at += count
-        frames, states = section(at - 1, at)
-        seen = Observation({name: part[0] for name, part in frames.items()}, states[0])
-        actions.append(policy.act(seen, "pick the cube"))
+        actions.append(policy.act(observation(at - 1), "pick the cube"))
     return actions
 
 

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 import urllib.request
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
@@ -70,6 +71,28 @@ class Remembering(Blind):
             assert {len(one) for one in history} == {len(obs.get("state_history", []))}
         states = self.memory[ctx.session_id]
         return {"actions": pose(obs["states"] if states is None else states[3])}
+
+
+class OneQueue(Remembering):
+    """Keeps one queue of actions for all clients, each of which empties it when an episode starts.
+
+    vla-eval's LeRobot server with `use_select_action` does so. Alone, a client gets the same
+    actions as from `Remembering`; beside others it gets some that were made for another's episode.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.queue = deque[Any]()
+
+    async def on_episode_start(self, config: Any, ctx: Any) -> None:
+        self.queue.clear()
+        await super().on_episode_start(config, ctx)
+
+    def predict(self, obs: Any, ctx: Any) -> Any:
+        made = super().predict(obs, ctx)  # keeps the history
+        if not self.queue:
+            self.queue.extend([made] * 4)
+        return self.queue.popleft()
 
 
 class Refusing(Remembering):
