@@ -141,7 +141,7 @@ def test_the_faults_of_its_mme_vla_server() -> None:
 
 
 def test_a_server_with_one_queue_mixes_up_its_clients() -> None:
-    """docs/how-to/connect-a-policy.md says how to avoid it; the leak probe finds it."""
+    """docs/how-to/connect-a-policy.md describes such servers."""
     with (
         servers.running(servers.OneQueue()) as port,
         closing(servers.made(port)) as one,
