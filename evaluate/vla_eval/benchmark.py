@@ -30,7 +30,7 @@ from robomme_interference_data.simulators.episode import Observation
 
 from .checks import actions_of
 from .configuration import check_label, check_robot
-from .harness_connection import check_connections, leave_connections
+from .harness_connection import CheckedConnections
 from .observations import ACTION_SPEC, CAMERAS, OBSERVATION_SPEC, ObservingPolicy
 
 SETTINGS = (
@@ -160,7 +160,8 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
         self._thread = Thread(target=self._work, name="rollouts", daemon=True)
         self._thread.start()
         self._running = False
-        check_connections()
+        self._connections = CheckedConnections(self._policy.cameras)
+        self._connections.begin()
 
     def get_tasks(self) -> list[Task]:
         """Return the tasks, with what identifies the rows of each."""
@@ -226,7 +227,7 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
 
     def cleanup(self) -> None:
         """End the simulator."""
-        leave_connections()
+        self._connections.end()
         self._stop()
         self._jobs.put(None)
         self._thread.join()

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import anyio
+import numpy as np
 import pytest
 from support import runs, worlds
 from support.lazy import lazy
@@ -17,6 +18,7 @@ from robomme_interference_data.cli.main import app
 from robomme_interference_data.errors import (
     InterferenceError,
     InvalidOptionError,
+    PolicyError,
     RunError,
     UnknownNameError,
 )
@@ -155,18 +157,24 @@ def test_another_server_ends_the_run(tmp_path: Path, caplog: pytest.LogCaptureFi
     assert "'checkpoint': 1" in caplog.text and "it began with" in caplog.text
 
 
-@pytest.mark.parametrize("fault", ["version", "actions"])
+@pytest.mark.parametrize("fault", ["version", "actions", "wrist"])
 def test_a_server_that_does_not_fit_ends_before_the_first_episode(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str
 ) -> None:
     server = servers.Noting(actions={"position": specs.POSITION_DELTA})
+    if fault == "wrist":
+        server = servers.Noting(observations={"wrist": specs.IMAGE_RGB})
     if fault == "version":
         assert benchmark.RoboMMEInterference  # imported with the version of this side
         monkeypatch.setattr("vla_eval.protocol.messages.PROTOCOL_VERSION", 2)
         server = servers.Noting()
     with servers.running(server) as port, pytest.raises(SystemExit) as raised:
         orchestrate(tmp_path, port, conditions=["no-history"])
-    words = {"version": "speaks version 2", "actions": "action position (3 values, delta_xyz)"}
+    words = {
+        "version": "speaks version 2",
+        "actions": "action position (3 values, delta_xyz)",
+        "wrist": "send_wrist_image: true",
+    }
     assert words[fault] in str(raised.value.code)
     assert not [*tmp_path.glob("*.json")]
 
@@ -263,4 +271,7 @@ def test_a_chunk_is_carried_out_action_by_action() -> None:
     assert [one.done for one in results] == [False, False, True]
     row = played.get_step_result(results[-1])
     assert (row["steps"], row["status"], row["success"]) == (worlds.STEPS, "fail", False)
+    played.reset({**task, "episode_idx": 0})
+    with raises(PolicyError):
+        played.step({"actions": [[*observation["states"][:7], np.nan]]})
     played.cleanup()
