@@ -62,10 +62,14 @@ def save_policy(
     with torch.random.fork_rng([]):
         torch.manual_seed(1)
         policy = get_policy_class(kind)(config)
-    before, after = make_pre_post_processors(config, dataset_stats=stats(cameras))
-    for part in (policy, before, after):
-        part.save_pretrained(folder)
+    policy.save_pretrained(folder)
+    save_processors(folder, config, stats(cameras))
     return folder
+
+
+def save_processors(folder: Path, config: Any, statistics: dict[str, Any]) -> None:
+    for part in make_pre_post_processors(config, dataset_stats=statistics):
+        part.save_pretrained(folder)
 
 
 def loaded(folder: Path) -> tuple[Any, Any, Any]:
