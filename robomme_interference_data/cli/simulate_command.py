@@ -55,7 +55,11 @@ def simulate(
         simulator_class,
     )
 
-    name = str(EpisodeId.parse(episode))
+    parsed = EpisodeId.parse(episode)
+    if parsed.start:  # of a distractor unit
+        expected = f"a whole episode, such as {parsed.scene}"
+        raise InvalidOptionError.expected("episode", episode, expected)
+    name = str(parsed)
     check_shift(simulator, shift)
     supported = simulator_class(simulator)
     policies = (*(name for name in ("oracle", "guess") if name in supported.policies), NO_POLICY)

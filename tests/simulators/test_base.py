@@ -159,6 +159,19 @@ def test_simulate_plays_an_episode_and_writes_what_is_seen(run: Run, tmp_path: P
 
 
 @pytest.mark.parametrize(
+    ("episode", "message"),
+    [
+        ("MoveCube", "'MoveCube' is not an episode id"),
+        ("MoveCube/tests/3", "'tests' is not a split"),
+        ("MoveCube/train/3@16", "expected a whole episode, such as MoveCube/train/3"),
+    ],
+)
+def test_simulate_needs_the_id_of_an_episode(run: Run, episode: str, message: str) -> None:
+    code, out, err = run(*SIMULATE, episode)
+    assert (code, out) == (1, "") and message in err
+
+
+@pytest.mark.parametrize(
     ("words", "message"),
     [
         ("--video {}/out.avi", ".mp4 file"),
