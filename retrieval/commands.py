@@ -19,9 +19,9 @@ from robomme_interference_data.cli.options import (
     BufferSetFolder,
     ConditionName,
     Conditions,
+    EpisodeName,
     Families,
     Picture,
-    QueryName,
     with_settings,
 )
 from robomme_interference_data.constants import DEMONSTRATIONS, MANIFEST_PATH
@@ -107,7 +107,7 @@ def index(
 
 def retrieve(
     buffer_set: BufferSetFolder,
-    episode: QueryName,
+    episode: EpisodeName,
     condition: ConditionName,
     encoder: EncoderName = "thumbnail",
     rule: Annotated[

@@ -240,6 +240,14 @@ class PolicyServerError(InterferenceError, ConnectionError):
     Fix: check that the server runs and is reachable; its log has the details.
     """
 
+    @classmethod
+    def changed(cls, server: str, reported: object, first: object) -> Self:
+        """Return the error for a server that reports something else than at first."""
+        return cls(
+            f"policy server {server} reports {reported}; it began with {first}",
+            "Serve the same model until the run ends.",
+        )
+
 
 class ServerKeepaliveError(PolicyServerError):
     """A policy server that closed its connection because one call blocked it for too long.

@@ -117,7 +117,10 @@ class ServerConnection(ABC):
         return self._connection is not None
 
     def open(self) -> None:
-        """Connect anew; retry while the server does not answer, or answers 5xx."""
+        """Connect anew; retry while the server does not answer, or answers 5xx.
+
+        A server that was started again must report the same as before.
+        """
         self.close()
         began, warned, hint, left = time.monotonic(), False, None, self._connect_s
 
@@ -152,7 +155,11 @@ class ServerConnection(ABC):
         except _NoAnswerError as error:
             reason = f"{error} (for {self._connect_s:g} s)"
             raise self._unreachable(reason, hint) from error.__cause__
-        self.metadata = self._greet(left)
+        reported = self._greet(left)
+        if self.metadata is not None and pack(reported) != pack(self.metadata):
+            self.close()
+            raise PolicyServerError.changed(self.name, reported, self.metadata)
+        self.metadata = reported
 
     @abstractmethod
     def _greet(self, seconds: float) -> dict[str, Any]:

@@ -6,14 +6,14 @@ The configuration is checked when the policy is made; weights are loaded at the 
 import copy
 import sys
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from lerobot.configs import FeatureType, PreTrainedConfig
+from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from numpy.typing import NDArray
 
@@ -77,6 +77,7 @@ class LeRobotPolicy(BatchPolicy):
             self._before, self._after = self._make_processors()
         names = _feature_names(self._before)
         _check_features(path, self._config, names)
+        _check_statistics(path, (*self._before.steps, *self._after.steps))
         wanted = [name for name in (FRONT, WRIST) if names[name] in self._config.input_features]
         self.cameras = tuple(name.removeprefix(CAMERA_PREFIX) for name in wanted)
         self._steps = int(self._config.n_obs_steps or 1)
@@ -307,6 +308,26 @@ def _feature_names(before: Any) -> dict[str, str]:
         renames = getattr(step, "rename_map", None) or {}
         names = {name: renames.get(known, known) for name, known in names.items()}
     return names
+
+
+def _check_statistics(path: str, steps: Iterable[Any]) -> None:
+    """Check that states and actions have the statistics by which they are normalized.
+
+    LeRobot passes values without statistics on unchanged: the robot would carry out the model's own
+    numbers.
+    """
+    for step in steps:
+        modes = getattr(step, "norm_map", {})
+        for name, feature in getattr(step, "features", {}).items():
+            mode = modes.get(feature.type, NormalizationMode.IDENTITY)
+            vector = feature.type in (FeatureType.STATE, FeatureType.ACTION)
+            if vector and mode is not NormalizationMode.IDENTITY and not step.stats.get(name):
+                raise PolicyError(
+                    f"the policy {path} normalizes {name} ({mode.value}), but has no statistics "
+                    "for it",
+                    "Save it with the processors of its training: make_pre_post_processors(config, "
+                    "dataset_stats=dataset.meta.stats).",
+                )
 
 
 def _check_features(path: str, config: Any, names: dict[str, str]) -> None:

@@ -28,7 +28,7 @@ from robomme_interference_data.evaluate.policies.kinds import PolicyKind
 from robomme_interference_data.evaluate.policies.policy import BATCH_METHODS, Policy
 from robomme_interference_data.evaluate.policies.registry import policy_kind
 from robomme_interference_data.evaluate.run.config import RunConfig, check_unused
-from robomme_interference_data.evaluate.run.plan import RunPlan, WorkItem
+from robomme_interference_data.evaluate.run.plan import RunPlan, WorkItem, plan_work
 from robomme_interference_data.evaluate.systems import System, check_history
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Resources
@@ -38,8 +38,8 @@ from robomme_interference_data.simulators.registry import SIMULATORS, check_shif
 from .settings import used_cameras
 
 
-def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> None:
-    """Check the settings against each other, the buffer set and the policy."""
+def check_settings(config: RunConfig, buffer_set: BufferSet) -> None:
+    """Check the settings against each other and the buffer set, without the policy."""
     simulator, kind = simulator_class(config.simulator), policy_kind(config.policy)
     if simulator.plays_back and not config.offline:
         raise InvalidOptionError(
@@ -47,7 +47,29 @@ def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> 
             f"Set {named('offline')} for an offline evaluation.",
         )
     check_shift(config.simulator, config.shift)
-    _check_policies(config, kind, policy)
+    _check_policies(config)
+    if kind.acts_out_answers:
+        check_unused(config, ["retrieval"], config.policy, "Set it for the questions instead.")
+    _check_robot(config, buffer_set, kind)
+    if config.videos:
+        from robomme_interference_data.viz.episode_video import check_pillow
+
+        check_pillow(named("videos"))
+    # Under which conditions the policy runs is not known yet, but their episodes are.
+    plan_work(
+        buffer_set.episodes_under(config.conditions),
+        conditions=config.conditions or buffer_set.conditions,
+        families=config.families,
+        episodes=config.episodes,
+        split=config.split,
+        shard=config.shard,
+    )
+
+
+def check_policy(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> None:
+    """Check what a policy declares against the settings and the buffer set."""
+    simulator, kind = simulator_class(config.simulator), policy_kind(config.policy)
+    _check_shared(config, kind, policy)
     scripts = [name for name in simulator.policies if kind.script in (None, name)]
     if policy.privileged and not scripts:
         raise InvalidOptionError(
@@ -55,14 +77,7 @@ def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> 
             "has none for it",
             _script_hint(config, kind),
         )
-    if kind.acts_out_answers:
-        check_unused(config, ["retrieval"], config.policy, "Set it for the questions instead.")
-    _check_robot(config, buffer_set, kind)
     _check_cameras(config, buffer_set.datasets[DEMONSTRATIONS], policy)
-    if config.videos:
-        from robomme_interference_data.viz.episode_video import check_pillow
-
-        check_pillow(named("videos"))
 
 
 def _check_cameras(config: RunConfig, demonstrations: Dataset, policy: Policy) -> None:
@@ -134,8 +149,8 @@ def _check_robot(config: RunConfig, buffer_set: BufferSet, kind: PolicyKind) -> 
         )
 
 
-def _check_policies(config: RunConfig, kind: PolicyKind, policy: Policy) -> None:
-    """Check the settings of shared policies, and that the policy can be shared."""
+def _check_policies(config: RunConfig) -> None:
+    """Check the settings of shared policies."""
     if config.policies is None:
         own = "policies that are not shared"
         unused = ("max_batch_size", "batch_wait_timeout_s", "policy_resources")
@@ -154,7 +169,11 @@ def _check_policies(config: RunConfig, kind: PolicyKind, policy: Policy) -> None
     wait_s = config.batch_wait_timeout_s
     if not 0 <= wait_s < math.inf:
         raise InvalidOptionError.expected("batch_wait_timeout_s", wait_s, "0 or more")
-    fault = _fault_of_sharing(kind, policy)
+
+
+def _check_shared(config: RunConfig, kind: PolicyKind, policy: Policy) -> None:
+    """Check that a policy can be shared, if it is to be."""
+    fault = None if config.policies is None else _fault_of_sharing(kind, policy)
     if fault is not None:
         raise InvalidOptionError(
             f"the policy {config.policy} cannot be shared by workers ({named('policies')}): "

@@ -28,7 +28,9 @@ from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.simulators.episode import Observation
 
-from .configuration import check_label
+from .checks import actions_of
+from .configuration import check_label, check_robot
+from .harness_connection import CheckedConnections
 from .observations import ACTION_SPEC, CAMERAS, OBSERVATION_SPEC, ObservingPolicy
 
 SETTINGS = (
@@ -137,6 +139,7 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
             system=system,
             **chosen,
         )
+        check_robot(opened, config.simulator)
         with_history = [name for name in config.conditions if name != NO_HISTORY]
         if with_history and not send_video_history:
             raise InvalidOptionError(
@@ -157,6 +160,8 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
         self._thread = Thread(target=self._work, name="rollouts", daemon=True)
         self._thread.start()
         self._running = False
+        self._connections = CheckedConnections(self._policy.cameras)
+        self._connections.begin()
 
     def get_tasks(self) -> list[Task]:
         """Return the tasks, with what identifies the rows of each."""
@@ -203,8 +208,7 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
 
     def step(self, action: Action) -> StepResult:
         """Execute a server's action, or a chunk of them."""
-        values = action.get("actions", action.get("action"))
-        self._policy.answers.put(np.atleast_2d(np.asarray(values, np.float32)))
+        self._policy.answers.put(np.atleast_2d(np.asarray(actions_of(action), np.float32)))
         return self._next()
 
     def make_obs(self, raw_obs: ServerObservation, task: Task) -> ServerObservation:
@@ -223,6 +227,7 @@ class RoboMMEInterference(StepBenchmark):  # type: ignore[misc]
 
     def cleanup(self) -> None:
         """End the simulator."""
+        self._connections.end()
         self._stop()
         self._jobs.put(None)
         self._thread.join()

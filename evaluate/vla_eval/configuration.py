@@ -6,11 +6,15 @@ from typing import Any
 
 import yaml
 
+from robomme_interference_data.constants import DEMONSTRATIONS, STATE
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import InvalidOptionError, named
 from robomme_interference_data.evaluate.run.plan import plan_work
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.ids import count_numbers
+from robomme_interference_data.simulators.episode import ACTION_SIZE
+from robomme_interference_data.simulators.registry import simulator_class
 
 BENCHMARK = f"{__package__}.benchmark:RoboMMEInterference"
 
@@ -25,6 +29,18 @@ def check_label(system: str) -> None:
             f"a server of vla-eval is not the paper's system {system}",
             f"Set {named('system')} to a name of your own; docs/how-to/connect-a-policy.md lists "
             "what differs.",
+        )
+
+
+def check_robot(buffer_set: BufferSet, simulator: str) -> None:
+    """Check that the robot has the states that servers read, and the actions that they return."""
+    (state,) = buffer_set.datasets[DEMONSTRATIONS].features[STATE]
+    action = simulator_class(simulator).action_size
+    if {state, action} != {ACTION_SIZE}:
+        raise InvalidOptionError(
+            f"vla-eval's servers get {ACTION_SIZE} state values and return {ACTION_SIZE} action "
+            f"values here, 7 joints and a gripper; this robot has {state} and {action}",
+            "Use the command evaluate, with a policy for this robot: python:module:factory.",
         )
 
 
@@ -47,10 +63,11 @@ def configuration(
     Raises:
         UnknownNameError: The buffer set lacks a family, condition or episode.
         InvalidIdError: `system` is not a name.
-        InvalidOptionError: It is a system of the paper.
+        InvalidOptionError: It is a system of the paper, or the robot has other actions or states.
     """
     check_label(system)
     opened = load_buffer_set(buffer_set)
+    check_robot(opened, simulator)
     plan = plan_work(
         opened.episodes_under(conditions or opened.conditions),
         conditions=conditions or opened.conditions,

@@ -8,7 +8,6 @@ from typing import Any
 
 from vla_eval.protocol.image_codec import is_encoded_image
 from vla_eval.protocol.messages import (
-    PROTOCOL_VERSION,
     Message,
     MessageType,
     make_hello_payload,
@@ -19,6 +18,8 @@ from vla_eval.protocol.messages import (
 from robomme_interference_data.errors import FormatError, PolicyServerError
 from robomme_interference_data.evaluate.policies.connection import ServerConnection
 from robomme_interference_data.evaluate.policies.wire import check_items
+
+from .checks import actions_of, fault_of
 
 
 class VlaEvalConnection(ServerConnection):
@@ -37,15 +38,8 @@ class VlaEvalConnection(ServerConnection):
     def hello(self, seconds: float | None = None) -> dict[str, Any]:
         """Return what the server declares; it answers this at any time."""
         hello = self._ask(MessageType.HELLO, make_hello_payload(), MessageType.HELLO, seconds)
-        version = hello.get("protocol_version")
         if "model_server" not in hello:
             raise self._other("its hello names no model server")
-        if version != PROTOCOL_VERSION:
-            raise self._failed(
-                f"speaks version {version} of vla-eval's protocol (it has vla-eval "
-                f"{hello.get('harness_version')}); expected version {PROTOCOL_VERSION}",
-                "Install the same vla-eval on both sides.",
-            )
         return hello
 
     def start_episode(self, task: dict[str, Any]) -> None:
@@ -58,11 +52,7 @@ class VlaEvalConnection(ServerConnection):
 
     def act(self, observation: dict[str, Any]) -> Any:
         """Return the actions for an observation."""
-        answer = self._ask(MessageType.OBSERVATION, observation, MessageType.ACTION)
-        actions = answer.get("actions", answer.get("action"))
-        if actions is None:
-            raise self._failed(f"answers without actions: {', '.join(map(str, answer))}", None)
-        return actions
+        return actions_of(self._ask(MessageType.OBSERVATION, observation, MessageType.ACTION))
 
     def _add(self, kind: MessageType, payload: dict[str, Any]) -> None:
         self._seq += 1
@@ -79,15 +69,10 @@ class VlaEvalConnection(ServerConnection):
         self._add(kind, payload)
         messages, self._unsent = self._unsent, []
         answer = self._exchange(messages, seconds or self._response_s, self._read)
+        fault = fault_of(answer, expected, self._seq)
+        if fault is not None:
+            raise self._failed(*fault)
         content: dict[str, Any] = answer.payload
-        if answer.type is MessageType.ERROR:
-            what = content.get("error", content)
-            raise self._failed(f"reports: {what}", "See the server's log for the traceback.")
-        if (answer.type, answer.seq) != (expected, self._seq):
-            raise self._failed(
-                f"sends {answer.type.value} {answer.seq}; expected {expected.value} {self._seq}",
-                "A server must answer every observation, and each once.",
-            )
         return content
 
     def _read(self, data: str | bytes) -> Message:

@@ -1,46 +1,20 @@
 """Policies behind a server of vla-eval: one observation, one answer."""
 
-from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from vla_eval.specs import GRIPPER_CLOSE_NEG, IMAGE_RGB, LANGUAGE, DimSpec
 
 from robomme_interference_data.errors import PolicyServerError
 from robomme_interference_data.evaluate.policies.connection import check_server_options
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.schema.other_states import check_rule
-from robomme_interference_data.simulators.episode import ACTION_SIZE, Observation
+from robomme_interference_data.simulators.episode import Observation
 
+from .checks import WRISTS, check_hello
 from .connection import VlaEvalConnection
-from .observations import ACTIONS, CAMERAS, HISTORIES, STATE, STATE_HISTORY, ObservingPolicy
-
-_WRISTS = ("wrist", "wrist_image")
-
-_IMAGES = ("image", "images", *CAMERAS.values(), *_WRISTS, *HISTORIES.values())
-
-_PARTS: Mapping[str, Mapping[str, DimSpec]] = {
-    "action": {
-        **dict.fromkeys(("actions", "action"), ACTIONS),
-        "joints": replace(ACTIONS, dims=ACTION_SIZE - 1),
-        "gripper": GRIPPER_CLOSE_NEG,
-    },
-    "observation": {
-        **dict.fromkeys(_IMAGES, IMAGE_RGB),
-        **dict.fromkeys(
-            ("state", STATE_HISTORY),
-            replace(STATE, accepts=frozenset({STATE.format, "joint_positions"})),
-        ),
-        "language": LANGUAGE,
-    },
-}
-"""What a server may declare of actions and observations."""
-
-_ASKED = ("send_wrist_image", "send_state", "send_video_history")
-"""What a server may ask for."""
+from .observations import HISTORIES, ObservingPolicy
 
 _ONE_CLIENT = ("MmeVlaModelServer",)
 """Servers that keep one history for all connections."""
@@ -87,9 +61,9 @@ class VlaEvalPolicy(ObservingPolicy):
         self._server.open()
         self._server.close()  # the first rollout may be minutes away
         hello = self._hello = self._server.metadata or {}
-        _check_fits(self._server.name, hello)
+        check_hello(self._server.name, hello)
         asked, declared = hello.get("observation_params", {}), hello.get("observation_spec", {})
-        wrist = asked.get("send_wrist_image", any(name in declared for name in _WRISTS))
+        wrist = asked.get("send_wrist_image", any(name in declared for name in WRISTS))
         history = asked.get("send_video_history", HISTORIES["front"] in declared)
         self.sends_state = bool(asked.get("send_state", "state" in declared))
         rule = check_rule(other_states)
@@ -101,21 +75,13 @@ class VlaEvalPolicy(ObservingPolicy):
 
     def reset(self, info: RolloutInfo) -> None:
         """Start an episode, connecting first, or again if the connection was lost."""
-        hello = None
         # The connection may have broken since the last rollout; no memory is lost at a reset.
         with suppress(PolicyServerError):
             if self._server.is_open:
                 self._server.end_episode()
-                hello = self._server.hello()
-        if hello is None:
+                self._server.hello()
+        if not self._server.is_open:
             self._server.open()
-            hello = self._server.metadata
-        if hello != self._hello:
-            self._server.close()
-            raise PolicyServerError(
-                f"policy server {self._server.name} reports {hello}; it began with {self._hello}",
-                "Serve the same model until the run ends.",
-            )
         self._server.start_episode({"name": info.goal, "seed": info.seed})
         super().reset(info)
 
@@ -131,31 +97,3 @@ class VlaEvalPolicy(ObservingPolicy):
     def close(self) -> None:
         """Close the connection, which ends the episode."""
         self._server.close()
-
-
-def _check_fits(server: str, hello: Mapping[str, Any]) -> None:
-    """Check that a server reads what rollouts send, and returns what they execute."""
-    faults = [
-        f"asks for {name}, which is not sent"
-        for name, value in hello.get("observation_params", {}).items()
-        if name.startswith("send_") and value and name not in _ASKED
-    ]
-    for what, known in _PARTS.items():
-        for name, part in hello.get(f"{what}_spec", {}).items():
-            declaration = f"declares the {what} {name} ({part['dims']} values, {part['format']})"
-            if name not in known:
-                faults.append(f"{declaration}; expected {', '.join(known)}")
-                continue
-            size, formats = known[name].dims, known[name].accepts or {known[name].format}
-            if part["dims"] not in (0, size) or part["format"] not in formats:
-                expected = f"{size} values, {' or '.join(sorted(formats))}"
-                faults.append(f"{declaration}; expected {expected}")
-    sizes = [part["dims"] for part in hello.get("action_spec", {}).values()]
-    if sizes and all(sizes) and sum(sizes) != ACTION_SIZE:
-        faults.append(f"declares {sum(sizes)} action values; expected {ACTION_SIZE}")
-    if faults:
-        raise PolicyServerError(
-            f"policy server {server} ({hello['model_server']}) does not fit: it "
-            f"{'; it '.join(faults)}",
-            "docs/how-to/connect-a-policy.md lists what is sent and what is executed.",
-        )

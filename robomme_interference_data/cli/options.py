@@ -47,7 +47,7 @@ Yes = Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")
 BufferSetFolder = Annotated[
     str, typer.Argument(metavar="BUFFER_SET", help="Folder of the buffer set, or NAMESPACE/NAME.")
 ]
-QueryName = Annotated[str, typer.Argument(help="Episode id, such as VideoRepick/test/7.")]
+EpisodeName = Annotated[str, typer.Argument(help="Episode id, such as VideoRepick/test/7.")]
 ConditionName = Annotated[str, typer.Argument(help="Condition, such as k3.")]
 Families = Annotated[list[str], typer.Option(help="Families.", show_default="all", **_LIST)]
 Conditions = Annotated[

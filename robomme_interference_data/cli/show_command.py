@@ -10,7 +10,7 @@ from robomme_interference_data.errors import InterferenceError, InvalidOptionErr
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
 
 from .console import check_output, echo, print_json, print_status
-from .options import AsJson, BufferSetFolder, Picture, QueryName
+from .options import AsJson, BufferSetFolder, EpisodeName, Picture
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 def show(
     buffer_set: BufferSetFolder,
-    episode: QueryName,
+    episode: EpisodeName,
     condition: Annotated[
         str | None, typer.Argument(help="Condition, such as k3; required without --question.")
     ] = None,

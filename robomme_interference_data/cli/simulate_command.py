@@ -10,7 +10,7 @@ from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP
 
 from .console import check_output, echo, print_json
-from .options import AsJson
+from .options import AsJson, EpisodeName
 
 
 def _option(panel: str, text: str, **more: Any) -> Any:
@@ -18,9 +18,7 @@ def _option(panel: str, text: str, **more: Any) -> Any:
 
 
 def simulate(
-    family: Annotated[str, _option("Episode", "Task family, such as MoveCube.")],
-    episode: Annotated[int, _option("Episode", "Index of the episode in its split, from 0.")] = 0,
-    split: Annotated[str, _option("Episode", "train, val or test.")] = "test",
+    episode: EpisodeName,
     policy: Annotated[
         str,
         _option(
@@ -43,9 +41,9 @@ def simulate(
 
     Examples:
     ```
-    robomme-interference simulate --family MoveCube --episode 3 --video out.mp4
-    ROBOMME_PYTHON=PATH robomme-interference simulate --simulator robomme \
-      --family MoveCube
+    robomme-interference simulate MoveCube/test/3 --video out.mp4
+    ROBOMME_PYTHON=PATH robomme-interference simulate MoveCube/test/3 \
+      --simulator robomme
     ```
     """
     from robomme_interference_data.ids import EpisodeId
@@ -57,6 +55,11 @@ def simulate(
         simulator_class,
     )
 
+    parsed = EpisodeId.parse(episode)
+    if parsed.start:  # of a distractor unit
+        expected = f"a whole episode, such as {parsed.scene}"
+        raise InvalidOptionError.expected("episode", episode, expected)
+    name = str(parsed)
     check_shift(simulator, shift)
     supported = simulator_class(simulator)
     policies = (*(name for name in ("oracle", "guess") if name in supported.policies), NO_POLICY)
@@ -65,7 +68,6 @@ def simulate(
     if video is not None and (video.suffix != ".mp4" or video.is_dir()):
         raise InvalidOptionError.expected("--video", str(video), "the path of an .mp4 file")
     check_output(video)
-    name = str(EpisodeId(family, split, episode))
     settings: dict[str, Any] = {"shift": shift}
     if video is None:
         settings["cameras"] = ()

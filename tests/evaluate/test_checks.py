@@ -27,11 +27,16 @@ from robomme_interference_data.errors import (
     MissingFileError,
     NoRendererError,
     PolicyError,
+    PolicyServerError,
     UnknownNameError,
 )
 from robomme_interference_data.evaluate import systems
 from robomme_interference_data.evaluate.policies.registry import make_policy
-from robomme_interference_data.evaluate.rollout.checks import check_plan, check_settings
+from robomme_interference_data.evaluate.rollout.checks import (
+    check_plan,
+    check_policy,
+    check_settings,
+)
 from robomme_interference_data.evaluate.rollout.settings import (
     check_system,
     default_system,
@@ -188,13 +193,40 @@ def test_recall_needs_evidence(tiny_buffers: Path, monkeypatch: pytest.MonkeyPat
     assert "reference/sources" in (raised.value.hint or "")
 
 
+@pytest.mark.parametrize(
+    ("changes", "error"),
+    [
+        ({"families": ("Nope",)}, UnknownNameError),
+        ({"conditions": ("k99",)}, InterferenceError),
+        ({"episodes": "7777"}, UnknownNameError),
+        ({"shift": "fog:1"}, InvalidOptionError),
+        ({"simulator": "nowhere:Nothing"}, InterferenceError),
+        ({"shard": "5/2"}, InvalidOptionError),
+    ],
+)
+def test_mistakes_are_found_before_a_server_is_asked(
+    tmp_path: Path, changes: dict[str, Any], error: type[InterferenceError]
+) -> None:
+    settings: dict[str, Any] = {
+        "policy": "websocket://127.0.0.1:9",
+        "policy_options": ("connect_s=0.1",),
+    }
+    with pytest.raises(PolicyServerError):
+        run(tmp_path / "run", **settings)
+    with pytest.raises(error) as raised:
+        run(tmp_path / "run", **settings | changes)
+    assert not isinstance(raised.value, PolicyServerError)
+
+
 # --- names -------------------------------------------------------------------------------------
 
 
 def check_name(tiny_buffers: Path, system: str, **changes: Any) -> None:
     settings = config(**{"simulator": "tabletop"} | changes)
     check_system(settings, system)
-    check_settings(settings, load_buffer_set(tiny_buffers), make_policy("noop"))
+    buffer_set = load_buffer_set(tiny_buffers)
+    check_settings(settings, buffer_set)
+    check_policy(settings, buffer_set, make_policy("noop"))
 
 
 @pytest.mark.parametrize(

@@ -241,6 +241,35 @@ def test_the_next_reset_connects_to_a_restarted_server() -> None:
     assert server.connections == 2
 
 
+def test_a_restarted_server_must_report_the_same() -> None:
+    server = PolicyServer()
+    server.metadata = {"checkpoint": "mine/1", "mean": np.zeros(2)}
+    with server.running():
+        policy = WebsocketPolicy("127.0.0.1", server.port)
+        rollout(policy, 2, [2], [16])
+    with server.running():
+        rollout(policy, 2, [2], [])
+    server.metadata = {"checkpoint": "mine/2", "mean": np.zeros(2)}
+    with server.running():
+        for _ in range(2):  # it stays an error
+            with raises(PolicyServerError):
+                policy.reset(info(0))
+
+
+def test_a_connection_that_is_closed_in_good_order_ends_the_rollout(server: PolicyServer) -> None:
+    """As a server does that restarts: its memory is lost, and nothing goes on without it."""
+    with client(server) as policy:
+        rollout(policy, 3, [3], [])
+        server.close_connections()
+        with raises(PolicyServerError):
+            policy.observe(*section(4, 5))
+        with raises(PolicyServerError):
+            policy.act(observation(4), "pick")
+        assert server.connections == 1
+        rollout(policy, 3, [3], [])
+    assert server.connections == 2
+
+
 def test_a_server_that_hangs_times_out(server: PolicyServer) -> None:
     resume = threading.Event()
     server.before = lambda message: resume.wait(30) and None if "prompt" in message else None

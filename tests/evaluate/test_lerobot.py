@@ -246,6 +246,15 @@ def test_policies_that_do_not_fit_are_errors(
     assert raised.value.hint
 
 
+@pytest.mark.parametrize("lacking", [STATE, ACTION])
+def test_a_policy_without_statistics_is_an_error(act: Path, tmp_path: Path, lacking: str) -> None:
+    folder, statistics = shutil.copytree(act, tmp_path / "policy"), small.stats((FRONT, WRIST))
+    del statistics[lacking]
+    small.save_processors(folder, small.loaded(act)[0].config, statistics)
+    with raises(PolicyError):
+        made(folder)
+
+
 def test_renamed_observations_fit(tmp_path: Path) -> None:
     top = "observation.images.top"
     folder = small.save_policy(tmp_path, "act", (top,))

@@ -36,7 +36,7 @@ from robomme_interference_data.evaluate.language.subgoal_settings import make_wr
 from robomme_interference_data.evaluate.language.subgoal_writers import ModelWriter, OracleWriter
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.evaluate.policies.registry import make_policy
-from robomme_interference_data.evaluate.rollout.checks import check_settings
+from robomme_interference_data.evaluate.rollout.checks import check_policy, check_settings
 from robomme_interference_data.evaluate.rollout.settings import check_system, default_system
 from robomme_interference_data.evaluate.run.history import HistoryReader
 from robomme_interference_data.runtime.executor import Executor, Serial
@@ -284,7 +284,9 @@ def test_settings_that_fit_together_and_others(
     settings = config(**{"simulator": "tabletop", "policy": "websocket://h:1"} | changes)
     if words is None:
         check_system(settings, system)
-        check_settings(settings, load_buffer_set(tiny_buffers), make_policy("noop"))
+        buffer_set = load_buffer_set(tiny_buffers)
+        check_settings(settings, buffer_set)
+        check_policy(settings, buffer_set, make_policy("noop"))
     else:
         with pytest.raises(InterferenceError) as raised:
             check_system(settings, system)

@@ -140,6 +140,20 @@ def test_the_faults_of_its_mme_vla_server() -> None:
     ]
 
 
+def test_a_server_with_one_queue_mixes_up_its_clients() -> None:
+    """docs/how-to/connect-a-policy.md describes such servers."""
+    with (
+        servers.running(servers.OneQueue()) as port,
+        closing(servers.made(port)) as one,
+        closing(servers.made(port)) as other,
+    ):
+        (alone,) = servers.play(one, history=5)
+        servers.play(other)  # an episode without history, which fills the queue
+        beside = one.act(observation(5), "pick")
+    np.testing.assert_array_equal(alone[0, :7], [3] * 7)  # the pose of the history's frame 3
+    np.testing.assert_array_equal(beside[0, :7], [0] * 7)  # the other's
+
+
 # --- in a run ----------------------------------------------------------------------------------
 
 

@@ -127,12 +127,12 @@ def test_closed_simulator() -> None:
 
 
 Run = Callable[..., tuple[int, str, str]]
-EPISODE = ("simulate", "--family", "MoveCube", "--simulator", DOUBLE)
+SIMULATE = ("simulate", "--simulator", DOUBLE)
 
 
 def test_simulate_plays_an_episode_and_writes_what_is_seen(run: Run, tmp_path: Path) -> None:
     video = tmp_path / "new" / "out.mp4"
-    _, out, _ = run(*EPISODE, "--json", "--episode", 200, "--video", video)
+    _, out, _ = run(*SIMULATE, "MoveCube/test/200", "--json", "--video", video)
     assert json.loads(out) == {
         "episode": "MoveCube/test/200",
         "simulator": "double",
@@ -159,6 +159,19 @@ def test_simulate_plays_an_episode_and_writes_what_is_seen(run: Run, tmp_path: P
 
 
 @pytest.mark.parametrize(
+    ("episode", "message"),
+    [
+        ("MoveCube", "'MoveCube' is not an episode id"),
+        ("MoveCube/tests/3", "'tests' is not a split"),
+        ("MoveCube/train/3@16", "expected a whole episode, such as MoveCube/train/3"),
+    ],
+)
+def test_simulate_needs_the_id_of_an_episode(run: Run, episode: str, message: str) -> None:
+    code, out, err = run(*SIMULATE, episode)
+    assert (code, out) == (1, "") and message in err
+
+
+@pytest.mark.parametrize(
     ("words", "message"),
     [
         ("--video {}/out.avi", ".mp4 file"),
@@ -176,7 +189,9 @@ def test_what_simulate_cannot_do_leaves_nothing(
     (tmp_path / "folder.mp4").mkdir()
     (tmp_path / "file").touch()
     given = words.replace("{}", str(tmp_path)).split()
-    code, out, err = run(*EPISODE, "--episode", UNKNOWN, *given)  # which playing would refuse
+    code, out, err = run(
+        *SIMULATE, f"MoveCube/test/{UNKNOWN}", *given
+    )  # which playing would refuse
     assert (code, out) == (1, "")
     assert message.replace("{}", str(tmp_path)) in err and "Traceback" not in err
     assert {path.name for path in tmp_path.iterdir()} == {"folder.mp4", "file"}

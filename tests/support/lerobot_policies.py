@@ -62,10 +62,14 @@ def save_policy(
     with torch.random.fork_rng([]):
         torch.manual_seed(1)
         policy = get_policy_class(kind)(config)
-    before, after = make_pre_post_processors(config, dataset_stats=stats(cameras))
-    for part in (policy, before, after):
-        part.save_pretrained(folder)
+    policy.save_pretrained(folder)
+    save_processors(folder, config, stats(cameras))
     return folder
+
+
+def save_processors(folder: Path, config: Any, statistics: dict[str, Any]) -> None:
+    for part in make_pre_post_processors(config, dataset_stats=statistics):
+        part.save_pretrained(folder)
 
 
 def loaded(folder: Path) -> tuple[Any, Any, Any]:
@@ -89,6 +93,12 @@ def section(start: int, stop: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
     return {name: np.stack(part) for name, part in frames.items()}, np.stack(states)
 
 
+def observation(number: int) -> Observation:
+    """The observation of one of them."""
+    frames, states = section(number, number + 1)
+    return Observation({name: part[0] for name, part in frames.items()}, states[0])
+
+
 def prepared(number: int) -> dict[str, Any]:
     """An observation as LeRobot's processors take it."""
     frames, states = section(number, number + 1)
@@ -110,9 +120,7 @@ def play(policy: Any, history: int, live: list[int]) -> list[np.ndarray]:
     for count in live:
         policy.observe(*section(at, at + count))
         at += count
-        frames, states = section(at - 1, at)
-        seen = Observation({name: part[0] for name, part in frames.items()}, states[0])
-        actions.append(policy.act(seen, "pick the cube"))
+        actions.append(policy.act(observation(at - 1), "pick the cube"))
     return actions
 
 

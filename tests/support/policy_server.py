@@ -160,6 +160,7 @@ class PolicyServer:
         self.before: Callable[[dict[str, Any]], Any] = lambda message: None
         self.status: HTTPStatus | None = None
         self.connections = 0
+        self._opened = list[ServerConnection]()
         self.options: dict[str, Any] = {"compression": None, "max_size": None}
         self._started = threading.Event()
 
@@ -197,6 +198,11 @@ class PolicyServer:
             thread.join(30)
             assert not thread.is_alive()
 
+    def close_connections(self) -> None:
+        """Close each connection with code 1000, as a server that shuts down does."""
+        for opened in self._opened:
+            asyncio.run_coroutine_threadsafe(opened.close(), self._stop.get_loop()).result(30)
+
     def _process(self, connection: ServerConnection, request: Request) -> Response | None:
         key = request.headers.get("Authorization")
         if self.api_key is not None and key != f"Api-Key {self.api_key}":
@@ -207,6 +213,7 @@ class PolicyServer:
 
     async def _handle(self, connection: ServerConnection) -> None:
         self.connections += 1
+        self._opened.append(connection)
         await connection.send(msgpack.packb(self.metadata, default=encode))
         while True:
             try:

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 import urllib.request
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
@@ -22,6 +23,7 @@ from vla_eval.model_servers import mme_vla
 from vla_eval.model_servers.predict import PredictModelServer
 from vla_eval.model_servers.serve import serve, serve_async
 from vla_eval.specs import IMAGE_RGB, RAW
+from websockets.exceptions import ConnectionClosedOK
 
 from robomme_interference_data.evaluate.policies.registry import make_policy
 
@@ -71,6 +73,28 @@ class Remembering(Blind):
         return {"actions": pose(obs["states"] if states is None else states[3])}
 
 
+class OneQueue(Remembering):
+    """Keeps one queue of actions for all clients, each of which empties it when an episode starts.
+
+    vla-eval's LeRobot server with `use_select_action` does so. Alone, a client gets the same
+    actions as from `Remembering`; beside others it gets some that were made for another's episode.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.queue = deque[Any]()
+
+    async def on_episode_start(self, config: Any, ctx: Any) -> None:
+        self.queue.clear()
+        await super().on_episode_start(config, ctx)
+
+    def predict(self, obs: Any, ctx: Any) -> Any:
+        made = super().predict(obs, ctx)  # keeps the history
+        if not self.queue:
+            self.queue.extend([made] * 4)
+        return self.queue.popleft()
+
+
 class Refusing(Remembering):
     """Raises at the goals of one family."""
 
@@ -102,6 +126,52 @@ class Dying(Remembering):
             died.touch()
             os._exit(3)
         return super().predict(obs, ctx)
+
+
+class Leaving(Remembering):
+    """Closes the connection after its third answer, with code 1000, in the n-th episodes.
+
+    It succeeds at its fifth answer. A client that continues on a new connection gets answers
+    without the history, and fails.
+    """
+
+    def __init__(self, *episodes: int):
+        super().__init__()
+        self.episodes, self.started = episodes, 0
+
+    async def on_episode_start(self, config: Any, ctx: Any) -> None:
+        self.started += 1
+        await super().on_episode_start(config, ctx)
+
+    async def on_observation(self, obs: Any, ctx: Any) -> None:
+        self.memory.setdefault(ctx.session_id, None)
+        await super().on_observation(obs, ctx)
+        if ctx.step == 2 and self.started in self.episodes:
+            raise ConnectionClosedOK(None, None)  # at which vla-eval closes the connection
+
+    def predict(self, obs: Any, ctx: Any) -> Any:
+        remembered = super().predict(obs, ctx)
+        return remembered if ctx.step >= 4 else {"actions": pose(obs["states"])}
+
+
+class Reloading(Leaving):
+    """Serves another model after it closed a connection."""
+
+    def get_observation_params(self) -> dict[str, Any]:
+        return self.params | {"checkpoint": self.started}
+
+
+class Full(Leaving):
+    """Cannot start the n-th episodes, and answers their observations all the same."""
+
+    async def on_episode_start(self, config: Any, ctx: Any) -> None:
+        await super().on_episode_start(config, ctx)
+        if self.started in self.episodes:
+            raise MemoryError("full")
+
+    async def on_observation(self, obs: Any, ctx: Any) -> None:
+        self.memory.setdefault(ctx.session_id, None)
+        await Remembering.on_observation(self, obs, ctx)
 
 
 class Noting(Blind):

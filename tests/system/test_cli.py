@@ -105,7 +105,7 @@ def test_a_bug_as_json(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     "arguments",
     [
         f"show S {EPISODE} k3 --out S/demonstrations/meta/strip.png",
-        "simulate --family MoveCube --video S/distractors/meta/look.mp4",
+        "simulate MoveCube/test/0 --video S/distractors/meta/look.mp4",
         f"retrieve S {EPISODE} k3 --out S/manifests/why.png",
         "retrieval-score S --out S/distractors",
         "evaluate S --policy noop --out S/demonstrations/run",
@@ -250,6 +250,13 @@ def test_control_characters_in_output_are_escaped(capsys: pytest.CaptureFixture[
 
 
 # --- as a program ---------------------------------------------------------------------------------
+
+
+def test_as_a_module_without_what_lies_in_the_current_folder(tmp_path: Path) -> None:
+    (tmp_path / "typer.py").write_text("raise RuntimeError('planted')")
+    command = [sys.executable, "-m", "robomme_interference_data", "--version"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.split()[0]) == (0, "robomme-interference"), done.stderr
 
 
 def test_output_folder_that_cannot_be_created(run: Run, tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ NOT_RUN = {
     ("many-machines.md", "index my-buffers --encoder siglip"): "a cluster and 3.5 GB of weights",
     (
         "official-simulator.md",
-        "simulate --simulator robomme",
+        "simulate MoveCube/test/0 --simulator robomme",
     ): "RoboMME; test_robomme_whole.py goes this way with a stand-in",
     (
         "official-simulator.md",

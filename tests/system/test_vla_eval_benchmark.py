@@ -6,6 +6,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import anyio
+import numpy as np
 import pytest
 from support import runs, worlds
 from support.lazy import lazy
@@ -16,6 +18,7 @@ from robomme_interference_data.cli.main import app
 from robomme_interference_data.errors import (
     InterferenceError,
     InvalidOptionError,
+    PolicyError,
     RunError,
     UnknownNameError,
 )
@@ -27,7 +30,12 @@ TESTS = Path(__file__).parents[1]
 BUFFERS = str(TESTS / "golden" / "buffer_set")
 CONDITIONS = ("no-history", "k0", "k1")
 benchmark = lazy("robomme_interference_data.evaluate.vla_eval.benchmark")
+configuration = lazy("robomme_interference_data.evaluate.vla_eval.configuration")
+connections = lazy("vla_eval.connection")
+export = lazy("vla_eval.results.export")
+orchestrator = lazy("vla_eval.orchestrator")
 servers = lazy("support.vla_eval_servers")
+specs = lazy("vla_eval.specs")
 
 
 def run(folder: Path, server: str, conditions: str = "no-history,k0,k1") -> tuple[Any, Path]:
@@ -99,6 +107,81 @@ def test_what_fails_is_an_error_and_the_next_rollout_runs(tmp_path: Path) -> Non
     }
     text = results.read_text()
     assert "this goal is odd" in text and "the world fell apart" in text
+
+
+def orchestrate(folder: Path, port: int, **params: Any) -> list[Any]:
+    """The rows that are scored after vla-eval's orchestrator ran in this process."""
+    given = {"buffer_set": BUFFERS, "system": "mine", "simulator": runs.WORLD, "episodes": "0"}
+    entry = {"benchmark": configuration.BENCHMARK, "episodes_per_task": 1}
+    entry["params"] = given | {"families": [*worlds.FAMILIES]} | params
+    settings: dict[str, Any] = {"server": {"url": f"ws://127.0.0.1:{port}", "timeout": 20}}
+    settings |= {"output_dir": str(folder), "benchmarks": [entry]}
+    played = orchestrator.Orchestrator(settings)
+    anyio.run(played.run)
+    export.export_eval(folder, played.eval_id)
+    return list(read_rows([folder / "RoboMMEInterference_aggregate.json"]))
+
+
+def test_a_connection_that_is_closed_within_an_episode_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    receive = connections.Connection.recv
+
+    async def late(*given: Any, **settings: Any) -> Any:
+        message = await receive(*given, **settings)
+        await anyio.sleep(0.02)  # the client notices the end before the next observation
+        return message
+
+    monkeypatch.setattr("vla_eval.connection.Connection.recv", late)
+    with servers.running(servers.Leaving(1, 3)) as port:
+        rows = orchestrate(tmp_path, port, conditions=["k0", "k1"])
+    assert sorted((row.condition, row.status) for row in rows) == [
+        *[("k0", "error")] * 2,
+        *[("k1", "success")] * 2,
+    ]
+
+
+def test_an_unread_answer_is_not_taken_for_a_later_one(tmp_path: Path) -> None:
+    with servers.running(servers.Full(1)) as port:
+        rows = orchestrate(tmp_path, port, conditions=["k0", "k1"])
+    assert sorted((row.status, row.steps) for row in rows) == [
+        ("error", 0),
+        *[("success", 5)] * 3,  # not one step later, as with the answer to the observation before
+    ]
+
+
+def test_another_server_ends_the_run(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with servers.running(servers.Reloading(1)) as port:
+        rows = orchestrate(tmp_path, port, conditions=["k0", "k1"])
+    assert [row.status for row in rows] == ["error", "error"]
+    assert "'checkpoint': 1" in caplog.text and "it began with" in caplog.text
+
+
+@pytest.mark.parametrize("fault", ["version", "actions", "wrist"])
+def test_a_server_that_does_not_fit_ends_before_the_first_episode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str
+) -> None:
+    server = servers.Noting(actions={"position": specs.POSITION_DELTA})
+    if fault == "wrist":
+        server = servers.Noting(observations={"wrist": specs.IMAGE_RGB})
+    if fault == "version":
+        assert benchmark.RoboMMEInterference  # imported with the version of this side
+        monkeypatch.setattr("vla_eval.protocol.messages.PROTOCOL_VERSION", 2)
+        server = servers.Noting()
+    with servers.running(server) as port, pytest.raises(SystemExit) as raised:
+        orchestrate(tmp_path, port, conditions=["no-history"])
+    words = {
+        "version": "speaks version 2",
+        "actions": "action position (3 values, delta_xyz)",
+        "wrist": "send_wrist_image: true",
+    }
+    assert words[fault] in str(raised.value.code)
+    assert not [*tmp_path.glob("*.json")]
+
+
+def test_a_robot_of_another_size_is_refused() -> None:
+    with raises(InvalidOptionError):
+        make(conditions=["no-history"], simulator="support.own_simulators:TwoArms")
 
 
 def test_the_configuration(tmp_path: Path) -> None:
@@ -188,4 +271,7 @@ def test_a_chunk_is_carried_out_action_by_action() -> None:
     assert [one.done for one in results] == [False, False, True]
     row = played.get_step_result(results[-1])
     assert (row["steps"], row["status"], row["success"]) == (worlds.STEPS, "fail", False)
+    played.reset({**task, "episode_idx": 0})
+    with raises(PolicyError):
+        played.step({"actions": [[*observation["states"][:7], np.nan]]})
     played.cleanup()

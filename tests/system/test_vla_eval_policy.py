@@ -75,3 +75,25 @@ def test_its_lerobot_server_acts_as_the_policy_here(tmp_path: Path, cameras: Any
     assert not np.array_equal(actions[16], expected[0][0])
     with raises(InvalidOptionError):
         make_policy(f"vla-eval:ws://127.0.0.1:{port}")
+
+
+@pytest.mark.slow
+def test_its_lerobot_server_has_one_queue_with_use_select_action(tmp_path: Path) -> None:
+    """docs/how-to/connect-a-policy.md says so: it is true as long as this passes."""
+    from vla_eval.model_servers.lerobot import LeRobotModelServer
+
+    folder = small.save_policy(tmp_path / "act", "act", ("observation.images.front",))
+    for own_queues in (True, False):
+        server = LeRobotModelServer(
+            "act", str(folder), device="cpu", use_select_action=not own_queues
+        )
+        with (
+            servers.running(server) as port,
+            closing(make_policy(f"vla-eval:ws://127.0.0.1:{port}", NAMED)) as one,
+            closing(make_policy(f"vla-eval:ws://127.0.0.1:{port}", NAMED)) as other,
+        ):
+            alone = np.concatenate(small.play(one, 0, [1] * 4))
+            small.play(one, 0, [1] * 2)
+            small.play(other, 0, [1])  # empties the queue, and takes its next action
+            third = one.act(small.observation(2), "pick the cube")
+        assert np.array_equal(third[0], alone[2]) is own_queues
