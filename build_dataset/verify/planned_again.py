@@ -80,7 +80,7 @@ def buffer_violations(
 def question_violations(buffer_set: BufferSet, *, decode: bool) -> Iterator[Violation]:
     """Plan all questions again, draw their pictures, and compare them with the stored ones."""
     stored = read_questions(buffer_set)
-    drawn = decode and find_spec("PIL") is not None
+    drawn = decode and can_draw()
     for question, marks in planned_questions(buffer_set):
         where = f"{QUESTIONS_PATH} {question.episode_id}"
         kept = stored.pop(question.episode_id)
@@ -98,10 +98,15 @@ def question_violations(buffer_set: BufferSet, *, decode: bool) -> Iterator[Viol
     )
 
 
-def _is_picture(stored: NDArray[np.uint8], query: Query, marks: Marks) -> bool:
-    from robomme_interference_data.build_dataset.question_pictures import is_picture
+def can_draw() -> bool:
+    """Return whether the pictures of questions can be drawn here: Pillow is optional."""
+    return find_spec("PIL") is not None
 
-    return is_picture(stored, query.frame(), marks)
+
+def _is_picture(stored: NDArray[np.uint8], query: Query, marks: Marks) -> bool:
+    from robomme_interference_data.build_dataset.question_pictures import picture
+
+    return np.array_equal(stored, picture(query.frame(), marks))
 
 
 def _difference(stored: Any, expected: Any) -> str:

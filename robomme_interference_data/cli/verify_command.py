@@ -104,6 +104,7 @@ def _verify_buffer_set(buffer_set: str, *, decode: bool, audit: bool, as_json: b
         verify_buffer_set,
         verify_datasets,
     )
+    from robomme_interference_data.build_dataset.verify.planned_again import can_draw
     from robomme_interference_data.progress import WorkProgress
 
     opened, incomplete = _open(buffer_set)
@@ -116,11 +117,15 @@ def _verify_buffer_set(buffer_set: str, *, decode: bool, audit: bool, as_json: b
         violations = list(checks)
     report: dict[str, Any] = {"violations": [vars(violation) for violation in violations]}
     skipped = 0
+    undrawn = False
     # A damaged buffer set may have no rows to count or to audit.
     if opened is not None and decode and not violations:
         skipped = undecoded_frames(opened)
+        undrawn = opened.header.questions is not None and not can_draw()
     if skipped:
         report["frames_not_decoded"] = skipped
+    if undrawn:
+        report["pictures_checked"] = False
     if not as_json:
         for violation in violations:
             echo(f"{violation.where}: {violation.what}")
@@ -133,6 +138,9 @@ def _verify_buffer_set(buffer_set: str, *, decode: bool, audit: bool, as_json: b
         if skipped:
             frames = counted(skipped, "frame")
             print_status(f"Not decoded: {frames}, of which only some cameras were fetched.")
+        if undrawn:
+            extra = 'pip install "robomme-interference-data[retrieval]"'
+            print_status(f"Not checked: the pictures of questions, which need Pillow: {extra}")
     leaks = False
     if opened is not None and audit and not violations:
         leaks = _audit(opened, report, as_json=as_json)
