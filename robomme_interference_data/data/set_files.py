@@ -257,7 +257,9 @@ def _check_is_there(folder: Path) -> None:
     if folder.is_dir():
         return
     others = sorted(
-        path.name for path in folder.parent.glob("[!.]*/") if path.name not in (*DATASETS, MANIFESTS)
+        path.name
+        for path in folder.parent.glob("[!.]*/")
+        if path.name not in (*DATASETS, MANIFESTS)
     )
     # Letters of other alphabets look alike: `ascii` tells them apart.
     found = f"; there is {', '.join(map(ascii, others))}" if others else ""
