@@ -68,7 +68,7 @@ def buffer_violations(
             yield Violation(name, f"is out of order in {MANIFEST_ROWS}")
         for field, value in to_dict(manifest).items():
             if row[field] != value:
-                yield Violation(name, f"{field} is {_difference(row[field], value)}")
+                yield Violation(name, f"{field} is {difference(row[field], value)}")
     yield from (Violation(name, f"should not be in {MANIFEST_ROWS}") for name in stored)
     if header.counts != counts:
         yield Violation(HEADER, f"counts are {header.counts}; expected {counts}")
@@ -85,7 +85,7 @@ def question_violations(buffer_set: BufferSet, *, decode: bool) -> Iterator[Viol
         where = f"{QUESTIONS_PATH} {question.episode_id}"
         kept = stored.pop(question.episode_id)
         if (found := replace(kept, picture=b"")) != question:
-            yield Violation(where, f"is {_difference(to_dict(found), to_dict(question))}")
+            yield Violation(where, f"is {difference(to_dict(found), to_dict(question))}")
             continue
         try:
             shown = decode_image(kept.picture)
@@ -109,8 +109,8 @@ def _is_picture(stored: NDArray[np.uint8], query: Query, marks: Marks) -> bool:
     return np.array_equal(stored, picture(query.frame(), marks))
 
 
-def _difference(stored: Any, expected: Any) -> str:
-    """Return two different values, shortened to where they differ."""
+def difference(stored: Any, expected: Any, gives: str = "the rules give") -> str:
+    """Return two different values, shortened to where they differ; `gives` is before the second."""
     position = ""
     while isinstance(stored, list) and isinstance(expected, list) and len(stored) == len(expected):
         index = next(i for i, value in enumerate(stored) if value != expected[i])
@@ -118,4 +118,4 @@ def _difference(stored: Any, expected: Any) -> str:
     if isinstance(stored, dict) and isinstance(expected, dict):
         keys = [key for key in expected if stored.get(key) != expected[key]]
         stored, expected = ({key: values.get(key) for key in keys} for values in (stored, expected))
-    return f"{stored!r}{position}; the rules give {expected!r}"
+    return f"{stored!r}{position}; {gives} {expected!r}"

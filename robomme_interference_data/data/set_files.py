@@ -256,11 +256,8 @@ def _check_is_there(folder: Path) -> None:
     """Check that a dataset's folder exists; if not, name the folder that may be meant."""
     if folder.is_dir():
         return
-    others = sorted(
-        path.name
-        for path in folder.parent.glob("[!.]*/")
-        if path.name not in (*DATASETS, MANIFESTS)
-    )
+    known = (*DATASETS, MANIFESTS)
+    others = sorted(path.name for path in folder.parent.glob("[!.]*/") if path.name not in known)
     # Letters of other alphabets look alike: `ascii` tells them apart.
     found = f"; there is {', '.join(map(ascii, others))}" if others else ""
     raise MissingFileError(
