@@ -23,6 +23,7 @@ from robomme_interference_data.data.questions import read_questions
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import datasets_of, in_order
+from robomme_interference_data.schema.manifest import ManifestHeader
 from robomme_interference_data.storage.video.encode import decode_image
 
 from .dataset import HEADER, Violation
@@ -70,10 +71,17 @@ def buffer_violations(
             if row[field] != value:
                 yield Violation(name, f"{field} is {difference(row[field], value)}")
     yield from (Violation(name, f"should not be in {MANIFEST_ROWS}") for name in stored)
+    yield from _header_violations(header, counts)
+
+
+def _header_violations(header: ManifestHeader, counts: Mapping[str, int]) -> Iterator[Violation]:
+    conditions = in_order(header.conditions)
+    names = tuple(condition.name for condition in conditions)
+    if header.conditions != names:
+        yield Violation(HEADER, f"conditions are {header.conditions}; expected {names}")
     if header.counts != counts:
         yield Violation(HEADER, f"counts are {header.counts}; expected {counts}")
-    needed = {*datasets_of(in_order(header.conditions))}
-    if not needed <= header.datasets.keys() <= {*DATASETS}:
+    if not {*datasets_of(conditions)} <= header.datasets.keys() <= {*DATASETS}:
         yield Violation(HEADER, f"datasets are {sorted(header.datasets)}")
 
 

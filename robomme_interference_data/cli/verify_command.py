@@ -1,5 +1,6 @@
 """The command `verify`."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -7,7 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from robomme_interference_data.build_dataset.config import SourceConfig
-from robomme_interference_data.errors import InvalidOptionError, MissingFileError, counted, named
+from robomme_interference_data.errors import (
+    FormatError,
+    HashMismatchError,
+    InvalidOptionError,
+    MissingFileError,
+    counted,
+    named,
+)
 from robomme_interference_data.schema.settings import changed_settings
 
 from .console import echo, print_json, print_status
@@ -15,6 +23,7 @@ from .options import AsJson, with_settings
 
 if TYPE_CHECKING:
     from robomme_interference_data.build_dataset.verify.dataset import Violation
+    from robomme_interference_data.build_dataset.verify.replay import Replay
     from robomme_interference_data.data.buffer_set import BufferSet
     from robomme_interference_data.evaluate.shortcuts import Shortcut
 
@@ -123,16 +132,24 @@ class _PlayedAgain:
     simulator: str
     settings: SourceConfig
 
-    def violations(self, opened: "BufferSet", report: dict[str, Any]) -> "list[Violation]":
-        """Play the episodes; add what was played to the report, and return the violations."""
+    def plan(self, opened: "BufferSet") -> "Replay | None":
+        """Choose the episodes; None if a dataset cannot be opened, which is a violation."""
         from robomme_interference_data.build_dataset.verify.replay import plan_replay
         from robomme_interference_data.ids import parse_numbers
+
+        chosen = self.settings.episodes
+        numbers = None if chosen is None else {*parse_numbers(chosen)}
+        with suppress(FormatError, HashMismatchError, MissingFileError):
+            return plan_replay(opened.datasets, self.simulator, numbers)
+        return None
+
+    def run(self, plan: "Replay", report: dict[str, Any]) -> "list[Violation]":
+        """Play the episodes; add what was played to the report, and return the violations."""
         from robomme_interference_data.progress import WorkProgress
         from robomme_interference_data.runtime.executor import Serial, make_executor
 
         settings = self.settings
-        numbers = None if settings.episodes is None else {*parse_numbers(settings.episodes)}
-        plan = plan_replay(opened.datasets, self.simulator, numbers)
+        # One worker needs no process of its own: there is nothing to write.
         alone = settings.workers == 1 and not settings.on_cluster
         executor = Serial() if alone else make_executor(settings)
         with WorkProgress(unit="episodes") as progress:
@@ -153,14 +170,16 @@ def _verify_buffer_set(
 
     opened, incomplete = _open(buffer_set)
     report: dict[str, Any] = {}
+    # First: what is wrong with the options shows before hours of decoding.
+    plan = played.plan(opened) if played is not None and opened is not None else None
     with WorkProgress() as progress:
         if opened is None:
             checks = verify_datasets(Path(buffer_set), decode=decode, progress=progress)
         else:
             checks = verify_buffer_set(opened, decode=decode, progress=progress)
         violations = list(checks)
-    if opened is not None and played is not None:
-        violations += played.violations(opened, report)
+    if played is not None and plan is not None and not violations:
+        violations += played.run(plan, report)
     report["violations"] = [vars(violation) for violation in violations]
     # A damaged buffer set may have no rows to count or to audit.
     if opened is not None and decode and not violations:
@@ -175,6 +194,8 @@ def _verify_buffer_set(
             else f"All {what} of {buffer_set}{' so far' if opened is None else ''} hold."
         )
         _print_extent(report)
+        if played is not None and "played_again" not in report:
+            print_status("Nothing was played again: correct the violations first.")
     leaks = False
     if opened is not None and audit and not violations:
         leaks = _audit(opened, report, as_json=as_json)
