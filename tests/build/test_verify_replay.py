@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from support import simulator_doubles
 from support.buffer_sets import build, dataset
@@ -21,6 +23,8 @@ from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.simulators.episode import EpisodeStart
 
 LESSONS = {"families": ("MoveCube",), "split": "test", "numbers": (0, 1)}
+RECORDS = "demonstrations/meta/interference.parquet"
+EPISODES = "demonstrations/meta/episodes/chunk-000/file-000.parquet"
 QUERY = "demonstrations MoveCube/test/1"
 
 
@@ -112,6 +116,21 @@ def test_what_cannot_be_played(lessons: Path, tiny_buffers: Path) -> None:
         played(lessons, {7})
     with raises(InvalidOptionError):
         played(tiny_buffers)
+
+
+@pytest.mark.slow
+def test_evidence_that_was_moved_in_a_lesson_of_tabletop(tmp_path: Path) -> None:
+    build(tmp_path, "demonstrations", open_source("tabletop"), **LESSONS | {"numbers": (0,)})
+    assert played(tmp_path) == ([], [])
+    for path in (RECORDS, EPISODES):
+        table = pq.read_table(tmp_path / path)
+        place, evidence = table.column_names.index("evidence"), table["evidence"].to_pylist()
+        start = evidence[0][0]["start"]
+        evidence[0][0]["start"] = start + 1
+        moved = pa.array(evidence, table.schema.field("evidence").type)
+        pq.write_table(table.set_column(place, "evidence", moved), tmp_path / path)
+    [found], _ = played(tmp_path)
+    assert f"evidence is {{'start': {start + 1}}} at 0; played again it is" in found
 
 
 @pytest.mark.slow
