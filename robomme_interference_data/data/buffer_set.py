@@ -110,7 +110,7 @@ class BufferSet:
 
     @property
     def rows_path(self) -> Path:
-        """File of the rows that the header names: after an interrupted build not `buffers.parquet`."""
+        """File of the rows that the header names, also after an interrupted build."""
         return self._table.path
 
     @property
