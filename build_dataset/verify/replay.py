@@ -7,16 +7,18 @@ goals and frames were ever right.
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.build_dataset.config import BuildConfig
 from robomme_interference_data.build_dataset.dataset.frame_selection import (
     NothingToStore,
     select_frames,
 )
-from robomme_interference_data.build_dataset.plan.datasets import open_sources
-from robomme_interference_data.build_dataset.sources import Recording, Source, SourceEpisode
+from robomme_interference_data.build_dataset.sources import (
+    Recording,
+    Source,
+    SourceEpisode,
+    open_source,
+)
 from robomme_interference_data.constants import (
     ACTION,
     CAMERA_PREFIX,
@@ -24,6 +26,7 @@ from robomme_interference_data.constants import (
     IDENTITY_PATH,
     LESSONS,
     PAPER_UNIT,
+    SHIFTED,
     STATE,
     UNITS,
     Unit,
@@ -42,6 +45,7 @@ from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Executor, Worker
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.records import EpisodeRecord, EvidenceSpan
+from robomme_interference_data.simulators.registry import simulator_class
 from robomme_interference_data.storage.arrays import FeatureDigests, combine
 
 from .dataset import Violation
@@ -156,13 +160,15 @@ def plan_replay(
         UnknownNameError: There is no such simulator.
         InvalidOptionError: It recorded no dataset, or none of the episodes.
     """
+    simulator_class(simulator)  # before anything else: it must be one
     played, violations = dict[str, PlayedDataset](), list[Violation]()
     kinds = {name: _kinds(dataset) for name, dataset in datasets.items()}
     recorded = {name: datasets[name] for name, found in kinds.items() if found == {simulator}}
-    config = BuildConfig(Path(), source=(simulator,))
     for name, dataset in recorded.items():
         unit = datasets[DISTRACTORS].unit if name in UNITS else PAPER_UNIT
-        [source] = open_sources(name, config, unit)
+        # As in a build: only the frames that a unit stores are drawn, if the first one is frame 0.
+        every = unit.in_dataset(name).stride if name in UNITS and unit.per_episode == 1 else 1
+        source = open_source(simulator, shifted=name == SHIFTED, every=every)
         stored = [*dataset.identity.sources]
         version = source.provenance.get("suite_version")
         if any(entry.get("suite_version") != version for entry in stored):
