@@ -16,33 +16,17 @@ _OVER = 14  # pixels of the view: a letter over its thing
 _APART = 40  # pixels: letters over the same thing
 _TILE, _MARGIN = 480, 16  # pixels: a drawing at most; of the view, round all paths
 _INK, _PAPER, _PATH = "black", "white", "#ffe800"
-_BOX = "#ff00fe"  # a color that nothing else has
 
 Spot = tuple[float, float]
 
 
-def is_picture(
-    stored: NDArray[np.uint8], view: NDArray[np.uint8], marks: Sequence[Sequence[Pixel]]
-) -> bool:
-    """Whether a stored picture shows these options on this view.
-
-    Pixels around letters and numbers are left out: versions of Pillow draw them a little
-    differently.
-    """
-    made, boxes = picture(view, marks), picture(view, marks, text=False)
-    compared = (made == boxes).all(axis=-1)
-    return stored.shape == made.shape and np.array_equal(stored[compared], made[compared])
-
-
-def picture(
-    view: NDArray[np.uint8], marks: Sequence[Sequence[Pixel]], *, text: bool = True
-) -> NDArray[np.uint8]:
+def picture(view: NDArray[np.uint8], marks: Sequence[Sequence[Pixel]]) -> NDArray[np.uint8]:
     """Return an enlarged first live view with options marked and lettered, `(H, W, 3) uint8`.
 
     An option of one point has its letter over it, beside those of other options of this point.
-    Options of several points are paths: each gets
-    its own drawing. Without points, the picture is the view. Without `text`, letters and numbers
-    are boxes.
+    Options of several points are paths: each gets its own drawing. Without points, the picture is
+    the view. The same view and marks give the same pixels on every machine, so that `verify` can
+    compare them: Pillow draws text alike from 11.2 on.
     """
     if not all(marks):
         return _enlarged(view, 2)
@@ -57,12 +41,12 @@ def picture(
             draw.line((_LARGER * x, above, _LARGER * x, _LARGER * y), fill=_INK, width=3)
             for place, letter in enumerate(together):
                 aside = _APART * (2 * place - len(together) + 1) // 2
-                _letter(draw, letter, (_LARGER * x + aside, above), text=text)
+                _letter(draw, letter, (_LARGER * x + aside, above))
         return np.asarray(image)
     top, left, side = _window(view, [point for path in marks for point in path])
     part = _enlarged(view[top : top + side, left : left + side], times := _TILE // side)
     tiles = [
-        _tile(part, letter, [(times * (x - left), times * (y - top)) for y, x in path], text=text)
+        _tile(part, letter, [(times * (x - left), times * (y - top)) for y, x in path])
         for letter, path in zip(LETTERS, marks, strict=False)
     ]
     tiles += [np.full_like(tiles[0], 255)] * (len(tiles) % 2)
@@ -81,9 +65,7 @@ def _window(view: NDArray[np.uint8], points: Sequence[Pixel]) -> tuple[int, int,
     return top, left, side
 
 
-def _tile(
-    part: NDArray[np.uint8], letter: str, path: Sequence[Spot], *, text: bool
-) -> NDArray[np.uint8]:
+def _tile(part: NDArray[np.uint8], letter: str, path: Sequence[Spot]) -> NDArray[np.uint8]:
     """Return a view with a path on it: a dot where it begins, an arrow where it ends.
 
     The points of a longer one are numbered, as it may come back to some.
@@ -99,8 +81,8 @@ def _tile(
     for number, point in enumerate(path, 1):
         numbers.setdefault(point, []).append(str(number))
     for (x, y), labels in numbers.items() if len(path) > 2 else ():
-        _text(draw, ",".join(labels), (x, y - 22), text=text)
-    _letter(draw, letter, (30, 30), text=text)
+        _text(draw, ",".join(labels), (x, y - 22))
+    _letter(draw, letter, (30, 30))
     draw.rectangle((0, 0, image.width - 1, image.height - 1), outline=_PAPER, width=2)
     return np.asarray(image)
 
@@ -116,26 +98,15 @@ def _arrow(draw: Any, points: Sequence[Spot], color: str, wide: int) -> None:
     draw.polygon(corners, fill=color)
 
 
-def _letter(draw: Any, letter: str, at: Spot, *, text: bool) -> None:
+def _letter(draw: Any, letter: str, at: Spot) -> None:
     x, y = at
     draw.ellipse((x - 19, y - 19, x + 19, y + 19), fill=_PAPER, outline=_INK, width=3)
-    if text:
-        draw.text(at, letter, fill=_INK, font=ImageFont.load_default(27), anchor="mm")
-    else:
-        _box(draw, at, 19)
+    draw.text(at, letter, fill=_INK, font=ImageFont.load_default(27), anchor="mm")
 
 
-def _text(draw: Any, words: str, at: Spot, *, text: bool) -> None:
-    if text:
-        font = ImageFont.load_default(19)
-        draw.text(at, words, fill=_PAPER, font=font, anchor="mm", stroke_width=2, stroke_fill=_INK)
-    else:
-        _box(draw, at, 8 * len(words) + 8)
-
-
-def _box(draw: Any, at: Spot, half: float) -> None:
-    x, y = at
-    draw.rectangle((x - half, y - 19, x + half, y + 19), fill=_BOX)
+def _text(draw: Any, words: str, at: Spot) -> None:
+    font = ImageFont.load_default(19)
+    draw.text(at, words, fill=_PAPER, font=font, anchor="mm", stroke_width=2, stroke_fill=_INK)
 
 
 def _enlarged(view: NDArray[np.uint8], times: int) -> NDArray[np.uint8]:

@@ -83,7 +83,7 @@ class BufferSetContent:
             dataset = buffer_set.datasets[name]
             files |= {folder + path: file for path, file in dataset_files(dataset).items()}
         rows_path = f"{MANIFESTS}/{MANIFEST_ROWS}"
-        files[rows_path] = LocalFile(buffer_set.files.path(rows_path))
+        files[rows_path] = LocalFile(buffer_set.rows_path)
         with suppress(MissingFileError):
             questions = buffer_set.files.path(QUESTIONS_PATH)
             if questions.is_file():

@@ -65,6 +65,10 @@ def verify_buffer_set(
         except InterferenceError as error:
             yield Violation(name, error.message)
             continue
+        if copy is None and header.datasets[name].location is not None and folder == root / name:
+            # The folder is read; whoever publishes the manifests would send readers elsewhere.
+            elsewhere = f"location of the {name} is {header.datasets[name].location}; the folder "
+            yield Violation(HEADER, f"{elsewhere}{name} is here: expected none")
         if not folder.is_relative_to(root):  # in a repository of its own
             for path in further_files(folder, ()):
                 yield Violation(f"{name}/{path}", "is not part of the dataset")

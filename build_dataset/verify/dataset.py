@@ -18,6 +18,7 @@ from robomme_interference_data.build_dataset.dataset.identity import (
 from robomme_interference_data.constants import (
     DISTRACTORS,
     EXECUTIONS,
+    FETCH_RECORD,
     IDENTITY_PATH,
     INDEX_DIR,
     INDEX_HEADER,
@@ -133,6 +134,9 @@ def _files(name: str, dataset: Dataset, copy: FetchedCopy | None) -> Iterator[Vi
     for path in sorted(sums.keys() | existing):
         if path not in existing and copy is not None and not copy.lists(root, path):
             continue  # not fetched
+        if path in existing and copy is not None and not copy.lists(root, path):
+            # Loading goes by the record: it refuses the buffers of such a file.
+            yield Violation(f"{name}/{path}", f"{UNLISTED} in {FETCH_RECORD}")
         if path not in sums:
             yield Violation(f"{name}/{path}", UNLISTED)
         elif problem := _file_problem(root, path):

@@ -134,6 +134,11 @@ def _rows(dataset: Dataset, index: int, first: int, task: int | None) -> Iterato
     path = dataset.lerobot.locate(index).data
     vectors = {name for name in _stored(dataset) if not name.startswith(CAMERA_PREFIX)}
     yield from _names(path, rows.names, vectors | {*FRAME_COLUMNS})
+    for name in sorted(vectors & {*rows.names}):
+        kind = rows.table([name])[name].type
+        values = kind.value_type if pa.types.is_nested(kind) else kind  # one value is no list
+        if values != pa.float32():
+            yield path, f"{name} of episode {index} is of type {values}; expected float"
     count = len(rows)
     if not np.array_equal(rows.scalars("index"), first + np.arange(count)):
         yield path, f"index of episode {index} is not {first} to {first + count - 1}"

@@ -23,6 +23,7 @@ from robomme_interference_data.data.questions import read_questions
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import datasets_of, in_order
+from robomme_interference_data.schema.manifest import ManifestHeader
 from robomme_interference_data.storage.video.encode import decode_image
 
 from .dataset import HEADER, Violation
@@ -68,24 +69,31 @@ def buffer_violations(
             yield Violation(name, f"is out of order in {MANIFEST_ROWS}")
         for field, value in to_dict(manifest).items():
             if row[field] != value:
-                yield Violation(name, f"{field} is {_difference(row[field], value)}")
+                yield Violation(name, f"{field} is {difference(row[field], value)}")
     yield from (Violation(name, f"should not be in {MANIFEST_ROWS}") for name in stored)
+    yield from _header_violations(header, counts)
+
+
+def _header_violations(header: ManifestHeader, counts: Mapping[str, int]) -> Iterator[Violation]:
+    conditions = in_order(header.conditions)
+    names = tuple(condition.name for condition in conditions)
+    if header.conditions != names:
+        yield Violation(HEADER, f"conditions are {header.conditions}; expected {names}")
     if header.counts != counts:
         yield Violation(HEADER, f"counts are {header.counts}; expected {counts}")
-    needed = {*datasets_of(in_order(header.conditions))}
-    if not needed <= header.datasets.keys() <= {*DATASETS}:
+    if not {*datasets_of(conditions)} <= header.datasets.keys() <= {*DATASETS}:
         yield Violation(HEADER, f"datasets are {sorted(header.datasets)}")
 
 
 def question_violations(buffer_set: BufferSet, *, decode: bool) -> Iterator[Violation]:
     """Plan all questions again, draw their pictures, and compare them with the stored ones."""
     stored = read_questions(buffer_set)
-    drawn = decode and find_spec("PIL") is not None
+    drawn = decode and can_draw()
     for question, marks in planned_questions(buffer_set):
         where = f"{QUESTIONS_PATH} {question.episode_id}"
         kept = stored.pop(question.episode_id)
         if (found := replace(kept, picture=b"")) != question:
-            yield Violation(where, f"is {_difference(to_dict(found), to_dict(question))}")
+            yield Violation(where, f"is {difference(to_dict(found), to_dict(question))}")
             continue
         try:
             shown = decode_image(kept.picture)
@@ -98,14 +106,19 @@ def question_violations(buffer_set: BufferSet, *, decode: bool) -> Iterator[Viol
     )
 
 
+def can_draw() -> bool:
+    """Return whether the pictures of questions can be drawn here: Pillow is optional."""
+    return find_spec("PIL") is not None
+
+
 def _is_picture(stored: NDArray[np.uint8], query: Query, marks: Marks) -> bool:
-    from robomme_interference_data.build_dataset.question_pictures import is_picture
+    from robomme_interference_data.build_dataset.question_pictures import picture
 
-    return is_picture(stored, query.frame(), marks)
+    return np.array_equal(stored, picture(query.frame(), marks))
 
 
-def _difference(stored: Any, expected: Any) -> str:
-    """Return two different values, shortened to where they differ."""
+def difference(stored: Any, expected: Any, gives: str = "the rules give") -> str:
+    """Return two different values, shortened to where they differ; `gives` is before the second."""
     position = ""
     while isinstance(stored, list) and isinstance(expected, list) and len(stored) == len(expected):
         index = next(i for i, value in enumerate(stored) if value != expected[i])
@@ -113,4 +126,4 @@ def _difference(stored: Any, expected: Any) -> str:
     if isinstance(stored, dict) and isinstance(expected, dict):
         keys = [key for key in expected if stored.get(key) != expected[key]]
         stored, expected = ({key: values.get(key) for key in keys} for values in (stored, expected))
-    return f"{stored!r}{position}; the rules give {expected!r}"
+    return f"{stored!r}{position}; {gives} {expected!r}"

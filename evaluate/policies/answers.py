@@ -27,6 +27,7 @@ from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout, is_done
 from robomme_interference_data.schema.codec import arrow_schema, from_table
 from robomme_interference_data.simulators.episode import Observation
+from robomme_interference_data.storage.csv_text import unquoted_table
 from robomme_interference_data.storage.files import sha256_file
 from robomme_interference_data.storage.text import read_text
 
@@ -154,7 +155,7 @@ def _read_csv(path: Path) -> dict[WorkItem, Rollout]:
         raise FormatError(f"{path}: {first_line(error)}", _ASK) from None
     if len({*table.column_names}) < len(table.column_names):
         raise FormatError.damaged(path, "a column occurs twice")
-    rows = [*from_table(Rollout, table, path)]
+    rows = [*from_table(Rollout, unquoted_table(table), path)]
     by_item = {WorkItem.of(row): row for row in rows}
     if len(by_item) < len(rows):
         raise FormatError.damaged(path, "a question has two answers")

@@ -20,6 +20,7 @@ from robomme_interference_data.constants import FORMAT_VERSION, RUN_HEADER, RUN_
 from robomme_interference_data.errors import RunError, named, visible
 from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
 from robomme_interference_data.schema.rollouts import FINAL, Status
+from robomme_interference_data.storage.csv_text import quoted_table
 from robomme_interference_data.storage.files import atomic_path, write_json
 from robomme_interference_data.storage.parquet import writing
 from robomme_interference_data.storage.staging import file_lock
@@ -84,7 +85,7 @@ class RunLog:
         with writing(parquet) as file:
             pq.write_table(table, file, compression="zstd")
         with writing(text) as file:
-            pa_csv.write_csv(table, file)
+            pa_csv.write_csv(quoted_table(table), file)
         self._write_header(with_counts(header, self.rows))
 
     def _write_header(self, header: RunHeader) -> None:

@@ -1,21 +1,35 @@
 """The command `verify`."""
 
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from robomme_interference_data.build_dataset.config import SourceConfig
-from robomme_interference_data.errors import InvalidOptionError, MissingFileError, counted, named
+from robomme_interference_data.errors import (
+    FormatError,
+    HashMismatchError,
+    InvalidOptionError,
+    MissingFileError,
+    counted,
+    named,
+)
 from robomme_interference_data.schema.settings import changed_settings
 
 from .console import echo, print_json, print_status
 from .options import AsJson, with_settings
 
 if TYPE_CHECKING:
+    from robomme_interference_data.build_dataset.verify.dataset import Violation
+    from robomme_interference_data.build_dataset.verify.replay import Replay
     from robomme_interference_data.data.buffer_set import BufferSet
     from robomme_interference_data.evaluate.shortcuts import Shortcut
 
+
+_OF_REPLAY = ("episodes", "workers", "executor", "resources")
+"""Settings of sources that --replay uses too."""
 
 _FOR_SOURCES = "my-buffers"
 """The folder in the command that builds verified sources, if none is given."""
@@ -45,6 +59,15 @@ def verify(
             "answer.",
         ),
     ] = False,
+    replay: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SIMULATOR",
+            help="Also play the episodes again on the simulator that recorded them, and compare "
+            "evidence, goals, states and images; --episodes chooses some.",
+            show_default=False,
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Recompute every hash and rule of a buffer set and list the violations; fails if there is one.
@@ -59,20 +82,22 @@ def verify(
     ```
     robomme-interference verify my-buffers
     robomme-interference verify my-buffers --audit --no-decode
+    robomme-interference verify my-buffers --replay tabletop --episodes 0-4
     robomme-interference verify --source frames:mine
     ```
     """
-    if _of_sources(sources, buffer_set, decode=decode, audit=audit):
+    if _of_sources(sources, buffer_set, decode=decode, audit=audit, replay=replay):
         from .verify_source import verify_sources
 
         verify_sources(sources, Path(buffer_set or _FOR_SOURCES), as_json=as_json)
     else:
         assert buffer_set is not None
-        _verify_buffer_set(buffer_set, decode=decode, audit=audit, as_json=as_json)
+        played = None if replay is None else _PlayedAgain(replay, sources)
+        _verify_buffer_set(buffer_set, played, decode=decode, audit=audit, as_json=as_json)
 
 
 def _of_sources(
-    sources: SourceConfig, buffer_set: str | None, *, decode: bool, audit: bool
+    sources: SourceConfig, buffer_set: str | None, *, decode: bool, audit: bool, replay: str | None
 ) -> bool:
     """Return whether sources are verified, not a buffer set.
 
@@ -80,15 +105,17 @@ def _of_sources(
         InvalidOptionError: Neither is given, or options without effect.
     """
     if sources.source:
-        if audit or not decode:
+        given = {"--audit": audit, "--replay": replay is not None, "--no-decode": not decode}
+        if without_effect := [option for option, is_given in given.items() if is_given]:
             raise InvalidOptionError(
-                f"{'--audit' if audit else '--no-decode'} has no effect on {named('source')}",
+                f"{without_effect[0]} has no effect on {named('source')}",
                 "Leave it out: all frames of a source are read.",
             )
         return True
-    if given := changed_settings(sources):
+    of_replay = _OF_REPLAY if replay is not None else ()
+    if changed := changed_settings(sources, of_replay):
         raise InvalidOptionError(
-            f"{named(given[0])} has no effect without {named('source')}",
+            f"{named(changed[0])} has no effect without {named('source')}",
             f"Leave it out, or add {named('source')}.",
         )
     if buffer_set is None:
@@ -99,29 +126,65 @@ def _of_sources(
     return False
 
 
-def _verify_buffer_set(buffer_set: str, *, decode: bool, audit: bool, as_json: bool) -> None:
+@dataclass(frozen=True)
+class _PlayedAgain:
+    """The simulator that plays episodes again, and the settings that choose and run them."""
+
+    simulator: str
+    settings: SourceConfig
+
+    def plan(self, opened: "BufferSet") -> "Replay | None":
+        """Choose the episodes; None if a dataset cannot be opened, which is a violation."""
+        from robomme_interference_data.build_dataset.verify.replay import plan_replay
+        from robomme_interference_data.ids import parse_numbers
+
+        chosen = self.settings.episodes
+        numbers = None if chosen is None else {*parse_numbers(chosen)}
+        with suppress(FormatError, HashMismatchError, MissingFileError):
+            return plan_replay(opened.datasets, self.simulator, numbers)
+        return None
+
+    def run(self, plan: "Replay", report: dict[str, Any]) -> "list[Violation]":
+        """Play the episodes; add what was played to the report, and return the violations."""
+        from robomme_interference_data.progress import WorkProgress
+        from robomme_interference_data.runtime.executor import Serial, make_executor
+
+        settings = self.settings
+        # One worker needs no process of its own: there is nothing to write.
+        alone = settings.workers == 1 and not settings.on_cluster
+        executor = Serial() if alone else make_executor(settings)
+        with WorkProgress(unit="episodes") as progress:
+            found = [*plan.run(executor, progress)]
+        report["played_again"] = len(plan.episodes)
+        report["images_not_compared"] = plan.without_frames
+        return found
+
+
+def _verify_buffer_set(
+    buffer_set: str, played: _PlayedAgain | None, *, decode: bool, audit: bool, as_json: bool
+) -> None:
     from robomme_interference_data.build_dataset.verify.buffer_set import (
-        undecoded_frames,
         verify_buffer_set,
         verify_datasets,
     )
     from robomme_interference_data.progress import WorkProgress
 
     opened, incomplete = _open(buffer_set)
-    progress = WorkProgress()
-    if opened is None:
-        checks = verify_datasets(Path(buffer_set), decode=decode, progress=progress)
-    else:
-        checks = verify_buffer_set(opened, decode=decode, progress=progress)
-    with progress:
+    report: dict[str, Any] = {}
+    # First: what is wrong with the options shows before hours of decoding.
+    plan = played.plan(opened) if played is not None and opened is not None else None
+    with WorkProgress() as progress:
+        if opened is None:
+            checks = verify_datasets(Path(buffer_set), decode=decode, progress=progress)
+        else:
+            checks = verify_buffer_set(opened, decode=decode, progress=progress)
         violations = list(checks)
-    report: dict[str, Any] = {"violations": [vars(violation) for violation in violations]}
-    skipped = 0
+    if played is not None and plan is not None and not violations:
+        violations += played.run(plan, report)
+    report["violations"] = [vars(violation) for violation in violations]
     # A damaged buffer set may have no rows to count or to audit.
     if opened is not None and decode and not violations:
-        skipped = undecoded_frames(opened)
-    if skipped:
-        report["frames_not_decoded"] = skipped
+        report |= _unchecked(opened)
     if not as_json:
         for violation in violations:
             echo(f"{violation.where}: {violation.what}")
@@ -131,9 +194,9 @@ def _verify_buffer_set(buffer_set: str, *, decode: bool, audit: bool, as_json: b
             if violations
             else f"All {what} of {buffer_set}{' so far' if opened is None else ''} hold."
         )
-        if skipped:
-            frames = counted(skipped, "frame")
-            print_status(f"Not decoded: {frames}, of which only some cameras were fetched.")
+        _print_extent(report)
+        if played is not None and "played_again" not in report:
+            print_status("Nothing was played again: correct the violations first.")
     leaks = False
     if opened is not None and audit and not violations:
         leaks = _audit(opened, report, as_json=as_json)
@@ -143,6 +206,36 @@ def _verify_buffer_set(buffer_set: str, *, decode: bool, audit: bool, as_json: b
         raise incomplete
     if violations or leaks:
         raise typer.Exit(1)
+
+
+def _unchecked(opened: "BufferSet") -> dict[str, Any]:
+    """Return what could not be checked, for the report."""
+    from robomme_interference_data.build_dataset.verify.buffer_set import undecoded_frames
+    from robomme_interference_data.build_dataset.verify.planned_again import can_draw
+
+    unchecked: dict[str, Any] = {}
+    if skipped := undecoded_frames(opened):
+        unchecked["frames_not_decoded"] = skipped
+    if opened.header.questions is not None and not can_draw():
+        unchecked["pictures_checked"] = False
+    return unchecked
+
+
+def _print_extent(report: dict[str, Any]) -> None:
+    """Print what was played again, and what could not be checked."""
+    if "played_again" in report:
+        print_status(f"Played again: {counted(report['played_again'], 'episode')}.")
+    if names := report.get("images_not_compared"):
+        print_status(
+            f"Images not compared: {', '.join(names)} were recorded with other versions or another "
+            "renderer than those here, or stored with loss."
+        )
+    if skipped := report.get("frames_not_decoded"):
+        frames = counted(skipped, "frame")
+        print_status(f"Not decoded: {frames}, of which only some cameras were fetched.")
+    if "pictures_checked" in report:
+        extra = 'pip install "robomme-interference-data[retrieval]"'
+        print_status(f"Not checked: the pictures of questions, which need Pillow: {extra}")
 
 
 def _open(buffer_set: str) -> "tuple[BufferSet | None, MissingFileError | None]":

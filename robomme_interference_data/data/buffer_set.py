@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -106,6 +107,11 @@ class BufferSet:
     def planned_buffers(self) -> int:
         """Number of buffers, including those that a partial copy lacks."""
         return len(self._table)
+
+    @property
+    def rows_path(self) -> Path:
+        """File of the rows that the header names, also after an interrupted build."""
+        return self._table.path
 
     @property
     def name(self) -> str:

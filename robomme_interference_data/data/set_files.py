@@ -12,6 +12,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import (
+    DATASETS,
     MANIFEST_HEADER,
     MANIFEST_ROWS,
     MANIFESTS,
@@ -227,8 +228,10 @@ class SetDatasets(Mapping[str, Dataset]):
 
     def __getitem__(self, name: str) -> Dataset:
         if name not in self._opened:
-            recorded = self._header.datasets[name]
-            dataset = Dataset(self._files_of(name))
+            recorded, files = self._header.datasets[name], self._files_of(name)
+            if isinstance(files, LocalFiles):
+                _check_is_there(files.root)
+            dataset = Dataset(files)
             if dataset.revision != recorded.revision:
                 raise HashMismatchError(
                     f"{dataset.files.describe()} has revision {dataset.revision[:12]}…; the "
@@ -247,3 +250,17 @@ class SetDatasets(Mapping[str, Dataset]):
 
     def __len__(self) -> int:
         return len(self._names)
+
+
+def _check_is_there(folder: Path) -> None:
+    """Check that a dataset's folder exists; if not, name the folder that may be meant."""
+    if folder.is_dir():
+        return
+    known = (*DATASETS, MANIFESTS)
+    others = sorted(path.name for path in folder.parent.glob("[!.]*/") if path.name not in known)
+    # Letters of other alphabets look alike: `ascii` tells them apart.
+    found = f"; there is {', '.join(map(ascii, others))}" if others else ""
+    raise MissingFileError(
+        f"the folder {folder} is missing{found}",
+        f"Restore the folder {folder.name!r}, or build the {folder.name} again.",
+    )

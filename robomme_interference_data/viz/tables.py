@@ -12,6 +12,7 @@ from typing import Any, Literal
 import pyarrow as pa
 
 from robomme_interference_data.schema.codec import arrow_schema
+from robomme_interference_data.storage.csv_text import quoted
 
 Format = Literal["text", "count", "rate", "points", "ratio", "number", "p", "flag"]
 """How the values of a column are shown. `rate` and `points` are fractions: CSV has six decimals of
@@ -53,13 +54,13 @@ class Table:
         return [dict(zip(self.columns, map(_known, row), strict=True)) for row in self.rows]
 
     def csv(self) -> str:
-        """Return the table as CSV."""
+        """Return the table as CSV, without text that a spreadsheet would run as a formula."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(self.columns)
         for row in self.rows:
             pairs = zip(row, self.columns.values(), strict=True)
-            writer.writerow([_plain(value, format_) for value, format_ in pairs])
+            writer.writerow([_cell(value, format_) for value, format_ in pairs])
         return out.getvalue()
 
     def _layout(self, left: str, right: str) -> tuple[list[str], list[str], list[list[str]]]:
@@ -195,6 +196,11 @@ def _plain(value: Any, format_: Format) -> str:
         text = f"{value:.6f}"
         return "0.000000" if text == "-0.000000" else text
     return f"{value:.6g}" if format_ == "p" else str(value)
+
+
+def _cell(value: Any, format_: Format) -> str:
+    text = _plain(value, format_)
+    return quoted(text) if isinstance(value, str) else text
 
 
 def _shown(value: Any, format_: Format) -> str:

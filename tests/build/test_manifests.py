@@ -24,6 +24,7 @@ from robomme_interference_data.errors import (
     MissingFileError,
     SourceError,
 )
+from robomme_interference_data.storage.files import sha256_file
 
 FAMILIES = ("MoveCube", "InsertPeg", "PatternLock", "Drawer")
 
@@ -188,6 +189,7 @@ def test_an_interrupted_build_leaves_the_old_manifests_or_the_new_ones(
     )
     assert buffer_set.load(QUERIES[0], "k0", verify=True).frames().any()
     assert list(verify_buffer_set(buffer_set, decode=False)) == []
+    assert sha256_file(buffer_set.rows_path) == buffer_set.header.rows  # what `publish` sends
     list(write_manifests(plan, root))
     assert sorted(contents(root / "manifests")) == ["buffers.parquet", "manifest.json"]
     assert len(load_buffer_set(root)) == len(QUERIES)

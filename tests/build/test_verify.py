@@ -143,6 +143,15 @@ def test_what_is_no_file_or_no_folder(own_buffers: Path) -> None:
     expect(own_buffers, f"{DATA}: is in data, a link; expected a folder")
 
 
+def test_a_folder_that_is_named_with_a_letter_that_looks_alike(own_buffers: Path) -> None:
+    (own_buffers / "distractors").rename(own_buffers / "distr\u0430ctors")
+    with pytest.raises(MissingFileError) as error:
+        load_buffer_set(own_buffers).check_tables(["k1"])
+    assert "distractors is missing" in error.value.message
+    assert r"distr\u0430ctors" in error.value.message
+    expect(own_buffers, "distractors: .*missing")
+
+
 def test_a_dataset_that_is_gone(own_buffers: Path) -> None:
     shutil.rmtree(own_buffers / "distractors")
     expect(own_buffers, "distractors: .*missing")

@@ -19,6 +19,7 @@ from support.retrieval import make_index
 from support.verifying import DATA, EPISODES, FRONT, RECORDS, VIDEO, expect, first_changed
 
 from robomme_interference_data import load_buffer_set
+from robomme_interference_data.constants import STATE
 from robomme_interference_data.data.dataset import Dataset, revision_of
 from robomme_interference_data.errors import FormatError, HashMismatchError, InterferenceError
 from robomme_interference_data.storage.files import LocalFiles
@@ -32,6 +33,11 @@ def as_text(name: str) -> Callable[[pa.Table], pa.Table]:
         return table.set_column(place, name, pa.array(list(map(str, values))))
 
     return change
+
+
+def doubled(table: pa.Table) -> pa.Table:
+    place, states = table.column_names.index(STATE), table[STATE].to_pylist()
+    return table.set_column(place, STATE, pa.array(states, pa.list_(pa.float64())))
 
 
 def first(name: str, value: Any) -> Callable[[Path], None]:
@@ -73,6 +79,7 @@ INFO, STATS, REPORT, IDENTITY = (
         (DATA, first("timestamp", 0.05), "timestamp of episode 3"),
         (DATA, table(as_text("timestamp")), "timestamp of episode 3 is of type string"),
         (DATA, first("task_index", 0), "task_index of episode 3"),
+        (DATA, table(doubled), "state of episode 3 is of type double; expected float"),
         (DATA, first("frame_index", 1), "frame_index"),
         (RECORDS, first("dataset_from_index", 7), "dataset_from_index"),
         (RECORDS, first(f"{FRONT}/to_timestamp", 1.0), "to_timestamp"),
@@ -104,6 +111,7 @@ INFO, STATS, REPORT, IDENTITY = (
         (HEADER, fields(seed=1), "the rules give"),
         (HEADER, fields(rule_version=2), "rule version 2; this package can check 1"),
         (HEADER, fields(counts={}), "counts are {}"),
+        (HEADER, fields(conditions=["k7", "k3", "k1", "k0", "no-history"]), "conditions are"),
         (HEADER, fields(conditions=["k0"]), "should not be in"),
         (HEADER, fields(position_limit=1400), "under k3 needs 1444 positions"),
     ],
@@ -221,13 +229,14 @@ def test_a_codec_that_the_videos_do_not_have(own_buffers: Path) -> None:
     expect(own_buffers, "distractors .*: has videos in gbrp, not lerobot-default", decode=True)
 
 
-def test_where_a_dataset_is_downloaded_from_is_no_content(own_buffers: Path) -> None:
-    """A folder takes precedence, and what is downloaded must have the revision."""
+def test_a_location_beside_the_folder(own_buffers: Path) -> None:
+    """It is no content, but would send the readers of the published manifests to another place."""
     revision, header = load_buffer_set(own_buffers).revision, own_buffers / HEADER
     changed = json.loads(header.read_text())
     changed["datasets"]["distractors"]["location"] = "someone/else@" + "0" * 40
     header.write_text(json.dumps(changed))
-    assert violations(own_buffers, decode=False) == []
+    [found] = violations(own_buffers, decode=False)
+    assert "someone/else" in found
     assert load_buffer_set(own_buffers).revision == revision
 
 

@@ -188,6 +188,18 @@ def test_a_part_is_verified(part: Path) -> None:
     ]
 
 
+def test_a_file_that_the_record_does_not_list_is_a_violation(part: Path) -> None:
+    """Its buffers cannot be loaded, though all files are right."""
+    path = part / RECORD
+    record = json.loads(path.read_text())
+    video = next(name for name in record["files"] if name.endswith(".mp4"))
+    path.write_text(json.dumps(record | {"files": [f for f in record["files"] if f != video]}))
+    found = [*verify_buffer_set(load_buffer_set(part), decode=False)]
+    assert [(one.where, one.what) for one in found if "listed in" in one.what] == [
+        (video, "is not listed in manifests/fetched.json")
+    ]
+
+
 def test_a_copy_is_repeated_and_widened(
     published: HubServer, part: Path, run: Run, tmp_path: Path
 ) -> None:

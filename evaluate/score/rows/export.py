@@ -9,6 +9,7 @@ from typing import Any
 from robomme_interference_data.constants import RECORDINGS
 from robomme_interference_data.errors import InvalidOptionError, counted
 from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.storage.csv_text import quoted
 from robomme_interference_data.storage.files import atomic_path
 
 from .reading import CheckedRows
@@ -35,7 +36,8 @@ def export(rows: CheckedRows, folder: Path) -> list[Path]:
     """Write rows in the released layout, a file `<system>-<simulator>_rollouts.csv` each.
 
     The released columns name no system, buffer set or revision; rows of a simulator other than
-    RoboMME get its name as one more column. A timeout is written as `ongoing`.
+    RoboMME get its name as one more column. A timeout is written as `ongoing`, and text that a
+    spreadsheet would run as a formula with an apostrophe before it, which reading removes.
     """
     seeds = len({(row.training_seed, row.model_seed) for row in rows})
     other_splits = sum(row.split != "test" for row in rows)
@@ -69,7 +71,7 @@ def export(rows: CheckedRows, folder: Path) -> list[Path]:
         ):
             writer = csv.writer(file)  # with CRLF, as released
             writer.writerow(columns)
-            writer.writerows(values(_released(row)) for row in group)
+            writer.writerows(map(quoted, values(_released(row))) for row in group)
     return sorted(files)
 
 
