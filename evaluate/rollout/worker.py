@@ -96,7 +96,9 @@ class RolloutFunction(RunFunction[RunConfig]):
 
     def describe(self) -> dict[str, str]:
         """Return the buffer set's revision and all versions."""
-        return super().describe() | simulator_versions(self.config.simulator)
+        return super().describe() | simulator_versions(
+            self.config.simulator, self.config.simulator_python
+        )
 
     def close(self) -> None:
         """Release simulator, policy and subgoal writer."""

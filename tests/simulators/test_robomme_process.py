@@ -22,7 +22,7 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.simulators import make_simulator
 from robomme_interference_data.simulators.registry import simulator_versions
-from robomme_interference_data.simulators.robomme.process import find_python, installed_versions
+from robomme_interference_data.simulators.remote.interpreter import _versions
 from robomme_interference_data.simulators.robomme.simulator import RoboMMESimulator
 from robomme_interference_data.simulators.tabletop import SUITE_VERSION
 
@@ -115,10 +115,10 @@ def test_an_interpreter_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     local = tmp_path / "python"  # there is another one on the path
     local.symlink_to(sys.executable)
     for given_path in ("./python", local, "~/python"):
-        assert find_python(given_path) == str(local)
-    assert find_python("python3") != str(local)
+        assert RoboMMESimulator.interpreter(given_path).path == str(local)
+    assert RoboMMESimulator.interpreter("python3").path != str(local)
     monkeypatch.setenv("ROBOMME_PYTHON", "./python")
-    assert find_python(None) == str(local)
+    assert RoboMMESimulator.interpreter().path == str(local)
 
 
 def test_missing_interpreter(tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_missing_interpreter(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("not a program")
     for path in (tmp_path / "nowhere" / "python", tmp_path, tmp_path / "notes.txt"):
         with raises(InvalidOptionError):
-            find_python(path)
+            RoboMMESimulator.interpreter(path)
 
 
 def test_unusable_interpreter(
@@ -178,7 +178,7 @@ def test_versions(robomme_python: Path, tmp_path: Path, monkeypatch: pytest.Monk
     assert found["robomme_python"] == platform.python_version()
     assert found["robomme_numpy"].startswith("1.")
     monkeypatch.setenv("PYTHONPATH", f"{os.environ['PYTHONPATH']}:{tmp_path}")
-    installed_versions.cache_clear()
+    _versions.cache_clear()
     installed_too = simulator_versions("robomme")
     assert installed_too == {**found, "robomme": "0.2+ab12"}
     assert simulator_versions("tabletop") == {"tabletop": str(SUITE_VERSION)}
