@@ -14,8 +14,8 @@ from pathlib import Path
 from robomme_interference_data.errors import InvalidOptionError, named
 from robomme_interference_data.runtime.safe_path import SAFE_PATH
 
-_ANSWER_S = 60.0
-"""Seconds for a program that does not start the simulator."""
+_ANSWER_S = 300.0
+"""Seconds for a program that does not start the simulator: imports are slow where much runs."""
 
 _VERSION = "import sys; print('%d.%d' % sys.version_info[:2])"
 """A program in any Python."""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.errors import (
     PRINTED_LINES,
     InterferenceError,
+    InvalidOptionError,
     MissingExtraError,
     NoRendererError,
     SimulatorCrashError,
@@ -88,6 +89,11 @@ class RemoteProcess:
                 f"{self._interpreter.path} cannot run the simulator "
                 f"{self._interpreter.simulator}: {answer['problem']}",
                 answer["fix"] or self._interpreter.advice,
+            )
+        if "refused" in answer:
+            raise InvalidOptionError(
+                f"simulator {self._interpreter.simulator!r}: its worker {answer['refused']}",
+                f"It takes {', '.join(answer['takes'])}.",
             )
         if "unknown" in answer:
             simulator = self._interpreter.simulator

@@ -25,13 +25,15 @@ big-endian 32-bit length, or -1 and an unsigned 64-bit one; then the bytes):
 2. for each array, in that order, each of its entries along the first axis: the bytes in C order.
 
 The first request is `start`; its arguments are those of `Worker`. An answer with the key `failed`
-has the text of an exception; with `problem`, why the worker cannot start. Nothing is pickled:
+has the text of an exception; with `refused`, why `Worker` does not take these arguments, and which
+ones it `takes`; with `problem`, what the interpreter lacks, and its `fix`. Nothing is pickled:
 pickles of numpy 1 and 2 differ, and loading one may run any code.
 """
 
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import json
 import os
 import queue
@@ -86,7 +88,14 @@ def serve(channel: Connection, path: str) -> None:
     head, _ = requests.get()
     head.pop("call")  # `start`
     try:
-        worker = load(path).Worker(**head)
+        make = load(path).Worker
+        signature = inspect.signature(make)
+        try:
+            signature.bind(**head)
+        except TypeError as error:
+            send(channel, {"refused": str(error), "takes": [*signature.parameters]})
+            return
+        worker = make(**head)
     except ImportError as error:
         traceback.print_exc()
         send(channel, {"problem": str(error), "fix": _fix(error)})
