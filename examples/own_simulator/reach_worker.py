@@ -23,7 +23,7 @@ GOALS = {
 }
 
 
-class Worker:
+class Episodes:
     """Runs one episode at a time; the phase with the marker is the lesson."""
 
     def __init__(self, cameras, size=96):

@@ -155,7 +155,7 @@ def test_failures_end_the_episode_or_the_process(bare_python: Path) -> None:
 def test_an_incomplete_answer_names_what_is_missing(bare_python: Path, tmp_path: Path) -> None:
     file = tmp_path / "half_worker.py"
     file.write_text(
-        "class Worker:\n"
+        "class Episodes:\n"
         "    def __init__(self, cameras): self.cameras = cameras\n"
         "    def reset(self, family, split, index, frame_step):\n"
         "        import numpy as np\n"
@@ -192,7 +192,7 @@ def test_an_older_python_runs_the_worker(version: str, tmp_path: Path) -> None:
     file = tmp_path / "worker_without_numpy.py"
     file.write_text(
         "import sys\n"
-        "class Worker:\n"
+        "class Episodes:\n"
         "    def version(self): return {'python': list(sys.version_info[:2])}, {}\n"
     )
     interpreter = Interpreter.find("old", "nothing", (3, 8), python)
@@ -232,6 +232,9 @@ def test_a_missing_library_is_named(bare_python: Path, monkeypatch: pytest.Monke
     assert caught.value.hint == (  # the environment has no pip
         f"Install what is missing: uv pip install --python {bare_python} falling-dots"
     )
+    with raises(MissingExtraError) as caught:  # not into the environment of this package
+        Dot(sys.executable)
+    assert "into a separate environment" in str(caught.value.hint)
 
 
 # --- the command line --------------------------------------------------------------------------

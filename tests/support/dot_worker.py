@@ -15,7 +15,7 @@ DIES, RAISES, DARK = 41, 42, 43
 SUCCESS = {"RightSide": 1.0, "LeftSide": -1.0}
 
 
-class Worker:
+class Episodes:
     def __init__(self, cameras, size=16, weight=1.0):
         if os.environ.get("DOT_NEEDS"):
             __import__(os.environ["DOT_NEEDS"])

@@ -139,7 +139,7 @@ def test_robommes_interpreter_is_asked(
     assert doctor.check_robomme().ok is None
     for python, ok, detail, fix in (
         (str(robomme_python), True, "robomme_numpy 1.", None),
-        (sys.executable, False, "RoboMME needs numpy < 2", "pip install 'numpy<2'"),
+        (sys.executable, False, "RoboMME needs numpy < 2", f"now {sys.executable}"),
         ("/nowhere/python", False, "is not an executable file", "now /nowhere/python"),
     ):
         monkeypatch.setenv("ROBOMME_PYTHON", python)

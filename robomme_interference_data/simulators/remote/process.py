@@ -2,6 +2,7 @@
 
 import re
 import subprocess
+import sys
 import threading
 from collections import deque
 from collections.abc import Mapping
@@ -43,7 +44,7 @@ class RemoteProcess:
 
     Args:
         interpreter: What runs it.
-        worker: File with the class `Worker`.
+        worker: File with the class `Episodes`.
         settings: Arguments of that class.
         answer_s: Seconds that it may take to start, and for each call.
     """
@@ -85,10 +86,12 @@ class RemoteProcess:
             remote_worker.send(self._channel, {"call": call, **arguments})
         answer, arrays = self._answer(call)
         if "problem" in answer:
+            # This package's own environment must not get the libraries of a simulator.
+            fix = None if self._interpreter.path == sys.executable else answer["fix"]
             raise MissingExtraError(
                 f"{self._interpreter.path} cannot run the simulator "
                 f"{self._interpreter.simulator}: {answer['problem']}",
-                answer["fix"] or self._interpreter.advice,
+                fix or self._interpreter.advice,
             )
         if "refused" in answer:
             raise InvalidOptionError(

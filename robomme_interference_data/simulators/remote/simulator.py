@@ -26,7 +26,7 @@ from .interpreter import Interpreter
 from .process import Arrays, RemoteProcess
 
 _WORKER_HINT = (
-    "`reset` and `step` of the class `Worker` return facts and arrays: see "
+    "`reset` and `step` of the class `Episodes` return facts and arrays: see "
     "docs/how-to/another-benchmark.md."
 )
 
@@ -35,12 +35,12 @@ class RemoteSimulator(Simulator):
     """A simulator whose libraries need another Python, in a process of that; see `Simulator`.
 
     A subclass declares what `Simulator` lists, and names the file of its worker. That file has a
-    class `Worker`, runs in the other interpreter, and need not import this package: Python 3.8 and
-    numpy are enough. The interpreter is `python`, or the one that the environment variable
+    class `Episodes`, runs in the other interpreter, and need not import this package: Python 3.8
+    and numpy are enough. The interpreter is `python`, or the one that the environment variable
     `<NAME>_PYTHON` names, such as `ROBOMME_PYTHON`.
 
-    The methods of `Worker` return facts, a dictionary of what JSON can hold, and arrays by name. Of
-    an array, the first axis is time:
+    The methods of `Episodes` return facts, a dictionary of what JSON can hold, and arrays by name.
+    The first axis of an array is time:
 
     - `__init__(cameras, **options)`: names of the cameras to draw, and `options`.
     - `reset(family, split, index, frame_step)` starts an episode and plays its lesson of T steps.
@@ -60,7 +60,7 @@ class RemoteSimulator(Simulator):
     the next reset starts a new one. An exception in a method ends the episode only.
 
     Attributes:
-        worker: File with the class `Worker`.
+        worker: File with the class `Episodes`.
         needs: What is to be installed in its environment, for errors.
         oldest_python: The oldest Python that can run the worker.
         remote_packages: Distributions in its environment whose versions are recorded.
@@ -71,7 +71,7 @@ class RemoteSimulator(Simulator):
         python: The interpreter; by default that of the environment variable.
         cameras: Names of the cameras to draw; all by default.
         answer_s: Seconds that it may take to start, and for each call.
-        options: Further arguments of `Worker`, as `--simulator-option` sets them.
+        options: Further arguments of `Episodes`, as `--simulator-option` sets them.
 
     Raises:
         InvalidOptionError: The interpreter is missing, too old or does not run, or a camera is
@@ -86,7 +86,7 @@ class RemoteSimulator(Simulator):
     oldest_python: ClassVar[tuple[int, int]] = (3, 8)
     remote_packages: ClassVar[tuple[str, ...]] = ("numpy",)
     episodes_per_process: int | None = None
-    settings = ("python", "cameras", "answer_s")
+    settings: ClassVar[tuple[str, ...]] = ("python", "cameras", "answer_s")
 
     def __init__(
         self,

@@ -2,9 +2,9 @@
 
 That interpreter may be older than this package and have other libraries, so this file needs only
 Python 3.8 and numpy. It runs as `python worker.py DESCRIPTOR FILE`: FILE is the user's, with a
-class `Worker`, whose methods are the calls:
+class `Episodes`, whose methods are the calls:
 
-    class Worker:
+    class Episodes:
         def __init__(self, cameras, **options): ...  # names of the cameras to draw; options
         def reset(self, family, split, index, frame_step): ...  # facts, arrays
         def step(self, action, observe): ...  # facts, arrays
@@ -24,10 +24,10 @@ big-endian 32-bit length, or -1 and an unsigned 64-bit one; then the bytes):
    answer has the facts. Its key `arrays` lists [name, dtype.str, shape] of what follows;
 2. for each array, in that order, each of its entries along the first axis: the bytes in C order.
 
-The first request is `start`; its arguments are those of `Worker`. An answer with the key `failed`
-has the text of an exception; with `refused`, why `Worker` does not take these arguments, and which
-ones it `takes`; with `problem`, what the interpreter lacks, and its `fix`. Nothing is pickled:
-pickles of numpy 1 and 2 differ, and loading one may run any code.
+The first request is `start`; its arguments are those of `Episodes`. An answer with the key `failed`
+has the text of an exception; with `refused`, why `Episodes` does not accept these arguments, and
+which ones it `takes`; with `problem`, what the interpreter lacks, and its `fix`. Nothing is
+pickled: pickles of numpy 1 and 2 differ, and loading one may run any code.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def serve(channel: Connection, path: str) -> None:
     head, _ = requests.get()
     head.pop("call")  # `start`
     try:
-        make = load(path).Worker
+        make = load(path).Episodes
         signature = inspect.signature(make)
         try:
             signature.bind(**head)

@@ -216,7 +216,7 @@ class RoboMMESimulator(RemoteSimulator):
     def _observation(self, arrays: Arrays, cameras: Sequence[str]) -> Observation:
         seen = super()._observation(arrays, cameras)
         for camera, image in seen.images.items():
-            if (image.shape, image.dtype) != (FRAME_SHAPE, np.uint8):
+            if image.shape != FRAME_SHAPE or image.dtype != np.uint8:
                 raise InvalidOptionError(
                     f"RoboMME's {camera} camera in {self._interpreter.path} gives {image.shape} "
                     f"{image.dtype}; expected {FRAME_SHAPE} uint8",

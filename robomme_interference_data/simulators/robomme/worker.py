@@ -29,7 +29,6 @@ def _sibling(name: str) -> Any:
 _patches, _rendering = _sibling("maniskill_patches"), _sibling("render_on_demand")
 _facts, _solvers, _steps = _sibling("facts"), _sibling("solvers"), _sibling("steps")
 
-
 NEEDED = {
     "cv2": "opencv-python",
     "defusedxml": "defusedxml",
@@ -76,19 +75,27 @@ def families() -> list[str]:
     """Return RoboMME's families."""
     try:
         return list(_builder().get_task_list())
-    except ModuleNotFoundError as error:
-        first = str(error.name).partition(".")[0]
-        missing = {first: NEEDED.get(first, first)}
-        missing |= {name: NEEDED[name] for name in NEEDED if importlib.util.find_spec(name) is None}
-        names = ", ".join(missing)
-        raise CannotRun(
-            f"robomme needs modules that are missing: {names}", *missing.values()
-        ) from error
     except Exception as error:
-        raise CannotRun(f"robomme cannot be imported: {_text(error)}") from error
+        missing = _missing(error) if isinstance(error, ModuleNotFoundError) else {}
+        why = f"robomme cannot be imported: {_text(error)}"
+        if missing:
+            why = f"robomme needs modules that are missing: {', '.join(missing)}"
+        raise CannotRun(why, *missing.values()) from error
 
 
-class Worker:
+def _missing(error: ModuleNotFoundError) -> dict[str, str]:
+    """Return all missing modules with their distributions, the one of an error first.
+
+    None if RoboMME itself lacks a part, which no index has.
+    """
+    first = str(error.name).partition(".")[0]
+    if first == "robomme":
+        return {}
+    further = {name: NEEDED[name] for name in NEEDED if importlib.util.find_spec(name) is None}
+    return {first: NEEDED.get(first, first), **further}
+
+
+class Episodes:
     """Runs one episode at a time, each in a new environment.
 
     A second reset of the same environment would give a different episode.
