@@ -144,13 +144,7 @@ class RemoteSimulator(Simulator):
             process.end()
             self._process = self._start()
         self._process.played += 1
-        arrays = self.call(
-            "reset",
-            family=episode.family,
-            split=episode.split,
-            index=episode.index,
-            frame_step=frame_step,
-        )
+        arrays = self.call("reset", **self._chosen(episode), frame_step=frame_step)
         first = self._observation(arrays, self._cameras)
         images = {camera: arrays[camera][:-1] for camera in self._cameras if frame_step}
         actions = arrays.get("actions", np.empty((0, self.action_size), np.float32))
@@ -160,6 +154,10 @@ class RemoteSimulator(Simulator):
         goals = tuple(self.fact("goals"))
         info = EpisodeInfo(goals, facts.get("difficulty"), facts.get("seed"), self.name)
         return lesson, first, info
+
+    def _chosen(self, episode: EpisodeId) -> dict[str, Any]:
+        """Return the arguments of `reset` that choose an episode."""
+        return {"family": episode.family, "split": episode.split, "index": episode.index}
 
     def _evidence(
         self, episode: EpisodeId, arrays: Arrays
