@@ -19,7 +19,13 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.runtime.executor import WorkersConfig
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS
-from robomme_interference_data.schema.settings import SETTING, setting
+from robomme_interference_data.schema.settings import (
+    PYTHON_HELP,
+    PYTHON_SHOWN,
+    SETTING,
+    SIMULATOR_OPTION_HELP,
+    setting,
+)
 
 _CPUS = os.cpu_count() or 1
 
@@ -160,6 +166,17 @@ class BuildConfig(WorkersConfig):
     fps: float | None = setting(
         None, help="Frames per second of recordings that do not state them.", group="Sources"
     )
+    simulator_python: str | None = setting(
+        None, metavar="PATH", help=PYTHON_HELP, shown=PYTHON_SHOWN, group="Sources"
+    )
+    simulator_options: tuple[str, ...] = setting(
+        (),
+        name="--simulator-option",
+        whole=True,
+        metavar="NAME=VALUE",
+        help=SIMULATOR_OPTION_HELP,
+        group="Sources",
+    )
     _: KW_ONLY
     workers: int = setting(_CPUS, help="Worker processes.", shown="all CPUs", group="Execution")
 
@@ -187,6 +204,8 @@ class SourceConfig(WorkersConfig):
     families_from: str | None = _same("families_from")
     several_tasks: str | None = _same("several_tasks")
     fps: float | None = _same("fps")
+    simulator_python: str | None = _same("simulator_python")
+    simulator_options: tuple[str, ...] = _same("simulator_options")
     _: KW_ONLY
     workers: int = _same("workers")
 

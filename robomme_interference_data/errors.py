@@ -212,6 +212,15 @@ class NoRendererError(InterferenceError, RuntimeError):
     Fix: install a Vulkan driver: `sudo make vulkan`; then `doctor`.
     """
 
+    @classmethod
+    def without_vulkan(cls, why: object) -> Self:
+        """Return the error for what a simulator raised without a Vulkan device."""
+        return cls(
+            f"no Vulkan device on this machine can render: {why}",
+            "Install a software driver: sudo make vulkan. Without the repository: libvulkan1 and "
+            "mesa-vulkan-drivers 24.3 or newer (Debian 12 has it in bookworm-backports).",
+        )
+
 
 class SimulatorError(InterferenceError, RuntimeError):
     """A simulator that cannot be made, lacks a method, or returns data of another shape.
@@ -284,7 +293,7 @@ class WorkerRetiredError(InterferenceError, RuntimeError):
     """
 
 
-SAME_FOR_ALL = (InvalidOptionError, MissingExtraError, SimulatorError)
+SAME_FOR_ALL = (InvalidOptionError, MissingExtraError, NoRendererError, SimulatorError)
 """Errors about settings or this machine: after one, other episodes would fail alike."""
 
 

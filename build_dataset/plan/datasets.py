@@ -112,13 +112,17 @@ def check_values(config: BuildConfig) -> None:
     if config.fps is not None and not 0 < config.fps < math.inf:
         raise InvalidOptionError.expected("fps", config.fps, "a positive number")
     make_executor(config)  # checks its settings
-    for name in ("columns", "families_from", "several_tasks"):
-        if getattr(config, name) and not any(takes(text, name) for text in config.source):
-            raise InvalidOptionError(
-                f"{named(name)} has no effect on {', '.join(config.source)}",
-                "Only the source lerobot takes it: leave it out.",
-                option=name,
-            )
+    for names, takers in (
+        (("columns", "families_from", "several_tasks"), "the source lerobot takes"),
+        (("simulator_python", "simulator_options"), "simulators take"),
+    ):
+        for name in names:
+            if getattr(config, name) and not any(takes(text, name) for text in config.source):
+                raise InvalidOptionError(
+                    f"{named(name)} has no effect on {', '.join(config.source)}",
+                    f"Only {takers} it: leave it out.",
+                    option=name,
+                )
 
 
 def open_sources(kind: str, config: BuildConfig, unit: Unit) -> tuple[Source, ...]:
@@ -133,6 +137,8 @@ def open_sources(kind: str, config: BuildConfig, unit: Unit) -> tuple[Source, ..
             columns=columns,
             families_from=config.families_from,
             several_tasks=config.several_tasks,
+            simulator_python=config.simulator_python,
+            simulator_options=config.simulator_options,
             every=unit.in_dataset(kind).stride if one_unit else 1,
         )
         for text in config.source

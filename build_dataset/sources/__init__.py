@@ -63,8 +63,8 @@ def open_source(specification: str, *, shifted: bool = False, **options: Any) ->
         specification: `KIND:LOCATION` or `KIND`; see `SOURCES`. Or `MODULE:NAME` of a simulator of
             the user, as in `make_simulator`.
         shifted: Whether to open the first live views under shifts instead of the episodes.
-        **options: `columns`, `families_from` and `several_tasks` for `lerobot`, `every` for
-            simulators; other kinds ignore them.
+        **options: `columns`, `families_from` and `several_tasks` for `lerobot`, `every`,
+            `simulator_python` and `simulator_options` for simulators; other kinds ignore them.
     """
     spec = _parse(specification)
     simulator = spec.arguments.get("name")

@@ -16,8 +16,9 @@ from robomme_interference_data.simulators.episode import (
     choose_cameras,
 )
 from robomme_interference_data.simulators.registry import (
-    accepted_settings,
+    find_simulator_python,
     make_simulator,
+    simulator_arguments,
     simulator_class,
 )
 
@@ -34,9 +35,18 @@ class SimulatorSource(Source):
         name: Registered name of the simulator.
         every: Draw every n-th frame only; all others have no images.
         shifted: Give the first live view under each shift instead of the episode.
+        simulator_python: Its own interpreter, if it needs one; None for the default.
+        simulator_options: Its own arguments, `NAME=VALUE`.
     """
 
-    def __init__(self, name: str, every: int = 1, shifted: bool = False):
+    def __init__(
+        self,
+        name: str,
+        every: int = 1,
+        shifted: bool = False,
+        simulator_python: str | None = None,
+        simulator_options: Sequence[str] = (),
+    ):
         self.name, self._every, self._shifted = name, every, shifted
         self._class = simulator_class(name)
         self.time_limit_s = self._class.episode_s
@@ -45,7 +55,12 @@ class SimulatorSource(Source):
         self.provenance = {"kind": name}
         if version is not None:
             self.provenance["suite_version"] = version
-        self._settings = {"subgoals": False}
+        if simulator_options:
+            self.provenance["options"] = sorted(simulator_options)
+        python = find_simulator_python(name, simulator_python)
+        self._settings = {"subgoals": False, "python": python}
+        self._options = tuple(simulator_options)
+        simulator_arguments(name, {"cameras": (), **self._settings}, self._options)  # raises
         self._simulator: Simulator | None = None
         self._cameras: tuple[str, ...] = ()
 
@@ -105,8 +120,9 @@ class SimulatorSource(Source):
         """Return the simulator with these cameras, which is kept for the next episode."""
         if self._simulator is None or self._cameras != cameras:
             self.close()
-            settings = accepted_settings(self.name, {"cameras": cameras, **self._settings})
-            self._simulator = make_simulator(self.name, **settings)
+            settings = {"cameras": cameras, **self._settings}
+            arguments = simulator_arguments(self.name, settings, self._options)
+            self._simulator = make_simulator(self.name, **arguments)
             self._cameras = cameras
         return self._simulator
 

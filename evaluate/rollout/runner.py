@@ -40,7 +40,11 @@ from robomme_interference_data.evaluate.run.worker import PlannedRun, RunContext
 from robomme_interference_data.evaluate.systems import System, SystemFacts, name_system
 from robomme_interference_data.runtime.executor import Executor, WorkerPool
 from robomme_interference_data.simulators.base import Simulator
-from robomme_interference_data.simulators.registry import simulator_class, simulator_versions
+from robomme_interference_data.simulators.registry import (
+    find_simulator_python,
+    simulator_class,
+    simulator_versions,
+)
 
 from .checks import check_plan, check_policy, check_settings
 from .other_states import check_other_states
@@ -117,7 +121,9 @@ def _describe_run(
         subgoals_identity = subgoal_settings.subgoals_identity(config, writer)
         metadata |= writer
     identity = policy_identity(config.policy, config.policy_options, policy_metadata)
-    versions = simulator_versions(config.simulator)
+    python = find_simulator_python(config.simulator, config.simulator_python)
+    config = dataclasses.replace(config, simulator_python=python)
+    versions = simulator_versions(config.simulator, python)
     facts = SystemFacts(
         policy=POLICIES.parse(config.policy).kind,
         policy_id=short_digest(identity),
@@ -133,6 +139,8 @@ def _describe_run(
     # Without units of another robot the rule has no effect.
     others = other_state_sizes(buffer_set.datasets)
     other_states = {"other_states": policy.other_states} if others else {}
+    options = sorted(config.simulator_options)
+    simulator_options = {"simulator_options": options} if options else {}
     return RunContext(
         config,
         system.name,
@@ -144,6 +152,7 @@ def _describe_run(
             "simulator_version": dict(versions),
             "subgoals": subgoals_identity,
             **other_states,
+            **simulator_options,
             **identity,
         },
         versions=versions,

@@ -19,9 +19,16 @@ from robomme_interference_data.evaluate.run.config import RunConfig, check_unuse
 from robomme_interference_data.evaluate.systems import SYSTEMS, System, name_system
 from robomme_interference_data.retrieval.select import Rule
 from robomme_interference_data.schema.sampling import Memory
-from robomme_interference_data.simulators.registry import accepted_settings, simulator_class
+from robomme_interference_data.simulators.registry import simulator_arguments, simulator_class
 
-_OF_SIMULATORS = ("simulator", "shift", "check_lesson", "videos")
+_OF_SIMULATORS = (
+    "simulator",
+    "simulator_python",
+    "simulator_options",
+    "shift",
+    "check_lesson",
+    "videos",
+)
 """Settings without effect along recordings."""
 
 
@@ -187,7 +194,8 @@ def simulator_options(
         "shift": config.shift,
         "subgoals": config.subgoals == ORACLE,
         "buffer_set": config.buffer_set,
+        "python": config.simulator_python,
         # Its own limit ends a little before the worker's: its error shows its output.
         "answer_s": 0.9 * config.simulator_timeout_s,
     }
-    return accepted_settings(config.simulator, settings)
+    return simulator_arguments(config.simulator, settings, config.simulator_options)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from robomme_interference_data.constants import DEMONSTRATIONS
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import (
+    NoRendererError,
     PolicyError,
     PolicyServerError,
     ServerKeepaliveError,
@@ -96,7 +97,9 @@ class RolloutFunction(RunFunction[RunConfig]):
 
     def describe(self) -> dict[str, str]:
         """Return the buffer set's revision and all versions."""
-        return super().describe() | simulator_versions(self.config.simulator)
+        return super().describe() | simulator_versions(
+            self.config.simulator, self.config.simulator_python
+        )
 
     def close(self) -> None:
         """Release simulator, policy and subgoal writer."""
@@ -138,7 +141,7 @@ class RolloutFunction(RunFunction[RunConfig]):
                 lesson, first, info = simulator.reset(str(episode), demonstration=False)
             check_drawn(lesson, first, sorted(cameras))
             check_episode(self.buffer_set.query(episode), lesson, first, info)
-        except SimulatorError:
+        except (NoRendererError, SimulatorError):
             raise
         except Exception:
             self.close()  # the rollout of this episode becomes an error row

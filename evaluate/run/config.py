@@ -10,7 +10,12 @@ from robomme_interference_data.constants import DEMONSTRATIONS, SPLITS
 from robomme_interference_data.errors import InvalidOptionError, named
 from robomme_interference_data.runtime.executor import WorkersConfig
 from robomme_interference_data.schema.sampling import MEMORY_FORM
-from robomme_interference_data.schema.settings import setting
+from robomme_interference_data.schema.settings import (
+    PYTHON_HELP,
+    PYTHON_SHOWN,
+    SIMULATOR_OPTION_HELP,
+    setting,
+)
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP
 
 if TYPE_CHECKING:
@@ -115,10 +120,17 @@ class RunConfig(WorkConfig):
         group=_SIMULATOR,
         help="Compare actions with those of the buffer set's executions, without a simulator.",
     )
-    simulator: str = setting(
-        "tabletop",
+    simulator: str = setting("tabletop", group=_SIMULATOR, help="tabletop, robomme or module:name.")
+    simulator_python: str | None = setting(
+        None, group=_SIMULATOR, metavar="PATH", help=PYTHON_HELP, shown=PYTHON_SHOWN
+    )
+    simulator_options: tuple[str, ...] = setting(
+        (),
+        name="--simulator-option",
+        whole=True,
+        metavar="NAME=VALUE",
         group=_SIMULATOR,
-        help="tabletop, robomme (its Python: ROBOMME_PYTHON) or module:name.",
+        help=SIMULATOR_OPTION_HELP,
     )
     shift: str = setting(NO_SHIFT, group=_SIMULATOR, help=SHIFT_HELP)
     policies: int | None = setting(

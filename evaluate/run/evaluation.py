@@ -22,6 +22,7 @@ from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import (
     InterferenceError,
+    NoRendererError,
     ServerDiedError,
     ServerKeepaliveError,
     SimulatorCrashError,
@@ -187,6 +188,8 @@ def _write_rows(
     errors, disk_full = 0, False
     try:
         for outcome in outcomes:
+            if isinstance(outcome.error, NoRendererError):  # no rollout can be drawn
+                raise outcome.error
             row, trace = _save_files(run, outcome, buffer_set, log)
             log.append(row, trace)
             for callback in callbacks:
@@ -197,7 +200,7 @@ def _write_rows(
                 break
         else:
             stopped = None
-    except InterferenceError as error:  # no worker is left
+    except InterferenceError as error:  # no worker is left, or none can draw
         stopped = error.message
         raise
     except OSError:  # a disk without space for a row has none for tables

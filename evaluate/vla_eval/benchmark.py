@@ -43,6 +43,8 @@ SETTINGS = (
     "model_seed",
     # The simulator:
     "simulator",
+    "simulator_python",
+    "simulator_options",
     "shift",
     "check_lesson",
     # The retrieval step:

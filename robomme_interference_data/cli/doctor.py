@@ -17,7 +17,12 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
-from robomme_interference_data.errors import InterferenceError, first_line
+from robomme_interference_data.errors import (
+    InterferenceError,
+    InvalidOptionError,
+    SimulatorCrashError,
+    first_line,
+)
 from robomme_interference_data.storage.hub import check_endpoint
 
 DISTRIBUTION = "robomme-interference-data"
@@ -199,21 +204,34 @@ def check_renderer(module: str = RENDERER, seconds: float = RENDERER_S) -> Check
 def check_robomme() -> Check:
     """Check that RoboMME's own solvers solve an episode, if its interpreter is configured."""
     from robomme_interference_data.simulators.play import play
-    from robomme_interference_data.simulators.robomme.process import PYTHON_VARIABLE
+    from robomme_interference_data.simulators.remote.interpreter import python_variable
     from robomme_interference_data.simulators.robomme.simulator import RoboMMESimulator
 
-    name, python = "Official simulator", os.environ.get(PYTHON_VARIABLE)
-    fix = f"export {PYTHON_VARIABLE}=PATH, the Python of an environment that has RoboMME"
+    name, variable = "Official simulator", python_variable(RoboMMESimulator.name)
+    python = os.environ.get(variable)
     if not python:
-        return Check(name, None, f"only --simulator robomme needs {PYTHON_VARIABLE}", fix)
+        fix = f"export {variable}=PATH, the Python of an environment that has RoboMME"
+        return Check(name, None, f"only --simulator robomme needs {variable}", fix)
+    another = f"set {variable}, now {python}, to the Python of an environment that has RoboMME"
+    shows_output = f"robomme-interference simulate {ORACLE_EPISODE} --simulator robomme"
     try:
-        with RoboMMESimulator(python, (), ROBOMME_S, subgoals=False) as simulator:
-            versions = [f"{key} {value}" for key, value in simulator.versions().items()]
+        versions = [f"{key} {value}" for key, value in RoboMMESimulator.versions().items()]
+        with RoboMMESimulator(None, (), ROBOMME_S, subgoals=False) as simulator:
+            patches = ", ".join(simulator.patches) or "nothing"
             status = play(simulator, ORACLE_EPISODE, "oracle", None)["status"]
+    except InvalidOptionError as error:
+        return Check(name, False, error.message, another)
+    except SimulatorCrashError as error:
+        return Check(name, False, error.message, f"{shows_output}, which shows its last output")
     except InterferenceError as error:
-        return Check(name, False, first_line(error), fix)
-    detail = f"{python}: {', '.join(versions)}; {ORACLE_EPISODE} with its own solvers: {status}"
-    return Check(name, status == "success", detail, None if status == "success" else fix)
+        # Its advice for whoever has set nothing is the other one's.
+        advice = RoboMMESimulator.interpreter().advice
+        return Check(name, False, error.message, another if error.hint == advice else error.hint)
+    detail = (
+        f"{python}: {', '.join(versions)}; patched: {patches}; {ORACLE_EPISODE} with its own "
+        f"solvers: {status}"
+    )
+    return Check(name, status == "success", detail, None if status == "success" else shows_output)
 
 
 def check_opencv() -> Check:

@@ -7,6 +7,11 @@ from typing import Annotated, Any
 import typer
 
 from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.schema.settings import (
+    PYTHON_HELP,
+    PYTHON_SHOWN,
+    SIMULATOR_OPTION_HELP,
+)
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP
 
 from .console import check_output, echo, print_json
@@ -30,8 +35,21 @@ def simulate(
     video: Annotated[Path | None, _option("Output", "Write a video to this .mp4 file.")] = None,
     as_json: AsJson = False,
     simulator: Annotated[
-        str, _option("Simulator", "tabletop, robomme (its Python: ROBOMME_PYTHON) or module:name.")
+        str, _option("Simulator", "tabletop, robomme or module:name.")
     ] = "tabletop",
+    simulator_python: Annotated[
+        str | None, _option("Simulator", PYTHON_HELP, metavar="PATH", show_default=PYTHON_SHOWN)
+    ] = None,
+    simulator_options: Annotated[
+        list[str],
+        typer.Option(
+            "--simulator-option",
+            help=SIMULATOR_OPTION_HELP,
+            metavar="NAME=VALUE",
+            rich_help_panel="Simulator",
+            show_default=False,
+        ),
+    ] = [],  # noqa: B006 - typer reads it only
     shift: Annotated[str, _option("Simulator", SHIFT_HELP)] = NO_SHIFT,
 ) -> None:
     r"""Play one episode: its demonstration, then a built-in policy.
@@ -42,16 +60,17 @@ def simulate(
     Examples:
     ```
     robomme-interference simulate MoveCube/test/3 --video out.mp4
-    ROBOMME_PYTHON=PATH robomme-interference simulate MoveCube/test/3 \
-      --simulator robomme
+    robomme-interference simulate MoveCube/test/3 --simulator robomme \
+      --simulator-python PATH
     ```
     """
     from robomme_interference_data.ids import EpisodeId
     from robomme_interference_data.simulators.play import NO_POLICY, play
     from robomme_interference_data.simulators.registry import (
-        accepted_settings,
         check_shift,
+        find_simulator_python,
         make_simulator,
+        simulator_arguments,
         simulator_class,
     )
 
@@ -68,11 +87,12 @@ def simulate(
     if video is not None and (video.suffix != ".mp4" or video.is_dir()):
         raise InvalidOptionError.expected("--video", str(video), "the path of an .mp4 file")
     check_output(video)
-    settings: dict[str, Any] = {"shift": shift}
+    python = find_simulator_python(simulator, simulator_python)
+    settings: dict[str, Any] = {"shift": shift, "python": python}
     if video is None:
         settings["cameras"] = ()
-    options = accepted_settings(simulator, settings)
-    with closing(make_simulator(simulator, **options)) as running:
+    arguments = simulator_arguments(simulator, settings, simulator_options)
+    with closing(make_simulator(simulator, **arguments)) as running:
         result = play(running, name, policy, video) | {"shift": shift}
     if video is not None:
         result["video"] = str(video)

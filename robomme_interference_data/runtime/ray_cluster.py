@@ -37,7 +37,7 @@ from .tasks import Outcome, Scheduler, TaskFunction, end_if_starting, unpickle_o
 
 logger = logging.getLogger(__name__)
 
-_PASSED = (SAFE_PATH, "HF_ENDPOINT", "HF_HUB_OFFLINE", "ROBOMME_PYTHON")
+_PASSED = (SAFE_PATH, "HF_ENDPOINT", "HF_HUB_OFFLINE")
 """Environment variables that workers inherit."""
 
 _CONNECT_S = 10.0

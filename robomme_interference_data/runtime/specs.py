@@ -187,7 +187,7 @@ def bind_options(
     known = f"Its options: {', '.join([*parameters, *also]) or 'none'}."
     values: dict[str, Any] = {}
     for name, text in _split_options(what, options, parameters.values()).items():
-        if name not in parameters and not _takes_any(signature):
+        if name in given or (name not in parameters and not _takes_any(signature)):
             hint = f"{nearest(name, [*parameters, *also], more='')} {known}"
             raise InvalidOptionError(f"{what}: there is no option {name}", hint.lstrip())
         kinds = declared.get(name)

@@ -17,6 +17,10 @@ from typing import Any
 SETTING = "setting"
 """Key of the declaration in a field's metadata."""
 
+PYTHON_HELP = "Python of a simulator that needs its own, such as robomme."
+PYTHON_SHOWN = "ROBOMME_PYTHON for robomme, NAME_PYTHON for the simulator NAME"
+SIMULATOR_OPTION_HELP = "Options of the simulator, arguments of its class."
+
 
 def setting(
     default: Any = dataclasses.MISSING,

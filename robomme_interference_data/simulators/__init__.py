@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from .base import Simulator
     from .episode import Demonstration, EpisodeInfo, Observation
     from .registry import SIMULATORS, make_simulator
+    from .remote.simulator import RemoteSimulator
 
 __all__ = [
     # factory
@@ -27,6 +28,7 @@ __all__ = [
     "SIMULATORS",
     # interface
     "Simulator",
+    "RemoteSimulator",
     "Demonstration",
     "EpisodeInfo",
     "Observation",
@@ -38,6 +40,7 @@ __getattr__ = lazy_exports(
     {
         ".registry": "make_simulator SIMULATORS",
         ".base": "Simulator",
+        ".remote.simulator": "RemoteSimulator",
         ".episode": "Demonstration EpisodeInfo Observation",
         "robomme_interference_data.schema.rollouts": "Status",
     },

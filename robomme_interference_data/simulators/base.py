@@ -48,7 +48,8 @@ class Simulator(ABC):
         action_names: Names of the values of an action; None if they have none.
         settings: Settings of a run that its constructor accepts: `cameras` (to render), `shift`,
             `subgoals` (whether `subgoal` will be called), `answer_s` (seconds that a call may
-            take), `buffer_set` (its location). A function accepts those that are its parameters.
+            take), `buffer_set` (its location), `python` (its own interpreter). A function accepts
+            those that are its parameters. Its other arguments are set by `--simulator-option`.
         policies: Its built-in policies: those of `act`, and `follow-subgoals` if it has
             `follow_subgoal`.
         shifts: Whether it supports shifts of the live scene.

@@ -1,7 +1,7 @@
 """Simulators by name. Their libraries are imported when one is made."""
 
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, get_type_hints
 
 from robomme_interference_data.constants import RECORDINGS
@@ -10,11 +10,13 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     SimulatorError,
     UnknownNameError,
+    named,
 )
-from robomme_interference_data.runtime.specs import import_factory, signature_of
+from robomme_interference_data.runtime.specs import bind_options, import_factory, signature_of
 from robomme_interference_data.schema.shifts import parse_shift
 
 from .base import Simulator
+from .remote.simulator import RemoteSimulator
 from .scene import Scene
 
 if TYPE_CHECKING:
@@ -104,6 +106,43 @@ def accepted_settings(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     return {setting: value for setting, value in settings.items() if setting in accepted}
 
 
+def simulator_arguments(
+    name: str, settings: Mapping[str, Any], options: Iterable[str] = ()
+) -> dict[str, Any]:
+    """Return the arguments of a simulator.
+
+    Args:
+        name: Its name.
+        settings: Settings of a run; it gets those that it accepts.
+        options: Its own arguments, `NAME=VALUE`; see `bind_options`.
+    """
+    accepted = accepted_settings(name, settings)
+    options = tuple(options)
+    if not options:  # of a factory without a signature nothing is known
+        return accepted
+    return accepted | bind_options(f"simulator {name!r}", find_simulator(name), accepted, options)
+
+
+def find_simulator_python(name: str, python: str | None) -> str | None:
+    """Return the path of a simulator's own interpreter, None if it runs in this one.
+
+    Args:
+        name: Name of the simulator.
+        python: The interpreter that is set; None for the default.
+    """
+    declared = simulator_class(name)
+    if issubclass(declared, RemoteSimulator):
+        return declared.interpreter(python).path
+    if python is not None:
+        raise InvalidOptionError(
+            f"{named('simulator_python')} has no effect on the simulator {name}, which runs in "
+            "this process",
+            "Leave it out.",
+            option="simulator_python",
+        )
+    return None
+
+
 def check_shift(name: str, shift: str) -> None:
     """Check that a simulator supports a shift."""
     if parse_shift(shift) is not None and not simulator_class(name).shifts:
@@ -123,6 +162,12 @@ def recorded_scene(query: "Query") -> Scene | None:
     return simulator_class(name).scene(query.episode_id.family, seed, difficulty, scene)
 
 
-def simulator_versions(name: str) -> dict[str, str]:
-    """Return the versions that a simulator's results depend on; see `Simulator.versions`."""
-    return simulator_class(name).versions()
+def simulator_versions(name: str, python: str | None = None) -> dict[str, str]:
+    """Return the versions that a simulator's results depend on; see `Simulator.versions`.
+
+    `python` is the path of its own interpreter; None for the default.
+    """
+    declared = simulator_class(name)
+    if issubclass(declared, RemoteSimulator):
+        return declared.versions(python)
+    return declared.versions()

@@ -9,7 +9,7 @@ import pytest
 from support.buffer_sets import QUERIES, copy_buffer_set
 from support.messages import raises
 from support.retrieval import QUIET, make_index
-from support.runs import CHEAT, config, run, run_one
+from support.runs import CHEAT, config, header, run, run_one
 from support.worlds import World
 
 from robomme_interference_data import load_buffer_set
@@ -161,6 +161,30 @@ def test_the_simulator_is_made_before_the_folder_and_only_for_remaining_rollouts
     assert len(made) == 2
     with pytest.raises(NoRendererError):
         run_one(tmp_path / "whole", conditions=("no-history", "k0"), **sample)
+
+
+def test_a_run_without_a_renderer_ends_once_and_resumes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Dark(World):
+        def reset(self, *given: Any, **more: Any) -> Any:
+            if broken:
+                raise NoRendererError.without_vulkan("vk::createInstanceUnique")
+            return super().reset(*given, **more)
+
+    broken = True
+    monkeypatch.setitem(SIMULATORS, "sample", lambda **options: Dark())
+    with raises(NoRendererError):
+        run(tmp_path / "run", simulator="sample")
+    assert not (tmp_path / "run" / "errors.log").exists()
+    assert "no Vulkan device" in header(tmp_path / "run")["invocations"][0]["stopped"]
+    broken = False
+    resumed = run(tmp_path / "run", simulator="sample")
+    assert [row.attempt for row in resumed.rows] == [1] * 4
+    # A simulator that is tried out shows it before there is a folder.
+    with raises(NoRendererError):
+        run(tmp_path / "tried", simulator="support.own_simulators:Dark")
+    assert not (tmp_path / "tried").exists()
 
 
 def test_only_cameras_in_use_are_rendered(tiny_buffers: Path) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 from support.simulator_doubles import Double
 from support.worlds import World
 
+from robomme_interference_data.errors import NoRendererError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.base import Simulator
@@ -94,6 +95,13 @@ class Breaks(Played):
 
     def _begin(self, episode: EpisodeId, frame_step: int) -> EpisodeStart:
         raise RuntimeError("the arm fell off")
+
+
+class Dark(Played):
+    """Cannot draw on this machine."""
+
+    def _begin(self, episode: EpisodeId, frame_step: int) -> EpisodeStart:
+        raise NoRendererError.without_vulkan("no driver")
 
 
 class Resetless:

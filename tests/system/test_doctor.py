@@ -137,15 +137,37 @@ def test_robommes_interpreter_is_asked(
 ) -> None:
     monkeypatch.delenv("ROBOMME_PYTHON")
     assert doctor.check_robomme().ok is None
-    for python, ok, detail in (
-        (str(robomme_python), True, "robomme_numpy 1."),
-        (sys.executable, False, "RoboMME needs numpy < 2"),
-        ("/nowhere/python", False, "is not an executable file"),
+    for python, ok, detail, fix in (
+        (str(robomme_python), True, "robomme_numpy 1.", None),
+        (sys.executable, False, "RoboMME needs numpy < 2", f"now {sys.executable}"),
+        ("/nowhere/python", False, "is not an executable file", "now /nowhere/python"),
     ):
         monkeypatch.setenv("ROBOMME_PYTHON", python)
         row = doctor.check_robomme()
         assert row.ok is ok
         assert detail in row.detail
+        assert row.fix is None if fix is None else fix in str(row.fix)
+    # Patches are listed: of a ManiSkill from the package index there are some.
+    monkeypatch.setenv("ROBOMME_PYTHON", str(robomme_python))
+    monkeypatch.setenv("STAND_IN_MANI_SKILL", "index")
+    assert "patched: stick planner's arguments, " in doctor.check_robomme().detail
+
+
+def test_an_unusable_interpreter_of_robomme_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old = tmp_path / "python"
+    old.write_text('#!/bin/sh\n[ "$1" = -c ] && echo 3.9 && exit\nexit 1\n')
+    old.chmod(0o755)
+    for python, detail in (
+        (str(old), "is Python 3.9; the simulator robomme needs Python 3.10 or newer"),
+        ("/nowhere/python", "ROBOMME_PYTHON=/nowhere/python is not an executable file"),
+    ):
+        monkeypatch.setenv("ROBOMME_PYTHON", python)
+        row = doctor.check_robomme()
+        assert (row.ok, row.detail.endswith(detail)) == (False, True)
+        # It is set, so the advice is not to set it, but to correct it.
+        assert str(row.fix).startswith(f"set ROBOMME_PYTHON, now {python}, to ")
 
 
 def test_the_hub_is_asked_and_a_token_never_shown(

@@ -71,6 +71,8 @@ NOT_RUN = {
     ("your-own-policy.md", "from pathlib import Path"): "starts processes; test_run.py",
     ("publish.md", "from datasets import load_dataset"): "reads the Hub; test_cards.py",
     ("another-benchmark.md", "from robomme_interference_data.simulators"): "an outline, not code",
+    ("another-benchmark.md", "build reach-buffers"): "another interpreter; test_remote.py makes it",
+    ("another-benchmark.md", "evaluate reach-buffers"): "the same",
 }
 """What pages show and this test does not run: page, beginning of the step, and why. It must shrink:
 an entry that fits no step is an error."""

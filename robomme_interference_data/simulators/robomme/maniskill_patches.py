@@ -11,6 +11,7 @@ import shutil
 import tempfile
 import xml.etree.ElementTree as ET
 from collections import defaultdict
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,6 +26,10 @@ WRIST, STICK = "wrist camera's size", "wrist camera on the stick"
 
 class CannotPatch(Exception):
     """This ManiSkill cannot be made to behave as RoboMME's fork does."""
+
+
+class CannotWrite(Exception):
+    """A patched file cannot be written."""
 
 
 def apply_patches(folder: Path) -> list[str]:
@@ -44,7 +49,7 @@ def apply_patches(folder: Path) -> list[str]:
             *_camera(PandaStick, PandaWristCam, STICK),
             *_camera(PandaWristCam, PandaWristCam, WRIST),
         ]
-    except CannotPatch:
+    except (CannotPatch, CannotWrite):
         raise
     except Exception as error:
         what = f"{type(error).__name__}: {error}"
@@ -156,18 +161,30 @@ class _Description:
         name = hashlib.sha256(b"\0".join([bytes(home), urdf, srdf])).hexdigest()
         out = folder / name
         if not out.is_dir():
-            folder.mkdir(parents=True, exist_ok=True)
-            partial = Path(tempfile.mkdtemp(prefix=f".{name}.", suffix=".partial", dir=folder))
-            for path in home.iterdir():
-                (partial / path.name).symlink_to(path)
-            for path, text in ((self._path, urdf), (self._path.with_suffix(".srdf"), srdf)):
-                (partial / path.name).unlink()
-                (partial / path.name).write_bytes(text)
+            texts = {self._path.name: urdf, self._path.with_suffix(".srdf").name: srdf}
             try:
-                partial.rename(out)
-            except OSError:  # another process was faster
-                shutil.rmtree(partial)
+                folder.mkdir(parents=True, exist_ok=True)
+                _write_beside_links(out, home, texts)
+            except OSError as error:
+                what = f"the folder {folder} cannot be written: {error.strerror}"
+                raise CannotWrite(what) from error
         return str(out / self._path.name)
+
+
+def _write_beside_links(out: Path, home: Path, texts: dict[str, bytes]) -> None:
+    """Write files to a new folder, beside links to all other files of another one."""
+    partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent))
+    try:
+        for path in home.iterdir():
+            if path.name not in texts:
+                (partial / path.name).symlink_to(path)
+        for name, text in texts.items():
+            (partial / name).write_bytes(text)
+        with suppress(OSError):  # another process was faster
+            partial.rename(out)
+    finally:
+        if partial.exists():
+            shutil.rmtree(partial)
 
 
 def _end(joint: Any, which: str) -> str:

@@ -3,6 +3,7 @@
 import json
 import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,19 +15,14 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.subgoal import Subgoal, read_grounded
-from robomme_interference_data.simulators.base import Simulator
-from robomme_interference_data.simulators.episode import (
-    ACTION_SIZE,
-    CAMERAS,
-    Demonstration,
-    EpisodeInfo,
-    EpisodeStart,
-    Observation,
-    choose_cameras,
-)
+from robomme_interference_data.simulators.episode import CAMERAS, EpisodeStart, Observation
+from robomme_interference_data.simulators.remote.process import Arrays, RemoteProcess
+from robomme_interference_data.simulators.remote.simulator import RemoteSimulator
 from robomme_interference_data.simulators.tabletop.episodes import episode_ids
+from robomme_interference_data.storage.cache import cache_folder
 
-from .process import Arrays, Process, find_python, installed_versions
+from . import versions as robomme_versions
+from . import worker as robomme_worker
 from .recorded_scene import read_scene
 from .scenes import OfficialScene
 
@@ -40,8 +36,8 @@ without images it stays at 2.3 GB. A new process takes 1.5 GB, and 10 s.
 """
 
 
-class RoboMMESimulator(Simulator):
-    """The official simulator; see `Simulator`. The constructor starts RoboMME's process.
+class RoboMMESimulator(RemoteSimulator):
+    """The official simulator; see `RemoteSimulator`. The constructor starts RoboMME's process.
 
     RoboMME plays the demonstration at every reset, in a new environment.
     It does not return the demonstration's actions, so `Demonstration.actions` is `(0, 8)`. In the
@@ -51,8 +47,7 @@ class RoboMMESimulator(Simulator):
     RoboMME has other attributes than those that the answer is read from.
 
     A new process replaces the old one every few episodes, because RoboMME's memory grows; results
-    do not depend on that. If the process dies or takes too long, it is ended and the call raises
-    `SimulatorCrashError`; the next reset starts a new one.
+    do not depend on that.
 
     Args:
         python: RoboMME's interpreter; by default the environment variable `ROBOMME_PYTHON`.
@@ -73,7 +68,10 @@ class RoboMMESimulator(Simulator):
     action_names = VALUE_NAMES
     name = "robomme"
     about = "the official simulator, RoboMME"
-    settings = ("cameras", "subgoals", "answer_s")
+    settings = ("python", "cameras", "subgoals", "answer_s")
+    worker = Path(robomme_worker.__file__)
+    needs = "RoboMME (https://github.com/RoboMME/robomme_benchmark)"
+    oldest_python = (3, 10)
     own_episodes = True
     try_out = False
     episode_s = 1800.0
@@ -85,10 +83,13 @@ class RoboMMESimulator(Simulator):
         answer_s: float = 900.0,
         subgoals: bool = True,
     ):
-        self._cameras, self._subgoals = choose_cameras(cameras), subgoals
-        self._python, self._answer_s = find_python(python), answer_s
-        self._process = Process(self._python, answer_s)
-        self._subgoal: str | None = None
+        self._subgoals = subgoals
+        cache = str(cache_folder("robomme"))
+        super().__init__(
+            python, cameras, answer_s, subgoals=subgoals, max_steps=MAX_STEPS, cache=cache
+        )
+        drawn = bool(self._cameras or subgoals)
+        self.episodes_per_process = EPISODES if drawn else 5 * EPISODES
         self._scene: OfficialScene | None = None
         self._answer: Any = None  # what the solvers act out
         self._follows = False  # whether it has got a subgoal
@@ -96,16 +97,16 @@ class RoboMMESimulator(Simulator):
     @property
     def patches(self) -> tuple[str, ...]:
         """What was patched because the installed ManiSkill is not RoboMME's fork."""
-        return self._process.patches
+        return tuple(self._found["patches"])
 
     @classmethod
-    def versions(cls) -> dict[str, str]:
-        """Return the versions in the interpreter `ROBOMME_PYTHON`.
+    def versions(cls, python: str | None = None) -> dict[str, str]:
+        """Return the versions in RoboMME's interpreter.
 
         They are of `robomme`, `robomme_mani_skill` and so on, and include Python, sapien, torch and
         numpy, and the commit of a package that was installed from one.
         """
-        return installed_versions(find_python(None))
+        return cls.interpreter(python).versions(Path(robomme_versions.__file__))
 
     @classmethod
     def episodes(cls) -> list[EpisodeId]:
@@ -132,8 +133,8 @@ class RoboMMESimulator(Simulator):
         self._follows = True
         text = None if subgoal is None else subgoal.text
         points = [] if subgoal is None else [list(point) for point in subgoal.points]
-        response, _ = self._process.call("follow", text=text, points=points, seed=self._seed)
-        return np.array(response["action"], np.float32)
+        self.call("follow", text=text, points=points, seed=self._seed)
+        return np.array(self.fact("action"), np.float32)
 
     def subgoal(self) -> Subgoal:
         """Return RoboMME's current subgoal; see `Simulator.subgoal`."""
@@ -144,20 +145,15 @@ class RoboMMESimulator(Simulator):
             )
         if not (self._subgoal or "").strip():
             raise UnknownNameError(
-                f"RoboMME in {self._python} provides no subgoal",
+                f"RoboMME in {self._interpreter.path} provides no subgoal",
                 "Run without subgoals, or with a newer RoboMME.",
             )
         return read_grounded(str(self._subgoal))
 
-    @property
-    def pid(self) -> int | None:
-        """The id of RoboMME's process, or None if there is none."""
-        return self._process.pid
-
-    def close(self) -> None:
-        """End RoboMME's process; afterwards, every method except `close` raises."""
-        super().close()
-        self._process.end()
+    def _start(self) -> RemoteProcess:
+        process = super()._start()
+        self._found, _ = process.call("describe")
+        return process
 
     def _begin(self, episode: EpisodeId, frame_step: int) -> EpisodeStart:
         if episode.answer is not None:
@@ -165,43 +161,24 @@ class RoboMMESimulator(Simulator):
                 f"{episode}: RoboMME cannot combine a scene with another answer",
                 f"Use the episode {episode.scene}, or the simulator tabletop.",
             )
-        families = [family for family in self._process.families if family in FAMILIES]
+        families = [family for family in self._found["families"] if family in FAMILIES]
         if episode.family not in families:
             raise UnknownNameError.among("family", episode.family, self.name, families)
-        most = EPISODES if self._cameras or self._subgoals else 5 * EPISODES
-        if self._process.pid is None or self._process.played >= most:
-            self._process.end()
-            self._process = Process(self._python, self._answer_s)
-        self._process.played += 1
-        facts, arrays = self._process.call(
-            "reset",
-            family=episode.family,
-            split=episode.split,
-            index=episode.index,
-            max_steps=MAX_STEPS,
-            cameras=self._cameras,
-            frame_step=frame_step,
-            subgoals=self._subgoals,
-        )
-        self._subgoal = facts["subgoal"]
-        first = self._observation(arrays, self._cameras)
-        images = {camera: arrays[camera][:-1] for camera in self._cameras if frame_step}
-        no_actions = np.empty((0, ACTION_SIZE), np.float32)
-        evidence = self._read_facts(facts, episode.family, arrays)
-        lesson = Demonstration(images, arrays["states"][:-1], no_actions, *evidence)
-        info = EpisodeInfo(tuple(facts["goals"]), facts["difficulty"], facts["seed"], self.name)
-        return lesson, first, info
+        start = super()._begin(episode, frame_step)
+        self._subgoal = self.fact("subgoal")
+        return start
 
-    def _read_facts(
-        self, facts: dict[str, Any], family: str, arrays: Arrays
+    def _evidence(
+        self, episode: EpisodeId, arrays: Arrays
     ) -> tuple[tuple[EvidenceSpan, ...] | None, str | None]:
         """Keep the scene; return the lesson's evidence and the scene as JSON, None if unknown."""
+        facts = self._facts
         self._scene, self._answer, self._follows = None, None, False
         self._seed, self._unreadable = facts["seed"], facts.get("unreadable", "")
         if facts["scene"] is None:
             return None, None
         text = json.dumps(facts["scene"], separators=(",", ":"), sort_keys=True)
-        self._scene = read_scene(family, text, facts["difficulty"])
+        self._scene = read_scene(episode.family, text, facts["difficulty"])
         return self._scene.evidence(arrays["moments"][:-1]), text
 
     def _act(
@@ -209,8 +186,8 @@ class RoboMMESimulator(Simulator):
     ) -> NDArray[np.float32]:
         if self._answer is None:
             self._answer = self._choose(policy, known, answer)
-        response, _ = self._process.call("act", answer=self._answer)
-        return np.array(response["action"], np.float32)
+        self.call("act", answer=self._answer)
+        return np.array(self.fact("action"), np.float32)
 
     def _choose(self, policy: str, known: Mapping[int, str], answer: int | None) -> Any:
         """Return the answer that a policy acts out."""
@@ -232,22 +209,17 @@ class RoboMMESimulator(Simulator):
     def _execute(
         self, episode: EpisodeId, action: NDArray[np.float32], observe: bool
     ) -> tuple[Observation, Status]:
-        answer, arrays = self._process.call("step", action=action.tolist(), observe=observe)
-        status = Status(answer["status"])
-        if status is Status.ERROR:
-            what = f"reports an error at step {self._steps}: {answer['message']}"
-            raise self._process.error(what)
-        self._subgoal = answer["subgoal"]
-        return self._observation(arrays, self._cameras if observe else ()), status
+        executed = super()._execute(episode, action, observe)
+        self._subgoal = self.fact("subgoal")
+        return executed
 
-    def _observation(self, arrays: Arrays, cameras: tuple[str, ...]) -> Observation:
-        """Copy the last frames and state into an observation."""
-        images = {camera: arrays[camera][-1].copy() for camera in cameras}
-        for camera, image in images.items():
-            if (image.shape, image.dtype) != (FRAME_SHAPE, np.uint8):
+    def _observation(self, arrays: Arrays, cameras: Sequence[str]) -> Observation:
+        seen = super()._observation(arrays, cameras)
+        for camera, image in seen.images.items():
+            if image.shape != FRAME_SHAPE or image.dtype != np.uint8:
                 raise InvalidOptionError(
-                    f"RoboMME's {camera} camera in {self._python} gives {image.shape} "
+                    f"RoboMME's {camera} camera in {self._interpreter.path} gives {image.shape} "
                     f"{image.dtype}; expected {FRAME_SHAPE} uint8",
                     "Install the RoboMME version of the published recordings.",
                 )
-        return Observation(images, arrays["states"][-1].copy())
+        return seen

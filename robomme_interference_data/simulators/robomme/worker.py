@@ -1,20 +1,14 @@
-"""The worker that runs RoboMME, in RoboMME's own interpreter.
+"""The worker that runs RoboMME, in RoboMME's own interpreter; see `RemoteSimulator`.
 
-That interpreter has numpy < 2 and not this package, so this file imports neither, and keeps to
-Python 3.11. It answers on an inherited pipe, because ManiSkill prints to stdout. Messages are not
-pickled, because pickles of numpy 1 and 2 differ.
+That interpreter has numpy < 2 and not this package, so this file does not import it, and keeps to
+Python 3.11.
 """
 
 import importlib
+import importlib.metadata
 import importlib.util
-import json
-import os
-import queue
-import signal
-import sys
-import threading
 import traceback
-from multiprocessing.connection import Connection
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -35,97 +29,121 @@ def _sibling(name: str) -> Any:
 _patches, _rendering = _sibling("maniskill_patches"), _sibling("render_on_demand")
 _facts, _solvers, _steps = _sibling("facts"), _sibling("solvers"), _sibling("steps")
 
+NEEDED = {
+    "cv2": "opencv-python",
+    "defusedxml": "defusedxml",
+    "gymnasium": "gymnasium==0.29.1",
+    "h5py": "h5py",
+    "imageio": "imageio",
+    "mani_skill": "mani-skill==3.0.1",
+    "matplotlib": "matplotlib",
+    "mplib": "mplib==0.1.1",
+    "pytorch_kinematics": "pytorch-kinematics==0.7.6",
+    "sapien": "sapien",
+    "scipy": "scipy",
+    "torch": "torch",
+    "transforms3d": "transforms3d",
+}
+"""Modules that RoboMME imports, or its ManiSkill, to the distributions that contain them."""
 
-def send(
-    channel: Connection, head: dict[str, Any], arrays: dict[str, list[Any]] | None = None
-) -> None:
-    """Send a message: its head as JSON, then the bytes of each array.
 
-    `arrays` maps a name to numpy arrays of one shape and type; they arrive as one array with a new
-    first axis.
+class CannotRun(ImportError):
+    """This interpreter cannot run RoboMME.
+
+    The program that runs this file reads `install`, distributions that it needs, or `fix`.
     """
-    arrays = arrays or {}
-    described = []
-    for name, items in arrays.items():
-        if len({(item.dtype.str, item.shape) for item in items}) != 1:
-            raise ValueError(f"{name}: expected arrays of one shape and type")
-        described.append([name, items[0].dtype.str, [len(items), *items[0].shape]])
-    channel.send_bytes(json.dumps({**head, "arrays": described}).encode())
-    for items in arrays.values():
-        for item in items:
-            channel.send_bytes(item.tobytes())
+
+    def __init__(self, why: str, *install: str, fix: str | None = None):
+        super().__init__(why)
+        self.install, self.fix = install, fix
 
 
-def receive(channel: Connection) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the head and the arrays, by name, of the next message."""
-    head = json.loads(channel.recv_bytes())
-    arrays: dict[str, Any] = {}
-    for name, dtype, shape in head.pop("arrays"):
-        import numpy as np
+def check_versions() -> None:
+    """Check the versions of libraries of which RoboMME needs an older one."""
+    numpy = str(importlib.import_module("numpy").__version__)
+    if int(numpy.partition(".")[0]) >= 2:
+        raise CannotRun(f"numpy is {numpy}; RoboMME needs numpy < 2", "numpy<2")
+    with suppress(importlib.metadata.PackageNotFoundError):
+        gymnasium = importlib.metadata.version("gymnasium")
+        if not gymnasium.startswith("0.29."):
+            raise CannotRun(
+                f"gymnasium is {gymnasium}; RoboMME needs gymnasium 0.29", NEEDED["gymnasium"]
+            )
 
-        arrays[name] = np.empty(shape, dtype)
-        for item in arrays[name].reshape(shape[0], -1):
-            channel.recv_bytes_into(item)
-    return head, arrays
 
-
-def probe(folder: Path) -> dict[str, Any]:
-    """Patch ManiSkill, and return RoboMME's families and the patches, or a `problem`."""
-    if importlib.util.find_spec("robomme") is None:
-        return {"problem": "robomme is not installed there"}
+def families() -> list[str]:
+    """Return RoboMME's families."""
     try:
-        numpy = str(importlib.import_module("numpy").__version__)
-        if int(numpy.partition(".")[0]) >= 2:
-            return {"problem": f"numpy is {numpy}; RoboMME needs numpy < 2"}
-        families = list(_builder().get_task_list())
-        return {"families": families, "patches": _patches.apply_patches(folder)}
-    except _patches.CannotPatch as error:
-        return {"problem": str(error)}
+        return list(_builder().get_task_list())
     except Exception as error:
-        traceback.print_exc()
-        return {"problem": f"robomme cannot be imported: {_text(error)}"}
+        missing = _missing(error) if isinstance(error, ModuleNotFoundError) else {}
+        why = f"robomme cannot be imported: {_text(error)}"
+        if missing:
+            why = f"robomme needs modules that are missing: {', '.join(missing)}"
+        raise CannotRun(why, *missing.values()) from error
+
+
+def _missing(error: ModuleNotFoundError) -> dict[str, str]:
+    """Return all missing modules with their distributions, the one of an error first.
+
+    None if RoboMME itself lacks a part, which no index has.
+    """
+    first = str(error.name).partition(".")[0]
+    if first == "robomme":
+        return {}
+    further = {name: NEEDED[name] for name in NEEDED if importlib.util.find_spec(name) is None}
+    return {first: NEEDED.get(first, first), **further}
 
 
 class Episodes:
     """Runs one episode at a time, each in a new environment.
 
     A second reset of the same environment would give a different episode.
+
+    Args:
+        cameras: Names of the cameras to draw.
+        subgoals: Whether to report subgoals, for which RoboMME draws its front camera.
+        max_steps: After so many steps an episode is late.
+        cache: Folder for patched files.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, cameras: list[str], subgoals: bool, max_steps: int, cache: str):
+        if importlib.util.find_spec("robomme") is None:
+            raise CannotRun("robomme is not installed there")
+        check_versions()
+        self._families = families()
+        try:
+            self._patches = _patches.apply_patches(Path(cache))
+        except _patches.CannotPatch as error:
+            raise CannotRun(str(error)) from error
+        except _patches.CannotWrite as error:
+            fix = "Free space there, or set XDG_CACHE_HOME to another folder."
+            raise CannotRun(str(error), fix=fix) from error
+        self._cameras, self._subgoals, self._max_steps = cameras, subgoals, max_steps
         self._env: Any = None
-        self._cameras: list[str] = []
-        self._subgoals = True
         self._script: Any = None
         self._rendering = _rendering.RenderOnDemand()
 
-    def reset(
-        self,
-        family: str,
-        split: str,
-        index: int,
-        max_steps: int,
-        cameras: list[str],
-        frame_step: int,
-        subgoals: bool,
-    ) -> Answer:
+    def describe(self) -> Answer:
+        """Return RoboMME's families, and what was patched."""
+        return {"families": self._families, "patches": self._patches}, {}
+
+    def reset(self, family: str, split: str, index: int, frame_step: int) -> Answer:
         """Play a demonstration; return the facts about the episode, its frames and its states.
 
-        Of the demonstration, every n-th frame is drawn, none if `every` is 0. The last frame and
-        state are the first live observation. `scene` and `moments` are what `facts.py` reads, or
-        `scene` is None and `unreadable` says why.
+        `scene` and `moments` are what `facts.py` reads, or `scene` is None and `unreadable` says
+        why.
         """
         self.close()
         builder = _builder()(
-            env_id=family, dataset=split, action_space="joint_angle", max_steps=max_steps
+            env_id=family, dataset=split, action_space="joint_angle", max_steps=self._max_steps
         )
         seed, difficulty = builder.resolve_episode(index)
         # RoboMME would make an environment anyway, with a seed that belongs to no episode.
         if seed is None or not difficulty:
             return {"unknown": f"{family} has {builder.get_episode_num()} {split} episodes"}, {}
         self._env = builder.make_env_for_episode(index)
-        self._cameras, self._subgoals = cameras, subgoals
-        self._rendering.needs_front = self._must_locate if subgoals else bool
+        self._rendering.needs_front = self._must_locate if self._subgoals else bool
         self._select_cameras(frame_step > 0)
         log = _facts.LessonLog(self._env, family)
         kept = _rendering.KeptFrames(self._env.unwrapped, frame_step)
@@ -151,7 +169,7 @@ class Episodes:
         lesson = self._frames(observations) if frame_step else {}
         if lesson:
             kept.check(_facts.kept_steps(self._env)[:-1])
-        for camera, image in self._rendering.images(self._env, cameras).items():
+        for camera, image in self._rendering.images(self._env, self._cameras).items():
             arrays[camera] = [*lesson.get(camera, [])[: -1 : frame_step or 1], image]
         return facts, arrays
 
@@ -221,38 +239,6 @@ class Episodes:
         return next((str(text) for text in texts if text), None) if self._subgoals else None
 
 
-def serve(channel: Connection, folder: Path) -> None:
-    """Answer requests until the other side closes the pipe, which ends this process."""
-    requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    threading.Thread(target=_read, args=(channel, requests), daemon=True).start()
-    hello = probe(folder)
-    send(channel, hello)
-    if "problem" in hello:
-        return
-    episodes = Episodes()
-    while True:
-        head, _ = requests.get()
-        call = getattr(episodes, head.pop("call"))
-        try:
-            answer, arrays = call(**head)
-        except Exception as error:
-            traceback.print_exc()
-            episodes.close()
-            answer, arrays = {"failed": _text(error)}, {}
-        send(channel, answer, arrays)
-
-
-def _read(channel: Connection, requests: Any) -> None:
-    """Queue requests; end this process, even during a call, when the other side is gone."""
-    try:
-        while True:
-            requests.put(receive(channel))
-    except Exception as error:
-        if not isinstance(error, EOFError | OSError):
-            traceback.print_exc()
-        os._exit(1)
-
-
 def _builder() -> Any:
     return importlib.import_module("robomme.env_record_wrapper").BenchmarkEnvBuilder
 
@@ -268,14 +254,3 @@ def _states(observations: Any) -> list[Any]:
 
 def _text(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}"
-
-
-def main() -> None:
-    """Serve on the pipe of a file descriptor; the second argument is a folder for patched files."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other side handles Ctrl-C
-    os.set_inheritable(int(sys.argv[1]), False)
-    serve(Connection(int(sys.argv[1])), Path(sys.argv[2]))
-
-
-if __name__ == "__main__":
-    main()

@@ -23,11 +23,7 @@ def make_renderer() -> sapien.render.RenderSystem:
     try:
         return sapien.render.RenderSystem(sapien.Device("cpu"))
     except RuntimeError as error:
-        raise NoRendererError(
-            f"no Vulkan device on this machine can render: {error}",
-            "Install a software driver: sudo make vulkan. Without the repository: libvulkan1 and "
-            "mesa-vulkan-drivers 24.3 or newer (Debian 12 has it in bookworm-backports).",
-        ) from error
+        raise NoRendererError.without_vulkan(error) from error
 
 
 def _check_shader_cache() -> None:
