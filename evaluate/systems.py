@@ -33,8 +33,8 @@ class SystemFacts:
     ] = None
     memory: Annotated[
         str | None,
-        "Rule by which the memory keeps frames, `full`, `framesamp:32` or `window:32`; None if "
-        "unknown, or if it keeps no frames.",
+        "Rule by which the memory keeps frames, such as `full`, `framesamp:32` or `window:60@2`; "
+        "None if unknown, or if it keeps no frames.",
     ] = None
     retrieval: Annotated[
         str | None,

@@ -169,7 +169,7 @@ _LEARNED = replace(_CONTROL, role=Role.LEARNED, identified=False, action_size=AC
 KINDS: dict[str, PolicyKind] = {
     "replay": replace(
         _CONTROL,
-        form="replay, replay:framesamp:N or replay:window:N",
+        form="replay, replay:framesamp:N, replay:window:N or replay:window:SECONDS@FPS",
         factory=f"{_HERE}.builtin:ReplayPolicy",
         target="(?P<memory>.+)",
         default="full",
@@ -180,7 +180,7 @@ KINDS: dict[str, PolicyKind] = {
     ),
     "recall": replace(
         _CONTROL,
-        form="recall, recall:framesamp:N or recall:window:N",
+        form="recall, recall:framesamp:N, recall:window:N or recall:window:SECONDS@FPS",
         factory=f"{_HERE}.builtin:Recall",
         target="(?P<memory>.+)",
         default="full",

@@ -214,6 +214,7 @@ def check_name(tiny_buffers: Path, system: str, **changes: Any) -> None:
             {"retrieval": "siglip", "retrieval_rule": "max/0.9", "retrieval_camera": "wrist"},
             *("retrieval-replay-window-max-0.9-wrist", "retrieval-replay-window"),
         ),
+        ({"policy": "replay:window:60@2"}, "replay-window60s2fps", "replay-window"),
     ],
 )
 def test_the_default_name_states_the_policy_and_the_retrieval_step(
