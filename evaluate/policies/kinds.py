@@ -61,7 +61,7 @@ class PolicyKind(SpecKind):
         role: What its results are for.
         identified: Whether its text and options identify it, so that rows have a label by default.
             Folders, revisions and servers have the same names for different checkpoints.
-        published: Whether it may be one of the paper's systems.
+        published: Whether it may be a system that the paper or others published.
         option_labels: Options that make another system: what the default label gets if they do not
             have their defaults, with `{}` for the value.
         action_size: Number of values that it reads of a state and returns in an action; None: any.
