@@ -227,9 +227,7 @@ _CONTROLS = (
 )
 
 
-def _elsewhere(
-    name: str, display: str, memory: str, *, integration: str | None = None
-) -> System:
+def _elsewhere(name: str, display: str, memory: str, *, integration: str | None = None) -> System:
     """A system with a window of frames that the paper does not report."""
     facts = SystemFacts(policy_id=name, memory=memory)
     return System(name, display, "last frames", integration, facts=facts, elsewhere=True)
