@@ -29,6 +29,7 @@ def ceiling(buffer_set: BufferSetFolder, config: CeilingConfig, as_json: AsJson 
     Examples:
     ```
     robomme-interference ceiling my-buffers --memory window
+    robomme-interference ceiling my-buffers --memory window:60@2
     robomme-interference ceiling my-buffers --memory framesamp:64 --frames 2
     robomme-interference ceiling my-buffers --retrieval thumbnail \
       --shift light:2

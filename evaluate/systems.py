@@ -33,8 +33,8 @@ class SystemFacts:
     ] = None
     memory: Annotated[
         str | None,
-        "Rule by which the memory keeps frames, `full`, `framesamp:32` or `window:32`; None if "
-        "unknown, or if it keeps no frames.",
+        "Rule by which the memory keeps frames, such as `full`, `framesamp:32` or `window:60@2`; "
+        "None if unknown, or if it keeps no frames.",
     ] = None
     retrieval: Annotated[
         str | None,
@@ -78,6 +78,7 @@ class System:
         base: Name of the published system without the retrieval step; None without one.
         position_limit: Maximum history and live frames together in memory; None: no limit.
         paper: Whether the paper reports it.
+        elsewhere: Whether others published it, with the memory in its facts.
     """
 
     name: str
@@ -88,6 +89,7 @@ class System:
     base: str | None = None
     position_limit: int | None = None
     paper: bool = False
+    elsewhere: bool = False
 
     @property
     def keeps_frames(self) -> bool | None:
@@ -224,8 +226,24 @@ _CONTROLS = (
     _with_memory("Retrieval-Replay", "replay", "FrameSamp", option="extrapolate", retrieval=True),
 )
 
-SYSTEMS: dict[str, System] = {system.name: system for system in (*PAPER_SYSTEMS, *_CONTROLS)}
-"""Name to system: the paper's, then the built-in policies. The order is that of tables."""
+
+def _elsewhere(name: str, display: str, memory: str, *, integration: str | None = None) -> System:
+    """A system with a window of frames that the paper does not report."""
+    facts = SystemFacts(policy_id=name, memory=memory)
+    return System(name, display, "last frames", integration, facts=facts, elsewhere=True)
+
+
+_OTHERS = (
+    # The last 60 s at 2 frames per second, of frames that it counts as 20 per second.
+    _elsewhere("simplememvla", "SimpleMemVLA", "window:120@1", integration="context"),
+    # LeRobot's pi05 with six frames a second apart: memory_frames=6, memory_stride=10.
+    _elsewhere("pi05-mem", "π0.5-MEM", "window:6@1"),
+)
+
+SYSTEMS: dict[str, System] = {
+    system.name: system for system in (*PAPER_SYSTEMS, *_CONTROLS, *_OTHERS)
+}
+"""Name to system: the paper's, the built-in policies, others. The order is that of tables."""
 
 
 def name_system(name: str) -> System:

@@ -37,7 +37,7 @@ class ReplayPolicy(Policy):
     memory.
 
     Args:
-        memory: `full`, `framesamp:N` or `window:N`; see `Memory.parse`.
+        memory: A rule, such as `full`, `framesamp:32` or `window:60@2`; see `Memory`.
         extrapolate: Continue the last motion for as many steps as history frames follow the last
             kept one. Such rows are those of another system.
     """
@@ -207,7 +207,7 @@ class Recall(Privileged):
     from the episode's seed, and the simulator's script carries it out. It reads no images.
 
     Args:
-        memory: `full`, `framesamp:N` or `window:N`; see `Memory.parse`.
+        memory: A rule, such as `full`, `framesamp:32` or `window:60@2`; see `Memory`.
     """
 
     def __init__(self, memory: str = "full"):

@@ -61,7 +61,7 @@ class PolicyKind(SpecKind):
         role: What its results are for.
         identified: Whether its text and options identify it, so that rows have a label by default.
             Folders, revisions and servers have the same names for different checkpoints.
-        published: Whether it may be one of the paper's systems.
+        published: Whether it may be a system that the paper or others published.
         option_labels: Options that make another system: what the default label gets if they do not
             have their defaults, with `{}` for the value.
         action_size: Number of values that it reads of a state and returns in an action; None: any.
@@ -169,7 +169,7 @@ _LEARNED = replace(_CONTROL, role=Role.LEARNED, identified=False, action_size=AC
 KINDS: dict[str, PolicyKind] = {
     "replay": replace(
         _CONTROL,
-        form="replay, replay:framesamp:N or replay:window:N",
+        form="replay, replay:framesamp:N, replay:window:N or replay:window:SECONDS@FPS",
         factory=f"{_HERE}.builtin:ReplayPolicy",
         target="(?P<memory>.+)",
         default="full",
@@ -180,7 +180,7 @@ KINDS: dict[str, PolicyKind] = {
     ),
     "recall": replace(
         _CONTROL,
-        form="recall, recall:framesamp:N or recall:window:N",
+        form="recall, recall:framesamp:N, recall:window:N or recall:window:SECONDS@FPS",
         factory=f"{_HERE}.builtin:Recall",
         target="(?P<memory>.+)",
         default="full",

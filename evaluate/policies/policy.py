@@ -68,9 +68,9 @@ class Policy(ABC):
             number of values than the query's: `pad`, zeros after fewer values; `omit`, zeros in
             place of all values; or `refuse`, no run with such units. A policy that reads no history
             states declares `omit`.
-        memory: Rule by which it keeps frames, `full`, `framesamp:N` or `window:N`, from which rows
-            get `evidence_kept`, the share of the evidence that it still has. None if it keeps none,
-            or by another rule.
+        memory: Rule by which it keeps frames, `full`, `framesamp:N`, `window:N` or
+            `window:SECONDS@FPS` (see `Memory`), from which rows get `evidence_kept`, the share of
+            the evidence that it still has. None if it keeps none, or by another rule.
     """
 
     cameras: tuple[str, ...] = ()

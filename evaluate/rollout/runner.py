@@ -110,7 +110,7 @@ def _describe_run(
 ) -> RunContext[RunConfig]:
     """Return what is known of a run from its settings, and from what its policy reports."""
     kind, published = policy_kind(config.policy), SystemFacts()
-    if system.paper:
+    if system.paper or system.elsewhere:
         published = system.facts
     subgoals, subgoals_identity, metadata = None, None, dict(policy_metadata)
     if config.subgoals is not None:

@@ -120,19 +120,22 @@ def _check_name(config: RunConfig, system: System) -> None:
 def _fault_of_name(config: RunConfig, system: System) -> str | None:
     """Return why a run is not the system with this name; None for a name of the user."""
     kind = policy_kind(config.policy)
-    if not system.paper:
-        control = kind.role in (Role.CONTROL, Role.REFERENCE)
-        if system.name not in SYSTEMS or (control and default_system(config) == system.name):
-            return None
-        step = "" if config.retrieval is None else " with a retrieval step in front"
-        return f"the policy {config.policy} is not the control {system.name}{step}"
-    return _fault_of_published_name(config, kind, system)
+    if system.name not in SYSTEMS:
+        return None
+    if system.paper or system.elsewhere:
+        return _fault_of_published_name(config, kind, system)
+    control = kind.role in (Role.CONTROL, Role.REFERENCE)
+    if control and default_system(config) == system.name:
+        return None
+    step = "" if config.retrieval is None else " with a retrieval step in front"
+    return f"the policy {config.policy} is not the control {system.name}{step}"
 
 
 def _fault_of_published_name(config: RunConfig, kind: PolicyKind, system: System) -> str | None:
-    """Return why a run is not a system of the paper, or None."""
+    """Return why a run is not a system of the paper or of others, or None."""
     if not kind.published:
-        return f"the policy {config.policy} is not the paper's system {system.name}"
+        whose = "the paper's system" if system.paper else "the system"
+        return f"the policy {config.policy} is not {whose} {system.name}"
     acts_on_subgoals = system.facts.subgoals is not None
     # Code of the user may write the subgoals itself.
     if acts_on_subgoals is not (config.subgoals is not None) and kind.role is not Role.OWN:

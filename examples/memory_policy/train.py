@@ -43,7 +43,7 @@ def arguments() -> argparse.Namespace:
     add("--task", "answer questions, or act", choices=("answer", "act"), default="answer")
     conditions = "NAME,… or NAME=WEIGHT,…"
     add("--conditions", conditions, type=weights, default="k0,k1,k3,k7", metavar="NAMES")
-    add("--memory", "framesamp:N, window:N or full", default="framesamp:32")
+    add("--memory", "framesamp:N, window:N, window:SECONDS@FPS or full", default="framesamp:32")
     add("--retrieval", "encoder of a retrieval step before the memory, such as thumbnail")
     add("--cameras", "NAME,…; the first if left out", type=names, metavar="NAMES")
     add("--image-size", "side of the images in pixels", type=whole(4, 4), default=64)

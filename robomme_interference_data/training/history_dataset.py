@@ -88,7 +88,8 @@ class HistoryDataset:
     Args:
         buffer_set: Folder, `namespace/name` on the Hub, or a `BufferSet`.
         conditions: Names of conditions with the weights to draw them, or names with equal weights.
-        memory: `framesamp:N`, `window:N` or `full`; N counts the current frame. See `Memory`.
+        memory: `framesamp:N`, `window:N`, `window:SECONDS@FPS` or `full`; N counts the current
+            frame. See `Memory`.
         cameras: Cameras of current and memory frames, possibly none of them; None for the first.
         image_size: Side of the images in pixels, see `resize`; None for no change of size.
         chunk: Actions per item. If 0, items have no actions and there is one per episode: the

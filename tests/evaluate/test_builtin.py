@@ -25,7 +25,6 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.evidence import map_evidence
 from robomme_interference_data.schema.manifest import SessionEntry, layout_sessions
 from robomme_interference_data.schema.records import EvidenceSpan
-from robomme_interference_data.schema.sampling import MEMORIES, Memory
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.episode import Observation
@@ -40,24 +39,6 @@ def state(joint: float, opening: float = 0.04) -> Vector:
 
 def seen(shade: int, joint: float, opening: float = 0.04) -> Observation:
     return Observation({"front": np.full((32, 32, 3), shade, np.uint8)}, state(joint, opening))
-
-
-def test_the_frames_that_a_memory_keeps() -> None:
-    assert list(Memory("full").earlier(5)) == [0, 1, 2, 3, 4]
-    assert list(Memory("window").earlier(100)) == list(range(69, 100))  # 32 with the live one
-    assert list(Memory("framesamp").earlier(30)) == list(range(30))
-    # numpy truncates linspace(0, 310, 32) to 0, 10, …, 310; the last one is the live frame.
-    assert list(Memory("framesamp").earlier(310)) == list(range(0, 310, 10))
-    assert Memory("window", 3).kept([5, 6, 8, 9]) == [8, 9]  # two, and the live one
-    with raises(UnknownNameError):
-        ReplayPolicy("windw")
-
-
-@given(st.sampled_from(sorted(MEMORIES)), st.integers(0, 5000))
-def test_a_memory_keeps_existing_frames_in_order(name: str, live: int) -> None:
-    kept = list(Memory(name).earlier(live))
-    assert kept == sorted(set(kept)) and set(kept) <= set(range(live))
-    assert len(kept) == min(live, 31) or name == "full"
 
 
 def test_replay_extrapolates_over_the_frames_missing_at_the_end() -> None:
@@ -192,6 +173,9 @@ class Recorder:
         ("full", {1: "from the left", 0: "takes peg 2"}),
         ("framesamp:32", {1: "from the left"}),  # every tenth frame of 310
         ("window:32", {}),  # from 279 on
+        ("window:30@1", {1: "from the left"}),  # 20, 30, …, 300
+        ("window:31@1", {1: "from the left"}),  # and 10
+        ("window:60@2", {0: "takes peg 2", 1: "from the left"}),  # 15, 20, …
     ],
 )
 def test_recall_knows_the_evidence_that_its_memory_keeps(

@@ -42,6 +42,9 @@ def test_evidence_kept_by_hand(tiny_buffers: Path) -> None:
         **{(family, "k0"): 0.5 for family in (*families, ALL)},
         **{(family, "k1"): 0 for family in (*families, ALL)},
     }
+    # In seconds: of 48 frames 38, which is 1 s old, and 28; or of those 2 s apart 28 and 8.
+    for memory, share in (("window:3@1", 0.5), ("window:6@0.5", 0)):
+        assert kept(tiny_buffers, memory=memory, conditions=("k0",))["MoveCube", "k0"] == share
     # Of 272 frames every ninth: 0, 8, 17, 26, 35, 43.
     assert set(kept(tiny_buffers, conditions=("k7",)).values()) == {1}
     # Without a lesson nothing is known.

@@ -270,6 +270,7 @@ def check_name(tiny_buffers: Path, system: str, **changes: Any) -> None:
             {"retrieval": "siglip", "retrieval_rule": "max/0.9", "retrieval_camera": "wrist"},
             *("retrieval-replay-window-max-0.9-wrist", "retrieval-replay-window"),
         ),
+        ({"policy": "replay:window:60@2"}, "replay-window60s2fps", "replay-window"),
     ],
 )
 def test_the_default_name_states_the_policy_and_the_retrieval_step(
@@ -295,6 +296,10 @@ def test_the_default_name_states_the_policy_and_the_retrieval_step(
         ("oracle", "my-upper-end", None),
         ("websocket://h:1", "perceptual-framesamp-modul", None),
         (CHEAT, "memer", None),
+        ("replay:window:120@1", "simplememvla", "is not the system simplememvla"),
+        ("lerobot:x/y", "pi05-mem", "is not the system pi05-mem"),
+        ("websocket://h:1", "simplememvla", None),
+        (CHEAT, "pi05-mem", None),
     ],
 )
 def test_a_name_of_the_table_needs_its_policy(
@@ -306,6 +311,22 @@ def test_a_name_of_the_table_needs_its_policy(
     with raises(InvalidOptionError) as raised:
         check_name(tiny_buffers, system, policy=policy)
     assert raised.value.hint is not None and "name of your own" in raised.value.hint
+
+
+def test_a_named_system_brings_its_memory(tmp_path: Path, tiny_buffers: Path) -> None:
+    """MoveCube's lesson of 48 frames shows the answer in frames 0 to 3, and in 31 to 38."""
+    found = {}
+    for system in ("simplememvla", "pi05-mem", "mine"):
+        (row,) = run_one(tmp_path / system, policy=CHEAT, system=system, conditions=("k0",)).rows
+        found[system] = row.memory, row.evidence_kept
+    # 38, 28, 18 and 8 are kept by both.
+    assert found == {
+        "simplememvla": ("window:120@1", 0.5),
+        "pi05-mem": ("window:6@1", 0.5),
+        "mine": (None, None),
+    }
+    with raises(InvalidOptionError):
+        check_name(tiny_buffers, "simplememvla", policy="websocket://h:1", retrieval="siglip")
 
 
 def test_the_papers_retrieval_system_chooses_by_max(tiny_buffers: Path) -> None:

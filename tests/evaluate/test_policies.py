@@ -62,7 +62,7 @@ def test_a_policy_is_parsed() -> None:
         ("lamp:Lamp", UnknownNameError, "write python:lamp:Lamp"),
         ("wss://a:1", UnknownNameError, "Write websocket:wss://a:1"),
         ("ws://a:1", UnknownNameError, "Write websocket://a:1"),
-        ("zzz", UnknownNameError, "replay, replay:framesamp:N or replay:window:N, recall,"),
+        ("zzz", UnknownNameError, "replay:window:N or replay:window:SECONDS@FPS, recall,"),
         *(
             (text, InvalidOptionError, f"policy '{text}'; expected {text.partition(':')[0]}")
             for text in (

@@ -78,7 +78,12 @@ def test_a_cache_that_cannot_be_written_costs_no_rollout(
 
 @pytest.mark.parametrize(
     ("option", "memory", "kept"),
-    [("memory=window", "window:32", 0.5), ("memory=framesamp:32", "framesamp:32", 1)],
+    [
+        ("memory=window", "window:32", 0.5),
+        ("memory=framesamp:32", "framesamp:32", 1),
+        # Of 48 frames 38 and 28: the answer is shown in frames 0 to 3, and in 31 to 38.
+        ("memory=window:3@1", "window:3@1", 0.5),
+    ],
 )
 def test_a_policy_of_the_user_declares_its_memory(
     tmp_path: Path, option: str, memory: str, kept: float

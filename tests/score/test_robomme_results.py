@@ -2,6 +2,7 @@
 
 import csv
 import json
+import runpy
 from collections import Counter
 from functools import cache
 from typing import Any
@@ -96,6 +97,61 @@ def test_ceilings_follow_from_the_lessons() -> None:
         assert told == tuple(f"{100 * sum(one) / 50:.1f}%" for one in rates)
         # From k1 on, `window` is at the level of chance.
         assert [chance(one, "window", 1) for one in lessons] == rates[0]
+
+
+CEILINGS = (RESULTS / "robomme/ceilings.csv").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_ceilings_of_published_memories_follow_from_the_lessons() -> None:
+    assert runpy.run_path(str(RESULTS / "make_ceilings.py"))["ceilings"]() == CEILINGS
+
+
+def test_ceilings_of_published_memories_are_those_of_the_file() -> None:
+    made = {
+        (row["memory"], row["condition"], int(row["live_frames"])): row
+        for row in csv.DictReader(CEILINGS.splitlines())
+        if row["family"] == "all"
+    }
+    listed = table(ROBOMME, "k7, 800 live")
+    for row in listed:
+        memory = row.pop("memory").strip("`")
+        del row["keeps"]
+        for head, text in row.items():
+            condition, _, live = head.partition(", ")
+            found = made[memory, condition, int(live.removesuffix(" live") or 0)]
+            assert text == f"{100 * float(found['success']):.1f}%", (memory, head)
+    assert len(listed) * 6 == len(made)
+    for memory in ("framesamp:32", "window:120@1"):
+        assert made[memory, "k7", 0]["all_parts"] == "450"
+    chance = sum(1 / len(scene_of(one).answers) for one in LESSONS) / 450
+    assert f"Chance is {100 * chance:.1f}%" in ROBOMME
+    assert float(made["window:6@1", "k7", 0]["success"]) == pytest.approx(chance, abs=1e-6)
+
+
+def test_ceilings_of_a_few_lessons_by_position() -> None:
+    """The file's numbers for a family, with sets of frames instead of the rule's code."""
+    rows = {
+        (row["memory"], row["condition"]): float(row["success"])
+        for row in csv.DictReader(CEILINGS.splitlines())
+        if row["family"] == "VideoPlaceOrder" and row["live_frames"] == "0"
+    }
+    lessons = [one for one in LESSONS if family_of(one) == "VideoPlaceOrder"]
+    for condition, later in (("k15", 480), ("k31", 992), ("raw-k3", 768)):
+        for memory, step, frames in (("window:120@1", 10, 120), ("window:60@2", 5, 120)):
+            found = 0.0
+            for one in lessons:
+                live = one["lesson_frames"] + later
+                kept = {live - step * j for j in range(1, frames)}
+                known = tuple(
+                    {
+                        span["part"]: span["text"]
+                        for span in one["evidence"]
+                        if kept.intersection(range(span["start"], span["stop"]))
+                    }.items()
+                )
+                found += 1 / len(_agreeing(one["episode_id"], known))
+            assert rows[memory, condition] == pytest.approx(found / 50, abs=1e-6)
 
 
 def test_frames_of_the_least_shown_part() -> None:

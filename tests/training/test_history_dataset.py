@@ -33,7 +33,7 @@ Make = Callable[..., HistoryDataset]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("memory", ["framesamp:8", "window:5", "full"])
+@pytest.mark.parametrize("memory", ["framesamp:8", "window:2@2.5", "full"])
 @pytest.mark.parametrize("condition", ["no-history", "k0", "k3"])
 @pytest.mark.parametrize("moment", [0, 3, LIVE - 1])
 def test_memory_is_of_the_buffer_and_the_execution(
@@ -148,7 +148,7 @@ def same(batch: dict[str, Any], collated: dict[str, Any]) -> None:
             assert values == list(collated[name])
 
 
-@pytest.mark.parametrize("memory", ["framesamp:8", "window:5", "full"])
+@pytest.mark.parametrize("memory", ["framesamp:8", "window:2@2.5", "full"])
 def test_a_batch_is_the_collated_items(memory: str, make: Make) -> None:
     data = make({"no-history": 1, "k0": 1, "k3": 1}, memory=memory)
     indices = [5, 0, 5, 2 * LIVE, LIVE - 1, *range(90, 99), -1]

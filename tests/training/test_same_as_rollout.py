@@ -73,7 +73,7 @@ class Watching(Policy):
         return {}
 
 
-@pytest.mark.parametrize("memory", ["framesamp:8", "window:5", "full"])
+@pytest.mark.parametrize("memory", ["framesamp:8", "window:2@2.5", "full"])
 @pytest.mark.parametrize(
     "condition, retrieval",
     [("no-history", None), ("k0", None), ("before-k3", None), ("before-k3", "thumbnail")],
