@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.build_dataset.sources import Frame, Recording
+from robomme_interference_data.build_dataset.sources.simulator import SimulatorSource
 from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, LESSONS, STATE, UNITS
 from robomme_interference_data.errors import (
     BuildError,
@@ -24,6 +25,10 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.records import EpisodeRecord, SpanDigests, lesson_spans
+from robomme_interference_data.simulators.registry import (
+    simulator_renderer,
+    simulator_versions,
+)
 from robomme_interference_data.storage.arrays import (
     FeatureDigests,
     combine,
@@ -96,6 +101,15 @@ class StageTask:
         if not starts:
             raise too_short(length, unit)
         return starts
+
+    def describe(self) -> dict[str, str]:
+        """Return what simulators report on this machine: all nodes of a cluster build alike."""
+        described = {}
+        for source in self.plan.sources:
+            if isinstance(source, SimulatorSource):
+                described |= simulator_versions(source.name)
+                described[f"renderer of {source.name}"] = str(simulator_renderer(source.name))
+        return described
 
     def close(self) -> None:
         """Close the sources."""

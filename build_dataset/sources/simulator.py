@@ -2,6 +2,7 @@
 
 from collections.abc import Generator, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, override
 
 from robomme_interference_data.constants import ACTION, STATE
@@ -40,17 +41,21 @@ class SimulatorSource(Source):
         self.name, self._every, self._shifted = name, every, shifted
         self._class = simulator_class(name)
         self.time_limit_s = self._class.episode_s
-        # Another version of the suite has other episodes.
-        version = self._class.suite_version
-        self.provenance = {"kind": name}
-        if version is not None:
-            self.provenance["suite_version"] = version
         self._settings = {"subgoals": False}
         self._simulator: Simulator | None = None
         self._cameras: tuple[str, ...] = ()
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_simulator": None}
+
+    @cached_property
+    def provenance(self) -> dict[str, Any]:  # type: ignore[override]
+        """Versions of the simulator, and its renderer on the machine that plans the build."""
+        return {
+            "kind": self.name,
+            "versions": self._class.versions(),
+            "renderer": self._class.renderer(),
+        }
 
     @override
     def episodes(self) -> list[SourceEpisode]:
@@ -61,8 +66,8 @@ class SimulatorSource(Source):
                 "Define the class method `episodes`, and name the class as MODULE:CLASS, or a "
                 "function with it as return annotation: see docs/how-to/another-benchmark.md.",
             )
-        listed = [SourceEpisode(episode, self.provenance) for episode in usual]
-        listed += [SourceEpisode(episode, self.provenance, further=True) for episode in further]
+        listed = [SourceEpisode(episode) for episode in usual]
+        listed += [SourceEpisode(episode, further=True) for episode in further]
         return sorted(listed, key=lambda episode: episode.id)
 
     @override

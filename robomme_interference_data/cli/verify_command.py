@@ -104,6 +104,7 @@ def _verify_buffer_set(buffer_set: str, *, decode: bool, audit: bool, as_json: b
         verify_buffer_set,
         verify_datasets,
     )
+    from robomme_interference_data.data.renderers import dataset_renderers, renderers_note
     from robomme_interference_data.progress import WorkProgress
 
     opened, incomplete = _open(buffer_set)
@@ -121,6 +122,11 @@ def _verify_buffer_set(buffer_set: str, *, decode: bool, audit: bool, as_json: b
         skipped = undecoded_frames(opened)
     if skipped:
         report["frames_not_decoded"] = skipped
+    note = None
+    if opened is not None and not violations:
+        note = renderers_note(dataset_renderers(opened.datasets).items())
+    if note is not None:
+        report["warnings"] = [note]
     if not as_json:
         for violation in violations:
             echo(f"{violation.where}: {violation.what}")
@@ -133,6 +139,8 @@ def _verify_buffer_set(buffer_set: str, *, decode: bool, audit: bool, as_json: b
         if skipped:
             frames = counted(skipped, "frame")
             print_status(f"Not decoded: {frames}, of which only some cameras were fetched.")
+        if note is not None:
+            print_status(f"Warning: {note}")
     leaks = False
     if opened is not None and audit and not violations:
         leaks = _audit(opened, report, as_json=as_json)

@@ -126,3 +126,8 @@ def recorded_scene(query: "Query") -> Scene | None:
 def simulator_versions(name: str) -> dict[str, str]:
     """Return the versions that a simulator's results depend on; see `Simulator.versions`."""
     return simulator_class(name).versions()
+
+
+def simulator_renderer(name: str) -> str | None:
+    """Return what draws a simulator's images on this machine; see `Simulator.renderer`."""
+    return simulator_class(name).renderer()

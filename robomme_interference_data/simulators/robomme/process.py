@@ -139,14 +139,14 @@ def _unusable(python: str, error: Exception) -> InvalidOptionError:
 
 @cache
 def installed_versions(python: str) -> dict[str, str]:
-    """Return the versions in an interpreter, without starting RoboMME."""
+    """Return the versions in an interpreter, and the patches, without starting RoboMME."""
     try:
         output = subprocess.check_output(
-            [python, robomme_versions.__file__],
+            [python, robomme_versions.__file__, str(cache_folder("robomme"))],
             env={**os.environ, **_ENVIRONMENT},
             stdin=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
-            timeout=60,
+            timeout=300,  # importing ManiSkill takes 10 s, on overloaded machines far longer
         )
         versions: dict[str, str] = json.loads(output)
     except (OSError, ValueError, subprocess.SubprocessError) as error:

@@ -24,6 +24,7 @@ from robomme_interference_data.simulators.episode import (
     Observation,
     choose_cameras,
 )
+from robomme_interference_data.simulators.sapien_renderer import renderer_in
 from robomme_interference_data.simulators.tabletop.episodes import episode_ids
 
 from .process import Arrays, Process, find_python, installed_versions
@@ -103,9 +104,15 @@ class RoboMMESimulator(Simulator):
         """Return the versions in the interpreter `ROBOMME_PYTHON`.
 
         They are of `robomme`, `robomme_mani_skill` and so on, and include Python, sapien, torch and
-        numpy, and the commit of a package that was installed from one.
+        numpy, the commit of a package that was installed from one, and `robomme_patches`, what is
+        patched in ManiSkill.
         """
         return installed_versions(find_python(None))
+
+    @classmethod
+    def renderer(cls) -> str | None:
+        """Return the renderer in the interpreter `ROBOMME_PYTHON`; see `Simulator.renderer`."""
+        return renderer_in(find_python(None))
 
     @classmethod
     def episodes(cls) -> list[EpisodeId]:
