@@ -43,7 +43,7 @@ def check_same_simulators(
         found = unequal(("it", _facts(before)), ("this build", _facts(source)))
         raise BuildError(
             f"{where} has episodes of another {source['kind']}: {'; '.join(found)}",
-            f"Build where versions and renderer are those, or {advice}",
+            f"Build with those versions and that renderer, {advice}",
         )
 
 

@@ -25,10 +25,7 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.records import EpisodeRecord, SpanDigests, lesson_spans
-from robomme_interference_data.simulators.registry import (
-    simulator_renderer,
-    simulator_versions,
-)
+from robomme_interference_data.simulators.registry import simulator_renderer, simulator_versions
 from robomme_interference_data.storage.arrays import (
     FeatureDigests,
     combine,
@@ -104,7 +101,7 @@ class StageTask:
 
     def describe(self) -> dict[str, str]:
         """Return what simulators report on this machine: all nodes of a cluster build alike."""
-        described = {}
+        described: dict[str, str] = {}
         for source in self.plan.sources:
             if isinstance(source, SimulatorSource):
                 described |= simulator_versions(source.name)

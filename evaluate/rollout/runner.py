@@ -10,11 +10,7 @@ from typing import TYPE_CHECKING, Any
 from robomme_interference_data.constants import DEMONSTRATIONS, EXECUTIONS, ORACLE
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import open_dataset
-from robomme_interference_data.data.renderers import (
-    LIVE_VIEWS,
-    dataset_renderers,
-    renderers_note,
-)
+from robomme_interference_data.data.renderers import LIVE_VIEWS, dataset_renderers, renderers_note
 from robomme_interference_data.data.state_reader import other_state_sizes
 from robomme_interference_data.errors import (
     InterferenceError,

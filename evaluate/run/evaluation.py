@@ -49,6 +49,7 @@ from .worker import Job, PlannedRun, RunContext
 if TYPE_CHECKING:
     import pandas
 
+
 @dataclass(frozen=True)
 class RunResult:
     """The result of a run.

@@ -104,7 +104,6 @@ def _verify_buffer_set(buffer_set: str, *, decode: bool, audit: bool, as_json: b
         verify_buffer_set,
         verify_datasets,
     )
-    from robomme_interference_data.data.renderers import dataset_renderers, renderers_note
     from robomme_interference_data.progress import WorkProgress
 
     opened, incomplete = _open(buffer_set)
@@ -122,11 +121,6 @@ def _verify_buffer_set(buffer_set: str, *, decode: bool, audit: bool, as_json: b
         skipped = undecoded_frames(opened)
     if skipped:
         report["frames_not_decoded"] = skipped
-    note = None
-    if opened is not None and not violations:
-        note = renderers_note(dataset_renderers(opened.datasets).items())
-    if note is not None:
-        report["warnings"] = [note]
     if not as_json:
         for violation in violations:
             echo(f"{violation.where}: {violation.what}")
@@ -139,17 +133,28 @@ def _verify_buffer_set(buffer_set: str, *, decode: bool, audit: bool, as_json: b
         if skipped:
             frames = counted(skipped, "frame")
             print_status(f"Not decoded: {frames}, of which only some cameras were fetched.")
-        if note is not None:
-            print_status(f"Warning: {note}")
     leaks = False
-    if opened is not None and audit and not violations:
-        leaks = _audit(opened, report, as_json=as_json)
+    if opened is not None and not violations:
+        _warn(opened, report, as_json=as_json)
+        leaks = audit and _audit(opened, report, as_json=as_json)
     if as_json:
         print_json(report)
     if incomplete is not None:
         raise incomplete
     if violations or leaks:
         raise typer.Exit(1)
+
+
+def _warn(opened: "BufferSet", report: dict[str, Any], *, as_json: bool) -> None:
+    """Add to the report, or print, what breaks no rule and readers must know."""
+    from robomme_interference_data.data.renderers import dataset_renderers, renderers_note
+
+    note = renderers_note(dataset_renderers(opened.datasets).items())
+    if note is None:
+        return
+    report["warnings"] = [note]
+    if not as_json:
+        print_status(f"Warning: {note}")
 
 
 def _open(buffer_set: str) -> "tuple[BufferSet | None, MissingFileError | None]":

@@ -246,9 +246,7 @@ class Scheduler[H: Handle](ABC):
                         waiting.append(queued)
                     else:
                         count = queued.failures + queued.losses
-                        yield replace(
-                            outcome, task=queued.task, attempts=count, first=queued.first
-                        )
+                        yield replace(outcome, task=queued.task, attempts=count, first=queued.first)
         finally:
             # The caller wants no more outcomes; idle workers stay for its next tasks.
             for worker in busy:

@@ -48,7 +48,7 @@ def describe_renderer() -> str:
     Raises:
         LookupError: No device can draw.
     """
-    import sapien  # it chooses the drivers that Vulkan loads, so it is first
+    import sapien.render  # it chooses the drivers that Vulkan loads, so it is first
 
     summary = sapien.render.get_device_summary()
     drivers = vulkan_devices()
@@ -82,7 +82,7 @@ def _selected(summary: str, drivers: dict[str, tuple[int, str]]) -> str:
 class _Create(ctypes.Structure):
     """`VkInstanceCreateInfo`."""
 
-    _fields_ = [  # noqa: RUF012 - the form that ctypes reads
+    _fields_ = [
         ("type", ctypes.c_int),
         ("next", ctypes.c_void_p),
         ("flags", ctypes.c_uint32),
@@ -97,7 +97,7 @@ class _Create(ctypes.Structure):
 class _Application(ctypes.Structure):
     """`VkApplicationInfo`."""
 
-    _fields_ = [  # noqa: RUF012
+    _fields_ = [
         ("type", ctypes.c_int),
         ("next", ctypes.c_void_p),
         ("name", ctypes.c_char_p),
@@ -111,7 +111,7 @@ class _Application(ctypes.Structure):
 class _Driver(ctypes.Structure):
     """`VkPhysicalDeviceDriverProperties`."""
 
-    _fields_ = [  # noqa: RUF012
+    _fields_ = [
         ("type", ctypes.c_int),
         ("next", ctypes.c_void_p),
         ("id", ctypes.c_int),
@@ -124,7 +124,7 @@ class _Driver(ctypes.Structure):
 class _Properties(ctypes.Structure):
     """`VkPhysicalDeviceProperties2`, with its limits as bytes."""
 
-    _fields_ = [  # noqa: RUF012
+    _fields_ = [
         ("type", ctypes.c_int),
         ("next", ctypes.c_void_p),
         ("versions", ctypes.c_uint32 * 4),
@@ -153,13 +153,11 @@ def vulkan_devices() -> dict[str, tuple[int, str]]:
     vulkan.vkEnumeratePhysicalDevices(instance, ctypes.byref(count), None)
     handles: Any = (ctypes.c_void_p * count.value)()
     vulkan.vkEnumeratePhysicalDevices(instance, ctypes.byref(count), handles)
-    devices = {}
+    devices: dict[str, tuple[int, str]] = {}
     for handle in handles:
         driver = _Driver(type=_DRIVER)
         properties = _Properties(type=_PROPERTIES, next=ctypes.addressof(driver))
-        vulkan.vkGetPhysicalDeviceProperties2(
-            ctypes.c_void_p(handle), ctypes.byref(properties)
-        )
+        vulkan.vkGetPhysicalDeviceProperties2(ctypes.c_void_p(handle), ctypes.byref(properties))
         texts = [text.decode("utf-8", "replace") for text in (driver.name, driver.info)]
         name = properties.name.decode("utf-8", "replace")
         devices.setdefault(name, (properties.kind, " ".join(filter(None, texts))))
