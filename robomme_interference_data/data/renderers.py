@@ -38,6 +38,6 @@ def renderers_note(renderers: Iterable[tuple[str, str | None]]) -> str | None:
     if unknown := [images for images in without if images not in known]:
         origins.append(f"{' and '.join(unknown)} unknown")
     return (
-        f"Images come from different renderers: {'; '.join(origins)}. Their pixels may differ: see "
-        "docs/explanation/exactness.md."
+        f"Images come from different renderers: {'; '.join(origins)}. Their pixels may differ, and "
+        "a policy can see that."
     )

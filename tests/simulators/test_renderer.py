@@ -33,10 +33,7 @@ def summary(*devices: tuple[str, int, int]) -> str:
         ([("llvmpipe", 1, -1)], "llvmpipe, driver llvmpipe Mesa 25.0.7, CPU"),
         ([("llvmpipe", 1, -1), ("NVIDIA H200", 1, 0)], "NVIDIA H200, driver NVIDIA 570.86, GPU"),
         # One without graphics, as in a container that was started without them.
-        (
-            [("NVIDIA H200", 0, 0), ("llvmpipe", 1, -1)],
-            "llvmpipe, driver llvmpipe Mesa 25.0.7, CPU",
-        ),
+        ([("NVIDIA H200", 0, 0), ("Radeon", 1, -1)], "Radeon, driver radv Mesa 25.0.7, GPU"),
         # A discrete device before an integrated one, and that one if it is the only GPU.
         ([("Intel Arc", 1, -1), ("Radeon", 1, -1)], "Radeon, driver radv Mesa 25.0.7, GPU"),
         ([("Intel Arc", 1, -1)], "Intel Arc, driver Intel Mesa 25.0.7, GPU"),
