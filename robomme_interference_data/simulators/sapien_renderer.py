@@ -13,7 +13,7 @@ import sys
 from functools import cache
 from typing import Any
 
-_SECONDS = 120
+_SECONDS = 300
 """Limit for the program: loading drivers takes long on overloaded machines."""
 
 # Of Vulkan's headers (vulkan_core.h).
