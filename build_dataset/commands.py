@@ -85,8 +85,11 @@ def build(
         if plan.questions:
             results[QUESTIONS] = _make_questions(root)
         leaks = _leaks(root) if plan.datasets and plan.manifests else []
+        note = _renderers_note(root) if plan.datasets else None
     if as_json:
         print_json(results)
+    if note is not None:
+        print_status(f"Warning: {note}")
     for leak in leaks:
         print_status(f"LEAK: {leak}")
     if leaks:
@@ -117,6 +120,17 @@ def _build_datasets(plans: "Mapping[str, DatasetPlan]", config: BuildConfig) -> 
             dataset = planned.matching(Dataset(LocalFiles(root / DEMONSTRATIONS)))
         results[kind] = _build_dataset(dataset, root / kind, config)
     return results
+
+
+def _renderers_note(root: Path) -> str | None:
+    """Return what readers must know if the datasets in a folder have different renderers."""
+    from robomme_interference_data.data.dataset import Dataset
+    from robomme_interference_data.data.loading import built_datasets
+    from robomme_interference_data.data.renderers import dataset_renderers, renderers_note
+    from robomme_interference_data.storage.files import LocalFiles
+
+    datasets = {name: Dataset(LocalFiles(root / name)) for name in built_datasets(root)}
+    return renderers_note(dataset_renderers(datasets).items())
 
 
 def _build_dataset(plan: "DatasetPlan", out: Path, workers: WorkersConfig) -> dict[str, Any]:

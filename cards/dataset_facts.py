@@ -27,6 +27,7 @@ from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.query_sessions import buffer_manifest
 from robomme_interference_data.data.questions import Question
+from robomme_interference_data.data.renderers import dataset_renderers, renderers_note
 from robomme_interference_data.data.state_reader import other_state_sizes, query_state_size
 from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
@@ -221,7 +222,7 @@ def _facts(
 
 
 def _changes(datasets: Mapping[str, Dataset]) -> list[str]:
-    """Return what the datasets lack or changed of their recordings, and states that differ."""
+    """Return what the datasets lack or changed of their recordings, and how they differ."""
     limits = []
     for name, dataset in datasets.items():
         named = name or DEMONSTRATIONS
@@ -230,6 +231,8 @@ def _changes(datasets: Mapping[str, Dataset]) -> list[str]:
             limits.append(f"The frames of the {named} are resized: {sizes[0]}.")
         if dataset.features[STATE] == (0,):
             limits.append(f"The {named} have no robot states: states have length 0.")
+    if note := renderers_note(dataset_renderers(datasets).items()):
+        limits.append(note)
     others = other_state_sizes(datasets) if DEMONSTRATIONS in datasets else {}
     for name, size in others.items():
         limits.append(

@@ -134,4 +134,9 @@ def dataset_rows(dataset: Dataset, name: str = "") -> ProvenanceRows:
             (f"source{of}", code(f"{repo}@{commit}" if commit else repo))
             for repo, commit in repositories_of(dataset).items()
         ),
+        *(
+            (f"renderer{of}", code(source["renderer"]))
+            for source in identity.sources
+            if source.get("renderer")
+        ),
     ]

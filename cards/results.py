@@ -197,6 +197,10 @@ def _provenance(scored: Score, run: RunHeader | None, table: Path) -> Provenance
         rows.append(("revision of the buffer set", "not in the rows"))
     rows.append((f"SHA-256 of `{table.name}`", code(sha256_file(table))))
     if run is not None:
+        renderers = run.identity.get("renderers")
+        for images, renderer in renderers.items() if isinstance(renderers, dict) else ():
+            if renderer is not None:
+                rows.append((f"renderer of the {escape(images)}", code(renderer)))
         policy = run.identity.get("policy")
         rows.append(("policy", code(policy) if policy else "not recorded"))
         for invocation in run.invocations[-1:]:

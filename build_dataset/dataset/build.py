@@ -43,6 +43,7 @@ from .existing import ExistingDataset, open_existing
 from .identity import complete_dataset, identity_of
 from .lerobot_writer import StoredEpisode, load_lerobot, require_lerobot, write_lerobot
 from .plan import DatasetPlan, PlannedEpisode
+from .same_simulators import check_staged_simulators
 from .stage import StageTask
 from .staged import Staged, keep_staged, read_staged, staged_name
 
@@ -79,6 +80,7 @@ def build_dataset(
         todo = [planned for planned in plan.episodes if str(planned.episode.id) not in known]
         before = len(stored)
         if todo or not existing:
+            check_staged_simulators(work, out, plan)
             _stage(work, plan, todo, stored, skipped, executor, progress)
             _write(work, out, plan, existing, stored, skipped, progress)
     frames = sum(episode.record.length for episode in stored)

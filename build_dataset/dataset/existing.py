@@ -29,6 +29,7 @@ from robomme_interference_data.storage.text import read_header
 from .identity import BuildReport
 from .lerobot_writer import StoredEpisode
 from .plan import DatasetPlan
+from .same_simulators import check_same_simulators
 from .statistics import Statistics, before_scaling, episode_statistics
 
 
@@ -105,13 +106,12 @@ def open_existing(out: Path, plan: DatasetPlan) -> ExistingDataset | None:
             # Units at full rate do not show the stride of the others, which they follow from.
             _advice(of_units if plan.kind == DISTRACTORS else None),
         )
-    # Another version of a simulator has other episodes under the same ids.
-    recorded = {source.get("kind"): source for source in identity.sources}
-    for provenance in plan.provenances:
-        before = recorded.get(provenance["kind"], provenance)
-        if "suite_version" in before and before != provenance:
-            found = unequal(("it", before), ("this source", provenance))
-            raise BuildError(f"{out} exists, of another source: {'; '.join(found)}", _advice())
+    check_same_simulators(
+        str(out),
+        identity.sources,
+        plan.provenances,
+        f"choose another {named('buffer_set')}, or remove the folder first.",
+    )
     if plan.fps is not None and not same_rate(plan.fps, dataset.fps):
         raise InvalidOptionError(
             f"{named('fps')} is {plan.fps:g}; {out} has {dataset.fps:g} frames per second",

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.build_dataset.sources import Frame, Recording
+from robomme_interference_data.build_dataset.sources.simulator import SimulatorSource
 from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, LESSONS, STATE, UNITS
 from robomme_interference_data.errors import (
     BuildError,
@@ -24,6 +25,7 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.records import EpisodeRecord, SpanDigests, lesson_spans
+from robomme_interference_data.simulators.registry import simulator_renderer, simulator_versions
 from robomme_interference_data.storage.arrays import (
     FeatureDigests,
     combine,
@@ -96,6 +98,16 @@ class StageTask:
         if not starts:
             raise too_short(length, unit)
         return starts
+
+    def describe(self) -> dict[str, str]:
+        """Return what simulators report on this machine: all nodes of a cluster build alike."""
+        described: dict[str, str] = {}
+        for source in self.plan.sources:
+            if isinstance(source, SimulatorSource):
+                simulator, python = source.name, source.python
+                described |= simulator_versions(simulator, python)
+                described[f"renderer of {simulator}"] = str(simulator_renderer(simulator, python))
+        return described
 
     def close(self) -> None:
         """Close the sources."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Generator, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, override
 
 from robomme_interference_data.constants import ACTION, STATE
@@ -20,6 +21,8 @@ from robomme_interference_data.simulators.registry import (
     make_simulator,
     simulator_arguments,
     simulator_class,
+    simulator_renderer,
+    simulator_versions,
 )
 
 from .base import Frame, Recording, Robot, Source, SourceEpisode
@@ -50,15 +53,8 @@ class SimulatorSource(Source):
         self.name, self._every, self._shifted = name, every, shifted
         self._class = simulator_class(name)
         self.time_limit_s = self._class.episode_s
-        # Another version of the suite has other episodes.
-        version = self._class.suite_version
-        self.provenance = {"kind": name}
-        if version is not None:
-            self.provenance["suite_version"] = version
-        if simulator_options:
-            self.provenance["options"] = sorted(simulator_options)
-        python = find_simulator_python(name, simulator_python)
-        self._settings = {"subgoals": False, "python": python}
+        self.python = find_simulator_python(name, simulator_python)
+        self._settings = {"subgoals": False, "python": self.python}
         self._options = tuple(simulator_options)
         simulator_arguments(name, {"cameras": (), **self._settings}, self._options)  # raises
         self._simulator: Simulator | None = None
@@ -66,6 +62,18 @@ class SimulatorSource(Source):
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_simulator": None}
+
+    @cached_property
+    def provenance(self) -> dict[str, Any]:  # type: ignore[override]
+        """Versions of the simulator, its renderer on the machine that plans, and its options."""
+        found: dict[str, Any] = {
+            "kind": self.name,
+            "versions": simulator_versions(self.name, self.python),
+            "renderer": simulator_renderer(self.name, self.python),
+        }
+        if self._options:
+            found["options"] = sorted(self._options)
+        return found
 
     @override
     def episodes(self) -> list[SourceEpisode]:
@@ -76,8 +84,8 @@ class SimulatorSource(Source):
                 "Define the class method `episodes`, and name the class as MODULE:CLASS, or a "
                 "function with it as return annotation: see docs/how-to/another-benchmark.md.",
             )
-        listed = [SourceEpisode(episode, self.provenance) for episode in usual]
-        listed += [SourceEpisode(episode, self.provenance, further=True) for episode in further]
+        listed = [SourceEpisode(episode) for episode in usual]
+        listed += [SourceEpisode(episode, further=True) for episode in further]
         return sorted(listed, key=lambda episode: episode.id)
 
     @override

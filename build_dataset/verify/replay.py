@@ -170,8 +170,8 @@ def plan_replay(
         every = unit.in_dataset(name).stride if name in UNITS and unit.per_episode == 1 else 1
         source = open_source(simulator, shifted=name == SHIFTED, every=every)
         stored = [*dataset.identity.sources]
-        version = source.provenance.get("suite_version")
-        if any(entry.get("suite_version") != version for entry in stored):
+        version = _suite_version(simulator, source.provenance)
+        if any(_suite_version(simulator, entry) != version for entry in stored):
             what = f"sources are {stored}; {simulator} is {source.provenance} here"
             violations.append(Violation(f"{name}/{IDENTITY_PATH}", what))
             continue
@@ -202,10 +202,16 @@ def _kinds(dataset: Dataset) -> set[str]:
     return {str(source.get("kind")) for source in dataset.identity.sources}
 
 
+def _suite_version(simulator: str, provenance: Mapping[str, Any]) -> object:
+    """Return the version of the episodes, which `Simulator.versions` has by the simulator's name."""
+    declared = simulator_class(simulator)
+    return provenance.get("versions", {}).get(declared.name or declared.__name__)
+
+
 def _differences(dataset: PlayedDataset, record: EpisodeRecord) -> Iterator[str]:
     """Play an episode, and yield how its record differs."""
     source = dataset.source
-    episode = SourceEpisode(replace(record.episode_id, start=0), source.provenance)
+    episode = SourceEpisode(replace(record.episode_id, start=0))
     recording = source.read(episode, dataset.cameras)
     with closing(recording.frames):
         yield from _of_metadata(dataset.name, recording, record)

@@ -1,14 +1,16 @@
 """Open a run of rollouts, simulated or along recordings: all that happens before the first one."""
 
 import dataclasses
+import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robomme_interference_data.constants import EXECUTIONS, ORACLE
+from robomme_interference_data.constants import DEMONSTRATIONS, EXECUTIONS, ORACLE
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import open_dataset
+from robomme_interference_data.data.renderers import LIVE_VIEWS, dataset_renderers, renderers_note
 from robomme_interference_data.data.state_reader import other_state_sizes
 from robomme_interference_data.errors import (
     InterferenceError,
@@ -48,12 +50,14 @@ from robomme_interference_data.simulators.registry import (
 
 from .checks import check_plan, check_policy, check_settings
 from .other_states import check_other_states
-from .settings import complete_settings
+from .settings import complete_settings, live_renderer
 from .worker import RolloutFunction, StartServer, StartSimulator
 
 if TYPE_CHECKING:
     from robomme_interference_data.evaluate.policies.answers import Answers
     from robomme_interference_data.evaluate.policies.shared import Address
+
+logger = logging.getLogger(__name__)
 
 
 @contextmanager
@@ -65,6 +69,8 @@ def open_rollouts(
     with lock_servers(config.policy, Path(config.out)):
         planned = plan_rollouts(config, buffer_set)
         run, items = planned.run, planned.items
+        if note := renderers_note(run.identity["renderers"].items()):
+            logger.warning(note)
         answers = _read_answers(run.config, buffer_set, items)
         todo = unfinished(Path(config.out), items)
         # Only a server that workers start identifies itself late: it is started even if no rollout
@@ -124,6 +130,7 @@ def _describe_run(
     python = find_simulator_python(config.simulator, config.simulator_python)
     config = dataclasses.replace(config, simulator_python=python)
     versions = simulator_versions(config.simulator, python)
+    live = live_renderer(config, policy.cameras, buffer_set.datasets[DEMONSTRATIONS])
     facts = SystemFacts(
         policy=POLICIES.parse(config.policy).kind,
         policy_id=short_digest(identity),
@@ -150,6 +157,7 @@ def _describe_run(
         metadata=metadata,
         identity={
             "simulator_version": dict(versions),
+            "renderers": {**dataset_renderers(buffer_set.datasets), LIVE_VIEWS: live},
             "subgoals": subgoals_identity,
             **other_states,
             **simulator_options,

@@ -19,7 +19,11 @@ from robomme_interference_data.evaluate.run.config import RunConfig, check_unuse
 from robomme_interference_data.evaluate.systems import SYSTEMS, System, name_system
 from robomme_interference_data.retrieval.select import Rule
 from robomme_interference_data.schema.sampling import Memory
-from robomme_interference_data.simulators.registry import simulator_arguments, simulator_class
+from robomme_interference_data.simulators.registry import (
+    simulator_arguments,
+    simulator_class,
+    simulator_renderer,
+)
 
 _OF_SIMULATORS = (
     "simulator",
@@ -183,6 +187,17 @@ def used_cameras(
     if config.retrieval is not None:
         used.add(demonstrations.camera(config.retrieval_camera, "retrieval_camera"))
     return used
+
+
+def live_renderer(
+    config: RunConfig, policy_cameras: Iterable[str], demonstrations: Dataset
+) -> str | None:
+    """Return the renderer of a run's live views; None if it has none, or if it is unknown.
+
+    Points of the simulator's own subgoals are located in its images.
+    """
+    drawn = used_cameras(config, policy_cameras, demonstrations) or config.subgoals == ORACLE
+    return simulator_renderer(config.simulator, config.simulator_python) if drawn else None
 
 
 def simulator_options(

@@ -29,7 +29,11 @@ from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.episode import check_drawn
-from robomme_interference_data.simulators.registry import make_simulator, simulator_versions
+from robomme_interference_data.simulators.registry import (
+    make_simulator,
+    simulator_renderer,
+    simulator_versions,
+)
 
 from .checks import check_episode
 from .rollout import run_rollout
@@ -96,10 +100,10 @@ class RolloutFunction(RunFunction[RunConfig]):
         return self._run(task, worker)
 
     def describe(self) -> dict[str, str]:
-        """Return the buffer set's revision and all versions."""
-        return super().describe() | simulator_versions(
-            self.config.simulator, self.config.simulator_python
-        )
+        """Return the buffer set's revision, all versions, and the simulator's renderer."""
+        simulator, python = self.config.simulator, self.config.simulator_python
+        described = super().describe() | simulator_versions(simulator, python)
+        return described | {"renderer": str(simulator_renderer(simulator, python))}
 
     def close(self) -> None:
         """Release simulator, policy and subgoal writer."""

@@ -40,6 +40,7 @@ from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.storage.files import atomic_path
 
 from .config import AskConfig, RunConfig, check_shared, with_camera
+from .faults import error_text, first_fault, first_trace
 from .identity import invocation, now, plain, run_identity
 from .log import RunLog, count_statuses, open_log
 from .plan import WorkItem, shuffle_work
@@ -48,9 +49,6 @@ from .worker import Job, PlannedRun, RunContext
 
 if TYPE_CHECKING:
     import pandas
-
-_ERROR_LETTERS = 2000
-"""Maximum length of an error text in a row."""
 
 
 @dataclass(frozen=True)
@@ -257,9 +255,10 @@ def _save_files(
         row,
         video=item.clip if (log.folder / item.clip).exists() else None,
         attempt=(log.rows[item].attempt if item in log.rows else 0) + outcome.attempts,
+        repeated_because=first_fault(log.rows.get(item), outcome),
         finished_at=now(),
     )
-    return row, "\n".join(filter(None, (trace, *lost))) or None
+    return row, "\n".join(filter(None, (trace, first_trace(outcome), *lost))) or None
 
 
 def _error_row(
@@ -278,7 +277,7 @@ def _error_row(
         history_frames=0,
         lesson_frames=0,
         lesson_share=None,
-        error=_error_text(error),
+        error=error_text(error),
         **columns,
     )
 
@@ -291,12 +290,3 @@ def _write(folder: Path, path: str, data: bytes) -> str | None:
     except OSError as error:
         return f"{path} could not be written: {error}"
     return None
-
-
-def _error_text(error: BaseException) -> str:
-    """Return an error and its hint in one line, as text that every file can hold."""
-    text = str(error)
-    if isinstance(error, InterferenceError):
-        hint = f" ({error.hint})" if error.hint else ""
-        text = f"{type(error).__name__}: {error.message}{hint}"
-    return str(plain(" ".join(text.split())[:_ERROR_LETTERS]))

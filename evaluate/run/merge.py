@@ -101,4 +101,4 @@ def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
 def _result(row: Rollout) -> Rollout:
     """Return a row without what may differ between two runs of the same rollout."""
     untimed: dict[str, Any] = dict.fromkeys(TIMING_COLUMNS)
-    return replace(row, attempt=1, video=None, **untimed)
+    return replace(row, attempt=1, repeated_because=None, video=None, **untimed)

@@ -17,7 +17,6 @@ from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.rollouts import Status, success_of
-from robomme_interference_data.simulators.registry import simulator_class
 
 from .config import AskConfig, RetrievalConfig, RunConfig
 from .history import HistoryReader
@@ -128,15 +127,13 @@ def make_selector(config: RetrievalConfig) -> "Selector | None":
 def package_versions(config: RunConfig | AskConfig) -> dict[str, str]:
     """Return the versions of Python and of the packages that a run uses, if installed.
 
-    RoboMME's interpreter has others: see `simulator_versions`.
+    Those that the simulator uses are in `simulator_versions`.
     """
     names = ["robomme-interference-data", "numpy", "av", "torch"]
     if isinstance(config, RunConfig):
         names += policy_kind(config.policy).packages
     if config.retrieval is not None:
         names.append("transformers")
-    if isinstance(config, RunConfig):
-        names += simulator_class(config.simulator).packages
     versions = {"python": platform.python_version()}
     for name in names:
         with suppress(metadata.PackageNotFoundError):

@@ -13,7 +13,7 @@ from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.viz.tables import Table
 
 from .compare_notes import below_table, differing, left_out, noise_floor, stopped_early
-from .rows.reading import CheckedRows, read_rows
+from .rows.reading import CheckedRows, read_rows, renderer_notes
 from .sides import Side, Sides, check_scenes, matched_sides, pairs_of, sides_of
 from .tables.comparison import (
     ACTION_ERRORS,
@@ -76,6 +76,7 @@ def compare(
     a_sides, b_sides = sides_of(a_rows), sides_of(b_rows)
     matched = list(matched_sides((a_rows, b_rows), (a_sides, b_sides)))
     notes = [*dict.fromkeys(note for rows in runs for note in rows.notes)]
+    notes += renderer_notes(header for rows in runs for header in rows.sources.values())
     notes += differing(a_rows, b_rows, matched)
     contrasts = list[Contrast]()
     for a, b in matched:

@@ -16,7 +16,7 @@ from .config import Against, Expected, Settings
 from .outcomes import Outcomes
 from .partners import base_of, ceilings_of
 from .placing import offline_outcomes, outcomes_of
-from .rows.reading import CheckedRows, read_rows
+from .rows.reading import CheckedRows, read_rows, renderer_notes
 from .tables import decay, effects, families, interaction, ranks
 from .tables.cells import SuccessCell, cells_of
 from .tables.contrast import Contrast
@@ -111,7 +111,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     cells = cells_of(simulated)
     compared, unpaired = _compared(simulated, draws)
     contrasts = correct(with_primary(compared, simulated))
-    notes = [*rows.notes, *unpaired]
+    notes = [*rows.notes, *renderer_notes(rows.sources.values()), *unpaired]
     notes += [sentence for each in simulated if (sentence := repeat_noise(each))]
     notes += [sentence for each in simulated for sentence in _unknown_runs(each)]
     tables = [*_tables(outcomes, cells, contrasts, draws), cost_table(rows, cells)]

@@ -198,8 +198,9 @@ def _verify_buffer_set(
         if played is not None and "played_again" not in report:
             print_status("Nothing was played again: correct the violations first.")
     leaks = False
-    if opened is not None and audit and not violations:
-        leaks = _audit(opened, report, as_json=as_json)
+    if opened is not None and not violations:
+        _warn(opened, report, as_json=as_json)
+        leaks = audit and _audit(opened, report, as_json=as_json)
     if as_json:
         print_json(report)
     if incomplete is not None:
@@ -236,6 +237,18 @@ def _print_extent(report: dict[str, Any]) -> None:
     if "pictures_checked" in report:
         extra = 'pip install "robomme-interference-data[retrieval]"'
         print_status(f"Not checked: the pictures of questions, which need Pillow: {extra}")
+
+
+def _warn(opened: "BufferSet", report: dict[str, Any], *, as_json: bool) -> None:
+    """Add to the report, or print, what breaks no rule and readers must know."""
+    from robomme_interference_data.data.renderers import dataset_renderers, renderers_note
+
+    note = renderers_note(dataset_renderers(opened.datasets).items())
+    if note is None:
+        return
+    report["warnings"] = [note]
+    if not as_json:
+        print_status(f"Warning: {note}")
 
 
 def _open(buffer_set: str) -> "tuple[BufferSet | None, MissingFileError | None]":

@@ -86,6 +86,7 @@ class Outcome:
         progress: What the function attached to the error, `error.progress`: plain values by name.
         trace: Traceback of the error, or of the worker that exceeded a limit; None if unknown.
         attempts: How often the task was started.
+        first: The outcome of the first attempt if the task was started again; None otherwise.
         files: Files that the task sent (see `Worker.send_file`), by path.
         node: The node of a cluster that ran it; None on this machine.
         worker: `alive` after the task; `dead` because of it; `late` if the task exceeded its own
@@ -98,6 +99,7 @@ class Outcome:
     progress: Mapping[str, Any] = field(default_factory=dict)
     trace: str | None = None
     attempts: int = 1
+    first: "Outcome | None" = None
     files: dict[str, bytes] = field(default_factory=dict)
     node: str | None = None
     worker: Literal["alive", "dead", "late", "lost"] = "alive"
@@ -161,11 +163,15 @@ class Handle(Protocol):
 
 @dataclass
 class QueuedTask:
-    """A task, how often it failed or killed its worker, and how often its worker was lost."""
+    """A task, how often it failed or killed its worker, and how often its worker was lost.
+
+    `first` is the outcome of its first attempt, after that.
+    """
 
     task: Any
     failures: int = 0
     losses: int = 0
+    first: Outcome | None = None
 
     def needs_retry(
         self, outcome: Outcome, attempts: int, again: tuple[type[Exception], ...]
@@ -235,11 +241,12 @@ class Scheduler[H: Handle](ABC):
                     if outcome.worker != "alive":
                         self._drop(worker)  # its number is free for the one that replaces it
                     if queued.needs_retry(outcome, attempts, again):
+                        queued.first = queued.first or replace(outcome, files={})
                         # At the end: it may kill another worker, and the other tasks come first.
                         waiting.append(queued)
                     else:
                         count = queued.failures + queued.losses
-                        yield replace(outcome, task=queued.task, attempts=count)
+                        yield replace(outcome, task=queued.task, attempts=count, first=queued.first)
         finally:
             # The caller wants no more outcomes; idle workers stay for its next tasks.
             for worker in busy:

@@ -88,6 +88,9 @@ class OutcomeColumns:
     steps: Annotated[int, "Executed steps; offline, compared actions."]
     error: Annotated[str | None, "What failed, in one line; only if the status is `error`."] = None
     attempt: Annotated[int, "Number of attempts, this one included."] = 1
+    repeated_because: Annotated[
+        str | None, "What failed in the first attempt, in one line; None if it is this one."
+    ] = None
     video: Annotated[str | None, "Path of its video inside the run's folder."] = None
 
     def __post_init__(self) -> None:

@@ -2,6 +2,8 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -87,10 +89,29 @@ class Simulator(ABC):
     def versions(cls) -> dict[str, str]:
         """Return the versions that its results depend on, by name, without starting it.
 
+        They are the `suite_version`, and those of the `packages` that are installed.
+
         Raises:
             InvalidOptionError: Its own interpreter, if it has one, does not run.
         """
-        return {} if cls.suite_version is None else {cls.name: str(cls.suite_version)}
+        versions = {}
+        if cls.suite_version is not None:
+            versions[cls.name or cls.__name__] = str(cls.suite_version)
+        for package in cls.packages:
+            with suppress(PackageNotFoundError):
+                versions[package] = version(package)
+        return versions
+
+    @classmethod
+    def renderer(cls) -> str | None:
+        """Return what draws its images on this machine, without starting it: a device and driver.
+
+        Datasets and runs record it, because images differ between renderers. None if it is unknown.
+
+        Raises:
+            InvalidOptionError: Its own interpreter, if it has one, does not run.
+        """
+        return None
 
     @classmethod
     def episodes(cls) -> list[EpisodeId]:

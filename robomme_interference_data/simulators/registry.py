@@ -171,3 +171,14 @@ def simulator_versions(name: str, python: str | None = None) -> dict[str, str]:
     if issubclass(declared, RemoteSimulator):
         return declared.versions(python)
     return declared.versions()
+
+
+def simulator_renderer(name: str, python: str | None = None) -> str | None:
+    """Return what draws a simulator's images on this machine; see `Simulator.renderer`.
+
+    `python` is the path of its own interpreter; None for the default.
+    """
+    declared = simulator_class(name)
+    if issubclass(declared, RemoteSimulator):
+        return declared.renderer(python)
+    return declared.renderer()

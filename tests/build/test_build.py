@@ -230,7 +230,7 @@ def test_what_cannot_follow_the_demonstrations_is_refused_before_it_is_built(
         assert not out.exists() and not staging_path(out).exists()
 
 
-TABLETOP = {"kind": "tabletop", "suite_version": 1}
+TABLETOP = {"kind": "tabletop", "versions": {"tabletop": "1", "sapien": "3.0.3"}, "renderer": "A"}
 
 
 @pytest.fixture(scope="module")
@@ -248,7 +248,13 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ({}, {"version": "2.0.0"}, "with other settings"),
         ({}, {"kind": "demonstrations"}, "with other settings"),
         ({"cameras": ("front", "wrist")}, {}, "cannot be in one dataset"),
-        ({"provenance": TABLETOP | {"suite_version": 2}}, {}, "suite_version"),
+        ({"provenance": TABLETOP | {"renderer": "B"}}, {}, "renderer: A in it, B in this build"),
+        (
+            {"provenance": TABLETOP | {"versions": {"tabletop": "1", "sapien": "3.0.4"}}},
+            {},
+            "sapien: 3.0.3 in it, 3.0.4 in this build",
+        ),
+        ({"provenance": TABLETOP | {"versions": {"tabletop": "1"}}}, {}, "missing in this build"),
     ],
 )
 def test_dataset_with_other_settings_is_unchanged(
@@ -258,8 +264,23 @@ def test_dataset_with_other_settings_is_unchanged(
     other = MadeUpSource({"A/train/1": (260, 5)}, **source)
     with raises(InterferenceError) as caught:
         build(built, other, **options)
+    assert message in caught.value.message
     assert "settings" not in message or "Choose another `buffer_set`" in str(caught.value.hint)
     assert contents(built) == before
+
+
+def test_an_interrupted_build_resumes_with_the_same_renderer_only(tmp_path: Path) -> None:
+    out, lengths = tmp_path / "out", {"A/train/0": (260, 5), "B/train/0": (260, 5)}
+    broken = {"B/train/0": {7: SourceError("it ends here")}}
+    with pytest.raises(SourceError):
+        build(out, MadeUpSource(lengths, broken, provenance=TABLETOP))
+    with raises(BuildError) as caught:
+        build(out, MadeUpSource(lengths, provenance=TABLETOP | {"renderer": "B"}))
+    assert "interrupted build" in caught.value.message and "renderer: A in it" in str(caught.value)
+    assert str(staging_path(out)) in str(caught.value.hint)
+    assert not out.exists()
+    assert build(out, MadeUpSource(lengths, provenance=TABLETOP)).episodes == 2
+    assert Dataset(LocalFiles(out)).identity.sources == (TABLETOP,)
 
 
 def test_episodes_of_other_cameras_mix_in_those_that_all_have(tmp_path: Path) -> None:

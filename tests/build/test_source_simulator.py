@@ -1,6 +1,7 @@
 """A simulator is a source like any other: its episodes are played while they are read."""
 
 import pickle
+from importlib.metadata import version
 from typing import Any
 
 import pytest
@@ -22,6 +23,7 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.simulators.registry import simulator_renderer
 from robomme_interference_data.simulators.tabletop import SUITE_VERSION
 
 
@@ -46,7 +48,15 @@ def read(source: Any, cameras: tuple[str, ...] | None = None) -> Recording:
 
 def test_an_episode_of_the_tabletop(made: list[Double]) -> None:
     source = open_source("tabletop")
-    assert source.provenance == {"kind": "tabletop", "suite_version": SUITE_VERSION}
+    assert source.provenance == {
+        "kind": "tabletop",
+        "versions": {
+            "tabletop": str(SUITE_VERSION),
+            "mani-skill": version("mani-skill"),
+            "sapien": version("sapien"),
+        },
+        "renderer": simulator_renderer("tabletop"),
+    }
     assert source.time_limit_s == 300  # seconds
     recording = read(source)
     metadata = (recording.seed, recording.difficulty, recording.simulator, recording.exact)
@@ -78,7 +88,6 @@ def test_only_every_third_frame_is_drawn(made: list[Double]) -> None:
 
 def test_robomme_provides_demonstrations_without_actions(made: list[Double]) -> None:
     source = open_source("robomme")
-    assert source.provenance == {"kind": "robomme"}
     assert source.time_limit_s == 1800
     frames = list(read(source).frames)
     assert [frame.is_demonstration for frame in frames] == [True] * 5 + [False] * 3
@@ -138,7 +147,8 @@ OWN = "support.own_simulators:"
 @pytest.mark.parametrize("name", ["Listed", "make_listed"])
 def test_a_simulator_of_ones_own_is_a_source(name: str) -> None:
     source = open_source(OWN + name)
-    assert source.provenance == {"kind": OWN + name, "suite_version": 4}
+    versions = {"Listed": "4"}
+    assert source.provenance == {"kind": OWN + name, "versions": versions, "renderer": None}
     listed = [str(episode.id) for episode in source.episodes()]
     assert listed == ["Press/train/0", "Press/train/1", "Press/test/0", "Press/test/1"]
     recording = source.read(source.episodes()[1], None)

@@ -6,9 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.buffer_sets import build
+from support.buffer_sets import build, plan_again
+from support.tabletop import PROVENANCE, Drawn
 
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
+from robomme_interference_data.cards.dataset_facts import buffer_set_facts
+from robomme_interference_data.cards.publication import Publication
+from robomme_interference_data.cards.render import card_text
 from robomme_interference_data.data.loading import next_build
 
 
@@ -61,3 +66,25 @@ def test_a_dataset_without_buffers_is_one_violation(own_buffers: Path, run: Any)
 def test_a_planned_set_is_planned_again_wherever_its_demonstrations_are(own_buffers: Path) -> None:
     shutil.rmtree(own_buffers / "demonstrations")
     assert next_build(own_buffers) == f"build {own_buffers} --only manifests"
+
+
+def test_lessons_and_units_from_different_renderers_are_a_warning(tmp_path: Path, run: Any) -> None:
+    lessons, units = PROVENANCE, PROVENANCE | {"renderer": "a GPU"}
+    build(tmp_path, "demonstrations", Drawn(lessons), split="test", families=("MoveCube",))
+    build(tmp_path, "distractors", Drawn(units), split="train", families=("InsertPeg",))
+    plan_again(tmp_path, ("k0", "k1"))
+    differ = f"demonstrations from {PROVENANCE['renderer']}; distractors from a GPU."
+    code, out, _ = run("verify", tmp_path, "--no-decode", "--json")
+    report = json.loads(out)
+    assert (code, report["violations"]) == (0, [])
+    assert [differ in warning for warning in report["warnings"]] == [True]
+    code, _, err = run("verify", tmp_path, "--no-decode")
+    assert code == 0 and "Warning: Images come from different renderers" in err
+    card = card_text(buffer_set_facts(load_buffer_set(tmp_path)), Publication("a/b", "1.0.0"))
+    for row in (
+        f"| renderer of the demonstrations | `{PROVENANCE['renderer']}` |",
+        "| renderer of the distractors | `a GPU` |",
+        f"- Images come from different renderers: {differ}",
+        '"sapien": "3.0.3"',
+    ):
+        assert row in card

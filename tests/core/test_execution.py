@@ -78,6 +78,9 @@ def test_a_task_is_started_again_after_some_errors(
     run = Serial().run(Noted(error, times), [1], attempts=attempts, again=(SimulatorCrashError,))
     (outcome,) = run
     assert (outcome.attempts, outcome.error is not None) == found
+    assert (outcome.first is None) == (outcome.attempts == 1)
+    if outcome.first is not None:
+        assert (outcome.first.error, outcome.first.first) == (error, None)
 
 
 def test_the_last_worker_may_not_retire() -> None:

@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support import worlds
 from support.asking import ask, behind, look, questions
 from support.chat_server import ChatServer
 from support.messages import raises
 from support.policy_server import PolicyServer
 from support.runs import header, run, run_one
-from support.tabletop import copy_tabletop
+from support.tabletop import PROVENANCE, TABLETOP, copy_tabletop
 
 from robomme_interference_data.build_dataset.questions import write_questions
 from robomme_interference_data.data.questions import digest_questions
@@ -112,6 +113,28 @@ def test_the_address_of_a_server_may_change_but_not_its_model(tmp_path: Path) ->
         first.metadata = {"checkpoint": "b"}
         with raises(RunError):
             served("one", first, shard="1/2")
+
+
+def test_a_run_that_sees_images_resumes_with_the_same_renderer_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv(worlds.BUFFER_SET, str(TABLETOP))
+    usual: dict[str, Any] = {"buffer_set": TABLETOP, "simulator": "support.worlds:rendered_world"}
+    drawn = PROVENANCE["renderer"]
+    for renderer, warns in ((drawn, False), ("a GPU", True)):
+        monkeypatch.setenv(worlds.RENDERER, str(renderer))
+        caplog.clear()
+        out = tmp_path / f"run {warns}"
+        run_one(out, policy=STILL, **usual)
+        found = header(out)["identity"]["renderers"]
+        assert found == {"demonstrations": drawn, "distractors": drawn, "live views": renderer}
+        differ = f"demonstrations and distractors from {drawn}; live views from a GPU"
+        assert (differ in caplog.text) is warns
+        run_one(tmp_path / f"blind {warns}", policy="noop", **usual)
+    with raises(RunError) as raised:
+        run_one(tmp_path / "run False", policy=STILL, **usual)
+    assert f"renderers.live views is {drawn!r} there, 'a GPU' here" in raised.value.message
+    run_one(tmp_path / "blind False", policy="noop", **usual)  # its results depend on no image
 
 
 def test_a_privileged_policy_is_recorded(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -168,13 +168,18 @@ def test_a_rollout_that_breaks_is_an_error_row_and_runs_again_on_resume(
     again = run(tmp_path / "run")
     assert again.counts == {"success": 2, "fail": 2, "timeout": 0, "error": 0}
     assert [row.attempt for row in again.rows] == [1, 1, attempts + 1, 1]
+    # Why the first attempt failed stays known, whoever repeated it.
+    assert [row.repeated_because for row in again.rows] == [None, None, broken.error, None]
 
 
 def test_a_simulator_that_crashes_once_costs_no_rollout(tmp_path: Path, trouble: Path) -> None:
     (trouble / "MoveCube-0").write_text("raise once")
     (row,) = run_one(tmp_path / "run").rows
-    assert (row.status, row.attempt) == ("fail", 2)
-    assert not (tmp_path / "run" / "errors.log").exists()
+    why = "SimulatorCrashError: the world fell apart (Pick it up.)"
+    assert (row.status, row.attempt, row.error, row.repeated_because) == ("fail", 2, None, why)
+    log = (tmp_path / "run" / "errors.log").read_text()
+    assert f"MoveCube/test/0 under no-history, attempt 2\nThe first attempt failed: {why}\n" in log
+    assert "Traceback" in log
 
 
 def test_a_crashed_simulator_is_not_used_again(

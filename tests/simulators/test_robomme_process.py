@@ -8,6 +8,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ import pytest
 from support.messages import raises
 from support.worker_calls import wait_until_gone
 
+from robomme_interference_data.build_dataset.sources import open_source
 from robomme_interference_data.errors import (
     InvalidOptionError,
     MissingExtraError,
@@ -181,12 +183,36 @@ def test_versions(robomme_python: Path, tmp_path: Path, monkeypatch: pytest.Monk
     (installed / "direct_url.json").write_text(json.dumps(origin))
     found = simulator_versions("robomme")
     # A package that is only on the path has no version.
-    assert found.keys() == {"robomme_python", "robomme_numpy"}
+    assert found.keys() == {"robomme_python", "robomme_numpy", "robomme_patches"}
+    assert found["robomme_patches"] == "none"  # the stand-in is RoboMME's fork
     assert found["robomme_python"] == platform.python_version()
     assert found["robomme_numpy"].startswith("1.")
     monkeypatch.setenv("PYTHONPATH", f"{os.environ['PYTHONPATH']}:{tmp_path}")
     _versions.cache_clear()
     installed_too = simulator_versions("robomme")
     assert installed_too == {**found, "robomme": "0.2+ab12"}
-    assert simulator_versions("tabletop") == {"tabletop": str(SUITE_VERSION)}
+    monkeypatch.setenv("STAND_IN_MANI_SKILL", "index")
+    installed_versions.cache_clear()
+    patched = simulator_versions("robomme")["robomme_patches"]
+    with RoboMMESimulator(robomme_python) as simulator:
+        assert patched == ", ".join(simulator.patches) != ""
+    monkeypatch.setenv("STAND_IN_MANI_SKILL", "strange")
+    installed_versions.cache_clear()
+    assert "robomme_patches" not in simulator_versions("robomme")  # it does not start either
+    installed_versions.cache_clear()
+    libraries = {name: version(name) for name in ("mani-skill", "sapien")}
+    assert simulator_versions("tabletop") == {"tabletop": str(SUITE_VERSION), **libraries}
     assert simulator_versions("support.worlds:World") == {}
+
+
+def test_demonstrations_record_the_versions_and_the_renderer(
+    robomme_python: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert open_source("robomme").provenance == {
+        "kind": "robomme",
+        "versions": simulator_versions("robomme"),
+        "renderer": "GPU of the stand-in",  # the second one draws, in its interpreter
+    }
+    monkeypatch.delenv("ROBOMME_PYTHON")
+    with raises(InvalidOptionError):
+        open_source("robomme").provenance  # noqa: B018

@@ -92,7 +92,8 @@ def of_any_policy(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
 def finished_rows(out: Path) -> list[dict[str, Any]]:
     """The recorded rows in canonical order, without what differs from run to run."""
     rows = read_record(out)
-    return [row | {"attempt": 1} for row in untimed(tuple(rows[item] for item in sorted(rows)))]
+    once = {"attempt": 1, "repeated_because": None}
+    return [row | once for row in untimed(tuple(rows[item] for item in sorted(rows)))]
 
 
 def wait_for_rows(out: Path, count: int, running: subprocess.Popen[str]) -> None:

@@ -192,12 +192,14 @@ def write_parquet(path: Path, given: Sequence[Rollout]) -> Path:
     return path
 
 
-def write_run(folder: Path, given: Sequence[Rollout], **header: Any) -> Path:
+def write_run(
+    folder: Path, given: Sequence[Rollout], identity: Mapping[str, Any] | None = None, **header: Any
+) -> Path:
     """A run's folder, as far as scoring looks at it."""
     folder.mkdir(parents=True, exist_ok=True)
     lines = [json.dumps(to_dict(one)) + "\n" for one in given]
     (folder / "rollouts.jsonl").write_text("".join(lines), encoding="utf-8")
-    run = RunHeader(1, {}, "made-up", **header)
+    run = RunHeader(1, dict(identity or {}), "made-up", **header)
     (folder / "run.json").write_text(json.dumps(to_dict(run)))
     return folder
 

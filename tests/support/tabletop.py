@@ -35,6 +35,13 @@ TABLETOP = Path(__file__).parents[1] / "golden" / "tabletop"
 """Two queries and a unit of each family, the queries with their questions; made by
 `support/make_golden.py`."""
 
+PROVENANCE = {
+    "kind": "tabletop",
+    "versions": {"tabletop": str(SUITE_VERSION), "mani-skill": "3.0.1", "sapien": "3.0.3"},
+    "renderer": "llvmpipe (LLVM 15.0.6, 256 bits), driver llvmpipe Mesa 25.0.7, CPU",
+}
+"""What its sources record, the same on every machine."""
+
 NUMBERS = (0, 2)
 """Of each family's queries: an easy one and a hard one."""
 
@@ -69,9 +76,7 @@ def shown(parts: int) -> list[tuple[int, ...]]:
 class Drawn(Source):
     """The queries, and a train episode of each family."""
 
-    provenance: dict[str, Any] = field(
-        default_factory=lambda: {"kind": "tabletop", "suite_version": SUITE_VERSION}
-    )
+    provenance: dict[str, Any] = field(default_factory=lambda: PROVENANCE)
 
     def episodes(self) -> list[SourceEpisode]:
         train = [SourceEpisode(EpisodeId(family, "train", 0), NOBODY) for family in FAMILIES]

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence, Set
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,12 @@ from robomme_interference_data.evaluate.policies.policy import Frames, RolloutIn
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.subgoal import Subgoal
+from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.episode import Demonstration, EpisodeInfo, Observation
 
 BUFFER_SET = "WORLDS_DATA"
 TROUBLE = "WORLDS_TROUBLE"
+RENDERER = "WORLDS_RENDERER"
 PAUSE = "WORLDS_PAUSE"
 ANSWER_FRAME = 3
 STEPS = 40
@@ -257,3 +259,16 @@ class Scripted(World):
             return Observation({}, self.seen.state), Status.ONGOING
         right = self.acted == self.right
         return Observation({}, self.seen.state), Status.SUCCESS if right else Status.FAIL
+
+
+class Rendered(Simulator):
+    """What `rendered_world` declares: the renderer in `WORLDS_RENDERER`."""
+
+    @classmethod
+    def renderer(cls) -> str | None:
+        return os.environ.get(RENDERER)
+
+
+def rendered_world() -> Rendered:
+    """A `World` on a machine with that renderer."""
+    return cast(Rendered, World())

@@ -1,10 +1,12 @@
 """Read rows of rollouts from any files; `checks` decides which of them are valid."""
 
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from robomme_interference_data.data.renderers import renderers_note
 from robomme_interference_data.errors import FormatError, InvalidOptionError, counted, named
 
 from .checks import Checks
@@ -114,6 +116,19 @@ def read_rows(
         tuple(bad_reasons[:_SHOWN]),
         len(bad_reasons),
     )
+
+
+def renderer_notes(runs: "Iterable[RunHeader | None]") -> list[str]:
+    """Return a note for each simulator whose images are known to come from different renderers."""
+    drawn = defaultdict[str, list[tuple[str, str | None]]](list)
+    for run in runs:
+        renderers = {} if run is None else run.identity.get("renderers")
+        if run is not None and isinstance(renderers, dict):
+            drawn[str(run.identity.get("simulator"))] += [
+                (images, None if renderer is None else str(renderer))
+                for images, renderer in renderers.items()
+            ]
+    return [note for pairs in drawn.values() if (note := renderers_note(pairs)) is not None]
 
 
 def _scenes(files: ReadFiles) -> "tuple[ScenesOf, frozenset[tuple[str, str]], tuple[str, ...]]":

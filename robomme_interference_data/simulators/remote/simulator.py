@@ -20,6 +20,7 @@ from robomme_interference_data.simulators.episode import (
     Observation,
     choose_cameras,
 )
+from robomme_interference_data.simulators.sapien_renderer import renderer_in
 
 from . import versions as versions_program
 from .interpreter import Interpreter
@@ -113,6 +114,13 @@ class RemoteSimulator(Simulator):
         interpreter = cls.interpreter(python)
         program = Path(versions_program.__file__)
         return super().versions() | interpreter.versions(program, (cls.name, *cls.remote_packages))
+
+    @classmethod
+    def renderer(cls, python: str | None = None) -> str | None:
+        """Return SAPIEN's renderer in its interpreter, if `remote_packages` has it; else None."""
+        if "sapien" not in cls.remote_packages:
+            return None
+        return renderer_in(cls.interpreter(python).path)
 
     @property
     def pid(self) -> int | None:

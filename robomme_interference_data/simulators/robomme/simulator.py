@@ -18,6 +18,7 @@ from robomme_interference_data.schema.subgoal import Subgoal, read_grounded
 from robomme_interference_data.simulators.episode import CAMERAS, EpisodeStart, Observation
 from robomme_interference_data.simulators.remote.process import Arrays, RemoteProcess
 from robomme_interference_data.simulators.remote.simulator import RemoteSimulator
+from robomme_interference_data.simulators.sapien_renderer import renderer_in
 from robomme_interference_data.simulators.tabletop.episodes import episode_ids
 from robomme_interference_data.storage.cache import cache_folder
 
@@ -104,9 +105,16 @@ class RoboMMESimulator(RemoteSimulator):
         """Return the versions in RoboMME's interpreter.
 
         They are of `robomme`, `robomme_mani_skill` and so on, and include Python, sapien, torch and
-        numpy, and the commit of a package that was installed from one.
+        numpy, the commit of a package that was installed from one, and `robomme_patches`, what is
+        patched in ManiSkill.
         """
-        return cls.interpreter(python).versions(Path(robomme_versions.__file__))
+        program = Path(robomme_versions.__file__)
+        return cls.interpreter(python).versions(program, (str(cache_folder("robomme")),))
+
+    @classmethod
+    def renderer(cls, python: str | None = None) -> str | None:
+        """Return the renderer in RoboMME's interpreter; see `Simulator.renderer`."""
+        return renderer_in(cls.interpreter(python).path)
 
     @classmethod
     def episodes(cls) -> list[EpisodeId]:

@@ -1,10 +1,9 @@
-"""The renderer; run as a program, it renders an image and prints the devices that can do so.
+"""The renderer; run as a program, it renders an image and prints what rendered it.
 
 ManiSkill and torch are not imported, so that this check is fast.
 """
 
 import os
-import re
 import sys
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -12,6 +11,7 @@ from tempfile import TemporaryFile
 import sapien
 
 from robomme_interference_data.errors import NoRendererError
+from robomme_interference_data.simulators.sapien_renderer import describe_renderer
 
 SHADERS = Path(__file__).parent / "shaders"
 """Folder of the suite's shaders. Those of sapien take ten seconds to compile."""
@@ -38,7 +38,7 @@ def _check_shader_cache() -> None:
 
 
 def main() -> None:
-    """Render an empty scene; print the devices that can render, or why none can."""
+    """Render an empty scene; print the renderer, or why there is none."""
     try:
         sapien.render.set_camera_shader_dir(str(SHADERS))
         scene = sapien.Scene([make_renderer()])
@@ -46,10 +46,10 @@ def main() -> None:
         scene.update_render()
         camera.take_picture()
         camera.get_picture("Color")
-    except (NoRendererError, RuntimeError) as error:
+        found = describe_renderer()
+    except (NoRendererError, LookupError, RuntimeError) as error:
         sys.exit(str(error).splitlines()[0])
-    devices = re.findall(r"GPU: (.+)\n +Supported: 1", sapien.render.get_device_summary())
-    sys.stdout.write("; ".join(devices) + "\n")  # noqa: TID251 - a program of its own
+    sys.stdout.write(f"{found}\n")  # noqa: TID251 - a program of its own
 
 
 if __name__ == "__main__":

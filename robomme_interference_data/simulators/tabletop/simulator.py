@@ -1,5 +1,6 @@
 """The embedded suite as a `Simulator`."""
 
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -20,6 +21,7 @@ from robomme_interference_data.simulators.episode import (
     Observation,
     choose_cameras,
 )
+from robomme_interference_data.simulators.sapien_renderer import renderer_in
 
 from . import SUITE_VERSION
 from .episodes import episode_ids, further_ids, seed_of
@@ -65,6 +67,11 @@ class TabletopSimulator(Simulator):
         self.env = make(render=bool(cameras), obs_mode="none")
         self.env.shift = parsed_shift
         self.env.observe(self._cameras)  # the first image is slow: shaders are compiled
+
+    @classmethod
+    def renderer(cls) -> str | None:
+        """Return the renderer of this environment; see `Simulator.renderer`."""
+        return renderer_in(sys.executable)
 
     @classmethod
     def episodes(cls) -> list[EpisodeId]:
