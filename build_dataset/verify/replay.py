@@ -203,7 +203,7 @@ def _kinds(dataset: Dataset) -> set[str]:
 
 
 def _suite_version(simulator: str, provenance: Mapping[str, Any]) -> object:
-    """Return the version of the episodes, which `Simulator.versions` has by the simulator's name."""
+    """Return the version of the episodes: see `Simulator.versions`."""
     declared = simulator_class(simulator)
     return provenance.get("versions", {}).get(declared.name or declared.__name__)
 

@@ -1,6 +1,7 @@
 """A simulator is a source like any other: its episodes are played while they are read."""
 
 import pickle
+import sys
 from importlib.metadata import version
 from typing import Any
 
@@ -86,6 +87,13 @@ def test_only_every_third_frame_is_drawn(made: list[Double]) -> None:
         assert all((one.images[name] == other.images[name]).all() for name in one.images)
 
 
+@pytest.fixture
+def some_robomme_python(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An interpreter that is found, and never starts RoboMME."""
+    monkeypatch.setenv("ROBOMME_PYTHON", sys.executable)
+
+
+@pytest.mark.usefixtures("some_robomme_python")
 def test_robomme_provides_demonstrations_without_actions(made: list[Double]) -> None:
     source = open_source("robomme")
     assert source.time_limit_s == 1800
@@ -94,7 +102,7 @@ def test_robomme_provides_demonstrations_without_actions(made: list[Double]) -> 
     assert [frame.action is None for frame in frames] == [True] * 5 + [False] * 3
     lesson = list(select_frames(DEMONSTRATIONS, read(source)))
     assert [frame.action for frame in lesson] == [None] * 6
-    assert made[0].options == {"subgoals": False}
+    assert made[0].options["subgoals"] is False
 
 
 def test_the_tabletop_under_shifts(made: list[Double]) -> None:
@@ -130,6 +138,7 @@ def test_one_simulator_is_kept_for_the_same_cameras(made: list[Double]) -> None:
         read(copy, ("top",))
 
 
+@pytest.mark.usefixtures("some_robomme_python")
 @pytest.mark.parametrize("name", ["tabletop", "robomme"])
 def test_episodes(name: str) -> None:
     source = open_source(name)

@@ -98,7 +98,7 @@ def test_images_count_on_the_recorded_renderer_only(
     identity["sources"][0]["renderer"] = "another"
     path.write_text(json.dumps(identity))
     assert played(lessons, {1}) == ([], ["demonstrations"])
-    identity["sources"][0]["versions"]["shown"] = "99"
+    identity["sources"][0]["versions"]["tabletop"] = "99"
     path.write_text(json.dumps(identity))
     [found], _ = played(lessons)
     assert found.startswith("demonstrations/meta/interference.json: sources are")

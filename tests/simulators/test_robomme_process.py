@@ -192,14 +192,14 @@ def test_versions(robomme_python: Path, tmp_path: Path, monkeypatch: pytest.Monk
     installed_too = simulator_versions("robomme")
     assert installed_too == {**found, "robomme": "0.2+ab12"}
     monkeypatch.setenv("STAND_IN_MANI_SKILL", "index")
-    installed_versions.cache_clear()
+    _versions.cache_clear()
     patched = simulator_versions("robomme")["robomme_patches"]
     with RoboMMESimulator(robomme_python) as simulator:
         assert patched == ", ".join(simulator.patches) != ""
     monkeypatch.setenv("STAND_IN_MANI_SKILL", "strange")
-    installed_versions.cache_clear()
+    _versions.cache_clear()
     assert "robomme_patches" not in simulator_versions("robomme")  # it does not start either
-    installed_versions.cache_clear()
+    _versions.cache_clear()
     libraries = {name: version(name) for name in ("mani-skill", "sapien")}
     assert simulator_versions("tabletop") == {"tabletop": str(SUITE_VERSION), **libraries}
     assert simulator_versions("support.worlds:World") == {}
@@ -215,4 +215,4 @@ def test_demonstrations_record_the_versions_and_the_renderer(
     }
     monkeypatch.delenv("ROBOMME_PYTHON")
     with raises(InvalidOptionError):
-        open_source("robomme").provenance  # noqa: B018
+        open_source("robomme")
