@@ -83,7 +83,10 @@ class BuildConfig(WorkersConfig):
         (), help="Families of the query episodes; default: all.", group="Episodes"
     )
     split: str | None = setting(
-        None, help="Split of the query episodes: train, val or test.", shown="all", group="Episodes"
+        None,
+        help="Split of the query episodes: train, val, test or heldout.",
+        shown="all",
+        group="Episodes",
     )
     episodes: str | None = setting(
         None,

@@ -29,7 +29,11 @@ FAMILIES = (
 )
 """The nine task families of the benchmark, in the paper's order (object, spatial, procedural)."""
 
-SPLITS = ("train", "val", "test")
+HELDOUT = "heldout"
+"""Split of the episodes that RoboMME's challenge published as seeds."""
+
+SPLITS = ("train", "val", "test", HELDOUT)
+"""Splits, in canonical order."""
 
 DIFFICULTIES = ("easy", "medium", "hard")
 

@@ -20,7 +20,7 @@ def _option(panel: str, text: str, **more: Any) -> Any:
 def simulate(
     family: Annotated[str, _option("Episode", "Task family, such as MoveCube.")],
     episode: Annotated[int, _option("Episode", "Index of the episode in its split, from 0.")] = 0,
-    split: Annotated[str, _option("Episode", "train, val or test.")] = "test",
+    split: Annotated[str, _option("Episode", "train, val, test or heldout.")] = "test",
     policy: Annotated[
         str,
         _option(

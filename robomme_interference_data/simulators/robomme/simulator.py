@@ -26,6 +26,7 @@ from robomme_interference_data.simulators.episode import (
 )
 from robomme_interference_data.simulators.tabletop.episodes import episode_ids
 
+from .heldout import heldout_ids, heldout_setup
 from .process import Arrays, Process, find_python, installed_versions
 from .recorded_scene import read_scene
 from .scenes import OfficialScene
@@ -109,8 +110,8 @@ class RoboMMESimulator(Simulator):
 
     @classmethod
     def episodes(cls) -> list[EpisodeId]:
-        """Return its episodes: the same ids as those of the embedded suite."""
-        return episode_ids()
+        """Return its episodes: the ids of the embedded suite, and those of the held-out split."""
+        return sorted([*episode_ids(), *heldout_ids()])
 
     @classmethod
     def scene(
@@ -168,6 +169,7 @@ class RoboMMESimulator(Simulator):
         families = [family for family in self._process.families if family in FAMILIES]
         if episode.family not in families:
             raise UnknownNameError.among("family", episode.family, self.name, families)
+        setup = heldout_setup(episode)
         most = EPISODES if self._cameras or self._subgoals else 5 * EPISODES
         if self._process.pid is None or self._process.played >= most:
             self._process.end()
@@ -176,8 +178,10 @@ class RoboMMESimulator(Simulator):
         facts, arrays = self._process.call(
             "reset",
             family=episode.family,
-            split=episode.split,
+            # RoboMME knows no held-out split: it gets their seeds in place of those of another one.
+            split=episode.split if setup is None else "test",
             index=episode.index,
+            setup=setup,
             max_steps=MAX_STEPS,
             cameras=self._cameras,
             frame_step=frame_step,

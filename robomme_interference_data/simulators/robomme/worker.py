@@ -104,6 +104,7 @@ class Episodes:
         family: str,
         split: str,
         index: int,
+        setup: list[Any] | None,
         max_steps: int,
         cameras: list[str],
         frame_step: int,
@@ -111,6 +112,7 @@ class Episodes:
     ) -> Answer:
         """Play a demonstration; return the facts about the episode, its frames and its states.
 
+        `setup` is a seed and a difficulty in place of those in RoboMME's metadata, or None.
         Of the demonstration, every n-th frame is drawn, none if `every` is 0. The last frame and
         state are the first live observation. `scene` and `moments` are what `facts.py` reads, or
         `scene` is None and `unreadable` says why.
@@ -119,6 +121,9 @@ class Episodes:
         builder = _builder()(
             env_id=family, dataset=split, action_space="joint_angle", max_steps=max_steps
         )
+        if setup is not None:
+            replaced = dict(zip(("seed", "difficulty"), setup, strict=True))
+            builder.metadata_index[family, index] = replaced
         seed, difficulty = builder.resolve_episode(index)
         # RoboMME would make an environment anyway, with a seed that belongs to no episode.
         if seed is None or not difficulty:
