@@ -94,6 +94,11 @@ class BuildConfig(WorkersConfig):
         "tabletop's 900 train episodes a family 0-99.",
         group="Episodes",
     )
+    shard: str = setting(
+        "1/1",
+        help="Part of the episodes to record, such as 2/8, for merge to build from.",
+        group="Episodes",
+    )
     unit_episodes: str | None = setting(
         None,
         help="Indices of the train episodes that units are cut from, such as 0-3; default: all.",

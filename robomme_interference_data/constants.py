@@ -178,6 +178,9 @@ MANIFESTS = "manifests"
 MANIFEST_HEADER = "manifest.json"
 MANIFEST_ROWS = "buffers.parquet"
 MANIFEST_PATH = f"{MANIFESTS}/{MANIFEST_HEADER}"
+SHARD_PATH = "shard.json"
+"""What the folder of a shard of a build is; in a buffer set, while shards are merged."""
+
 FETCH_RECORD = f"{MANIFESTS}/fetched.json"
 """What a copy of a published buffer set holds."""
 
