@@ -16,7 +16,7 @@ from robomme_interference_data.cli.console import (
 from robomme_interference_data.cli.options import AsJson, Yes, with_settings
 from robomme_interference_data.constants import DEMONSTRATIONS, MANIFESTS, REPORT_PATH, STATE
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError, counted, named
-from robomme_interference_data.runtime.executor import WorkersConfig, make_executor
+from robomme_interference_data.runtime.executor import make_executor
 
 from .config import QUESTIONS, BuffersConfig, BuildConfig
 
@@ -80,7 +80,8 @@ def build(
         plan = plan_build(config, request)
         if plan.buffers is not None:
             _confirm(plan.buffers, yes=yes)
-        _carry_out(plan, config, {}, as_json=as_json)
+        built = _carry_out(plan, config, {})
+        _report(plan, config.buffer_set, built, as_json=as_json)
 
 
 def merge_builds(shards: Sequence[Path], out: Path, *, as_json: bool) -> None:
@@ -96,8 +97,9 @@ def merge_builds(shards: Sequence[Path], out: Path, *, as_json: bool) -> None:
         staged = {kind: [staged_folder(shard, kind) for shard in shards] for kind in plan.datasets}
         for kind, dataset in plan.datasets.items():
             check_all_staged(dataset, staged[kind])
-        _carry_out(plan, config, staged, as_json=as_json)
+        built = _carry_out(plan, config, staged)
         release(out)
+        _report(plan, out, built, as_json=as_json)
 
 
 def _build_shard(
@@ -126,7 +128,7 @@ def _build_shard(
             # As in a whole build, units must look like the demonstrations.
             planned = dataset if first is None else dataset.matching(first)
             with WorkProgress(unit="episodes") as progress:
-                executor = make_executor(config)
+                executor = make_executor(config.fitting(dataset.worker_gb))
                 stored = stage_dataset(planned, staged_folder(root, kind), executor, progress)
             if kind == DEMONSTRATIONS and stored:
                 first = stored[0]
@@ -141,14 +143,12 @@ def _build_shard(
 
 
 def _carry_out(
-    plan: "BuildPlan", config: BuildConfig, staged: Mapping[str, Sequence[Path]], *, as_json: bool
-) -> None:
-    """Build what is planned, and print the results; exit with 1 if the buffers leak.
+    plan: "BuildPlan", config: BuildConfig, staged: Mapping[str, Sequence[Path]]
+) -> dict[str, Any]:
+    """Build what is planned; return the results by part.
 
     `staged` has further folders of staged episodes, by dataset.
     """
-    from robomme_interference_data.data.loading import next_build
-
     root, results = config.buffer_set, dict[str, Any]()
     if plan.datasets:
         _print_episodes(plan.datasets)
@@ -159,6 +159,13 @@ def _carry_out(
         results[MANIFESTS] = _plan_buffers(root, plan.files(root), plan.buffers)
     if plan.questions:
         results[QUESTIONS] = _make_questions(root)
+    return results
+
+
+def _report(plan: "BuildPlan", root: Path, results: dict[str, Any], *, as_json: bool) -> None:
+    """Print the results and the next command; exit with 1 if the buffers leak."""
+    from robomme_interference_data.data.loading import next_build
+
     leaks = _leaks(root) if plan.datasets and plan.manifests else []
     if as_json:
         print_json(results)
@@ -202,7 +209,7 @@ def _build_datasets(
 
 
 def _build_dataset(
-    plan: "DatasetPlan", out: Path, workers: WorkersConfig, staged: Sequence[Path]
+    plan: "DatasetPlan", out: Path, config: BuildConfig, staged: Sequence[Path]
 ) -> dict[str, Any]:
     from robomme_interference_data.data.dataset import Dataset
     from robomme_interference_data.progress import WorkProgress
@@ -211,7 +218,8 @@ def _build_dataset(
     from .dataset.build import build_dataset
 
     with WorkProgress(unit="episodes") as progress:
-        result = build_dataset(plan, out, make_executor(workers), progress, staged)
+        executor = make_executor(config.fitting(plan.worker_gb))
+        result = build_dataset(plan, out, executor, progress, staged)
     added = f"{result.added} added" if result.added else "nothing to add"
     episodes, frames = counted(result.episodes, "episode"), counted(result.frames, "frame")
     print_status(f"{out}: {added}; {episodes}, {frames}")

@@ -1,11 +1,10 @@
 """The settings of a build."""
 
 import dataclasses
-import os
 import re
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from robomme_interference_data.constants import (
     DATASETS,
@@ -18,10 +17,9 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.runtime.executor import WorkersConfig
+from robomme_interference_data.runtime.memory import fitting_workers
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS
 from robomme_interference_data.schema.settings import SETTING, setting
-
-_CPUS = os.cpu_count() or 1
 
 QUESTIONS = "questions"
 
@@ -43,8 +41,27 @@ def chosen_cameras(setting: tuple[str, ...]) -> tuple[str, ...] | None:
     return tuple(sorted(setting)) or None
 
 
+@dataclass(frozen=True, kw_only=True)
+class FittingWorkersConfig(WorkersConfig):
+    """Settings of workers, by default as many as this machine has cores and memory for."""
+
+    workers: int | None = setting(  # type: ignore[assignment]  # None until `fitting`
+        None,
+        help="Worker processes.",
+        metavar="N",
+        shown="all CPUs, as far as memory suffices for that many simulators",
+        group="Execution",
+    )
+
+    def fitting(self, worker_gb: float) -> Self:
+        """Return the settings with the number of workers, each of which takes so many GB."""
+        if self.workers is not None:
+            return self
+        return dataclasses.replace(self, workers=fitting_workers(worker_gb))
+
+
 @dataclass(frozen=True)
-class BuildConfig(WorkersConfig):
+class BuildConfig(FittingWorkersConfig):
     """Settings of a build: of a whole buffer set, or of one part of it."""
 
     buffer_set: Path = setting(
@@ -168,8 +185,6 @@ class BuildConfig(WorkersConfig):
     fps: float | None = setting(
         None, help="Frames per second of recordings that do not state them.", group="Sources"
     )
-    _: KW_ONLY
-    workers: int = setting(_CPUS, help="Worker processes.", shown="all CPUs", group="Execution")
 
 
 def _same(name: str, **changed: Any) -> Any:
@@ -180,7 +195,7 @@ def _same(name: str, **changed: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class SourceConfig(WorkersConfig):
+class SourceConfig(FittingWorkersConfig):
     """Settings of a build that decide which recordings are read, and how."""
 
     source: tuple[str, ...] = _same("source", group="Sources")
@@ -195,8 +210,6 @@ class SourceConfig(WorkersConfig):
     families_from: str | None = _same("families_from")
     several_tasks: str | None = _same("several_tasks")
     fps: float | None = _same("fps")
-    _: KW_ONLY
-    workers: int = _same("workers")
 
 
 @dataclass(frozen=True)

@@ -63,6 +63,11 @@ class DatasetPlan:
         return recorded if self.resize is None else recorded | {"resize": str(self.resize)}
 
     @property
+    def worker_gb(self) -> float:
+        """Memory in GB that a worker takes."""
+        return max(source.worker_gb for source in self.sources)
+
+    @property
     def provenances(self) -> list[dict[str, Any]]:
         """What the dataset records about each source."""
         return [self.provenance(number) for number in range(len(self.sources))]

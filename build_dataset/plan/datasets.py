@@ -111,7 +111,7 @@ def check_values(config: BuildConfig) -> None:
             )
     if config.fps is not None and not 0 < config.fps < math.inf:
         raise InvalidOptionError.expected("fps", config.fps, "a positive number")
-    make_executor(config)  # checks its settings
+    make_executor(config.fitting(0))  # checks its settings
     for name in ("columns", "families_from", "several_tasks"):
         if getattr(config, name) and not any(takes(text, name) for text in config.source):
             raise InvalidOptionError(

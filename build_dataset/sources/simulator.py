@@ -40,6 +40,7 @@ class SimulatorSource(Source):
         self.name, self._every, self._shifted = name, every, shifted
         self._class = simulator_class(name)
         self.time_limit_s = self._class.episode_s
+        self.worker_gb = self._class.worker_gb
         # Another version of the suite has other episodes.
         version = self._class.suite_version
         self.provenance = {"kind": name}

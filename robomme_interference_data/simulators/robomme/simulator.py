@@ -78,6 +78,7 @@ class RoboMMESimulator(Simulator):
     own_episodes = True
     try_out = False
     episode_s = 1800.0
+    worker_gb = 2.5
 
     def __init__(
         self,
