@@ -33,13 +33,18 @@ from robomme_interference_data.evaluate.systems import System, check_history
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Resources
 from robomme_interference_data.simulators.episode import Demonstration, EpisodeInfo, Observation
-from robomme_interference_data.simulators.registry import SIMULATORS, check_shift, simulator_class
+from robomme_interference_data.simulators.registry import (
+    SIMULATORS,
+    check_shift,
+    simulator_class,
+    simulator_versions,
+)
 
 from .settings import used_cameras
 
 
-def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> None:
-    """Check the settings against each other, the buffer set and the policy."""
+def check_settings(config: RunConfig, buffer_set: BufferSet) -> None:
+    """Check the settings against each other and the buffer set: all that needs no policy."""
     simulator, kind = simulator_class(config.simulator), policy_kind(config.policy)
     if simulator.plays_back and not config.offline:
         raise InvalidOptionError(
@@ -47,6 +52,19 @@ def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> 
             f"Set {named('offline')} for an offline evaluation.",
         )
     check_shift(config.simulator, config.shift)
+    if kind.acts_out_answers:
+        check_unused(config, ["retrieval"], config.policy, "Set it for the questions instead.")
+    _check_robot(config, buffer_set, kind)
+    if config.videos:
+        from robomme_interference_data.viz.episode_video import check_pillow
+
+        check_pillow(named("videos"))
+    simulator_versions(config.simulator)  # raises if its interpreter does not run
+
+
+def check_policy(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> None:
+    """Check the settings against the policy."""
+    simulator, kind = simulator_class(config.simulator), policy_kind(config.policy)
     _check_policies(config, kind, policy)
     scripts = [name for name in simulator.policies if kind.script in (None, name)]
     if policy.privileged and not scripts:
@@ -55,14 +73,7 @@ def check_settings(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> 
             "has none for it",
             _script_hint(config, kind),
         )
-    if kind.acts_out_answers:
-        check_unused(config, ["retrieval"], config.policy, "Set it for the questions instead.")
-    _check_robot(config, buffer_set, kind)
     _check_cameras(config, buffer_set.datasets[DEMONSTRATIONS], policy)
-    if config.videos:
-        from robomme_interference_data.viz.episode_video import check_pillow
-
-        check_pillow(named("videos"))
 
 
 def _check_cameras(config: RunConfig, demonstrations: Dataset, policy: Policy) -> None:

@@ -35,14 +35,14 @@ from robomme_interference_data.evaluate.policies.registry import (
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.identity import retrieval_text, short_digest
 from robomme_interference_data.evaluate.run.log import unfinished
-from robomme_interference_data.evaluate.run.plan import WorkItem, plan_run
+from robomme_interference_data.evaluate.run.plan import WorkItem, check_episodes, plan_run
 from robomme_interference_data.evaluate.run.worker import PlannedRun, RunContext
 from robomme_interference_data.evaluate.systems import System, SystemFacts, name_system
 from robomme_interference_data.runtime.executor import Executor, WorkerPool
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.registry import simulator_class, simulator_versions
 
-from .checks import check_plan, check_settings
+from .checks import check_plan, check_policy, check_settings
 from .other_states import check_other_states
 from .settings import complete_settings
 from .worker import RolloutFunction, StartServer, StartSimulator
@@ -82,8 +82,11 @@ def open_rollouts(
 def plan_rollouts(config: RunConfig, buffer_set: BufferSet) -> PlannedRun[RunConfig]:
     """Check settings and policy, and plan the run, without workers."""
     config, system = complete_settings(config)
+    # All that is wrong without a policy is found before a server is waited for.
+    check_settings(config, buffer_set)
+    check_episodes(config, buffer_set)
     policy, metadata = describe_policy(config.policy, config.policy_options, workers=config.workers)
-    check_settings(config, buffer_set, policy)
+    check_policy(config, buffer_set, policy)
     run = _describe_run(config, system, buffer_set, policy, metadata)
     plan = plan_run(config, run.facts, buffer_set)
     items = plan.items()

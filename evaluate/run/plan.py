@@ -117,7 +117,20 @@ def plan_run(config: "WorkConfig", facts: SystemFacts, buffer_set: "BufferSet") 
     )
     if not conditions:  # no planned one applies; raises
         _check_condition(facts, buffer_set.conditions[0], buffer_set)
-    plan = plan_work(
+    plan = _plan(config, buffer_set, conditions)
+    for condition in plan.conditions:
+        _check_condition(facts, condition, buffer_set)
+    buffer_set.check_tables(plan.conditions)
+    return plan
+
+
+def check_episodes(config: "WorkConfig", buffer_set: "BufferSet") -> None:
+    """Check that the episodes and conditions of a run exist, whatever its system is."""
+    _plan(config, buffer_set, config.conditions or tuple(buffer_set.conditions))
+
+
+def _plan(config: "WorkConfig", buffer_set: "BufferSet", conditions: tuple[str, ...]) -> RunPlan:
+    return plan_work(
         buffer_set.episodes_under(conditions),
         conditions=conditions,
         families=config.families,
@@ -125,10 +138,6 @@ def plan_run(config: "WorkConfig", facts: SystemFacts, buffer_set: "BufferSet") 
         split=config.split,
         shard=config.shard,
     )
-    for condition in plan.conditions:
-        _check_condition(facts, condition, buffer_set)
-    buffer_set.check_tables(plan.conditions)
-    return plan
 
 
 def nothing_to_retrieve(hint: str) -> InvalidOptionError:

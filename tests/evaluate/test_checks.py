@@ -31,7 +31,7 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.evaluate import systems
 from robomme_interference_data.evaluate.policies.registry import make_policy
-from robomme_interference_data.evaluate.rollout.checks import check_plan, check_settings
+from robomme_interference_data.evaluate.rollout.checks import check_plan, check_policy, check_settings
 from robomme_interference_data.evaluate.rollout.settings import (
     check_system,
     default_system,
@@ -130,6 +130,27 @@ def test_the_default_is_all_conditions_that_apply(tmp_path: Path) -> None:
         run_one(tmp_path / "k0", policy=still, conditions=("k0",))
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"families": ("NoFamily",)},
+        {"episodes": "99"},
+        {"conditions": ("k5",)},
+        {"shift": "fog:1"},
+        {"simulator": "robomme"},  # without an interpreter
+    ],
+)
+def test_cheap_checks_come_before_a_server_is_waited_for(
+    tmp_path: Path, wrong: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("ROBOMME_PYTHON", raising=False)
+    # No server listens there: it would be waited for, 600 s by default.
+    absent: dict[str, Any] = {"policy": "websocket://127.0.0.1:9", "system": "mine"}
+    with raises(InterferenceError):
+        run(tmp_path / "run", policy_options=("checkpoint=c",), **absent | wrong)
+    assert not (tmp_path / "run").exists()
+
+
 # --- the simulator -----------------------------------------------------------------------------
 
 
@@ -194,7 +215,9 @@ def test_recall_needs_evidence(tiny_buffers: Path, monkeypatch: pytest.MonkeyPat
 def check_name(tiny_buffers: Path, system: str, **changes: Any) -> None:
     settings = config(**{"simulator": "tabletop"} | changes)
     check_system(settings, system)
-    check_settings(settings, load_buffer_set(tiny_buffers), make_policy("noop"))
+    opened = load_buffer_set(tiny_buffers)
+    check_settings(settings, opened)
+    check_policy(settings, opened, make_policy("noop"))
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.evaluate.policies.registry import make_policy
-from robomme_interference_data.evaluate.rollout.checks import check_episode, check_settings
+from robomme_interference_data.evaluate.rollout.checks import check_episode, check_policy, check_settings
 from robomme_interference_data.evaluate.rollout.settings import simulator_options
 from robomme_interference_data.simulators import Simulator
 from robomme_interference_data.simulators.episode import Observation
@@ -115,10 +115,12 @@ def test_policies_that_do_not_fit(
     settings = config(simulator=OWN + simulator, policy=policy)
     opened, made = load_buffer_set(tiny_buffers), make_policy(policy)
     if error is None:
-        check_settings(settings, opened, made)
+        check_settings(settings, opened)
+        check_policy(settings, opened, made)
         return
     with pytest.raises(error) as raised:
-        check_settings(settings, opened, made)
+        check_settings(settings, opened)
+        check_policy(settings, opened, made)
     assert words in raised.value.message
 
 
