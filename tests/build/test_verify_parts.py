@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.buffer_sets import build
+from support.buffer_sets import build, plan_again, violations
 
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.data.loading import next_build
@@ -61,3 +61,13 @@ def test_a_dataset_without_buffers_is_one_violation(own_buffers: Path, run: Any)
 def test_a_planned_set_is_planned_again_wherever_its_demonstrations_are(own_buffers: Path) -> None:
     shutil.rmtree(own_buffers / "demonstrations")
     assert next_build(own_buffers) == f"build {own_buffers} --only manifests"
+
+
+def test_extended_demonstrations_need_new_manifests(own_buffers: Path) -> None:
+    """One line with the command, not one for each buffer that is planned in another way."""
+    build(own_buffers, "demonstrations", SampleSource(size=32), families=("InsertPeg",))
+    command = f"robomme-interference build {own_buffers} --only manifests"
+    expected = f"demonstrations: changed after the buffers were planned: run {command}"
+    assert violations(own_buffers, decode=False) == [expected]
+    plan_again(own_buffers)
+    assert violations(own_buffers, decode=False) == []
