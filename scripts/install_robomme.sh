@@ -35,6 +35,9 @@ if [[ -e $env && ! -f $env/pyvenv.cfg && -n $(ls -A "$env") ]]; then
 fi
 uv=$(command -v uv || command -v "$here/../.venv/bin/uv") ||
   fail "uv is missing, which reads RoboMME's lock" "Install it: python -m pip install uv"
+# uv does not read pip's settings: use the same index as pip does.
+index=${PIP_INDEX_URL:-$(python3 -m pip config get global.index-url 2>/dev/null || true)}
+if [[ -n $index ]]; then export UV_DEFAULT_INDEX=${UV_DEFAULT_INDEX:-$index}; fi
 
 say "RoboMME at commit $commit, into $env ..."
 [[ -f $env/pyvenv.cfg ]] || "$uv" venv --quiet --python 3.11 "$env"

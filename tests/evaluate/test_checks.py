@@ -31,7 +31,11 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.evaluate import systems
 from robomme_interference_data.evaluate.policies.registry import make_policy
-from robomme_interference_data.evaluate.rollout.checks import check_plan, check_policy, check_settings
+from robomme_interference_data.evaluate.rollout.checks import (
+    check_plan,
+    check_policy,
+    check_settings,
+)
 from robomme_interference_data.evaluate.rollout.settings import (
     check_system,
     default_system,
