@@ -68,8 +68,7 @@ def play(python: str, kind: str, family: str, steps: int) -> Played:
     """Play it with the simulator of this package."""
     cameras, demonstration, often = KINDS[kind]
     with RoboMMESimulator(python, cameras=cameras, subgoals=kind == EVERY_IMAGE) as simulator:
-        simulator.reset(f"{family}/test/1", demonstration=demonstration)
-        simulator.step(np.zeros(8, np.float32), observe=demonstration)  # to be warm
+        simulator.reset(f"{family}/test/1", demonstration=False)  # to be warm
         worked, began = processor_seconds(simulator.pid), time.perf_counter()
         lesson, first, _ = simulator.reset(f"{family}/test/0", demonstration=demonstration)
         ready = time.perf_counter()

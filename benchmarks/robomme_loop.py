@@ -47,7 +47,7 @@ def play(builder: Any, index: int, steps: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Play an episode to be warm, then the one that counts."""
+    """Play the episode."""
     patches, folder, family, steps = sys.argv[1:]
     with contextlib.redirect_stdout(sys.stderr):  # ManiSkill prints there
         spec: Any = importlib.util.spec_from_file_location("patches", patches)
@@ -58,7 +58,7 @@ def main() -> None:
         builder = wrapper.BenchmarkEnvBuilder(
             env_id=family, dataset="test", action_space="joint_angle", max_steps=1300
         )
-        play(builder, 1, 1)
+        builder.make_env_for_episode(1).close()  # to be warm
         result = play(builder, 0, int(steps))
     print(json.dumps(result))
 
