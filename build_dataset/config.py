@@ -183,7 +183,10 @@ class BuildConfig(FittingWorkersConfig):
         group="Sources",
     )
     fps: float | None = setting(
-        None, help="Frames per second of recordings that do not state them.", group="Sources"
+        None,
+        help="Frames per second of recordings that do not state them.",
+        group="Sources",
+        rare=True,
     )
 
 
