@@ -1,7 +1,7 @@
 """The command `build`."""
 
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,16 +15,18 @@ from robomme_interference_data.cli.console import (
 )
 from robomme_interference_data.cli.options import AsJson, Yes, with_settings
 from robomme_interference_data.constants import DEMONSTRATIONS, MANIFESTS, REPORT_PATH, STATE
-from robomme_interference_data.errors import MissingFileError, counted
-from robomme_interference_data.runtime.executor import WorkersConfig, make_executor
+from robomme_interference_data.errors import InvalidOptionError, MissingFileError, counted, named
+from robomme_interference_data.runtime.executor import make_executor
 
 from .config import QUESTIONS, BuffersConfig, BuildConfig
 
 if TYPE_CHECKING:
+    from robomme_interference_data.schema.shard import Shard
     from robomme_interference_data.storage.files import Files
 
     from .dataset.plan import DatasetPlan
     from .plan.buffers import NextBuffers
+    from .plan.parts import BuildPlan
 
 _MAX_SKIPPED = 10
 """Skipped episodes to print."""
@@ -65,27 +67,111 @@ def build(
       --demonstrations namespace/name@data-1.0.0
     ```
     """
-    from robomme_interference_data.data.loading import next_build
+    from robomme_interference_data.schema.shard import Shard
 
     from .plan.parts import plan_build
+    from .shards import check_is_no_shard
 
-    root, results = config.buffer_set, dict[str, Any]()
+    shard = Shard.parse(config.shard)
     with graceful_interrupt("Finished episodes are kept"):
+        if not shard.is_whole:
+            _build_shard(config, request, shard, as_json=as_json)
+            return
+        check_is_no_shard(config.buffer_set)
         plan = plan_build(config, request)
         if plan.buffers is not None:
             _confirm(plan.buffers, yes=yes)
-        if plan.datasets:
-            counts = (f"{kind} {len(part.episodes):,}" for kind, part in plan.datasets.items())
-            print_status(f"Recorded episodes: {', '.join(counts)}")
-            results |= _build_datasets(plan.datasets, config)
-        if plan.manifests and plan.buffers is not None:
-            if plan.base is not None:
-                _copy_demonstrations(plan.base.files, root)
-            results[MANIFESTS] = _plan_buffers(root, plan.files(root), plan.buffers)
-        if plan.questions:
-            results[QUESTIONS] = _make_questions(root)
-        leaks = _leaks(root) if plan.datasets and plan.manifests else []
-        note = _renderers_note(root) if plan.datasets else None
+        built = _carry_out(plan, config, {})
+        _report(plan, config.buffer_set, built, as_json=as_json)
+
+
+def merge_builds(shards: Sequence[Path], out: Path, *, as_json: bool) -> None:
+    """Build a buffer set from the episodes that shards have recorded; see the command `merge`."""
+    from .dataset.same_simulators import check_same_simulators
+    from .plan.parts import plan_build
+    from .shards import check_all_staged, claim, read_shards, release, staged_folder
+
+    with graceful_interrupt("The shards are unchanged"):
+        record = read_shards(shards)
+        claim(out, record)
+        config, request = record.configs(out)
+        plan = plan_build(config, request)
+        staged = {kind: [staged_folder(shard, kind) for shard in shards] for kind in plan.datasets}
+        for kind, dataset in plan.datasets.items():
+            advice = "such as on a machine that recorded a shard."
+            check_same_simulators("the shards", record.sources, dataset.provenances, advice)
+            check_all_staged(dataset, staged[kind])
+        built = _carry_out(plan, config, staged)
+        release(out)
+        _report(plan, out, built, as_json=as_json)
+
+
+def _build_shard(
+    config: BuildConfig, request: BuffersConfig, shard: "Shard", *, as_json: bool
+) -> None:
+    """Record the episodes of a shard."""
+    from robomme_interference_data.progress import WorkProgress
+
+    from .dataset.build import stage_dataset
+    from .plan.parts import plan_build
+    from .shards import recording, staged_folder
+
+    root, results = config.buffer_set, dict[str, Any]()
+    plan = plan_build(config, request)
+    plans = {kind: dataset.share(shard) for kind, dataset in plan.datasets.items()}
+    if not plans:
+        raise InvalidOptionError(
+            f"{named('shard', str(shard))} has no effect: no episodes are recorded",
+            "Leave it out.",
+            option="shard",
+        )
+    with recording(config, request, plan):
+        _print_episodes(plans)
+        first = None
+        for kind, dataset in plans.items():
+            # As in a whole build, units must look like the demonstrations.
+            planned = dataset if first is None else dataset.matching(first)
+            with WorkProgress(unit="episodes") as progress:
+                executor = make_executor(config.fitting(dataset.worker_gb))
+                stored = stage_dataset(planned, staged_folder(root, kind), executor, progress)
+            if kind == DEMONSTRATIONS and stored:
+                first = stored[0]
+            results[kind] = {"episodes": len(stored)}
+            print_status(f"{root}: {counted(len(stored), 'episode')} of the {kind}")
+    if as_json:
+        print_json({"shard": str(shard), **results})
+    print_status(
+        "Next, when all shards are built: robomme-interference merge "
+        f"{shlex.quote(str(root))} … --out BUFFER_SET"
+    )
+
+
+def _carry_out(
+    plan: "BuildPlan", config: BuildConfig, staged: Mapping[str, Sequence[Path]]
+) -> dict[str, Any]:
+    """Build what is planned; return the results by part.
+
+    `staged` has further folders of staged episodes, by dataset.
+    """
+    root, results = config.buffer_set, dict[str, Any]()
+    if plan.datasets:
+        _print_episodes(plan.datasets)
+        results |= _build_datasets(plan.datasets, config, staged)
+    if plan.manifests and plan.buffers is not None:
+        if plan.base is not None:
+            _copy_demonstrations(plan.base.files, root)
+        results[MANIFESTS] = _plan_buffers(root, plan.files(root), plan.buffers)
+    if plan.questions:
+        results[QUESTIONS] = _make_questions(root)
+    return results
+
+
+def _report(plan: "BuildPlan", root: Path, results: dict[str, Any], *, as_json: bool) -> None:
+    """Print the results and the next command; exit with 1 if the buffers leak."""
+    from robomme_interference_data.data.loading import next_build
+
+    leaks = _leaks(root) if plan.datasets and plan.manifests else []
+    note = _renderers_note(root) if plan.datasets else None
     if as_json:
         print_json(results)
     if note is not None:
@@ -100,6 +186,11 @@ def build(
         print_status(f"Next: robomme-interference {next_build(root)}")
 
 
+def _print_episodes(plans: "Mapping[str, DatasetPlan]") -> None:
+    counts = (f"{kind} {len(part.episodes):,}" for kind, part in plans.items())
+    print_status(f"Recorded episodes: {', '.join(counts)}")
+
+
 def _confirm(change: "NextBuffers", *, yes: bool) -> None:
     """Print how the planned buffers change, and ask before any is lost."""
     for line in change.lines():
@@ -108,7 +199,9 @@ def _confirm(change: "NextBuffers", *, yes: bool) -> None:
         confirm("Replace these planned buffers?", "replacing planned buffers", yes=yes)
 
 
-def _build_datasets(plans: "Mapping[str, DatasetPlan]", config: BuildConfig) -> dict[str, Any]:
+def _build_datasets(
+    plans: "Mapping[str, DatasetPlan]", config: BuildConfig, staged: Mapping[str, Sequence[Path]]
+) -> dict[str, Any]:
     from robomme_interference_data.data.dataset import Dataset
     from robomme_interference_data.storage.files import LocalFiles
 
@@ -118,7 +211,7 @@ def _build_datasets(plans: "Mapping[str, DatasetPlan]", config: BuildConfig) -> 
         if kind != DEMONSTRATIONS and DEMONSTRATIONS in plans:
             # They are built first, so that other sizes and rates are found early.
             dataset = planned.matching(Dataset(LocalFiles(root / DEMONSTRATIONS)))
-        results[kind] = _build_dataset(dataset, root / kind, config)
+        results[kind] = _build_dataset(dataset, root / kind, config, staged.get(kind, ()))
     return results
 
 
@@ -133,7 +226,9 @@ def _renderers_note(root: Path) -> str | None:
     return renderers_note(dataset_renderers(datasets).items())
 
 
-def _build_dataset(plan: "DatasetPlan", out: Path, workers: WorkersConfig) -> dict[str, Any]:
+def _build_dataset(
+    plan: "DatasetPlan", out: Path, config: BuildConfig, staged: Sequence[Path]
+) -> dict[str, Any]:
     from robomme_interference_data.data.dataset import Dataset
     from robomme_interference_data.progress import WorkProgress
     from robomme_interference_data.storage.files import LocalFiles
@@ -141,7 +236,8 @@ def _build_dataset(plan: "DatasetPlan", out: Path, workers: WorkersConfig) -> di
     from .dataset.build import build_dataset
 
     with WorkProgress(unit="episodes") as progress:
-        result = build_dataset(plan, out, make_executor(workers), progress)
+        executor = make_executor(config.fitting(plan.worker_gb))
+        result = build_dataset(plan, out, executor, progress, staged)
     added = f"{result.added} added" if result.added else "nothing to add"
     episodes, frames = counted(result.episodes, "episode"), counted(result.frames, "frame")
     print_status(f"{out}: {added}; {episodes}, {frames}")

@@ -1,11 +1,10 @@
 """The settings of a build."""
 
 import dataclasses
-import os
 import re
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from robomme_interference_data.constants import (
     DATASETS,
@@ -18,6 +17,7 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.runtime.executor import WorkersConfig
+from robomme_interference_data.runtime.memory import fitting_workers
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS
 from robomme_interference_data.schema.settings import (
     PYTHON_HELP,
@@ -26,8 +26,6 @@ from robomme_interference_data.schema.settings import (
     SIMULATOR_OPTION_HELP,
     setting,
 )
-
-_CPUS = os.cpu_count() or 1
 
 QUESTIONS = "questions"
 
@@ -49,8 +47,27 @@ def chosen_cameras(setting: tuple[str, ...]) -> tuple[str, ...] | None:
     return tuple(sorted(setting)) or None
 
 
+@dataclass(frozen=True, kw_only=True)
+class FittingWorkersConfig(WorkersConfig):
+    """Settings of workers, by default as many as this machine has cores and memory for."""
+
+    workers: int | None = setting(  # type: ignore[assignment]  # None until `fitting`
+        None,
+        help="Worker processes.",
+        metavar="N",
+        shown="all CPUs, as far as memory suffices for that many simulators",
+        group="Execution",
+    )
+
+    def fitting(self, worker_gb: float) -> Self:
+        """Return the settings with the number of workers, each of which takes so many GB."""
+        if self.workers is not None:
+            return self
+        return dataclasses.replace(self, workers=fitting_workers(worker_gb))
+
+
 @dataclass(frozen=True)
-class BuildConfig(WorkersConfig):
+class BuildConfig(FittingWorkersConfig):
     """Settings of a build: of a whole buffer set, or of one part of it."""
 
     buffer_set: Path = setting(
@@ -89,12 +106,20 @@ class BuildConfig(WorkersConfig):
         (), help="Families of the query episodes; default: all.", group="Episodes"
     )
     split: str | None = setting(
-        None, help="Split of the query episodes: train, val or test.", shown="all", group="Episodes"
+        None,
+        help="Split of the query episodes: train, val, test or heldout.",
+        shown="all",
+        group="Episodes",
     )
     episodes: str | None = setting(
         None,
         help="Indices of the query episodes, such as 0-49 or 0,3,10-12; default: all, of "
         "tabletop's 900 train episodes a family 0-99.",
+        group="Episodes",
+    )
+    shard: str = setting(
+        "1/1",
+        help="Part of the episodes to record, such as 2/8, for merge to build from.",
         group="Episodes",
     )
     unit_episodes: str | None = setting(
@@ -164,7 +189,10 @@ class BuildConfig(WorkersConfig):
         group="Sources",
     )
     fps: float | None = setting(
-        None, help="Frames per second of recordings that do not state them.", group="Sources"
+        None,
+        help="Frames per second of recordings that do not state them.",
+        group="Sources",
+        rare=True,
     )
     simulator_python: str | None = setting(
         None, metavar="PATH", help=PYTHON_HELP, shown=PYTHON_SHOWN, group="Sources"
@@ -177,8 +205,6 @@ class BuildConfig(WorkersConfig):
         help=SIMULATOR_OPTION_HELP,
         group="Sources",
     )
-    _: KW_ONLY
-    workers: int = setting(_CPUS, help="Worker processes.", shown="all CPUs", group="Execution")
 
 
 def _same(name: str, **changed: Any) -> Any:
@@ -189,7 +215,7 @@ def _same(name: str, **changed: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class SourceConfig(WorkersConfig):
+class SourceConfig(FittingWorkersConfig):
     """Settings of a build that decide which recordings are read, and how."""
 
     source: tuple[str, ...] = _same("source", group="Sources")
@@ -206,8 +232,6 @@ class SourceConfig(WorkersConfig):
     fps: float | None = _same("fps")
     simulator_python: str | None = _same("simulator_python")
     simulator_options: tuple[str, ...] = _same("simulator_options")
-    _: KW_ONLY
-    workers: int = _same("workers")
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
-"""The commands `ceiling`, `evaluate`, `ask` and `merge`."""
+"""The commands `ceiling`, `evaluate` and `ask`, and `merge` for runs."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
@@ -139,25 +139,11 @@ def _run(config: RunConfig | AskConfig, kept: str, unit: str, *, as_json: bool) 
         raise typer.Exit(1)
 
 
-def merge(
-    runs: Annotated[list[Path], typer.Argument(help="Folders of the shards of a run.")],
-    out: Annotated[Path, typer.Option(help="New folder of the merged run.")],
-    as_json: AsJson = False,
-) -> None:
-    """Merge the shards of a run, and list missing and duplicate rollouts.
-
-    The shards must have the same settings, except those that cannot change a result. The merged run
-    can be scored like any other; evaluate with its folder as --out runs what is missing.
-
-    Example:
-    ```
-    robomme-interference merge runs/shard-1 runs/shard-2 --out runs/whole
-    ```
-    """
+def merge_shards(runs: Sequence[Path], out: Path, *, as_json: bool) -> None:
+    """Merge the shards of a run; see the command `merge`."""
     from .run.merge import merge_runs
     from .run.progress import rate_table
 
-    check_output(out)
     merged = merge_runs(runs, out)
     lists = {name: getattr(merged, name) for name in _LISTS}
     if as_json:

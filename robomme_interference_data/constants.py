@@ -29,7 +29,11 @@ FAMILIES = (
 )
 """The nine task families of the benchmark, in the paper's order (object, spatial, procedural)."""
 
-SPLITS = ("train", "val", "test")
+HELDOUT = "heldout"
+"""Split of the episodes that RoboMME's challenge published as seeds."""
+
+SPLITS = ("train", "val", "test", HELDOUT)
+"""Splits, in canonical order."""
 
 DIFFICULTIES = ("easy", "medium", "hard")
 
@@ -174,6 +178,9 @@ MANIFESTS = "manifests"
 MANIFEST_HEADER = "manifest.json"
 MANIFEST_ROWS = "buffers.parquet"
 MANIFEST_PATH = f"{MANIFESTS}/{MANIFEST_HEADER}"
+SHARD_PATH = "shard.json"
+"""What the folder of a shard of a build is; in a buffer set, while shards are merged."""
+
 FETCH_RECORD = f"{MANIFESTS}/fetched.json"
 """What a copy of a published buffer set holds."""
 

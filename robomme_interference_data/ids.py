@@ -38,7 +38,7 @@ class EpisodeId:
     Args:
         family: Task family: a letter, then letters, digits, `_`, `.` or `-`; not `all` or a
             difficulty.
-        split: `train`, `val` or `test`.
+        split: `train`, `val`, `test` or `heldout`.
         index: Number of the episode within family and split, from 0.
         answer: Number of the played answer, from 0; None for the scene's correct answer.
         start: First raw frame of a distractor unit in the episode, from 0.

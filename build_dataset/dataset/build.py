@@ -60,9 +60,21 @@ class BuildResult:
 
 
 def build_dataset(
-    plan: DatasetPlan, out: Path, executor: Executor, progress: WorkProgress
+    plan: DatasetPlan,
+    out: Path,
+    executor: Executor,
+    progress: WorkProgress,
+    staged: Sequence[Path] = (),
 ) -> BuildResult:
-    """Build or extend one of a buffer set's datasets, a LeRobot v3 dataset in the folder `out`."""
+    """Build or extend one of a buffer set's datasets, a LeRobot v3 dataset in the folder `out`.
+
+    Args:
+        plan: What to build.
+        out: Folder of the dataset.
+        executor: Stages the episodes.
+        progress: Where progress is shown.
+        staged: Further folders with staged episodes, as `stage_dataset` fills them.
+    """
     require_lerobot()
     get_codec(plan.codec)
     out = out.resolve()  # a folder cannot be renamed to a link, or "."
@@ -81,14 +93,26 @@ def build_dataset(
         before = len(stored)
         if todo or not existing:
             check_staged_simulators(work, out, plan)
-            _stage(work, plan, todo, stored, skipped, executor, progress)
+            folders = [work / "episodes", *staged]
+            _stage(folders, plan, todo, stored, skipped, executor, progress)
             _write(work, out, plan, existing, stored, skipped, progress)
     frames = sum(episode.record.length for episode in stored)
     return BuildResult(out, len(stored), frames, len(stored) - before, skipped)
 
 
+def stage_dataset(
+    plan: DatasetPlan, folder: Path, executor: Executor, progress: WorkProgress
+) -> list[StoredEpisode]:
+    """Stage the episodes of a plan in a folder, for a build elsewhere; return those stored."""
+    get_codec(plan.codec)
+    stored: list[StoredEpisode] = []
+    folder.mkdir(parents=True, exist_ok=True)
+    _stage([folder], plan, plan.episodes, stored, {}, executor, progress)
+    return stored
+
+
 def _stage(
-    work: Path,
+    folders: Sequence[Path],
     plan: DatasetPlan,
     todo: Sequence[PlannedEpisode],
     stored: list[StoredEpisode],
@@ -96,12 +120,13 @@ def _stage(
     executor: Executor,
     progress: WorkProgress,
 ) -> None:
-    """Stage episodes, and add each to `stored` or `skipped`."""
+    """Stage episodes in the first folder if none has them; add each to `stored` or `skipped`."""
     built = stored[:1]  # of the dataset that is extended; all its episodes are alike
     limit = plan.time_limit_s or max(source.time_limit_s for source in plan.sources)
 
     def folder(planned: PlannedEpisode) -> Path:
-        return work / "episodes" / staged_name(plan, planned)
+        name = staged_name(plan, planned)
+        return next((at / name for at in folders if (at / name).is_dir()), folders[0] / name)
 
     def take(
         planned: PlannedEpisode, staged: Staged, *, before: bool, node: str | None = None
@@ -117,7 +142,8 @@ def _stage(
                     for earlier in built:
                         _check_alike(earlier, episode)
             except SourceError:
-                shutil.rmtree(folder(planned))  # no later attempt can use it
+                if folder(planned).parent == folders[0]:
+                    shutil.rmtree(folder(planned))  # no later attempt can use it
                 raise
             for episode in episodes:
                 stored.append(episode)
@@ -131,7 +157,7 @@ def _stage(
             missing.append(planned)
         else:
             take(planned, done, before=True)
-    estimate = BuildEstimate(work, len(missing), executor.workers)
+    estimate = BuildEstimate(folders[0].parent, len(missing), executor.workers)
     failures: list[Outcome] = []
     # Closing ends the workers, also after an error.
     with closing(executor.run(StageTask(plan), missing, time_limit=limit)) as outcomes:

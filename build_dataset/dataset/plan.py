@@ -8,7 +8,9 @@ from robomme_interference_data.build_dataset.alike import Look, in_buffers
 from robomme_interference_data.build_dataset.sources import Source, SourceEpisode
 from robomme_interference_data.constants import PAPER_UNIT, Unit
 from robomme_interference_data.data.dataset import Dataset
+from robomme_interference_data.schema.shard import Shard
 
+from .lerobot_writer import StoredEpisode
 from .resize import Resize
 
 
@@ -61,11 +63,22 @@ class DatasetPlan:
         return recorded if self.resize is None else recorded | {"resize": str(self.resize)}
 
     @property
+    def worker_gb(self) -> float:
+        """Memory in GB that a worker takes."""
+        return max(source.worker_gb for source in self.sources)
+
+    @property
     def provenances(self) -> list[dict[str, Any]]:
         """What the dataset records about each source."""
         return [self.provenance(number) for number in range(len(self.sources))]
 
-    def matching(self, demonstrations: Dataset) -> "DatasetPlan":
+    def share(self, shard: Shard) -> "DatasetPlan":
+        """Return the plan of a shard's episodes, in canonical order."""
+        episodes = shard.share(self.episodes, lambda planned: planned.episode.id)
+        episodes.sort(key=lambda planned: planned.episode.id)
+        return dataclasses.replace(self, episodes=tuple(episodes))
+
+    def matching(self, demonstrations: Dataset | StoredEpisode) -> "DatasetPlan":
         """Return the plan with episodes that must look like those of the demonstrations."""
         look = in_buffers(self.kind, demonstrations.features, demonstrations.fps)
         return dataclasses.replace(self, must_match=look)

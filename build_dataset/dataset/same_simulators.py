@@ -40,7 +40,7 @@ def check_same_simulators(
         before = earlier.get(source["kind"])
         if before is None or "versions" not in source or before == source:
             continue
-        found = unequal(("it", _facts(before)), ("this build", _facts(source)))
+        found = unequal(("it", facts_of(before)), ("this build", facts_of(source)))
         raise BuildError(
             f"{where} has episodes of another {source['kind']}: {'; '.join(found)}",
             f"Build with those versions and that renderer, {advice}",
@@ -66,7 +66,7 @@ def check_staged_simulators(work: Path, out: Path, plan: DatasetPlan) -> None:
     write_json(path, recorded | {source["kind"]: source for source in plan.provenances})
 
 
-def _facts(source: Mapping[str, Any]) -> dict[str, Any]:
+def facts_of(source: Mapping[str, Any]) -> dict[str, Any]:
     """Return a provenance with each version as a fact of its own."""
     versions = source.get("versions", {})
     return {name: fact for name, fact in source.items() if name != "versions"} | versions

@@ -15,6 +15,7 @@ from robomme_interference_data.constants import (
     IDENTITY_PATH,
     MANIFESTS,
     MAX_K,
+    SHARD_PATH,
 )
 from robomme_interference_data.data.loading import next_build
 from robomme_interference_data.errors import BuildError, MissingFileError, named
@@ -31,6 +32,8 @@ def check_root(root: Path) -> None:
     """Check that a folder is absent, empty or, as far as a build has come, a buffer set."""
     if root.exists() and not root.is_dir():
         raise BuildError(f"{root} is a file", f"Choose another {named('buffer_set')}.")
+    if (root / SHARD_PATH).is_file():  # a shard of a build, or what shards are merged into
+        return
     parts = [root / name for name in (*DATASETS, MANIFESTS)]
     if not root.exists() or any(path.exists() or staging_path(path).exists() for path in parts):
         return

@@ -111,7 +111,7 @@ def check_values(config: BuildConfig) -> None:
             )
     if config.fps is not None and not 0 < config.fps < math.inf:
         raise InvalidOptionError.expected("fps", config.fps, "a positive number")
-    make_executor(config)  # checks its settings
+    make_executor(config.fitting(0))  # checks its settings
     for names, takers in (
         (("columns", "families_from", "several_tasks"), "the source lerobot takes"),
         (("simulator_python", "simulator_options"), "simulators take"),

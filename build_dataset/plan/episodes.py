@@ -27,7 +27,7 @@ def choose_episodes(
     Args:
         sources: The sources.
         families: Families; empty for all.
-        split: `train`, `val` or `test`; None for all.
+        split: `train`, `val`, `test` or `heldout`; None for all.
         numbers: Indices of episodes in their split; None for all but those that a source lists as
             further ones.
         queries: These episodes alone, whatever the other filters are; None to filter.

@@ -200,10 +200,12 @@ class Source(Protocol):
         provenance: What a dataset built from the source records about it, including its `kind`;
             the same on every machine (no local paths), e.g. a Hub repository with its commit.
         time_limit_s: Default limit in seconds for reading and storing one episode.
+        worker_gb: Memory in GB that a worker with it takes; 0 if that is little.
     """
 
     provenance: dict[str, Any]
     time_limit_s: float = 1800.0
+    worker_gb: float = 0
 
     def episodes(self) -> list[SourceEpisode]:
         """List all episodes, in the canonical order of their ids.

@@ -112,7 +112,7 @@ _COLUMNS: dict[str, tuple[Callable[[Any], Any], str]] = {
     # They name the episode.
     "episode_id": (_text, "its id"),
     "family": (_text, "the name of one"),
-    "split": (_text, "train, val or test"),
+    "split": (_text, "train, val, test or heldout"),
     "index": (_whole, "a whole number"),
     # They describe it.
     "tasks": (_texts, "texts"),

@@ -53,6 +53,7 @@ class SimulatorSource(Source):
         self.name, self._every, self._shifted = name, every, shifted
         self._class = simulator_class(name)
         self.time_limit_s = self._class.episode_s
+        self.worker_gb = self._class.worker_gb
         self.python = find_simulator_python(name, simulator_python)
         self._settings = {"subgoals": False, "python": self.python}
         self._options = tuple(simulator_options)

@@ -73,16 +73,33 @@ def verify_buffer_set(
             for path in further_files(folder, ()):
                 yield Violation(f"{name}/{path}", "is not part of the dataset")
     yield from _datasets(datasets, header, copy, progress if decode else None)
-    if len(datasets) == len(buffer_set.datasets):
+    changed = [
+        name
+        for name, dataset in datasets.items()
+        if dataset.revision != header.datasets[name].revision
+    ]
+    for name in changed:
+        yield Violation(name, f"changed after the buffers were planned: {_plan_again(buffer_set)}")
+    # Of buffers that are planned from other episodes, every row would differ.
+    if len(datasets) == len(buffer_set.datasets) and not changed:
         yield from caught(MANIFESTS, buffer_violations(buffer_set, datasets))
     if decode and {DEMONSTRATIONS, EXECUTIONS} <= datasets.keys():
         executions, demonstrations = datasets[EXECUTIONS], datasets[DEMONSTRATIONS]
         yield from caught(EXECUTIONS, _executions(executions, demonstrations, copy))
-    if header.questions is not None and (copy is None or copy.lists(root, QUESTIONS_PATH)):
+    listed = header.questions is not None and (copy is None or copy.lists(root, QUESTIONS_PATH))
+    if listed and not changed:
         yield from caught(QUESTIONS_PATH, _table(root, QUESTIONS_PATH, Question))
         yield from caught(QUESTIONS_PATH, question_violations(buffer_set, decode=decode))
-    elif (root / QUESTIONS_PATH).exists():
+    elif not listed and (root / QUESTIONS_PATH).exists():
         yield Violation(QUESTIONS_PATH, f"is not listed in {HEADER}")
+
+
+def _plan_again(buffer_set: BufferSet) -> str:
+    """Return what to do about datasets that are not those of the manifests."""
+    if buffer_set.copy is not None or not isinstance(buffer_set.files, LocalFiles):
+        return "fetch it again"
+    root = str(buffer_set.files.root)
+    return f"run {shlex.join(['robomme-interference', 'build', root, '--only', MANIFESTS])}"
 
 
 def verify_datasets(

@@ -33,7 +33,13 @@ from robomme_interference_data.evaluate.systems import System, check_history
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Resources
 from robomme_interference_data.simulators.episode import Demonstration, EpisodeInfo, Observation
-from robomme_interference_data.simulators.registry import SIMULATORS, check_shift, simulator_class
+from robomme_interference_data.simulators.registry import (
+    SIMULATORS,
+    check_shift,
+    find_simulator_python,
+    simulator_class,
+    simulator_versions,
+)
 
 from .settings import used_cameras
 
@@ -47,6 +53,8 @@ def check_settings(config: RunConfig, buffer_set: BufferSet) -> None:
             f"Set {named('offline')} for an offline evaluation.",
         )
     check_shift(config.simulator, config.shift)
+    python = find_simulator_python(config.simulator, config.simulator_python)
+    simulator_versions(config.simulator, python)  # raises if its interpreter does not run
     _check_policies(config)
     if kind.acts_out_answers:
         check_unused(config, ["retrieval"], config.policy, "Set it for the questions instead.")

@@ -55,7 +55,7 @@ class WorkConfig(WorkersConfig, RetrievalConfig):
     episodes: str | None = setting(
         None, group=_EPISODES, help="Episode numbers, such as 0-49 or 0,3,10-12; default: all."
     )
-    split: str = setting("test", group=_EPISODES, help="train, val or test.", rare=True)
+    split: str = setting("test", group=_EPISODES, help="train, val, test or heldout.", rare=True)
     shard: str = setting(
         "1/1", group=_EPISODES, help="Part of the plan to run, such as 2/8; see merge."
     )

@@ -1,7 +1,5 @@
 """The plan of a run: which rollouts or questions, and in which order."""
 
-import hashlib
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
@@ -11,14 +9,13 @@ from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.ids import EpisodeId, count_numbers, format_numbers, parse_numbers
 from robomme_interference_data.schema.conditions import NO_HISTORY, in_order, parse_condition
 from robomme_interference_data.schema.rollouts import RolloutKey
+from robomme_interference_data.schema.shard import Shard, shuffle_key
 from robomme_interference_data.storage.text import canonical_json
 
 if TYPE_CHECKING:  # readers of rows need neither
     from robomme_interference_data.data.buffer_set import BufferSet
 
     from .config import WorkConfig
-
-_SHARD = re.compile(r"(\d{1,6})/(\d{1,6})")
 
 
 @dataclass(frozen=True)
@@ -84,7 +81,7 @@ class RunPlan:
 
     def __post_init__(self) -> None:
         # Without listing the rollouts: a file may have plans of millions.
-        _read_shard(self.shard)
+        Shard.parse(self.shard)
         in_order(self.conditions)
         for group, numbers in self.episodes.items():
             EpisodeId.parse(f"{group}/0")
@@ -96,29 +93,15 @@ class RunPlan:
         return len(self.conditions) * sum(map(count_numbers, self.episodes.values()))
 
     def items(self) -> tuple[WorkItem, ...]:
-        """Return the rollouts of the shard in canonical order: by episode and condition.
-
-        Shards take episodes in turn from the shuffled order: they are disjoint, together they are
-        the plan, and their sizes differ by at most one episode.
-        """
-        number, of = _read_shard(self.shard)
+        """Return the rollouts of the shard in canonical order: by episode and condition."""
         known = [
             EpisodeId.parse(f"{group}/{index}")
             for group, numbers in self.episodes.items()
             for index in parse_numbers(numbers)
         ]
-        episodes = sorted(sorted(known, key=_shuffle_key)[number - 1 :: of])
+        episodes = sorted(Shard.parse(self.shard).share(known, lambda episode: episode))
         names = [condition.name for condition in in_order(self.conditions)]
         return tuple(WorkItem(name, episode) for episode in episodes for name in names)
-
-
-def _read_shard(text: str) -> tuple[int, int]:
-    shard = _SHARD.fullmatch(text)
-    if shard is None or not 1 <= int(shard[1]) <= int(shard[2]):
-        raise InvalidOptionError.expected(
-            "shard", text, "NUMBER/OF, such as 2/8 for the second of eight"
-        )
-    return int(shard[1]), int(shard[2])
 
 
 def plan_run(config: "WorkConfig", facts: SystemFacts, buffer_set: "BufferSet") -> RunPlan:
@@ -134,7 +117,20 @@ def plan_run(config: "WorkConfig", facts: SystemFacts, buffer_set: "BufferSet") 
     )
     if not conditions:  # no planned one applies; raises
         _check_condition(facts, buffer_set.conditions[0], buffer_set)
-    plan = plan_work(
+    plan = _plan(config, buffer_set, conditions)
+    for condition in plan.conditions:
+        _check_condition(facts, condition, buffer_set)
+    buffer_set.check_tables(plan.conditions)
+    return plan
+
+
+def check_episodes(config: "WorkConfig", buffer_set: "BufferSet") -> None:
+    """Check that the episodes and conditions of a run exist, whatever its system is."""
+    _plan(config, buffer_set, config.conditions or tuple(buffer_set.conditions))
+
+
+def _plan(config: "WorkConfig", buffer_set: "BufferSet", conditions: tuple[str, ...]) -> RunPlan:
+    return plan_work(
         buffer_set.episodes_under(conditions),
         conditions=conditions,
         families=config.families,
@@ -142,10 +138,6 @@ def plan_run(config: "WorkConfig", facts: SystemFacts, buffer_set: "BufferSet") 
         split=config.split,
         shard=config.shard,
     )
-    for condition in plan.conditions:
-        _check_condition(facts, condition, buffer_set)
-    buffer_set.check_tables(plan.conditions)
-    return plan
 
 
 def nothing_to_retrieve(hint: str) -> InvalidOptionError:
@@ -223,8 +215,4 @@ def shuffle_work(items: Iterable[WorkItem]) -> tuple[WorkItem, ...]:
     A run that stops early has covered all families and difficulties evenly, and each episode under
     all of its conditions.
     """
-    return tuple(sorted(items, key=lambda item: _shuffle_key(item.episode)))
-
-
-def _shuffle_key(episode: EpisodeId) -> bytes:
-    return hashlib.sha256(str(episode).encode()).digest()
+    return tuple(sorted(items, key=lambda item: shuffle_key(item.episode)))

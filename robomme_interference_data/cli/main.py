@@ -28,7 +28,7 @@ from robomme_interference_data.evaluate.vla_eval import commands as vla_eval
 from robomme_interference_data.retrieval import commands as retrieving
 from robomme_interference_data.storage.hub import check_endpoint
 
-from . import commands, show_command, simulate_command, verify_command
+from . import commands, merge_command, show_command, simulate_command, verify_command
 from .console import echo, log_to_stderr, print_status, write_utf8
 
 PROGRAM = "robomme-interference"
@@ -131,7 +131,7 @@ _GROUPS: dict[str, tuple[tuple[str, Callable[..., None]], ...]] = {
         ("ceiling", evaluating.ceiling),
         ("evaluate", evaluating.evaluate),
         ("ask", evaluating.ask),
-        ("merge", evaluating.merge),
+        ("merge", merge_command.merge),
         ("vla-eval-config", vla_eval.vla_eval_config),
     ),
     "Scores": (("score", scoring.score), ("compare", scoring.compare), ("power", scoring.power)),

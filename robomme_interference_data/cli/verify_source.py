@@ -41,12 +41,13 @@ def verify_sources(config: "SourceConfig", root: Path, *, as_json: bool) -> None
 
     with graceful_interrupt("Nothing is kept"):
         names, sources, episodes, problems = _listed(config, root)
+        workers = config.fitting(max((source.worker_gb for source in sources), default=0))
         task = CheckTask(sources, chosen_cameras(config.cameras), config.fps)
         with WorkProgress(unit="episodes") as progress:
             progress.start("Reading", len(episodes))
             # One worker needs no process of its own: there is nothing to write.
-            alone = config.workers == 1 and not config.on_cluster
-            executor = Serial() if alone else make_executor(config)
+            alone = workers.workers == 1 and not workers.on_cluster
+            executor = Serial() if alone else make_executor(workers)
             report = check_sources(names, task, episodes, executor, progress.advance)
     report = dataclasses.replace(report, problems=[*problems, *report.problems])
     command = _build_command(config, root, report)

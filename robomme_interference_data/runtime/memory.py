@@ -1,5 +1,6 @@
-"""A limit on the memory of this process, for commands that read files of strangers."""
+"""The memory of this machine: a limit on this process, and how many workers fit in it."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -34,3 +35,16 @@ def memory_limit(most: int) -> Iterator[None]:
         ) from None
     finally:
         resource.setrlimit(resource.RLIMIT_DATA, (before, highest))
+
+
+def fitting_workers(worker_gb: float) -> int:
+    """Return how many workers this machine has cores and memory for; at least one.
+
+    Args:
+        worker_gb: Memory in GB that each of them takes; 0 if it does not matter.
+    """
+    cores = os.cpu_count() or 1
+    if not worker_gb or not hasattr(os, "sysconf"):  # Windows
+        return cores
+    memory_gb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+    return max(1, min(cores, int(memory_gb / worker_gb)))

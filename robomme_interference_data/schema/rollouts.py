@@ -49,7 +49,7 @@ class RolloutKey:
     revision: Annotated[str, "Identity of the buffer set, `BufferSet.revision`."]
     family: Annotated[str, "Task family of the query episode."]
     condition: Annotated[str, "`no-history`, `k0`, `k1`, …"]
-    split: Annotated[str, "`train`, `val` or `test`."]
+    split: Annotated[str, "`train`, `val`, `test` or `heldout`."]
     episode: Annotated[int, "Index of the query episode."]
     shift: Annotated[str, "Difference of the live scene to the lesson's, `light:2`; or `none`."]
     training_seed: Annotated[

@@ -62,6 +62,7 @@ class Simulator(ABC):
         suite_version: Version of its episodes; None if they have none.
         packages: Distributions of this environment that it uses.
         episode_s: Seconds that recording one episode may take.
+        worker_gb: Memory in GB that a worker with it takes.
         action_size: Length of an action; an instance may set another one.
     """
 
@@ -80,6 +81,7 @@ class Simulator(ABC):
     suite_version: ClassVar[int | None] = None
     packages: ClassVar[tuple[str, ...]] = ()
     episode_s: ClassVar[float] = 300.0
+    worker_gb: ClassVar[float] = 1.5
     action_size: int = ACTION_SIZE
     _episode: EpisodeId | None = None
     _steps = 0

@@ -144,10 +144,20 @@ def test_episodes(name: str) -> None:
     source = open_source(name)
     ids = [episode.id for episode in source.episodes()]
     assert ids == sorted({*ids})
-    assert len(choose_episodes([source])) == len(FAMILIES) * (100 + 50 + 50)
+    held_out = 50 if name == "robomme" else 0
+    assert len(choose_episodes([source])) == len(FAMILIES) * (100 + 50 + 50 + held_out)
     named = [one.id.index for _, one in choose_episodes([source], numbers=(99, 100, 899, 900))]
     assert sorted({*named}) == ([99, 100, 899] if name == "tabletop" else [99])
     assert len(named) == len(FAMILIES) * len({*named})
+    if name == "robomme":
+        chosen = choose_episodes([source], split="heldout", numbers=(0, 49))
+        assert [str(one.id) for _, one in chosen[:2]] == [
+            "VideoRepick/heldout/0",
+            "VideoRepick/heldout/49",
+        ]
+    else:
+        with raises(SourceError):
+            choose_episodes([source], split="heldout")
 
 
 OWN = "support.own_simulators:"

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.buffer_sets import build, plan_again
+from support.buffer_sets import build, plan_again, violations
 from support.tabletop import PROVENANCE, Drawn
 
 from robomme_interference_data import load_buffer_set
@@ -88,3 +88,13 @@ def test_lessons_and_units_from_different_renderers_are_a_warning(tmp_path: Path
         '"sapien": "3.0.3"',
     ):
         assert row in card
+
+
+def test_extended_demonstrations_need_new_manifests(own_buffers: Path) -> None:
+    """One line with the command, not one for each buffer that is planned in another way."""
+    build(own_buffers, "demonstrations", SampleSource(size=32), families=("InsertPeg",))
+    command = f"robomme-interference build {own_buffers} --only manifests"
+    expected = f"demonstrations: changed after the buffers were planned: run {command}"
+    assert violations(own_buffers, decode=False) == [expected]
+    plan_again(own_buffers)
+    assert violations(own_buffers, decode=False) == []

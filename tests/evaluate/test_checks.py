@@ -135,6 +135,27 @@ def test_the_default_is_all_conditions_that_apply(tmp_path: Path) -> None:
         run_one(tmp_path / "k0", policy=still, conditions=("k0",))
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"families": ("NoFamily",)},
+        {"episodes": "99"},
+        {"conditions": ("k5",)},
+        {"shift": "fog:1"},
+        {"simulator": "robomme"},  # without an interpreter
+    ],
+)
+def test_cheap_checks_come_before_a_server_is_waited_for(
+    tmp_path: Path, wrong: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("ROBOMME_PYTHON", raising=False)
+    # No server listens there: it would be waited for, 600 s by default.
+    absent: dict[str, Any] = {"policy": "websocket://127.0.0.1:9", "system": "mine"}
+    with raises(InterferenceError):
+        run(tmp_path / "run", policy_options=("checkpoint=c",), **absent | wrong)
+    assert not (tmp_path / "run").exists()
+
+
 # --- the simulator -----------------------------------------------------------------------------
 
 
@@ -248,9 +269,9 @@ def test_mistakes_are_found_before_a_server_is_asked(
 def check_name(tiny_buffers: Path, system: str, **changes: Any) -> None:
     settings = config(**{"simulator": "tabletop"} | changes)
     check_system(settings, system)
-    buffer_set = load_buffer_set(tiny_buffers)
-    check_settings(settings, buffer_set)
-    check_policy(settings, buffer_set, make_policy("noop"))
+    opened = load_buffer_set(tiny_buffers)
+    check_settings(settings, opened)
+    check_policy(settings, opened, make_policy("noop"))
 
 
 @pytest.mark.parametrize(

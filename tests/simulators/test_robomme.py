@@ -10,14 +10,17 @@ import pytest
 from support.messages import raises
 from support.worker_calls import wait_until_gone
 
+from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import (
     InvalidOptionError,
     SimulatorCrashError,
     UnknownNameError,
 )
+from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators import Status
+from robomme_interference_data.simulators.robomme.heldout import heldout_setup
 from robomme_interference_data.simulators.robomme.render_on_demand import KeptFrames
 from robomme_interference_data.simulators.robomme.simulator import EPISODES, RoboMMESimulator
 
@@ -57,6 +60,35 @@ def test_an_episode_is_what_robomme_returns(simulator: RoboMMESimulator) -> None
     # Seeds: 640000 + 1000 times the rank of test, val, train + index.
     seeds = [simulator.reset(f"MoveCube/{split}/1")[2].seed for split in ("val", "train")]
     assert seeds == [641_001, 642_001]
+
+
+def test_held_out_episodes_are_made_from_their_published_seeds(simulator: RoboMMESimulator) -> None:
+    # Of 50 episodes a family the first 10 are easy, 20 medium, 20 hard: MoveCube's begin with
+    # seeds 2900001, 2900500, 2901000, 2901500; VideoUnmask's last one is 2105300.
+    lesson, _, info = simulator.reset("MoveCube/heldout/3")
+    assert (len(lesson), info.seed, info.difficulty) == (5, 2_901_500, "easy")
+    lesson, _, info = simulator.reset("VideoUnmask/heldout/39")
+    assert (len(lesson), info.difficulty) == (41, "hard")
+    scene = RoboMMESimulator.scene("VideoUnmask", info.seed, info.difficulty, lesson.scene)
+    assert scene is not None and len(scene.answers) == 3  # as of any other split
+    assert simulator.act("oracle").shape == (8,)
+    # The episode of the test split under the same index stays what it was.
+    assert simulator.reset("MoveCube/test/3")[2].seed == 640_003
+    for episode in ("MoveCube/heldout/50", "BinFill/heldout/0"):
+        with raises(UnknownNameError):
+            simulator.reset(episode)
+
+
+def test_the_held_out_split_is_listed_with_its_source() -> None:
+    held_out = [one for one in RoboMMESimulator.episodes() if one.split == "heldout"]
+    assert [str(held_out[0]), str(held_out[-1])] == [
+        "VideoRepick/heldout/0",
+        "RouteStick/heldout/49",
+    ]
+    setups = [heldout_setup(episode) for episode in held_out]
+    assert len({setup.seed for setup in setups if setup}) == len(FAMILIES) * 50
+    assert setups[0] == (2_400_000, "easy") and setups[49] == (2_406_401, "hard")
+    assert heldout_setup(EpisodeId("MoveCube", "test", 0)) is None
 
 
 def test_a_step_executes_the_action(simulator: RoboMMESimulator) -> None:

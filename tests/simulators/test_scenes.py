@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from robomme_interference_data.constants import DIFFICULTIES, FAMILIES, SPLITS
+from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.ids import EpisodeId
 
 pytest.importorskip("mani_skill", reason="needs the extra sim")
@@ -18,6 +18,7 @@ pytest.importorskip("mani_skill", reason="needs the extra sim")
 from robomme_interference_data.simulators.tabletop.bodies import CUBE, SIDE
 from robomme_interference_data.simulators.tabletop.camera import to_pixels
 from robomme_interference_data.simulators.tabletop.episodes import (
+    EPISODES,
     difficulty_of,
     episode_ids,
     further_ids,
@@ -71,7 +72,7 @@ def test_seeds_and_difficulties_are_fixed() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("family", FAMILIES)
 def test_each_answer_occurs_equally_often_to_within_one(family: str) -> None:
-    for split, difficulty in product(SPLITS, DIFFICULTIES):
+    for split, difficulty in product(EPISODES, DIFFICULTIES):
         drawn = scenes(family, split, difficulty)
         counts = Counter(scene.right for scene in drawn)
         each = [counts[answer] for answer in drawn[0].answers]

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
-HELPERS = {"loopback_hub", "made_buffer_set", "nothing", "common"}
+HELPERS = {"loopback_hub", "made_buffer_set", "nothing", "common", "robomme_loop"}
 NAMES = sorted({path.stem for path in FOLDER.glob("*.py")} - HELPERS)
 
 

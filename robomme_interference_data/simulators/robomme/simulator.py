@@ -24,6 +24,7 @@ from robomme_interference_data.storage.cache import cache_folder
 
 from . import versions as robomme_versions
 from . import worker as robomme_worker
+from .heldout import heldout_ids, heldout_setup
 from .recorded_scene import read_scene
 from .scenes import OfficialScene
 
@@ -76,6 +77,7 @@ class RoboMMESimulator(RemoteSimulator):
     own_episodes = True
     try_out = False
     episode_s = 1800.0
+    worker_gb = 2.5
 
     def __init__(
         self,
@@ -118,8 +120,8 @@ class RoboMMESimulator(RemoteSimulator):
 
     @classmethod
     def episodes(cls) -> list[EpisodeId]:
-        """Return its episodes: the same ids as those of the embedded suite."""
-        return episode_ids()
+        """Return its episodes: the ids of the embedded suite, and those of the held-out split."""
+        return sorted([*episode_ids(), *heldout_ids()])
 
     @classmethod
     def scene(
@@ -175,6 +177,12 @@ class RoboMMESimulator(RemoteSimulator):
         start = super()._begin(episode, frame_step)
         self._subgoal = self.fact("subgoal")
         return start
+
+    def _chosen(self, episode: EpisodeId) -> dict[str, Any]:
+        setup = heldout_setup(episode)
+        # RoboMME knows no held-out split: it gets their seeds in place of those of another one.
+        split = episode.split if setup is None else "test"
+        return {**super()._chosen(episode), "split": split, "setup": setup}
 
     def _evidence(
         self, episode: EpisodeId, arrays: Arrays

@@ -128,9 +128,12 @@ class Episodes:
         """Return RoboMME's families, and what was patched."""
         return {"families": self._families, "patches": self._patches}, {}
 
-    def reset(self, family: str, split: str, index: int, frame_step: int) -> Answer:
+    def reset(
+        self, family: str, split: str, index: int, frame_step: int, setup: list[Any] | None
+    ) -> Answer:
         """Play a demonstration; return the facts about the episode, its frames and its states.
 
+        `setup` is a seed and a difficulty in place of those in RoboMME's metadata, or None.
         `scene` and `moments` are what `facts.py` reads, or `scene` is None and `unreadable` says
         why.
         """
@@ -138,6 +141,9 @@ class Episodes:
         builder = _builder()(
             env_id=family, dataset=split, action_space="joint_angle", max_steps=self._max_steps
         )
+        if setup is not None:
+            replaced = dict(zip(("seed", "difficulty"), setup, strict=True))
+            builder.metadata_index[family, index] = replaced
         seed, difficulty = builder.resolve_episode(index)
         # RoboMME would make an environment anyway, with a seed that belongs to no episode.
         if seed is None or not difficulty:

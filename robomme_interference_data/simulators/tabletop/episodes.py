@@ -2,7 +2,7 @@
 
 from numpy.random import RandomState
 
-from robomme_interference_data.constants import DIFFICULTIES, FAMILIES, SPLITS
+from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.errors import UnknownNameError
 from robomme_interference_data.ids import EpisodeId
 
@@ -21,6 +21,8 @@ def seed_of(episode: EpisodeId) -> int:
     """Return the seed of an episode; no two episodes share one."""
     if episode.family not in FAMILIES:
         raise UnknownNameError.among("family", episode.family, "tabletop", FAMILIES)
+    if episode.split not in EPISODES:
+        raise UnknownNameError.among("split", episode.split, "tabletop", EPISODES)
     count = TRAIN if episode.split == "train" else EPISODES[episode.split]
     if episode.index >= count:
         raise UnknownNameError(
@@ -55,8 +57,8 @@ def episode_ids() -> list[EpisodeId]:
     return [
         EpisodeId(family, split, index)
         for family in FAMILIES
-        for split in SPLITS
-        for index in range(EPISODES[split])
+        for split, count in EPISODES.items()
+        for index in range(count)
     ]
 
 

@@ -183,20 +183,25 @@ class BenchmarkEnvBuilder:
     def __init__(self, env_id, dataset="test", action_space="joint_angle", max_steps=10000):
         assert action_space == "joint_angle"
         self.family, self.max_steps = env_id, max_steps
-        self.rank = ("test", "val", "train").index(dataset)
+        rank = ("test", "val", "train").index(dataset)
+        self.metadata_index = {
+            (env_id, episode): {
+                "seed": 640_000 + 1000 * rank + episode,
+                "difficulty": ("easy", "medium", "hard")[episode % 3],
+            }
+            for episode in range(50)
+        }
 
     @classmethod
     def get_task_list(cls):
         return ["MoveCube", "VideoRepick", "VideoUnmask", "PatternLock", "RouteStick", "BinFill"]
 
     def get_episode_num(self):
-        return 50
+        return len(self.metadata_index)
 
     def resolve_episode(self, episode):
-        if episode >= self.get_episode_num():
-            return None, None
-        difficulty = ("easy", "medium", "hard")[episode % 3]
-        return 640_000 + 1000 * self.rank + episode, difficulty
+        found = self.metadata_index.get((self.family, episode), {})
+        return found.get("seed"), found.get("difficulty")
 
     def make_env_for_episode(self, episode_idx):
         seed, _ = self.resolve_episode(episode_idx)
