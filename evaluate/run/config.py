@@ -167,6 +167,9 @@ class RunConfig(WorkConfig):
         group=_SUBGOALS,
         help="Options of the writer, such as frames=32 or response_s=60.",
     )
+    no_probe: bool = setting(
+        False, group=_EXECUTION, help="Do not test before the run whether a state survives a reset."
+    )
     videos: bool = setting(False, group=_EXECUTION, help="Write a video of each rollout.")
     check_lesson: bool = setting(
         False,

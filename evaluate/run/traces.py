@@ -1,0 +1,344 @@
+"""The rules of the leak probe: which rollouts it plays, and what their differences show.
+
+A rollout is repeated after other rollouts. If its values differ, all plays are repeated in the same
+order: a state that survives a reset gives the same differences again, noise does not.
+"""
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import MAX_STEPS
+from robomme_interference_data.schema.conditions import parse_condition
+from robomme_interference_data.schema.subgoal import Subgoal
+from robomme_interference_data.simulators.episode import Observation
+from robomme_interference_data.stats.significance import poisson_binomial
+
+from .plan import WorkItem, shuffle_work
+
+SHORT_STEPS = 72
+"""Steps of a short play: four and a half chunks, so that a queue of actions is left over."""
+
+ENOUGH_ROLLOUTS = 120
+"""Rollouts from which on a run is probed with a whole rollout, too: 6 plays are 5% of them."""
+
+LEAK_P = 0.01
+"""Largest p-value at which plays that are noisy show a leak."""
+
+_SHARE, _FEWEST, _MOST = 0.05, 4, 12
+"""Of a noisy system: the share of a run's rollouts in `rounds`, and bounds of its rollouts."""
+
+
+# --- what is played ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Turn:
+    """A rollout that the probe plays.
+
+    Attributes:
+        item: The rollout.
+        whole: Whether it is played to its end, and not for `SHORT_STEPS` steps only.
+        beside: The rollout whose calls another client of the same policy makes in between.
+    """
+
+    item: WorkItem
+    whole: bool = False
+    beside: WorkItem | None = None
+
+    @property
+    def label(self) -> str:
+        """The rollout, and how it is played."""
+        return self.item.key + ("" if self.whole else f" ({SHORT_STEPS} steps)")
+
+
+def sequence(items: Sequence[WorkItem], *, clients: int) -> tuple[Turn, ...]:
+    """Return what the probe plays, in this order, with one policy; each time with the same past.
+
+    The first rollout comes with a new policy, and after another rollout, which has the longest
+    history and so leaves most behind. Runs of `ENOUGH_ROLLOUTS` or more play that one to its end,
+    too: some states are left only then. With several clients of one policy, another client acts
+    between the calls of the last play.
+
+    Args:
+        items: The planned rollouts, at least one.
+        clients: Number of workers that one policy or server serves.
+    """
+    ordered = shuffle_work(items)
+    first = min(ordered, key=_history_rank)
+    others = [item for item in ordered if item.episode.family != first.episode.family]
+    others = others or [item for item in ordered if item.episode != first.episode] or [*ordered]
+    second = max(others, key=_history_rank)
+    turns = [Turn(first), Turn(second), Turn(first)]
+    if len(items) >= ENOUGH_ROLLOUTS:
+        turns += [Turn(second, whole=True), Turn(first)]
+    if clients > 1:
+        turns.append(Turn(second, beside=first))
+    return tuple(turns)
+
+
+def rounds(items: Sequence[WorkItem]) -> tuple[Turn, ...]:
+    """Return what is played of a noisy system: some rollouts, whole, in order, again, and backward.
+
+    So most are played twice after the same rollout and once after another one.
+    """
+    ordered = sorted(items, key=lambda item: hashlib.sha256(item.key.encode()).digest())
+    count = int(len(items) * _SHARE) // 3
+    chosen = [Turn(item, whole=True) for item in ordered[: min(max(count, _FEWEST), _MOST)]]
+    return (*chosen, *chosen, *reversed(chosen))
+
+
+def _history_rank(item: WorkItem) -> tuple[object, ...]:
+    return _rank(item.condition)
+
+
+def _rank(condition: str) -> tuple[object, ...]:
+    return tuple(parse_condition(condition).sort_key)
+
+
+# --- what is compared --------------------------------------------------------------------------
+
+
+class Part(Enum):
+    """What gives the values of a rollout."""
+
+    RETRIEVAL = "retrieval step"
+    SIMULATOR = "simulator"
+    WRITER = "subgoal writer"
+    POLICY = "policy"
+
+
+class Event(NamedTuple):
+    """A value in a rollout: what gave it, after how many steps, and a digest of it."""
+
+    part: Part
+    step: int
+    digest: bytes
+
+
+@dataclass
+class Trace:
+    """Collects the values of a rollout, in order.
+
+    Attributes:
+        most_steps: After so many steps the rollout ends.
+        collects: Whether it collects anything: digests of images take time.
+        events: The values.
+        first_action: The first action; empty before it.
+    """
+
+    most_steps: int = MAX_STEPS
+    collects: bool = True
+    events: list[Event] = field(default_factory=list)
+    first_action: tuple[float, ...] = ()
+
+    def received(self, frames: Sequence[int]) -> None:
+        """Add which frames of the history the policy receives."""
+        self._add(Part.RETRIEVAL, 0, np.array(frames, np.int64))
+
+    def observed(self, step: int, observation: Observation) -> None:
+        """Add an observation of the simulator."""
+        images = [observation.images[name] for name in sorted(observation.images)]
+        self._add(Part.SIMULATOR, step, *images, observation.state)
+
+    def told(self, step: int, subgoal: Subgoal) -> None:
+        """Add a subgoal."""
+        self._add(Part.WRITER, step, np.frombuffer(subgoal.grounded.encode(), np.uint8))
+
+    def acted(self, step: int, action: NDArray[np.float32]) -> None:
+        """Add an action of the policy."""
+        self.first_action = self.first_action or tuple(action.tolist())
+        self._add(Part.POLICY, step, action)
+
+    def ended(self, step: int, status: str) -> None:
+        """Add how the simulator ended the rollout."""
+        self._add(Part.SIMULATOR, step, np.frombuffer(status.encode(), np.uint8))
+
+    def _add(self, part: Part, step: int, *arrays: NDArray[Any]) -> None:
+        if not self.collects:
+            return
+        digest = hashlib.sha256()
+        for array in arrays:
+            digest.update(f"{array.dtype.str}{array.shape}".encode())
+            digest.update(np.ascontiguousarray(array))
+        self.events.append(Event(part, step, digest.digest()[:16]))
+
+
+@dataclass(frozen=True)
+class Play:
+    """A rollout that the probe played.
+
+    Attributes:
+        turn: What was played.
+        past: Labels of what the same client played since it was new.
+        after: Label of what the probe played just before; None at its beginning.
+        events: The values.
+        first_action: The first action.
+        status: How it ended; None if it was cut short.
+    """
+
+    turn: Turn
+    past: tuple[str, ...]
+    after: str | None
+    events: tuple[Event, ...]
+    first_action: tuple[float, ...] = ()
+    status: str | None = None
+
+    @property
+    def circumstances(self) -> str:
+        """What came before it, and what happened beside it, in words."""
+        before = f"after {self.past[-1]}" if self.past else "with a new policy"
+        beside = self.turn.beside
+        return before + (f", while another client plays {beside.key}" if beside else "")
+
+
+class Verdict(Enum):
+    """What plays show."""
+
+    INDEPENDENT = "independent"
+    """All values are the same after any predecessor."""
+
+    LEAK = "leak"
+    """Values differ after another predecessor, and never after the same one."""
+
+    NOISE = "nondeterministic"
+    """Values differ after the same predecessor, too."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """The first value in which two plays of a rollout differ."""
+
+    event: Event
+    first: Play
+    second: Play
+
+
+def judge(plays: Sequence[Play]) -> tuple[Verdict, Difference | None]:
+    """Return what plays show, and the earliest difference that shows it.
+
+    The values of a play follow either from all that its client did since it was new, or, in a
+    process or server that outlives its clients, from the play just before. If one of these explains
+    all differences, and is known from repeated plays, a state survives.
+    """
+    apart = _differences(plays)
+    if not apart:
+        return Verdict.INDEPENDENT, None
+    differing = {difference.first.turn.item for difference in apart}
+    pasts: tuple[Callable[[Play], object], ...] = (
+        lambda play: (play.turn.beside, play.past),
+        lambda play: (play.turn.beside, play.after),
+    )
+    for past in pasts:
+        repeated = {
+            a.turn.item
+            for a, b in combinations(plays, 2)
+            if a.turn.item == b.turn.item and past(a) == past(b)
+        }
+        explained = all(past(each.first) != past(each.second) for each in apart)
+        if explained and differing <= repeated:
+            return Verdict.LEAK, min(apart, key=_step)
+    unexplained = [each for each in apart if pasts[0](each.first) == pasts[0](each.second)]
+    return Verdict.NOISE, min(unexplained or apart, key=_step)
+
+
+def _step(difference: Difference) -> int:
+    return difference.event.step
+
+
+def _differences(plays: Sequence[Play]) -> list[Difference]:
+    """Return the first difference of each two plays of a rollout that differ."""
+    found = []
+    for first, second in combinations(plays, 2):
+        if first.turn.item == second.turn.item:
+            event = first_difference(first.events, second.events)
+            if event is not None:
+                found.append(Difference(event, first, second))
+    return found
+
+
+def first_difference(first: Sequence[Event], second: Sequence[Event]) -> Event | None:
+    """Return the first event in which two traces differ, as far as both go; None without one."""
+    return next((b for a, b in zip(first, second, strict=False) if a != b), None)
+
+
+# --- noisy systems -----------------------------------------------------------------------------
+
+
+def flips(plays: Sequence[Play]) -> tuple[int, int]:
+    """Return how many rollouts were played twice after the same one, and ended differently."""
+    pairs = [same for same, _ in _same_and_other(plays)]
+    return len(pairs), sum(first.status != second.status for first, second in pairs)
+
+
+def noise_p(repeats: Sequence[Sequence[Play]], plays: Sequence[Play]) -> float:
+    """Return the p-value of a leak in a noisy system: the smallest of all tests, corrected.
+
+    Each test supposes that the past has no effect. Then plays of a rollout may change places:
+
+    - of the first actions at two places of the `repeats`, the two halves that belong together are
+      rarely closest within;
+    - of three `plays`, two after the same rollout, these are closest in at most a third of the
+      rollouts, by their first actions and by their outcomes.
+
+    Args:
+        repeats: The plays of a sequence, at least twice.
+        plays: The plays of `rounds`.
+    """
+    places = [*zip(*repeats, strict=True)]
+    found = [
+        _halves_p([play.first_action for play in (*first, *second)])
+        for first, second in combinations(places, 2)
+        if first[0].turn.item == second[0].turn.item
+    ]
+    triples = [(*same, other) for same, other in _same_and_other(plays) if other is not None]
+    for distance in (_action_distance, _outcome_distance):
+        closest = sum(
+            distance(a, b) < min(distance(a, other), distance(b, other)) for a, b, other in triples
+        )
+        if triples:
+            found.append(poisson_binomial(closest, [1 / 3] * len(triples)))
+    return min(1.0, len(found) * min(found))
+
+
+def _halves_p(actions: Sequence[tuple[float, ...]]) -> float:
+    """Return the share of divisions into halves that are as close within as the given one."""
+    vectors = np.array(actions)
+    distances = np.abs(vectors[:, None] - vectors[None]).max(axis=2)
+    half = len(actions) // 2
+
+    def within(chosen: tuple[int, ...]) -> float:
+        rest = [place for place in range(len(actions)) if place not in chosen]
+        return float(sum(distances[np.ix_(part, part)].sum() for part in (chosen, rest)))
+
+    given = within(tuple(range(half)))
+    # Either half of a division names it: only that with the first play is counted.
+    sums = [within((0, *others)) for others in combinations(range(1, len(actions)), half - 1)]
+    return sum(value <= given for value in sums) / len(sums)
+
+
+def _same_and_other(plays: Sequence[Play]) -> Iterator[tuple[tuple[Play, Play], Play | None]]:
+    """Yield two plays of a rollout after the same one, and, if any, one after another one."""
+    known = [play for play in plays if play.after is not None]
+    for item in dict.fromkeys(play.turn.item for play in known):
+        own = [play for play in known if play.turn.item == item]
+        for first, second in combinations(own, 2):
+            if first.after == second.after:
+                others = (play for play in own if play.after != first.after)
+                yield (first, second), next(others, None)
+                break
+
+
+def _action_distance(first: Play, second: Play) -> float:
+    difference = np.subtract(first.first_action, second.first_action)
+    return float(np.abs(difference).max(initial=0.0))
+
+
+def _outcome_distance(first: Play, second: Play) -> float:
+    return float(first.status != second.status)
